@@ -1,0 +1,49 @@
+# `make demo` and `make test` do all set-up: Python packages in .venv (or the active environment), a working libLLVM.
+ACTIVE := $(or $(VIRTUAL_ENV),$(CONDA_PREFIX))
+BIN := $(or $(ACTIVE),.venv)/bin
+OUT ?= out/demo
+
+.PHONY: help demo test quick bench notebooks docs lint clean
+
+help:
+	@echo "make demo       fit a small capture made on the spot and write $(OUT)/report.html"
+	@echo "make test       all tests"
+	@echo "make quick      the tests that take seconds"
+	@echo "make bench      reduced benchmarks, renews benchmarks/results"
+	@echo "make notebooks  runs the notebooks in reduced size"
+	@echo "make docs       builds the documentation into site/"
+	@echo "make lint       ruff and mypy"
+
+demo:
+	@.ci/setup
+	$(BIN)/mifit demo --out $(OUT)
+
+test:
+	@.ci/setup test
+	$(BIN)/ruff check .
+	$(BIN)/python -m pytest
+
+quick:
+	@.ci/setup test
+	$(BIN)/python -m pytest -m "not slow"
+
+bench:
+	@.ci/setup
+	$(BIN)/python -m benchmarks
+
+notebooks:
+	@.ci/setup notebooks
+	$(BIN)/python notebooks/run.py
+
+docs:
+	@.ci/setup docs
+	$(BIN)/mkdocs build --strict
+
+lint:
+	@.ci/setup test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf .venv build dist site *.egg-info

@@ -1,0 +1,54 @@
+"""Facial reflectance and geometry from two views, on Mitsuba 3 and Dr.Jit.
+
+Importing this package doesn't import Mitsuba; the names below load what they need when first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_EXPORTS = {
+    "Capture": "mifit.capture",
+    "MorphableModel": "mifit.morphable",
+    "Camera": "mifit.core.camera",
+    "SHLighting": "mifit.core.sh",
+    "FitConfig": "mifit.config",
+    "GeometryConfig": "mifit.config",
+    "ReflectanceConfig": "mifit.config",
+    "NormalsConfig": "mifit.config",
+    "InputError": "mifit.errors",
+    "MifitError": "mifit.errors",
+    "VariantError": "mifit.errors",
+    "ConvergenceError": "mifit.errors",
+    "set_variant": "mifit.render.variant",
+    "register_plugins": "mifit.render.plugins",
+    "load_scene": "mifit.render.scene",
+    "fit": "mifit.pipeline",
+    "track": "mifit.stages.track",
+    "fit_geometry": "mifit.stages.fit_geometry",
+    "infer_reflectance": "mifit.stages.infer_reflectance",
+    "refine_normals": "mifit.stages.refine_normals",
+    "Reconstruction": "mifit.output.reconstruction",
+}
+
+__all__ = ["__version__", *_EXPORTS]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _EXPORTS:
+        value = getattr(importlib.import_module(_EXPORTS[name]), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'mifit' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture as Capture
+    from mifit.morphable import MorphableModel as MorphableModel

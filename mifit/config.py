@@ -1,0 +1,133 @@
+"""Settings: one frozen dataclass per stage, read from TOML or dictionaries with unknown keys refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from mifit.errors import InputError
+
+
+@dataclass(frozen=True)
+class GeometryConfig:
+    """Stage 1, morphable-model fitting (paper, section 4)."""
+
+    landmark_weight: float = 10.0
+    prior_weight: float = 5e-5
+    max_iterations: int = 30
+
+
+@dataclass(frozen=True)
+class ReflectanceConfig:
+    """Stage 2, reflectance inference (paper, section 5)."""
+
+    texture_size: int = 512
+    solver: Literal["als", "adam"] = "als"
+    shading: Literal["auto", "paper", "prefiltered", "shadowed"] = "auto"
+    exponent: float = 5.0
+    specular_difference_weight: float = 0.1
+    smoothness_weight: float = 0.001
+    max_iterations: int = 30
+
+
+@dataclass(frozen=True)
+class NormalsConfig:
+    """Stage 3, normal refinement (paper, section 6)."""
+
+    solver: Literal["gauss_newton", "adam"] = "gauss_newton"
+    laplacian_weight: float = 1e-3
+    magnitude_weight: float = 0.3
+    max_iterations: int = 100
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """All settings of ``mifit.fit``."""
+
+    geometry: GeometryConfig = field(default_factory=GeometryConfig)
+    reflectance: ReflectanceConfig = field(default_factory=ReflectanceConfig)
+    normals: NormalsConfig = field(default_factory=NormalsConfig)
+
+    @classmethod
+    def load(cls, path: str | Path) -> FitConfig:
+        """Read a TOML file with one table per stage; raises InputError that names file, key and value."""
+        return from_mapping(cls, read_toml(path), str(path))
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Parse a TOML file; raises InputError when it is missing or malformed."""
+    try:
+        import tomllib
+    except ModuleNotFoundError:  # Python 3.10
+        import tomli as tomllib  # type: ignore[no-redef]
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such configuration file") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}: not a readable TOML file: {error}") from None
+
+
+def from_mapping(cls: type, values: Any, where: str) -> Any:
+    """Build a config dataclass from nested dictionaries.
+
+    Parameters
+    ----------
+    cls : type
+        A config dataclass.
+    values : dict
+        Its settings; missing keys keep their defaults.
+    where : str
+        File or option that the values come from, for messages.
+
+    Raises
+    ------
+    InputError
+        Unknown key (the nearest known one is named) or a value of the wrong type.
+    """
+    if not isinstance(values, dict):
+        raise InputError(f"{where}: found {values!r}, expected a table of settings for {cls.__name__}")
+    hints = typing.get_type_hints(cls)
+    known = [f.name for f in dataclasses.fields(cls)]
+    arguments = {}
+    for key, value in values.items():
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, 1)
+            hint = f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(known)}"
+            raise InputError(f"{where}: unknown key '{key}'; {hint}")
+        arguments[key] = _convert(hints[key], value, f"{where}: {key}")
+    try:
+        return cls(**arguments)
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    """Check one value against its type hint and return it as that type."""
+    origin, options = typing.get_origin(hint), typing.get_args(hint)
+    if dataclasses.is_dataclass(hint):
+        return from_mapping(typing.cast(type, hint), value, where)
+    if origin is Literal:
+        if value not in options:
+            raise InputError(f"{where}: found {value!r}, expected one of {', '.join(map(repr, options))}")
+        return value
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in options:
+            return None
+        return _convert(next(o for o in options if o is not type(None)), value, where)
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise InputError(f"{where}: found {value!r}, expected a list")
+        return tuple(_convert(options[0], v, where) for v in value)
+    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        if value != value or value in (float("inf"), float("-inf")):
+            raise InputError(f"{where}: found {value!r}, expected a finite number")
+        return float(value)
+    if isinstance(value, bool) != (hint is bool) or not isinstance(value, hint):
+        raise InputError(f"{where}: found {value!r}, expected a value of type {hint.__name__}")
+    return value

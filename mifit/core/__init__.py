@@ -1,0 +1,1 @@
+"""Plain NumPy parts that know nothing of Mitsuba: cameras, images, meshes, UV maps, harmonics, metrics."""

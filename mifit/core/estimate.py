@@ -1,0 +1,125 @@
+"""What each stage hands to the next: frozen records of plain arrays.
+
+Lengths are in the capture's units, colours linear Rec. 709. World space is the capture's; object space is the
+morphable model's: ``world = scale * rotation @ object + translation``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Report:
+    """How a stage ended.
+
+    Attributes
+    ----------
+    outcome : str
+        ``"converged"``, ``"max_iterations"``, ``"diverged"`` or another value of ``solve.Outcome``.
+    energies : dict of str to list of float
+        Energy per term over the iterations (same length each).
+    seconds : float
+        Wall time of the stage.
+    warnings : tuple of str
+        Things a person should know, in words.
+    details : dict
+        Further figures of the stage; JSON values only.
+    """
+
+    outcome: str
+    energies: dict[str, list[float]] = field(default_factory=dict)
+    seconds: float = 0.0
+    warnings: tuple[str, ...] = ()
+    details: dict = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class GeometryEstimate:
+    """Stage 1: morphable-model fit.
+
+    Attributes
+    ----------
+    timesteps : tuple of int
+    identity : (Ki,), albedo : (Ka,)
+        Shared coefficients in standard deviations.
+    expression : (T, Ke)
+    rotation : (T, 3, 3), translation : (T, 3), scale : float
+        Object to world.
+    vertices : (T, V, 3) float32
+        World space.
+    vertex_albedo : (V, 3) float32
+        Linear reflectance of the fitted model.
+    shading : (9, 3)
+        Paper's l_k in I_d = C_d * sum l_k phi_k(n): SH coefficients in world axes, basis of ``core.sh``.
+    ambient : float
+        The paper's I_a, in linear image units.
+    """
+
+    timesteps: tuple[int, ...]
+    identity: NDArray
+    albedo: NDArray
+    expression: NDArray
+    rotation: NDArray
+    translation: NDArray
+    scale: float
+    vertices: NDArray
+    vertex_albedo: NDArray
+    shading: NDArray
+    ambient: float
+    report: Report
+
+    def index(self, timestep: int) -> int:
+        """Position of a timestep in the per-timestep arrays; KeyError when it was not fitted."""
+        if timestep not in self.timesteps:
+            raise KeyError(timestep)
+        return self.timesteps.index(timestep)
+
+
+@dataclass(frozen=True)
+class ReflectanceEstimate:
+    """Stage 2: maps shared by all timesteps, and lighting.
+
+    Attributes
+    ----------
+    diffuse : (S, S, 3) float32
+        Diffuse albedo C_d + delta C_d, 0..1.
+    specular : (S, S) float32
+        Specular albedo C_s, 0..1.
+    confidence : (S, S) float32
+        0 where never seen, 1 where seen often and well.
+    radiance : (B*B, 3) float64
+        SH coefficients of the incident radiance, world axes, convention of ``core.sh``.
+    ambient : float
+    exponent : float
+        Blinn-Phong exponent.
+    shading_model : str
+        ``"paper"``, ``"prefiltered"`` or ``"shadowed"``: how maps and lighting make an image.
+    """
+
+    diffuse: NDArray
+    specular: NDArray
+    confidence: NDArray
+    radiance: NDArray
+    ambient: float
+    exponent: float
+    shading_model: str
+    report: Report
+
+
+@dataclass(frozen=True)
+class NormalsEstimate:
+    """Stage 3: refined normals per timestep.
+
+    Attributes
+    ----------
+    timesteps : tuple of int
+    normal_object : (T, S, S, 3) float32
+        Unit normals in object space; (0, 0, 0) outside the covered texels.
+    """
+
+    timesteps: tuple[int, ...]
+    normal_object: NDArray
+    report: Report

@@ -1,0 +1,42 @@
+"""Triangle-mesh geometry on plain arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+
+def face_cross(vertices: NDArray, faces: NDArray) -> NDArray:
+    """(F, 3) unnormalised face normals; the length is twice the area. Counter-clockwise is outward."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return np.cross(b - a, c - a)
+
+
+def vertex_sum_matrix(faces: NDArray, n_vertices: int) -> sp.csr_matrix:
+    """(V, F) 0/1 matrix that sums face values over the faces around each vertex."""
+    f = np.repeat(np.arange(len(faces)), 3)
+    return sp.csr_matrix((np.ones(3 * len(faces)), (faces.ravel(), f)), shape=(n_vertices, len(faces)))
+
+
+def vertex_normals(vertices: NDArray, faces: NDArray) -> NDArray:
+    """(V, 3) unit normals, area weighted; a vertex without area gets (0, 0, 1)."""
+    cross = face_cross(np.asarray(vertices, dtype=np.float64), faces)
+    n = np.zeros((len(vertices), 3))
+    for axis in range(3):
+        for corner in range(3):
+            n[:, axis] += np.bincount(faces[:, corner], cross[:, axis], minlength=len(vertices))
+    return normalize(n)
+
+
+def normalize(v: NDArray) -> NDArray:
+    """Unit vectors along the last axis; a zero vector becomes (0, 0, 1)."""
+    length = np.linalg.norm(v, axis=-1, keepdims=True)
+    out = v / np.where(length > 0, length, 1.0)
+    out[length[..., 0] == 0] = (0.0, 0.0, 1.0)
+    return out
+
+
+def interpolate(values: NDArray, faces: NDArray, face: NDArray, weights: NDArray) -> NDArray:
+    """Vertex values (V, C) at points given by face index (N,) and barycentric weights (N, 3) -> (N, C)."""
+    return np.einsum("nk,nkc->nc", weights, values[faces[face]])

@@ -1,0 +1,111 @@
+"""UV space: which point of the surface each texel of a map shows, and how maps are read.
+
+A map is an (S, S, ...) array with row 0 at v = 1; the centre of texel (row, column) lies at
+u = (column + 0.5) / S, v = 1 - (row + 0.5) / S.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class TexelMap:
+    """Surface points of the texels of one square map.
+
+    Attributes
+    ----------
+    size : int
+        Texels along one side.
+    index : (N,) int64
+        Flat index (row * size + column) of each covered texel, ascending.
+    face : (N,) int32
+        Face index of each covered texel.
+    weights : (N, 3) float32
+        Barycentric weights of the face's three corners.
+    """
+
+    size: int
+    index: NDArray[np.int64]
+    face: NDArray[np.int32]
+    weights: NDArray[np.float32]
+
+    def to_map(self, values: NDArray, fill: float = 0.0) -> NDArray:
+        """Scatter per-texel values (N, ...) into a map (S, S, ...)."""
+        out = np.full((self.size * self.size, *values.shape[1:]), fill, dtype=values.dtype)
+        out[self.index] = values
+        return out.reshape(self.size, self.size, *values.shape[1:])
+
+    def from_map(self, image: NDArray) -> NDArray:
+        """Gather a map (S, S, ...) into per-texel values (N, ...)."""
+        return image.reshape(self.size * self.size, *image.shape[2:])[self.index]
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """(S, S) coverage."""
+        out = np.zeros(self.size * self.size, dtype=bool)
+        out[self.index] = True
+        return out.reshape(self.size, self.size)
+
+
+def rasterize_uv(uv: NDArray, faces_uv: NDArray, size: int, face_mask: NDArray | None = None) -> TexelMap:
+    """Find the face and the barycentric weights under the centre of every texel.
+
+    Parameters
+    ----------
+    uv : (T, 2) float
+        Texture vertices in [0, 1].
+    faces_uv : (F, 3) int
+        Texture-vertex indices per face.
+    size : int
+        Map side in texels.
+    face_mask : (F,) bool, optional
+        Faces to rasterise; all by default. Faces that reach outside [0, 1] are clipped to the map.
+    """
+    selected = np.arange(len(faces_uv)) if face_mask is None else np.flatnonzero(face_mask)
+    corners = uv[faces_uv[selected]].astype(np.float64) * (size, -size) + (0.0, size)  # pixel x, y
+    low = np.clip(np.ceil(corners.min(1) - 0.5), 0, size).astype(np.int64)
+    high = np.clip(np.floor(corners.max(1) - 0.5) + 1, 0, size).astype(np.int64)
+    extent = np.maximum(high - low, 0)
+    count = extent[:, 0] * extent[:, 1]
+    tri = np.repeat(np.arange(len(selected)), count)
+    k = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    x = low[tri, 0] + k % np.maximum(extent[tri, 0], 1)
+    y = low[tri, 1] + k // np.maximum(extent[tri, 0], 1)
+    a, b, c = (corners[tri, i] for i in range(3))
+    px, py = x + 0.5, y + 0.5
+    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        w1 = ((px - a[:, 0]) * (c[:, 1] - a[:, 1]) - (py - a[:, 1]) * (c[:, 0] - a[:, 0])) / area
+        w2 = ((b[:, 0] - a[:, 0]) * (py - a[:, 1]) - (b[:, 1] - a[:, 1]) * (px - a[:, 0])) / area
+    w = np.stack([1.0 - w1 - w2, w1, w2], axis=1)
+    inside = (w >= -1e-9).all(1) & np.isfinite(w).all(1)
+    flat, first = np.unique((y * size + x)[inside], return_index=True)
+    return TexelMap(
+        size, flat, selected[tri[inside][first]].astype(np.int32), w[inside][first].astype(np.float32)
+    )
+
+
+def sample_map(image: NDArray, uv: NDArray) -> NDArray:
+    """Bilinear look-up of a map (S, S, ...) at (N, 2) texture coordinates, clamped at the border."""
+    size = image.shape[0]
+    x = np.clip(uv[:, 0] * size - 0.5, 0, size - 1)
+    y = np.clip((1.0 - uv[:, 1]) * size - 0.5, 0, size - 1)
+    return bilinear(image, x, y)
+
+
+def bilinear(image: NDArray, x: NDArray, y: NDArray) -> NDArray:
+    """Bilinear look-up of (H, W, ...) at integer-centred column x and row y (N,), clamped at the border."""
+    h, w = image.shape[:2]
+    x, y = np.clip(x, 0, w - 1), np.clip(y, 0, h - 1)
+    x0 = np.minimum(x.astype(np.int64), max(w - 2, 0))
+    y0 = np.minimum(y.astype(np.int64), max(h - 2, 0))
+    x1, y1 = np.minimum(x0 + 1, w - 1), np.minimum(y0 + 1, h - 1)
+    shape = (-1,) + (1,) * (image.ndim - 2)
+    fx, fy = (x - x0).reshape(shape).astype(image.dtype), (y - y0).reshape(shape).astype(image.dtype)
+    top = image[y0, x0] * (1 - fx) + image[y0, x1] * fx
+    bottom = image[y1, x0] * (1 - fx) + image[y1, x1] * fx
+    return top * (1 - fy) + bottom * fy

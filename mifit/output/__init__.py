@@ -1,0 +1,1 @@
+"""What a reconstruction is turned into: result folder, renders, exports, report."""

@@ -1,0 +1,171 @@
+"""``mifit.fit``: capture and model -> geometry -> reflectance -> normals -> reconstruction."""
+
+from __future__ import annotations
+
+import dataclasses
+import resource
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import mifit
+from mifit import checkpoint
+from mifit.config import FitConfig
+from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
+from mifit.errors import InputError
+from mifit.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+    from mifit.output.reconstruction import Reconstruction
+
+Stage = Literal["geometry", "reflectance", "normals"]
+STAGES: tuple[Stage, ...] = ("geometry", "reflectance", "normals")
+T = TypeVar("T")
+
+
+def fit(
+    capture: Capture,
+    model: MorphableModel,
+    cameras: Sequence[str] | None = None,
+    timesteps: Sequence[int] | None = None,
+    config: FitConfig | None = None,
+    until: Stage = "normals",
+    seed: int = 0,
+    progress: Progress = silent,
+    checkpoints: str | Path | None = None,
+) -> Reconstruction:
+    """Recover geometry, reflectance, lighting and normals of a face from a capture.
+
+    Parameters
+    ----------
+    capture : Capture
+        Images with cameras and landmarks.
+    model : MorphableModel
+        The face model to fit.
+    cameras : sequence of str, optional
+        Cameras to use; no other camera's images are read. Default: the capture's first two.
+    timesteps : sequence of int, optional
+        Timesteps to fit jointly; default: the first four.
+    config : FitConfig, optional
+        Settings of the stages.
+    until : {"geometry", "reflectance", "normals"}
+        Last stage to run.
+    seed : int
+        Seed of everything random.
+    progress : Progress
+        Called as work advances.
+    checkpoints : path, optional
+        Folder for finished stages. A stage found there, computed from the same inputs, isn't run again.
+
+    Returns
+    -------
+    Reconstruction
+
+    Raises
+    ------
+    InputError
+        An unknown camera, timestep or stage, or inputs that a stage can't use.
+    ConvergenceError
+        A stage that ended without a usable result.
+
+    Notes
+    -----
+    The three stages of Song, Zheng, Cai, Cham, "Recovering Facial Reflectance and Geometry from Multi-view
+    Images", sections 4 to 6. A Mitsuba variant must be active (``mifit.set_variant``).
+    """
+    from mifit.output.reconstruction import Reconstruction
+    from mifit.stages.fit_geometry import fit_geometry
+    from mifit.stages.infer_reflectance import infer_reflectance
+    from mifit.stages.refine_normals import refine_normals
+
+    config = config or FitConfig()
+    cameras = choose("camera", capture.cameras, cameras, 2)
+    timesteps = choose("timestep", capture.timesteps, timesteps, 4)
+    if until not in STAGES:
+        raise InputError(f"until: found {until!r}, expected one of {', '.join(STAGES)}")
+    folder = None if checkpoints is None else Path(checkpoints)
+    started = time.perf_counter()
+    inputs = {
+        "version": mifit.__version__,
+        "capture": capture.digest(cameras, timesteps),
+        "model": model.digest,
+        "cameras": list(cameras),
+        "timesteps": list(timesteps),
+        "seed": seed,
+    }
+
+    def stage(name: Stage, cls: type[T], used: dict[str, Any], run: Callable[[], T]) -> T:
+        key = checkpoint.digest({**inputs, **used})
+        done = checkpoint.load(folder, name, cls, key) if folder else None
+        if done is None:
+            done = run()
+            if folder:
+                checkpoint.save(folder, name, done, key)
+        return done
+
+    settings = dataclasses.asdict(config)
+    used = {"geometry": settings["geometry"]}
+    geometry = stage(
+        "geometry",
+        GeometryEstimate,
+        used,
+        lambda: fit_geometry(capture, model, cameras, timesteps, config.geometry, seed=seed, progress=progress),
+    )
+    reflectance, normals = None, None
+    if until != "geometry":
+        used = {**used, "reflectance": settings["reflectance"]}
+        reflectance = stage(
+            "reflectance",
+            ReflectanceEstimate,
+            used,
+            lambda: infer_reflectance(
+                capture, model, geometry, cameras, config.reflectance, seed=seed, progress=progress
+            ),
+        )
+    if until == "normals":
+        assert reflectance is not None
+        found = reflectance
+        used = {**used, "normals": settings["normals"]}
+        normals = stage(
+            "normals",
+            NormalsEstimate,
+            used,
+            lambda: refine_normals(
+                capture, model, geometry, found, cameras, config.normals, seed=seed, progress=progress
+            ),
+        )
+    return Reconstruction(
+        model=model,
+        geometry=geometry,
+        reflectance=reflectance,
+        normals=normals,
+        config=settings,
+        cameras=tuple(cameras),
+        capture_digest=inputs["capture"],
+        units=capture.units,
+        unit_mm=capture.unit_mm,
+        seconds=time.perf_counter() - started,
+        peak_memory=peak_memory(),
+    )
+
+
+def choose(kind: str, known: Sequence[T], wanted: Sequence[T] | None, default: int) -> tuple[T, ...]:
+    """The wanted cameras or timesteps, checked, without repeats; the first ``default`` ones when none is named."""
+    if wanted is None:
+        return tuple(known[:default])
+    for item in wanted:
+        if item not in known:
+            raise InputError(f"{kind} {item!r}: not in the capture; it has {', '.join(map(str, known))}")
+    if not wanted:
+        raise InputError(f"no {kind} named; the capture has {', '.join(map(str, known))}")
+    return tuple(dict.fromkeys(wanted))
+
+
+def peak_memory() -> int:
+    """Largest resident memory of this process so far, in bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

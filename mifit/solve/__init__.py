@@ -1,0 +1,1 @@
+"""Nonlinear least squares; knows nothing of faces or rendering."""

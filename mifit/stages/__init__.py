@@ -1,0 +1,1 @@
+"""The stages: inputs + config + seed -> estimate. Data flows geometry -> reflectance -> normals."""
