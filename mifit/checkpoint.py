@@ -10,13 +10,13 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from mifit.core.estimate import Report
+from mifit.core.files import replacing
 
 T = TypeVar("T")
 
@@ -39,16 +39,8 @@ def save(folder: Path, stage: str, estimate: Any, key: str) -> None:
         else:
             scalars[field.name] = value
     arrays["_meta"] = np.frombuffer(json.dumps({"key": key, "scalars": scalars}).encode(), dtype=np.uint8)
-    folder.mkdir(parents=True, exist_ok=True)
-    temporary = folder / f".{stage}.{os.getpid()}.npz"
-    try:
-        with open(temporary, "wb") as stream:
-            np.savez(stream, **arrays)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, folder / f"{stage}.npz")
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(folder / f"{stage}.npz") as temporary, open(temporary, "wb") as stream:
+        np.savez(stream, **arrays)
 
 
 def load(folder: Path, stage: str, cls: type[T], key: str) -> T | None:

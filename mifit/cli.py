@@ -1,0 +1,229 @@
+"""The ``mifit`` command: parsing, exit codes and nothing else; the work is in ``mifit.commands``.
+
+Exit codes: 0 success, 2 bad usage or bad input (one line on stderr), 1 a failure of mifit's own, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import mifit
+from mifit.errors import InputError, MifitError
+
+
+class _Parser(argparse.ArgumentParser):
+    """Reports bad usage in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def _names(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if not names:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected names separated by commas")
+    return names
+
+
+def _timesteps(text: str) -> list[int]:
+    """``0,1,5-8`` -> [0, 1, 5, 6, 7, 8]."""
+    found: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        try:
+            found.extend(range(int(first), int(last if dash else first) + 1))
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"found {text!r}, expected numbers such as 0,1,2 or 0-7") from None
+    if not found:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a first number not above the last, such as 0-7")
+    return found
+
+
+def _at_least(low: int) -> Callable[[str], int]:
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = low - 1
+        if value < low:
+            raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number of at least {low}")
+        return value
+
+    return parse
+
+
+def _real(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not abs(value) < float("inf"):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a finite number")
+    return value
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    common.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    common.add_argument(
+        "--variant",
+        default="auto",
+        help="Mitsuba variant; auto: CUDA where it works, else LLVM (default: auto)",
+    )
+    common.add_argument("--seed", type=_at_least(0), default=0, help="seed of everything random (default: 0)")
+
+    parser = _Parser(prog="mifit", description="Facial reflectance and geometry from two views.")
+    parser.add_argument("--version", action="version", version=f"mifit {mifit.__version__}")
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="COMMAND", parser_class=_Parser, title="commands"
+    )
+
+    def add(name: str, text: str) -> argparse.ArgumentParser:
+        return commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".", parents=[common])
+
+    p = add("doctor", "what of the set-up works, what doesn't, and the command that mends it")
+    p.add_argument("--json", action="store_true", help="print JSON")
+
+    p = add("demo", "fit a small capture made on the spot, judge it on the held-out view, write a report")
+    p.add_argument("--out", type=Path, default=Path("out/demo"), help="folder to write (default: out/demo)")
+
+    p = add("synth", "path-traced captures with ground truth")
+    p.add_argument("--out", type=Path, required=True, help="capture folder to write")
+    p.add_argument("--subjects", type=_at_least(1), default=1)
+    p.add_argument("--timesteps", type=_at_least(1), default=4)
+    p.add_argument("--env", type=Path, help="lat-long HDR environment; default: a procedural studio")
+    p.add_argument("--model", default="builtin", help="morphable model: a path or builtin")
+    p.add_argument("--width", type=_at_least(16), default=680)
+    p.add_argument("--height", type=_at_least(16), default=480)
+    p.add_argument("--spp", type=_at_least(1), default=64, help="samples per pixel (default: 64)")
+
+    p = add("import", "a capture from videos, image folders, COLMAP text models or nerfstudio transforms.json")
+    p.add_argument("--video", type=Path, action="append", default=[], help="one camera's video; repeat per camera")
+    p.add_argument("--images", type=Path, action="append", default=[], help="one camera's folder of images; repeat")
+    p.add_argument("--calibration", type=Path, help="OpenCV stereo calibration, YAML or XML")
+    p.add_argument("--colmap", type=Path, help="folder with cameras.txt and images.txt")
+    p.add_argument("--transforms", type=Path, help="nerfstudio transforms.json")
+    p.add_argument("--every", type=_at_least(1), default=1, help="keep every N-th frame")
+    p.add_argument("--start", type=_at_least(0), default=0, help="first frame")
+    p.add_argument("--count", type=_at_least(1), help="number of frames to keep")
+    p.add_argument("--out", type=Path, required=True, help="capture folder to write")
+
+    p = add("landmarks", "detect 68 landmarks in every image and write them into the capture")
+    p.add_argument("capture", type=Path)
+    p.add_argument("--detector", help="mediapipe, face-alignment or lbf; default: the first that is there")
+
+    p = add("fit", "fit geometry, reflectance and normals to a capture")
+    p.add_argument("capture", type=Path)
+    p.add_argument("--out", type=Path, required=True, help="result folder to write")
+    p.add_argument("--config", type=Path, help="TOML file with tables geometry, reflectance, normals")
+    p.add_argument("--model", default="builtin", help="morphable model: a path or builtin (default)")
+    p.add_argument("--cameras", type=_names, help="cameras to use, e.g. left,right; default: the first two")
+    p.add_argument("--timesteps", type=_timesteps, help="e.g. 0,1,2,3 or 0-3; default: the first four")
+    p.add_argument("--until", choices=["geometry", "reflectance", "normals"], default="normals")
+    p.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
+    p.add_argument("--force", action="store_true", help="replace an existing result")
+
+    p = add("track", "geometry and normals of further timesteps, reflectance and lighting fixed")
+    p.add_argument("capture", type=Path)
+    p.add_argument("--result", type=Path, required=True, help="result folder of mifit fit; extended in place")
+    p.add_argument("--timesteps", type=_timesteps, help="default: all that aren't in the result yet")
+    p.add_argument("--resume", action="store_true", help="keep the frames that an earlier run has written")
+
+    p = add("evaluate", "error on a held-out view")
+    p.add_argument("result", type=Path)
+    p.add_argument("--capture", type=Path, required=True)
+    p.add_argument("--camera", required=True)
+    p.add_argument("--timesteps", type=_timesteps, help="default: all of the result")
+    p.add_argument("--region", choices=["model", "truth"], default="model", help="whose face area counts")
+    p.add_argument("--json", type=Path, help="file to write the figures to")
+
+    p = add("render", "render a reconstruction from a camera of the capture")
+    p.add_argument("result", type=Path)
+    p.add_argument("--capture", type=Path, required=True)
+    p.add_argument("--camera", required=True)
+    p.add_argument("--timestep", type=_at_least(0), required=True)
+    p.add_argument("--out", type=Path, required=True, help="image to write: .png (8-bit sRGB) or .exr (linear)")
+    p.add_argument("--method", choices=["full", "diffuse", "pca"], default="full")
+    p.add_argument("--integrator", choices=["local", "path"], default="local")
+
+    p = add("turntable", "novel views about the vertical axis, with and without specular")
+    p.add_argument("result", type=Path)
+    p.add_argument("--out", type=Path, required=True)
+    p.add_argument("--from", dest="start", type=_real, default=-35.0, help="first angle in degrees")
+    p.add_argument("--to", dest="stop", type=_real, default=35.0, help="last angle in degrees")
+    p.add_argument("--steps", type=_at_least(1), default=7)
+
+    p = add("relight", "relit views under a measured environment")
+    p.add_argument("result", type=Path)
+    p.add_argument("--env", type=Path, required=True, help="lat-long environment, .hdr or .exr")
+    p.add_argument("--out", type=Path, required=True)
+    p.add_argument("--rotate", type=_real, default=0.0, help="turn the environment about the vertical, degrees")
+
+    p = add("export", "geometry with its maps for other programs")
+    p.add_argument("result", type=Path)
+    p.add_argument("--format", choices=["glb", "obj", "ply", "mitsuba"], required=True)
+    p.add_argument("--out", type=Path, required=True)
+
+    p = add("run", "a scene-file driven experiment or a sweep of them")
+    p.add_argument("experiment", type=Path)
+    p.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
+    p.add_argument("--out", type=Path)
+    p.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")
+
+    p = add("model", "inspect and convert morphable models")
+    actions = p.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser)
+    q = actions.add_parser("info", help="print a table", parents=[common])
+    q.add_argument("model", help="a path or builtin")
+    q.add_argument("--preview", type=Path, help="also write a sheet of the mean and the first modes")
+    q = actions.add_parser("convert", help="write a model in mifit's own format", parents=[common])
+    q.add_argument("source", type=Path)
+    q.add_argument("out", type=Path)
+    q.add_argument("--kind", help="format of SOURCE; default: recognised by content")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    arguments = build_parser().parse_args(argv)
+    try:
+        from mifit import commands
+
+        return _run(getattr(commands, arguments.command.replace("import", "import_")), arguments)
+    except KeyboardInterrupt:
+        print("mifit: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of our output has gone; nothing is left to say
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except Exception as error:
+        if arguments.debug:
+            raise
+        return _report(error)
+
+
+def _run(command: Callable[[Any], int | None], arguments: argparse.Namespace) -> int:
+    return command(arguments) or 0
+
+
+def _report(error: Exception) -> int:
+    """One line on stderr and the exit code that goes with the error."""
+    message = " ".join(str(error).split())
+    if isinstance(error, MifitError):
+        print(f"mifit: {message}", file=sys.stderr)
+        return 2 if isinstance(error, InputError) else 1
+    if isinstance(error, OSError) and error.filename:
+        print(f"mifit: {error.filename}: {error.strerror}", file=sys.stderr)
+        return 2
+    print(f"mifit: internal error, {type(error).__name__}: {message}; run again with --debug", file=sys.stderr)
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,313 @@
+"""What each ``mifit`` command does, given its parsed arguments. Raises InputError for bad input."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import sys
+from argparse import Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mifit.config import FitConfig, NormalsConfig, from_mapping
+from mifit.console import console_progress
+from mifit.core.files import write_text
+from mifit.errors import InputError
+
+if TYPE_CHECKING:
+    from mifit.output.reconstruction import Reconstruction
+
+CHECKPOINTS = ".checkpoint"
+DEMO = {"width": 340, "height": 240, "spp": 48, "timesteps": 4}
+"""Size of the capture that ``mifit demo`` makes: small enough for seconds, large enough to show a face."""
+
+
+def _use_variant(arguments: Namespace) -> str:
+    import mifit
+
+    return mifit.set_variant(arguments.variant)
+
+
+def _say(arguments: Namespace, text: str) -> None:
+    if not arguments.quiet:
+        print(text, file=sys.stderr, flush=True)
+
+
+def doctor(arguments: Namespace) -> int:
+    """Print what works; exit code 1 when the pipeline can't run."""
+    from mifit.render.variant import doctor
+
+    checks = doctor()
+    if arguments.json:
+        print(json.dumps(checks, indent=2))
+    else:
+        width = max(len(check["check"]) for check in checks)
+        for check in checks:
+            mark = "ok  " if check["ok"] else ("FAIL" if check["required"] else "-   ")
+            print(f"{mark} {check['check']:<{width}}  {check['found']}")
+            if not check["ok"] and check["fix"]:
+                print(f"     {'':<{width}}  mend: {check['fix']}")
+    return 0 if all(check["ok"] for check in checks if check["required"]) else 1
+
+
+def demo(arguments: Namespace) -> None:
+    """Synthesise, fit, evaluate, report."""
+    out = arguments.out
+    capture = out / "capture"
+    progress = console_progress(arguments.quiet)
+    _use_variant(arguments)
+    from mifit.synth import synthesize
+
+    shutil.rmtree(capture, ignore_errors=True)
+    _say(arguments, "Rendering a capture: two cameras to fit, a third to judge by")
+    synthesize(capture, seed=arguments.seed, progress=progress, **DEMO)
+    common = {
+        "quiet": arguments.quiet,
+        "debug": arguments.debug,
+        "variant": arguments.variant,
+        "seed": arguments.seed,
+    }
+    fit(
+        Namespace(
+            **common,
+            capture=capture,
+            out=out,
+            config=None,
+            model="builtin",
+            cameras=["left", "right"],
+            timesteps=None,
+            until="normals",
+            resume=False,
+            force=True,
+        )
+    )
+    evaluate(
+        Namespace(
+            **common,
+            result=out,
+            capture=capture,
+            camera="third",
+            timesteps=None,
+            region="model",
+            json=out / "third.json",
+        )
+    )
+    print(f"Report: {out / 'report.html'}")
+
+
+def synth(arguments: Namespace) -> None:
+    """Write path-traced captures."""
+    _use_variant(arguments)
+    from mifit.synth import synthesize
+
+    synthesize(
+        arguments.out,
+        subjects=arguments.subjects,
+        timesteps=arguments.timesteps,
+        env=arguments.env,
+        model=arguments.model,
+        seed=arguments.seed,
+        width=arguments.width,
+        height=arguments.height,
+        spp=arguments.spp,
+        progress=console_progress(arguments.quiet),
+    )
+    print(f"Capture: {arguments.out}")
+
+
+def import_(arguments: Namespace) -> None:
+    """Make a capture from other files."""
+    from mifit.capture import import_capture
+
+    import_capture(
+        arguments.out,
+        videos=arguments.video,
+        calibration=arguments.calibration,
+        images=arguments.images,
+        colmap=arguments.colmap,
+        transforms=arguments.transforms,
+        every=arguments.every,
+        start=arguments.start,
+        count=arguments.count,
+        progress=console_progress(arguments.quiet),
+    )
+    print(f"Capture: {arguments.out}")
+
+
+def landmarks(arguments: Namespace) -> None:
+    """Detect landmarks and write them into the capture."""
+    from mifit.capture import detect_landmarks
+
+    print(detect_landmarks(arguments.capture, arguments.detector, progress=console_progress(arguments.quiet)))
+
+
+def fit(arguments: Namespace) -> None:
+    """Run the stages and write the result folder."""
+    import mifit
+
+    out: Path = arguments.out
+    if (out / "result.json").exists() and not (arguments.resume or arguments.force):
+        raise InputError(f"--out {out}: holds a result already; --resume goes on with it, --force replaces it")
+    config = FitConfig.load(arguments.config) if arguments.config else FitConfig()
+    capture = mifit.Capture.load(arguments.capture)
+    model = mifit.MorphableModel.load(arguments.model)
+    _use_variant(arguments)
+    from mifit.output.report import write_report
+
+    if arguments.force:
+        shutil.rmtree(out / CHECKPOINTS, ignore_errors=True)
+    result = mifit.fit(
+        capture,
+        model,
+        cameras=arguments.cameras,
+        timesteps=arguments.timesteps,
+        config=config,
+        until=arguments.until,
+        seed=arguments.seed,
+        progress=console_progress(arguments.quiet),
+        checkpoints=out / CHECKPOINTS,
+    )
+    result = dataclasses.replace(result, model_source=str(arguments.model))
+    result.save(out)
+    write_report(out, result, capture)
+    print(f"Result: {out}")
+
+
+def track(arguments: Namespace) -> None:
+    """Extend a result by further timesteps."""
+    import mifit
+    from mifit.pipeline import choose
+
+    result = mifit.Reconstruction.load(arguments.result)
+    capture = mifit.Capture.load(arguments.capture)
+    _use_variant(arguments)
+    from mifit.stages.track import track_into
+
+    rest = [t for t in capture.timesteps if t not in result.geometry.timesteps]
+    timesteps = choose("timestep", capture.timesteps, arguments.timesteps, len(capture.timesteps))
+    timesteps = tuple(t for t in timesteps if arguments.timesteps or t in rest)
+    track_into(
+        arguments.result,
+        result,
+        capture,
+        timesteps,
+        config=from_mapping(NormalsConfig, result.config.get("normals", {}), "result.json: config: normals"),
+        seed=arguments.seed,
+        resume=arguments.resume,
+        progress=console_progress(arguments.quiet),
+    )
+    print(f"Result: {arguments.result}")
+
+
+def evaluate(arguments: Namespace) -> None:
+    """Error on a held-out view: a table on stdout, JSON on request, the report renewed."""
+    import mifit
+
+    result = mifit.Reconstruction.load(arguments.result)
+    capture = mifit.Capture.load(arguments.capture)
+    _use_variant(arguments)
+    from mifit.output.evaluate import evaluate
+    from mifit.output.report import write_report
+
+    found = evaluate(
+        result,
+        capture,
+        arguments.camera,
+        timesteps=arguments.timesteps,
+        region=arguments.region,
+        progress=console_progress(arguments.quiet),
+    )
+    if arguments.camera in result.cameras:
+        _say(arguments, f"mifit: warning: camera {arguments.camera!r} was fitted, so this is no held-out error")
+    if arguments.json:
+        write_text(arguments.json, json.dumps(found, indent=2) + "\n")
+    print(f"camera {found['camera']}, timesteps {found['timesteps']}, {found['region_pixels']} pixels")
+    print(f"{'method':<10}{'PSNR dB':>9}{'RMSE':>8}")
+    for method, figures in found["methods"].items():
+        print(f"{method:<10}{figures['psnr']:>9.2f}{figures['rmse']:>8.2f}")
+    write_report(arguments.result, result, capture, evaluation=found)
+
+
+def render(arguments: Namespace) -> None:
+    """Render one timestep from a camera of the capture."""
+    import mifit
+    from mifit.core.image import write_image
+
+    result = mifit.Reconstruction.load(arguments.result)
+    capture = mifit.Capture.load(arguments.capture)
+    camera = capture.camera(arguments.camera)
+    _use_variant(arguments)
+    image = result.render(camera, arguments.timestep, method=arguments.method, integrator=arguments.integrator)
+    write_image(arguments.out, image)
+    print(f"Image: {arguments.out}")
+
+
+def _result_and_variant(arguments: Namespace) -> Reconstruction:
+    import mifit
+
+    result = mifit.Reconstruction.load(arguments.result)
+    _use_variant(arguments)
+    return result
+
+
+def turntable(arguments: Namespace) -> None:
+    """Write novel views about the vertical axis."""
+    result = _result_and_variant(arguments)
+    from mifit.output.turntable import write_turntable
+
+    progress = console_progress(arguments.quiet)
+    write_turntable(result, arguments.out, arguments.start, arguments.stop, arguments.steps, progress=progress)
+    print(f"Views: {arguments.out}")
+
+
+def relight(arguments: Namespace) -> None:
+    """Write views under another environment."""
+    result = _result_and_variant(arguments)
+    from mifit.output.relight import write_relit
+
+    progress = console_progress(arguments.quiet)
+    write_relit(result, arguments.env, arguments.out, rotate=arguments.rotate, seed=arguments.seed, progress=progress)
+    print(f"Views: {arguments.out}")
+
+
+def export(arguments: Namespace) -> None:
+    """Write geometry and maps for another program."""
+    result = _result_and_variant(arguments)
+    from mifit.output.export import export
+
+    export(result, arguments.format, arguments.out)
+    print(f"Export: {arguments.out}")
+
+
+def run(arguments: Namespace) -> None:
+    """Run an experiment or a sweep."""
+    from mifit.experiment import run_experiment
+
+    summary = run_experiment(
+        arguments.experiment,
+        overrides=arguments.overrides,
+        out=arguments.out,
+        dask=arguments.dask,
+        variant=arguments.variant,
+        seed=arguments.seed,
+        progress=console_progress(arguments.quiet),
+    )
+    print(summary)
+
+
+def model(arguments: Namespace) -> None:
+    """Inspect or convert a morphable model."""
+    import mifit
+    from mifit.morphable import describe
+
+    if arguments.action == "info":
+        loaded = mifit.MorphableModel.load(arguments.model)
+        print(describe.model_info(loaded))
+        if arguments.preview:
+            describe.save_preview(loaded, arguments.preview)
+            print(f"Preview: {arguments.preview}")
+    else:
+        options: dict[str, Any] = {"kind": arguments.kind} if arguments.kind else {}
+        mifit.MorphableModel.load(arguments.source, **options).save(arguments.out)
+        print(f"Model: {arguments.out}")
