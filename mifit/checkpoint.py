@@ -10,6 +10,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -59,5 +61,5 @@ def load(folder: Path, stage: str, cls: type[T], key: str) -> T | None:
                 value = tuple(value)
             values[name] = value
         return cls(**values)
-    except (OSError, ValueError, KeyError, TypeError, EOFError):
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
         return None

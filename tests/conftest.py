@@ -29,3 +29,13 @@ def variant() -> str:
     import mifit
 
     return mifit.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture(scope="session")
+def tiny_capture(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A path-traced capture of the built-in model: cameras left, right and third, three timesteps, 200 x 150."""
+    from mifit.synth import synthesize
+
+    folder = tmp_path_factory.mktemp("tiny") / "capture"
+    synthesize(folder, timesteps=3, model="builtin:coarse", width=200, height=150, spp=12, seed=3)
+    return folder

@@ -1,0 +1,154 @@
+"""The command line: exit codes, one-line errors, the whole path from a capture to a figure."""
+
+import json
+import math
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from mifit.cli import main
+
+COMMANDS = "doctor demo synth import landmarks fit track evaluate render turntable relight export run model".split()
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout and stderr of one command."""
+    try:
+        code = main([str(a) for a in arguments])
+    except SystemExit as stop:
+        code = stop.code
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def refused(capsys, *arguments):
+    """The one line that a refused command prints."""
+    code, _, err = run(capsys, *arguments, "--quiet")
+    assert code == 2, err
+    assert err.count("\n") == 1, err
+    assert "Traceback" not in err
+    return err
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help(capsys, command):
+    code, out, _ = run(capsys, command, "--help")
+    assert code == 0
+    assert "usage: mifit" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fit"], "required: capture, --out"),
+        (["nonsense"], "invalid choice: 'nonsense'"),
+        (["fit", "x", "--out", "y", "--timesteps", "a"], "expected numbers such as"),
+        (["fit", "x", "--out", "y", "--cameras", ","], "expected names separated by commas"),
+        (["synth", "--out", "x", "--spp", "0"], "expected a whole number of at least 1"),
+        (["relight", "x", "--env", "e", "--out", "y", "--rotate", "nan"], "expected a finite number"),
+    ],
+)
+def test_bad_usage(capsys, arguments, message):
+    assert message in refused(capsys, *arguments)
+
+
+@pytest.fixture
+def capture(tiny_capture, tmp_path):
+    """A copy of the tiny capture to spoil."""
+    return shutil.copytree(tiny_capture, tmp_path / "capture")
+
+
+def edit(capture, change):
+    path = capture / "transforms.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def test_missing_capture(capsys, tmp_path):
+    assert str(tmp_path / "none") in refused(capsys, "fit", tmp_path / "none", "--out", tmp_path / "out")
+
+
+def test_image_of_another_size(capsys, capture, tmp_path):
+    path = capture / json.loads((capture / "transforms.json").read_text())["frames"][0]["file_path"]
+    cv2.imwrite(str(path), np.zeros((30, 40, 3), np.uint8))
+    line = refused(capsys, "fit", capture, "--out", tmp_path / "out", "--model", "builtin:coarse")
+    assert path.name in line
+    assert "40" in line and "200" in line
+
+
+def test_nan_in_a_transform(capsys, capture, tmp_path):
+    edit(capture, lambda c: c["frames"][1]["transform_matrix"][0].__setitem__(3, math.nan))
+    assert "transform_matrix" in refused(capsys, "fit", capture, "--out", tmp_path / "out")
+
+
+def test_camera_that_misses_a_timestep(capsys, capture, tmp_path):
+    gone = {"camera_id": "right", "timestep_index": 1}
+    keep = lambda f: any(f[k] != v for k, v in gone.items())  # noqa: E731
+    edit(capture, lambda c: c.__setitem__("frames", [f for f in c["frames"] if keep(f)]))
+    line = refused(capsys, "fit", capture, "--out", tmp_path / "out")
+    assert "right" in line and "1" in line
+
+
+def test_too_few_landmarks(capsys, capture, tmp_path):
+    for path in capture.glob("landmarks/*/*.json"):
+        content = json.loads(path.read_text())
+        content["visible"] = [i < 2 for i in range(68)]
+        path.write_text(json.dumps(content))
+    line = refused(capsys, "fit", capture, "--out", tmp_path / "out", "--model", "builtin:coarse")
+    assert "landmark" in line and "6" in line
+
+
+def test_empty_model_file(capsys, capture, tmp_path):
+    model = tmp_path / "model.npz"
+    model.touch()
+    assert "model.npz" in refused(capsys, "fit", capture, "--out", tmp_path / "out", "--model", model)
+
+
+def test_unknown_config_key(capsys, capture, tmp_path):
+    config = tmp_path / "c.toml"
+    config.write_text("[reflectance]\nexponnent = 3\n")
+    line = refused(capsys, "fit", capture, "--out", tmp_path / "out", "--config", config)
+    assert "exponnent" in line and "'exponent'" in line
+
+
+def test_unknown_camera(capsys, capture, tmp_path):
+    line = refused(capsys, "fit", capture, "--out", tmp_path / "out", "--cameras", "left,top")
+    assert "'top'" in line and "left" in line
+
+
+def test_doctor(capsys, variant):
+    code, out, _ = run(capsys, "doctor", "--json")
+    checks = json.loads(out)
+    assert code == 0
+    assert {"check", "ok", "found", "fix", "required"} <= set(checks[0])
+
+
+@pytest.mark.slow
+def test_from_capture_to_figures(capsys, tiny_capture, tmp_path):
+    out = tmp_path / "result"
+    config = tmp_path / "c.toml"
+    config.write_text("[reflectance]\ntexture_size = 128\n")
+    fit = ["fit", tiny_capture, "--out", out, "--model", "builtin:coarse", "--cameras", "left,right", "--quiet"]
+    code, _, err = run(capsys, *fit, "--timesteps", "0,1", "--config", config)
+    assert code == 0, err
+    for name in ("result.json", "report.html", "scene.xml", "lighting.exr", "maps/diffuse.exr", "maps/specular.exr"):
+        assert (out / name).stat().st_size > 0
+    assert "result.json" not in refused(capsys, *fit[:-1])  # an existing result isn't overwritten unasked
+    code, table, err = run(
+        capsys, "evaluate", out, "--capture", tiny_capture, "--camera", "third", "--json", out / "third.json", "--quiet"
+    )
+    assert code == 0, err
+    figures = json.loads((out / "third.json").read_text())
+    assert figures["camera"] == "third"
+    assert figures["region_pixels"] > 500
+    assert figures["methods"]["full"]["psnr"] > 20
+    assert "full" in table
+    code, _, err = run(
+        capsys, "render", out, "--capture", tiny_capture, "--camera", "third", "--timestep", "0",
+        "--out", tmp_path / "x.png", "--quiet",
+    )  # fmt: skip
+    assert code == 0, err
+    assert cv2.imread(str(tmp_path / "x.png"), cv2.IMREAD_UNCHANGED).shape == (150, 200, 4)
