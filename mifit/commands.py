@@ -218,7 +218,7 @@ def evaluate(arguments: Namespace) -> None:
         region=arguments.region,
         progress=console_progress(arguments.quiet),
     )
-    if arguments.camera in result.cameras:
+    if arguments.camera in [camera.name for camera in result.cameras]:
         _say(arguments, f"mifit: warning: camera {arguments.camera!r} was fitted, so this is no held-out error")
     if arguments.json:
         write_text(arguments.json, json.dumps(found, indent=2) + "\n")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import resource
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -143,13 +142,13 @@ def fit(
         geometry=geometry,
         reflectance=reflectance,
         normals=normals,
-        config=settings,
-        cameras=tuple(cameras),
+        config={**settings, "seed": seed},
+        cameras=tuple(capture.camera(name) for name in cameras),
         capture_digest=inputs["capture"],
         units=capture.units,
         unit_mm=capture.unit_mm,
         seconds=time.perf_counter() - started,
-        peak_memory=peak_memory(),
+        peak_memory_mb=peak_memory_mb(),
     )
 
 
@@ -165,7 +164,11 @@ def choose(kind: str, known: Sequence[T], wanted: Sequence[T] | None, default: i
     return tuple(dict.fromkeys(wanted))
 
 
-def peak_memory() -> int:
-    """Largest resident memory of this process so far, in bytes."""
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far, in MiB; 0 where the system doesn't tell."""
+    try:
+        import resource
+    except ModuleNotFoundError:  # Windows
+        return 0.0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)
