@@ -1,0 +1,326 @@
+"""Image files: PNG, JPEG, TIFF, OpenEXR and Radiance HDR, read to linear float32 and written whole or not at all.
+
+8- and 16-bit files hold sRGB-coded values and are decoded to linear Rec. 709, 0..1; floating-point files (EXR,
+HDR) are linear already. The kind of a file is told by its first bytes, not by its name. Sizes are read
+from the header and checked before a pixel is decoded, so a small file can't claim gigabytes. An orientation tag
+is not applied: pixel coordinates of a calibration refer to the pixels as stored.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mifit.core.files import replacing
+from mifit.core.quiet import silenced_stderr
+from mifit.errors import InputError
+
+MAX_PIXELS = 2**26
+"""Largest image that is decoded: 8192 x 8192."""
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".hdr")
+"""Names that image folders are searched for."""
+
+
+@dataclass(frozen=True)
+class Image:
+    """A decoded image file.
+
+    Attributes
+    ----------
+    pixels : (H, W, 3) float32
+        Linear Rec. 709.
+    alpha : (H, W) float32 or None
+        Coverage, 0..1, where the file has it.
+    clipped : (H, W) bool
+        Pixels with a channel at the largest code value of an integer format.
+    bits : int
+        Bits per channel in the file: 8, 16 or 32 (floating point).
+    """
+
+    pixels: NDArray[np.float32]
+    alpha: NDArray[np.float32] | None
+    clipped: NDArray[np.bool_]
+    bits: int
+
+
+def srgb_to_linear(values: ArrayLike) -> NDArray:
+    """SRGB-coded values (0..1) -> linear (IEC 61966-2-1), any shape; float32 stays float32."""
+    v = _as_float(values)
+    return np.where(v <= 0.04045, v / 12.92, ((np.maximum(v, 0.0) + 0.055) / 1.055) ** 2.4).astype(v.dtype)
+
+
+def linear_to_srgb(values: ArrayLike) -> NDArray:
+    """Linear values -> sRGB-coded (IEC 61966-2-1), any shape; values above 1 stay above 1."""
+    v = _as_float(values)
+    return np.where(v <= 0.0031308, v * 12.92, 1.055 * np.maximum(v, 0.0) ** (1 / 2.4) - 0.055).astype(v.dtype)
+
+
+def _as_float(values: ArrayLike) -> NDArray:
+    v = np.asarray(values)
+    return v if v.dtype in (np.float32, np.float64) else v.astype(np.float64)
+
+
+def to_8_bit(linear: ArrayLike) -> NDArray[np.uint8]:
+    """Linear colour -> 8-bit sRGB codes, clipped to 0..255; NaN becomes 0."""
+    coded = np.nan_to_num(linear_to_srgb(linear), nan=0.0)
+    return np.asarray(np.clip(coded, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+_TABLE_8 = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
+
+
+def read_image(path: str | Path) -> NDArray[np.float32]:
+    """Read an image file to linear float32 (H, W, 3); see `load_image` for alpha, clipping and bit depth.
+
+    Raises
+    ------
+    InputError
+        The file is missing, not an image, truncated, CMYK or larger than `MAX_PIXELS`.
+    """
+    return load_image(path).pixels
+
+
+def load_image(path: str | Path) -> Image:
+    """Read an image file with its alpha, clipped pixels and bit depth.
+
+    Grey images become three equal channels. CMYK is refused: without its ink profile the colours would be a guess.
+
+    Raises
+    ------
+    InputError
+        The file is missing, not an image, truncated, CMYK or larger than `MAX_PIXELS`.
+    """
+    data = _read_bytes(path)
+    decode = {"exr": _decode_exr, "hdr": _decode_hdr, "raster": _decode_raster}[_kind(data, path)]
+    try:
+        with silenced_stderr():
+            return decode(data, path)
+    except InputError:
+        raise
+    except Exception as error:  # decoders raise all kinds; for the caller they mean one thing
+        raise _damaged(path, error) from None
+
+
+def _kind(data: bytes, path: str | Path) -> str:
+    if data[:4] == b"\x76\x2f\x31\x01":
+        return "exr"
+    if data[:2] == b"#?":
+        return "hdr"
+    if data[:8] == b"\x89PNG\r\n\x1a\n" or data[:2] == b"\xff\xd8" or data[:4] in (b"II*\0", b"MM\0*"):
+        return "raster"
+    found = f"a file that starts with {data[:8]!r}" if data else "an empty file"
+    raise InputError(f"{path}: found {found}, expected a PNG, JPEG, TIFF, EXR or HDR image")
+
+
+def _damaged(path: str | Path, error: Exception | None = None) -> InputError:
+    text = "" if error is None else f" ({(str(error) or type(error).__name__).splitlines()[0]})"
+    return InputError(f"{path}: damaged or truncated image{text}; expected a whole file: export or copy it again")
+
+
+def image_size(path: str | Path) -> tuple[int, int]:
+    """(width, height) of an image file from its header, without decoding pixels; InputError when unreadable."""
+    data = _read_bytes(path)
+    measure = {"exr": _exr_size, "hdr": _hdr_size, "raster": _raster_size}[_kind(data, path)]
+    try:
+        with silenced_stderr():
+            return measure(data)
+    except Exception as error:
+        raise _damaged(path, error) from None
+
+
+def _read_bytes(path: str | Path) -> bytes:
+    try:
+        return Path(path).read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such image file") from None
+    except OSError as error:
+        raise InputError(f"{path}: can't be read: {error.strerror}") from None
+
+
+def _check_size(size: tuple[int, int], path: str | Path) -> None:
+    width, height = size
+    if width < 1 or height < 1 or width * height > MAX_PIXELS:
+        raise InputError(
+            f"{path}: the header claims {width} x {height} pixels, expected at most {MAX_PIXELS // 10**6} megapixels; "
+            "scale the image down"
+        )
+
+
+def _open_raster(data: bytes) -> Any:
+    from PIL import Image as Pillow
+    from PIL import UnidentifiedImageError
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Pillow warns of large images; we check the size ourselves
+        try:
+            return Pillow.open(io.BytesIO(data), formats=("PNG", "JPEG", "TIFF"))
+        except UnidentifiedImageError:  # its text names a memory address
+            raise ValueError("header not understood") from None
+
+
+def _raster_size(data: bytes) -> tuple[int, int]:
+    with _open_raster(data) as header:
+        return header.size
+
+
+def _decode_raster(data: bytes, path: str | Path) -> Image:
+    """PNG, JPEG, TIFF: Pillow decodes 8 bits (it notices truncation), OpenCV 16 bits."""
+    with _open_raster(data) as image:
+        _check_size(image.size, path)
+        if image.mode == "CMYK":
+            raise InputError(f"{path}: found a CMYK image, expected RGB; convert it with its ink profile first")
+        if _bits(image, data) > 8:
+            image.verify()
+            return _decode_16_bit(data, path)
+        has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+        codes = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
+    alpha = np.float32(1 / 255) * codes[..., 3] if has_alpha else None
+    colour = codes[..., :3]
+    return Image(_TABLE_8[colour], alpha, (colour == 255).any(-1), 8)
+
+
+def _bits(image: Any, data: bytes) -> int:
+    if image.format == "PNG":
+        return data[24]
+    if image.format == "TIFF":
+        return max(image.tag_v2.get(258, (8,)))
+    return 8
+
+
+def _decode_16_bit(data: bytes, path: str | Path) -> Image:
+    codes = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if codes is None:
+        raise _damaged(path)
+    if codes.dtype != np.uint16:
+        raise InputError(f"{path}: found {codes.dtype} pixels, expected 8 or 16 bits; save floating point as EXR")
+    if codes.ndim == 2:
+        codes = codes[..., None]
+    channels = codes.shape[2]
+    colour = codes[..., 2::-1] if channels >= 3 else np.repeat(codes[..., :1], 3, axis=-1)
+    alpha = np.float32(1 / 65535) * codes[..., -1] if channels in (2, 4) else None
+    table = srgb_to_linear(np.arange(65536) / 65535.0).astype(np.float32)
+    return Image(table[colour], alpha, (colour == 65535).any(-1), 16)
+
+
+def _float_image(colour: NDArray, alpha: NDArray | None) -> Image:
+    pixels = np.ascontiguousarray(colour, dtype=np.float32)
+    coverage = None if alpha is None else np.ascontiguousarray(alpha, dtype=np.float32)
+    return Image(pixels, coverage, np.zeros(pixels.shape[:2], dtype=bool), 32)
+
+
+def _exr_size(data: bytes) -> tuple[int, int]:
+    import OpenEXR
+
+    with OpenEXR.File(io.BytesIO(data), header_only=True) as file:
+        low, high = file.header()["dataWindow"]
+    width, height = (np.asarray(high, dtype=np.int64) - np.asarray(low, dtype=np.int64) + 1).tolist()
+    return width, height
+
+
+def _decode_exr(data: bytes, path: str | Path) -> Image:
+    import OpenEXR
+
+    _check_size(_exr_size(data), path)
+    with redirect_stdout(io.StringIO()), OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:
+        found = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
+    names = next((n for n in (("R", "G", "B"), ("Y", "Y", "Y")) if set(n) <= set(found)), None)
+    if names is None:
+        raise InputError(f"{path}: found channels {', '.join(sorted(found))}, expected R, G, B or Y")
+    return _float_image(np.stack([found[name] for name in names], axis=-1), found.get("A"))
+
+
+_HDR_RESOLUTION = re.compile(rb"\n([-+][YX]) (\d+) ([-+][YX]) (\d+)\n")
+
+
+def _hdr_size(data: bytes) -> tuple[int, int]:
+    match = _HDR_RESOLUTION.search(data[:65536])
+    if match is None or (match[1], match[3]) != (b"-Y", b"+X"):
+        raise ValueError("no resolution line '-Y height +X width' in the header")
+    return int(match[4]), int(match[2])
+
+
+def _decode_hdr(data: bytes, path: str | Path) -> Image:
+    width, height = _hdr_size(data)
+    _check_size((width, height), path)
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.shape != (height, width, 3):
+        raise _damaged(path)
+    return _float_image(pixels[..., ::-1], None)
+
+
+def write_image(path: str | Path, linear: ArrayLike) -> None:
+    """Write linear colour to a file, whole or not at all; missing folders are made.
+
+    Parameters
+    ----------
+    path : path
+        ``.png`` is written as 8-bit sRGB (alpha as it is), ``.jpg`` likewise at quality 95, ``.exr`` as linear
+        float32, ``.hdr`` as linear RGBE.
+    linear : (H, W), (H, W, 1), (H, W, 3) or (H, W, 4)
+        Grey, colour, or colour with alpha.
+
+    Raises
+    ------
+    InputError
+        An array of another shape, a suffix that isn't known, or alpha in a format without it.
+    """
+    pixels = np.asarray(linear, dtype=np.float32)
+    if pixels.ndim == 3 and pixels.shape[2] == 1:
+        pixels = pixels[..., 0]
+    if not (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] in (3, 4))) or 0 in pixels.shape:
+        raise InputError(f"{path}: found an array of shape {pixels.shape}, expected (H, W), (H, W, 3) or (H, W, 4)")
+    suffix = Path(path).suffix.lower()
+    if suffix == ".exr":
+        data = _encode_exr(pixels)
+    elif suffix in (".png", ".jpg", ".jpeg", ".hdr"):
+        if suffix != ".png" and pixels.ndim == 3 and pixels.shape[2] == 4:
+            raise InputError(f"{path}: found an image with alpha, which {suffix} can't hold; write .png or .exr")
+        data = _encode_opencv(suffix, pixels)
+    else:
+        raise InputError(f"{path}: found suffix {suffix!r}, expected .png, .jpg, .exr or .hdr")
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def encode_png(codes: NDArray[np.uint8]) -> bytes:
+    """8-bit sRGB codes, (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA -> bytes of a PNG file."""
+    if codes.ndim == 3:
+        codes = codes[..., [2, 1, 0, 3][: codes.shape[2]]]
+    return cv2.imencode(".png", np.ascontiguousarray(codes))[1].tobytes()
+
+
+def _encode_opencv(suffix: str, pixels: NDArray[np.float32]) -> bytes:
+    if suffix == ".hdr":
+        rgb = np.repeat(pixels[..., None], 3, axis=-1) if pixels.ndim == 2 else pixels
+        return cv2.imencode(".hdr", np.ascontiguousarray(rgb[..., ::-1]))[1].tobytes()
+    codes = to_8_bit(pixels)
+    if pixels.ndim == 3 and pixels.shape[2] == 4:  # alpha is coverage, not light: no transfer curve
+        alpha = np.clip(np.nan_to_num(pixels[..., 3]), 0.0, 1.0)
+        codes[..., 3] = (alpha * 255.0 + 0.5).astype(np.uint8)
+    if suffix == ".png":
+        return encode_png(codes)
+    bgr = codes if codes.ndim == 2 else np.ascontiguousarray(codes[..., ::-1])
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+
+
+def _encode_exr(pixels: NDArray[np.float32]) -> bytes:
+    import OpenEXR
+
+    names = "Y" if pixels.ndim == 2 else "RGBA"[: pixels.shape[2]]
+    planes = pixels[..., None] if pixels.ndim == 2 else pixels
+    channels = {name: np.ascontiguousarray(planes[..., i]) for i, name in enumerate(names)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    stream = io.BytesIO()
+    with OpenEXR.File(header, channels) as file:
+        file.write(stream)
+    return stream.getvalue()
