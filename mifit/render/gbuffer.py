@@ -1,0 +1,201 @@
+"""Primary visibility, found once per geometry and cached as plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.camera import Camera
+from mifit.errors import InputError
+
+MESH_POSITIONS = "vertex_positions"
+MESH_FACES = "faces"
+MESH_TEXCOORDS = "vertex_texcoords"
+MESH_NORMALS = "vertex_normals"
+
+SHADOW_EPSILON = 1e-3
+"""Part of a ray's far end, relative to the scene's diagonal, in which hits count as the surface point itself."""
+
+
+@dataclass(frozen=True)
+class GBuffer:
+    """What each pixel's central ray hits first.
+
+    Attributes
+    ----------
+    face : (H, W) int32
+        Face index; -1 where nothing is hit.
+    weights : (H, W, 3) float32
+        Barycentric weights of the face's three corners; 0 where nothing is hit.
+    depth : (H, W) float32
+        Distance along the camera's z axis in the scene's units; infinite where nothing is hit.
+    """
+
+    face: NDArray[np.int32]
+    weights: NDArray[np.float32]
+    depth: NDArray[np.float32]
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """(H, W) pixels that see the mesh."""
+        return self.face >= 0
+
+
+def make_mesh(
+    vertices: NDArray, faces: NDArray, uv: NDArray | None = None, normals: NDArray | None = None, bsdf: Any = None
+) -> Any:
+    """Build an ``mi.Mesh`` from arrays, with one UV pair and normal per vertex where given.
+
+    Parameters
+    ----------
+    vertices : (V, 3), faces : (F, 3)
+        Positions and corner indices, counter-clockwise outward.
+    uv : (V, 2), normals : (V, 3), optional
+        Without normals the mesh is shaded flat.
+    bsdf : mi.BSDF, optional
+
+    Raises
+    ------
+    InputError
+        Wrong shapes, indices out of range or positions that are not finite.
+    """
+    import mitsuba as mi
+
+    vertices, faces = np.asarray(vertices), np.asarray(faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices):
+        raise InputError(f"vertices: found shape {vertices.shape}, expected (V, 3)")
+    if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
+        raise InputError(f"faces: found shape {faces.shape}, expected (F, 3)")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(f"faces: found indices {faces.min()} to {faces.max()}, expected 0 to {len(vertices) - 1}")
+    if not np.isfinite(vertices).all():
+        raise InputError("vertices: found values that are not finite")
+    properties = mi.Properties()
+    if bsdf is not None:
+        properties["mesh_bsdf"] = bsdf
+    mesh = mi.Mesh(
+        "surface",
+        vertex_count=len(vertices),
+        face_count=len(faces),
+        props=properties,
+        has_vertex_normals=normals is not None,
+        has_vertex_texcoords=uv is not None,
+    )
+    parameters = mi.traverse(mesh)
+    parameters[MESH_POSITIONS] = np.ascontiguousarray(vertices, dtype=np.float32).ravel()
+    parameters[MESH_FACES] = np.ascontiguousarray(faces, dtype=np.uint32).ravel()
+    if uv is not None:
+        parameters[MESH_TEXCOORDS] = np.ascontiguousarray(uv, dtype=np.float32).ravel()
+    if normals is not None:
+        parameters[MESH_NORMALS] = np.ascontiguousarray(normals, dtype=np.float32).ravel()
+    parameters.update()
+    return mesh
+
+
+class SurfaceScene:
+    """A mesh that rays can be sent at.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float
+        World space.
+    faces : (F, 3) int
+        Corner indices.
+
+    Raises
+    ------
+    InputError
+        Wrong shapes, indices out of range or positions that are not finite.
+    """
+
+    def __init__(self, vertices: NDArray, faces: NDArray) -> None:
+        import mitsuba as mi
+
+        self._mesh = make_mesh(vertices, faces)
+        self._scene = mi.load_dict({"type": "scene", "mesh": self._mesh})
+        self._parameters = mi.traverse(self._scene)
+        self._key = next(k for k in self._parameters.keys() if k.endswith(MESH_POSITIONS))
+        self._vertex_count = len(vertices)
+        self._diagonal = _diagonal(vertices)
+
+    def update(self, vertices: NDArray) -> None:
+        """Move the mesh to new positions (V, 3) and rebuild what rays are traced against."""
+        vertices = np.asarray(vertices)
+        if vertices.shape != (self._vertex_count, 3):
+            raise InputError(f"vertices: found shape {vertices.shape}, expected ({self._vertex_count}, 3)")
+        if not np.isfinite(vertices).all():
+            raise InputError("vertices: found values that are not finite")
+        self._parameters[self._key] = np.ascontiguousarray(vertices, dtype=np.float32).ravel()
+        self._parameters.update()
+        self._diagonal = _diagonal(vertices)
+
+    def gbuffer(self, camera: Camera) -> GBuffer:
+        """Intersect the rays through all pixel centres of an undistorted camera.
+
+        Raises
+        ------
+        InputError
+            The camera has lens distortion; undistort the images first.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        if any(camera.distortion):
+            raise InputError(f"camera {camera.name}: found lens distortion, expected an undistorted camera")
+        directions = camera.pixel_rays(camera.pixel_centres()).reshape(-1, 3)
+        ray = mi.Ray3f(mi.Point3f(camera.position), _vector(directions))
+        hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
+        dr.eval(hit.t, hit.prim_uv, hit.prim_index)  # one kernel: each array read would trace the rays again
+        valid = np.array(hit.is_valid()).astype(bool)
+        face = np.where(valid, np.array(hit.prim_index).astype(np.int32), -1)
+        u, v, t = (np.array(x, dtype=np.float32) for x in (hit.prim_uv.x, hit.prim_uv.y, hit.t))
+        weights = np.where(valid[:, None], np.stack([1.0 - u - v, u, v], axis=1), 0.0).astype(np.float32)
+        depth = np.where(valid, t * (directions @ camera.rotation[2]), np.inf).astype(np.float32)
+        shape = (camera.height, camera.width)
+        return GBuffer(face.reshape(shape), weights.reshape(*shape, 3), depth.reshape(shape))
+
+    def visible_from(self, points: NDArray, origin: NDArray) -> NDArray[np.bool_]:
+        """Whether nothing of the mesh lies between surface points and an origin outside the mesh.
+
+        The far end of each ray, ``SHADOW_EPSILON`` of the scene's diagonal, is left out, so that a point isn't
+        hidden by its own surface. A point that faces away is hidden by what lies in front of it; at silhouettes
+        the caller should test the normal as well.
+
+        Parameters
+        ----------
+        points : (N, 3)
+            World space, on the mesh.
+        origin : (3,)
+            World space, e.g. a camera's position.
+
+        Returns
+        -------
+        (N,) bool
+        """
+        import mitsuba as mi
+
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        if not len(points):
+            return np.zeros(0, dtype=bool)
+        direction = points - np.asarray(origin, dtype=np.float64)
+        distance = np.linalg.norm(direction, axis=1)
+        direction /= np.maximum(distance, 1e-30)[:, None]
+        reach = np.maximum(distance - SHADOW_EPSILON * self._diagonal, 0.0)
+        ray = mi.Ray3f(mi.Point3f(np.asarray(origin, dtype=np.float64)), _vector(direction))
+        ray.maxt = mi.Float(reach.astype(np.float32))
+        hit = self._scene.ray_test(ray)
+        return ~np.array(hit).astype(bool)
+
+
+def _vector(values: NDArray) -> Any:
+    """(N, 3) array -> mi.Vector3f."""
+    import mitsuba as mi
+
+    return mi.Vector3f(np.ascontiguousarray(values.T, dtype=np.float32))
+
+
+def _diagonal(vertices: NDArray) -> float:
+    return float(np.linalg.norm(np.ptp(np.asarray(vertices, dtype=np.float64), axis=0)))

@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from mifit.core.camera import Camera
+from mifit.core.mesh import interpolate
+from mifit.errors import InputError
+from mifit.render.gbuffer import SurfaceScene
+
+
+@pytest.fixture(scope="module")
+def ball() -> tuple[np.ndarray, np.ndarray]:
+    sphere = trimesh.creation.icosphere(4, 1.0)
+    return np.array(sphere.vertices) * (10.0, 12.0, 9.0), np.array(sphere.faces)
+
+
+@pytest.fixture(scope="module")
+def camera() -> Camera:
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, 3] = (1.0, -2.0, 60.0)
+    return Camera("test", 120, 90, 260.0, 250.0, 61.3, 44.1, world_to_camera)
+
+
+def test_hits_project_to_pixel_centres(variant: str, ball, camera: Camera) -> None:
+    vertices, faces = ball
+    g = SurfaceScene(vertices, faces).gbuffer(camera)
+    assert 1000 < g.mask.sum() < g.mask.size
+    assert g.weights[g.mask].min() > -1e-5 and np.allclose(g.weights[g.mask].sum(1), 1.0, atol=1e-5)
+    assert (g.weights[~g.mask] == 0).all() and np.isinf(g.depth[~g.mask]).all()
+    points = interpolate(vertices, faces, g.face[g.mask], g.weights[g.mask].astype(np.float64))
+    assert np.abs(camera.project(points) - camera.pixel_centres()[g.mask]).max() < 1e-3
+    assert np.abs(camera.to_camera(points)[:, 2] - g.depth[g.mask]).max() < 1e-3
+
+
+def test_update_moves_the_mesh(variant: str, ball, camera: Camera) -> None:
+    vertices, faces = ball
+    scene = SurfaceScene(vertices, faces)
+    before = scene.gbuffer(camera).mask.sum()
+    scene.update(vertices * 0.5)
+    after = scene.gbuffer(camera)
+    assert 0.2 * before < after.mask.sum() < 0.3 * before
+    assert np.array_equal(after.face, SurfaceScene(vertices * 0.5, faces).gbuffer(camera).face)
+
+
+def test_visibility_of_vertices(variant: str, ball, camera: Camera) -> None:
+    vertices, faces = ball
+    normals = vertices / np.array([10.0, 12.0, 9.0]) ** 2
+    view = camera.position - vertices
+    cosine = (view * normals).sum(1) / np.linalg.norm(view, axis=1) / np.linalg.norm(normals, axis=1)
+    visible = SurfaceScene(vertices, faces).visible_from(vertices, camera.position)
+    assert visible[cosine > 0.1].all() and not visible[cosine < -0.1].any()
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e4])
+def test_visibility_does_not_depend_on_units(variant: str, ball, camera: Camera, size: float) -> None:
+    vertices, faces = ball
+    g = SurfaceScene(vertices, faces).gbuffer(camera)
+    points = interpolate(vertices, faces, g.face[g.mask], g.weights[g.mask].astype(np.float64))
+    visible = SurfaceScene(vertices * size, faces).visible_from(points * size, camera.position * size)
+    assert visible.mean() > 0.999
+
+
+def test_a_wall_hides(variant: str) -> None:
+    wall = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0], [-9, -9, -5], [9, -9, -5], [0, 9, -5]], float)
+    scene = SurfaceScene(wall, np.array([[0, 1, 2], [3, 4, 5]]))
+    points = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -5.0], [5.0, -5.0, -5.0]])
+    assert scene.visible_from(points, np.array([0.0, 0.0, 50.0])).tolist() == [True, False, True]
+    assert scene.visible_from(np.zeros((0, 3)), np.zeros(3)).shape == (0,)
+
+
+def test_bad_meshes_are_refused(variant: str, ball, camera: Camera) -> None:
+    vertices, faces = ball
+    with pytest.raises(InputError, match=r"expected \(V, 3\)"):
+        SurfaceScene(vertices[:, :2], faces)
+    with pytest.raises(InputError, match="expected 0 to"):
+        SurfaceScene(vertices[:10], faces)
+    with pytest.raises(InputError, match="not finite"):
+        SurfaceScene(np.where(vertices > 9, np.nan, vertices), faces)
+    scene = SurfaceScene(vertices, faces)
+    with pytest.raises(InputError, match="found shape"):
+        scene.update(vertices[:5])
+    bent = Camera("bent", 8, 8, 9, 9, 4, 4, np.eye(4), (0.1, 0.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="distortion"):
+        scene.gbuffer(bent)
