@@ -1,0 +1,125 @@
+"""Files of 68 iBUG landmarks: JSON, ``.pts`` and ``.npy``.
+
+All are read to the project's pixel convention, the centre of the first pixel at (0.5, 0.5). JSON files of a capture
+are in it already. ``.pts`` and ``.npy`` files come from tools that put that centre at (0, 0) (iBUG's, written by
+MATLAB tools, at (1, 1)); the caller names the origin where it matters.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.files import write_text
+from mifit.errors import InputError
+
+COUNT = 68
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """68 iBUG points in one image.
+
+    Attributes
+    ----------
+    points : (68, 2) float64
+        Pixel coordinates; finite, also where invisible.
+    visible : (68,) bool
+        Points to be trusted.
+    """
+
+    points: NDArray[np.float64]
+    visible: NDArray[np.bool_]
+
+
+def read_landmarks(path: str | Path, first_pixel: float | None = None) -> Landmarks:
+    """Read a landmark file, its kind told by its suffix.
+
+    Parameters
+    ----------
+    path : path
+        ``.json`` (``{"points": [[x, y], ...], "visible": [...]}``, or a bare list of points), ``.pts`` or ``.npy``
+        ((68, 2), or (68, 3) with visibility as third column). A point without finite coordinates is invisible.
+    first_pixel : float, optional
+        Coordinate of the first pixel's centre in the file: 0.5 by default for JSON, 1 for ``.pts`` (iBUG's
+        convention), 0 for ``.npy`` (image-array convention).
+
+    Raises
+    ------
+    InputError
+        A missing or malformed file, or another number of points than 68.
+    """
+    path = Path(path)
+    reader = {".json": _read_json, ".pts": _read_pts, ".npy": _read_npy}.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"{path}: found suffix {path.suffix!r}, expected .json, .pts or .npy landmarks")
+    try:
+        points, visible = reader(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such landmark file") from None
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: not a readable landmark file: {error}") from None
+    if points.shape != (COUNT, 2):
+        raise InputError(
+            f"{path}: found {len(points)} landmarks of shape {points.shape}, expected 68 points (iBUG-68) of x and y"
+        )
+    if visible.shape != (COUNT,):
+        raise InputError(f"{path}: found {visible.size} visibility flags, expected {COUNT}")
+    default = {".json": 0.5, ".pts": 1.0, ".npy": 0.0}[path.suffix.lower()]
+    points = points + (0.5 - (default if first_pixel is None else first_pixel))
+    finite = np.isfinite(points).all(axis=1)
+    return Landmarks(np.where(finite[:, None], points, 0.0), visible & finite)
+
+
+def write_landmarks(path: str | Path, landmarks: Landmarks) -> None:
+    """Write the JSON form, whole or not at all."""
+    text = json.dumps(
+        {
+            "convention": "ibug68",
+            "points": np.round(landmarks.points, 3).tolist(),
+            "visible": [bool(v) for v in landmarks.visible],
+        }
+    )
+    write_text(path, text + "\n")
+
+
+def _read_json(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    data: Any = json.loads(path.read_text(encoding="utf-8"))
+    if isinstance(data, list):
+        data = {"points": data}
+    if not isinstance(data, dict) or "points" not in data:
+        raise InputError(f"{path}: found no key 'points', expected a list of 68 [x, y] pairs under it")
+    convention = data.get("convention", "ibug68")
+    if convention != "ibug68":
+        raise InputError(f"{path}: convention: found {convention!r}, expected 'ibug68'")
+    points = np.array([[np.nan, np.nan] if p is None else p for p in data["points"]], dtype=np.float64)
+    flags = data.get("visible")
+    visible = np.ones(len(points), dtype=bool) if flags is None else np.array(flags, dtype=bool)
+    return points, visible
+
+
+def _read_pts(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    text = path.read_text(encoding="utf-8", errors="replace")
+    opened, closed = text.find("{"), text.find("}")
+    if opened < 0 or closed < opened:
+        raise InputError(f"{path}: found no {{ ... }} block, expected the iBUG .pts layout")
+    values = np.array(text[opened + 1 : closed].split(), dtype=np.float64)
+    if values.size % 2:
+        raise InputError(f"{path}: found {values.size} numbers, expected {2 * COUNT} (x and y of 68 points)")
+    points = values.reshape(-1, 2)
+    return points, np.ones(len(points), dtype=bool)
+
+
+def _read_npy(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    values = np.load(path, allow_pickle=False)
+    if values.ndim != 2 or values.shape[1] not in (2, 3):
+        raise InputError(f"{path}: found an array of shape {values.shape}, expected (68, 2) or (68, 3)")
+    visible = values[:, 2] > 0.5 if values.shape[1] == 3 else np.ones(len(values), dtype=bool)
+    return values[:, :2].astype(np.float64), visible
