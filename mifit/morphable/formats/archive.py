@@ -1,0 +1,97 @@
+"""Guarded reading of ``.npz`` archives: every size is checked before anything is allocated."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from mifit.errors import InputError
+
+MAX_BYTES = 4 << 30
+"""No model that exists is larger when unpacked."""
+
+_MAX_RATIO, _SLACK = 100, 16 << 20  # real arrays of floats compress far less
+
+
+def npz_keys(path: Path) -> list[str] | None:
+    """Names of the arrays in an ``.npz`` file, or None when the file is not a zip archive."""
+    if not zipfile.is_zipfile(path):
+        return None
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return [n[:-4] for n in archive.namelist() if n.endswith(".npy")]
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
+        raise InputError(f"{path}: damaged zip archive: {error}") from None
+
+
+def read_npz(path: str | Path, keys: Iterable[str] | None = None) -> dict[str, NDArray]:
+    """Read arrays of an ``.npz`` file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    keys : iterable of str, optional
+        Arrays to read where present; all by default.
+
+    Raises
+    ------
+    InputError
+        Not an archive, truncated, an array's header disagrees with its size, an object array (which could
+        run code), or more data than a file of this size can honestly hold.
+    """
+    path = Path(path)
+    wanted = None if keys is None else set(keys)
+    out: dict[str, NDArray] = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = {i.filename[:-4]: i for i in archive.infolist() if i.filename.endswith(".npy")}
+            members = {k: i for k, i in members.items() if wanted is None or k in wanted}
+            total = sum(i.file_size for i in members.values())
+            limit = min(MAX_BYTES, _MAX_RATIO * path.stat().st_size + _SLACK)
+            if total > limit:
+                raise InputError(
+                    f"{path}: claims {total} bytes when unpacked, expected at most {limit} for a file of this size"
+                )
+            for key, info in members.items():
+                with archive.open(info) as stream:
+                    out[key] = _read_npy(stream, info.file_size, f"{path}: {key}")
+    except InputError:
+        raise
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (
+        zipfile.BadZipFile, zlib.error, OSError, ValueError, EOFError, KeyError, struct.error,
+        NotImplementedError, RuntimeError, SyntaxError, TypeError,
+    ) as error:  # fmt: skip
+        raise InputError(f"{path}: damaged .npz file: {error}") from None
+    return out
+
+
+def _read_npy(stream, size: int, where: str) -> NDArray:
+    """Read one array whose header must account for the member's size exactly."""
+    version = npy.read_magic(stream)
+    if version == (1, 0):
+        shape, fortran, dtype = npy.read_array_header_1_0(stream)
+    elif version == (2, 0):
+        shape, fortran, dtype = npy.read_array_header_2_0(stream)
+    else:
+        raise InputError(f"{where}: .npy version {version}, expected (1, 0) or (2, 0)")
+    if dtype.hasobject:
+        raise InputError(f"{where}: holds Python objects, which are refused; expected numbers or text")
+    count = math.prod(shape)
+    if any(n < 0 for n in shape) or count * dtype.itemsize > size:
+        raise InputError(f"{where}: header claims shape {shape} of {dtype}, but the member has {size} bytes")
+    data = stream.read(count * dtype.itemsize)
+    if len(data) != count * dtype.itemsize:
+        raise InputError(f"{where}: {len(data)} bytes of data, expected {count * dtype.itemsize}")
+    array = np.frombuffer(data, dtype, count)
+    return array.reshape(shape[::-1]).T if fortran else array.reshape(shape)

@@ -1,0 +1,82 @@
+"""Gaussian-process fields over a surface, as modes: squared-exponential kernels, low rank by Nyström's method.
+
+A zero-mean Gaussian process with kernel k has, on the vertices, the covariance K. From a few inducing points Z
+comes K ~ Phi Phi^T with Phi = K_xz K_zz^(-1/2), so the columns of Phi are modes with unit-variance
+coefficients. Sums of processes concatenate their columns; ``compress`` turns the columns of a sum into the
+leading principal modes of the same process (Lüthi et al., Gaussian Process Morphable Models).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.morphable.topology import farthest_points
+
+MIRROR = np.array([-1.0, 1.0, 1.0])
+
+
+def kernel(x: NDArray, y: NDArray, scale: float) -> NDArray:
+    """exp(-|x - y|^2 / (2 scale^2)) for points (N, 3) and (M, 3) -> (N, M)."""
+    squared = (x**2).sum(1)[:, None] + (y**2).sum(1) - 2.0 * x @ y.T
+    return np.exp(np.maximum(squared, 0.0) / (-2.0 * scale**2))
+
+
+def field_modes(
+    points: NDArray, scale: float, count: int, parity: int = 0, where: NDArray | None = None
+) -> NDArray[np.float32]:
+    """Modes of a scalar field of unit standard deviation with a squared-exponential kernel.
+
+    Parameters
+    ----------
+    points : (V, 3) float
+        Vertices.
+    scale : float
+        Correlation length, in units of the points.
+    count : int
+        Inducing points.
+    parity : {0, 1, -1}
+        1: fields that equal their mirror image in x -> -x; -1: fields that change their sign; 0: neither.
+        With 1 or -1 the pointwise deviation is 1 or 0 on the mirror plane, 1/sqrt(2) far from it.
+    where : (V,) bool, optional
+        Vertices among which inducing points are spread; all by default.
+
+    Returns
+    -------
+    (V, <= count) float32
+    """
+    pool = points if where is None else points[where]
+    if parity:
+        pool = pool[pool[:, 0] >= 0]  # the other half's kernels are the same functions
+    z = pool[farthest_points(pool, count)]
+
+    def covariance(a: NDArray, b: NDArray) -> NDArray:
+        k = kernel(a, b, scale)
+        return k if parity == 0 else 0.5 * (k + parity * kernel(a, b * MIRROR, scale))
+
+    values, vectors = np.linalg.eigh(covariance(z, z))
+    keep = values > 1e-5 * values[-1]
+    return (covariance(points, z) @ (vectors[:, keep] / np.sqrt(values[keep]))).astype(np.float32)
+
+
+def compress(columns: NDArray[np.float32], count: int) -> NDArray[np.float32]:
+    """Leading principal modes of the process with the given columns.
+
+    Parameters
+    ----------
+    columns : (N, M) float32
+        Modes with independent unit-variance coefficients; they need not be orthogonal.
+    count : int
+        Modes to keep, at most M.
+
+    Returns
+    -------
+    (N, min(count, M)) float32
+        Orthogonal modes, each as long as its standard deviation, longest first; the sign of each is fixed by
+        its largest entry.
+    """
+    gram = (columns.T @ columns).astype(np.float64)
+    vectors = np.linalg.eigh(gram)[1][:, ::-1][:, :count]
+    modes = columns @ vectors.astype(np.float32)
+    peak = np.abs(modes).argmax(0)
+    return modes * np.where(modes[peak, np.arange(modes.shape[1])] < 0, -1.0, 1.0).astype(np.float32)

@@ -1,0 +1,322 @@
+"""The morphable model: mean shape and albedo with linear modes, and what a pipeline must know of the mesh."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mifit.core.mesh import face_cross
+from mifit.errors import InputError
+
+_LANDMARKS = 68
+
+
+@dataclass(frozen=True, eq=False)
+class MorphableModel:
+    """A linear model of face shape and albedo; immutable and validated on construction.
+
+    Object space has y up and the nose along +z; coefficients are in standard deviations.
+
+    Parameters
+    ----------
+    name : str
+        What a person calls the model.
+    mean : (V, 3) float32
+        Mean shape, in units of ``unit_mm`` millimetres.
+    faces : (F, 3) int32
+        Vertex indices, counter-clockwise seen from outside.
+    identity : (V, 3, Ki) float32
+        Identity modes, premultiplied by their standard deviations.
+    expression : (V, 3, Ke) float32
+        Expression modes, likewise.
+    mean_albedo : (V, 3) float32
+        Mean diffuse albedo, linear Rec. 709 reflectance.
+    albedo_modes : (V, 3, Ka) float32
+        Albedo modes, premultiplied by their standard deviations.
+    uv : (T, 2) float32
+        Texture vertices; faces of ``face_mask`` lie in [0, 1].
+    faces_uv : (F, 3) int32
+        Texture-vertex indices per face.
+    landmarks : (68,) int32
+        Vertices of the 68 iBUG points.
+    face_mask : (F,) bool
+        Faces that enter photometric terms and the maps.
+    symmetry : (V,) int32, optional
+        For each vertex its mirror image's index in x -> -x.
+    unit_mm : float
+        Millimetres per model unit.
+    expression_names : tuple of str
+        One name per expression mode.
+    expression_bounds : (Ke, 2) float32
+        Lower and upper bounds of each expression coefficient; infinite when free.
+
+    Raises
+    ------
+    InputError
+        An array has the wrong shape, is not finite, or an index is out of range; the message names it.
+    """
+
+    name: str
+    mean: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    identity: NDArray[np.float32]
+    expression: NDArray[np.float32]
+    mean_albedo: NDArray[np.float32]
+    albedo_modes: NDArray[np.float32]
+    uv: NDArray[np.float32]
+    faces_uv: NDArray[np.int32]
+    landmarks: NDArray[np.int32]
+    face_mask: NDArray[np.bool_]
+    symmetry: NDArray[np.int32] | None = None
+    unit_mm: float = 10.0
+    expression_names: tuple[str, ...] = ()
+    expression_bounds: NDArray[np.float32] = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        v, f = len(np.atleast_1d(self.mean)), len(np.atleast_1d(self.faces))
+        ke = np.shape(self.expression)[-1] if np.ndim(self.expression) == 3 else 0
+        if self.expression_bounds is None:
+            self._set("expression_bounds", np.tile([-np.inf, np.inf], (ke, 1)))
+        if not self.expression_names:
+            self._set("expression_names", tuple(f"expression_{k:02d}" for k in range(ke)))
+        expected: dict[str, tuple[tuple, type]] = {
+            "mean": ((v, 3), np.float32),
+            "faces": ((f, 3), np.int32),
+            "identity": ((v, 3, None), np.float32),
+            "expression": ((v, 3, None), np.float32),
+            "mean_albedo": ((v, 3), np.float32),
+            "albedo_modes": ((v, 3, None), np.float32),
+            "uv": ((None, 2), np.float32),
+            "faces_uv": ((f, 3), np.int32),
+            "landmarks": ((_LANDMARKS,), np.int32),
+            "face_mask": ((f,), np.bool_),
+            "symmetry": ((v,), np.int32),
+            "expression_bounds": ((ke, 2), np.float32),
+        }
+        for key, (shape, dtype) in expected.items():
+            if key == "symmetry" and self.symmetry is None:
+                continue
+            self._set(key, _checked(self.name, key, getattr(self, key), shape, dtype))
+        if v < 4 or f < 1:
+            raise InputError(f"{self.name}: mean has {v} vertices and faces {f} rows, expected a surface")
+        for key, limit in (("faces", v), ("faces_uv", len(self.uv)), ("landmarks", v), ("symmetry", v)):
+            index = getattr(self, key)
+            if index is not None and index.size and (index.min() < 0 or index.max() >= limit):
+                raise InputError(
+                    f"{self.name}: {key} holds indices {index.min()}..{index.max()}, expected 0..{limit - 1}"
+                )
+        if not self.face_mask.any():
+            raise InputError(f"{self.name}: face_mask selects no face, expected at least one")
+        if len(self.expression_names) != ke:
+            raise InputError(f"{self.name}: {len(self.expression_names)} expression_names for {ke} modes")
+        if not (np.isfinite(self.unit_mm) and self.unit_mm > 0):
+            raise InputError(f"{self.name}: unit_mm is {self.unit_mm}, expected a positive number")
+        if (self.expression_bounds[:, 0] > self.expression_bounds[:, 1]).any():
+            raise InputError(f"{self.name}: expression_bounds has a lower bound above its upper bound")
+
+    def _set(self, key: str, value: object) -> None:
+        object.__setattr__(self, key, value)
+
+    # -- sizes --------------------------------------------------------------------------------------------
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of geometry vertices V."""
+        return len(self.mean)
+
+    @property
+    def n_identity(self) -> int:
+        """Number of identity modes Ki."""
+        return self.identity.shape[2]
+
+    @property
+    def n_expression(self) -> int:
+        """Number of expression modes Ke."""
+        return self.expression.shape[2]
+
+    @property
+    def n_albedo(self) -> int:
+        """Number of albedo modes Ka."""
+        return self.albedo_modes.shape[2]
+
+    # -- Jacobians: views of the bases, never copies ------------------------------------------------------
+
+    @property
+    def identity_jacobian(self) -> NDArray[np.float32]:
+        """(3V, Ki) derivative of the flattened shape by identity coefficients; a view."""
+        return self.identity.reshape(3 * self.n_vertices, -1)
+
+    @property
+    def expression_jacobian(self) -> NDArray[np.float32]:
+        """(3V, Ke) derivative of the flattened shape by expression coefficients; a view."""
+        return self.expression.reshape(3 * self.n_vertices, -1)
+
+    @property
+    def albedo_jacobian(self) -> NDArray[np.float32]:
+        """(3V, Ka) derivative of the flattened albedo by albedo coefficients; a view."""
+        return self.albedo_modes.reshape(3 * self.n_vertices, -1)
+
+    # -- evaluation ---------------------------------------------------------------------------------------
+
+    def shape(self, identity: ArrayLike | None = None, expression: ArrayLike | None = None) -> NDArray[np.float32]:
+        """Vertices for given coefficients.
+
+        Parameters
+        ----------
+        identity : (<= Ki,) float, optional
+            Identity coefficients in standard deviations; missing ones are zero.
+        expression : (<= Ke,) float, optional
+            Expression coefficients, likewise.
+
+        Returns
+        -------
+        (V, 3) float32
+            Object space, in units of ``unit_mm`` millimetres.
+        """
+        out = self.mean.ravel()
+        if identity is not None:
+            out = out + _product(self.identity_jacobian, identity, "identity", self.name)
+        if expression is not None:
+            out = out + _product(self.expression_jacobian, expression, "expression", self.name)
+        return out.reshape(-1, 3).copy() if out.base is not None else out.reshape(-1, 3)
+
+    def albedo(self, coefficients: ArrayLike | None = None) -> NDArray[np.float32]:
+        """(V, 3) float32 linear reflectance for albedo coefficients in standard deviations; not clipped."""
+        if coefficients is None:
+            return self.mean_albedo.copy()
+        out = self.mean_albedo.ravel() + _product(self.albedo_jacobian, coefficients, "albedo", self.name)
+        return out.reshape(-1, 3)
+
+    def sample(
+        self, seed: int = 0, scale: float = 1.0
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Draw random coefficients from the model's prior.
+
+        Parameters
+        ----------
+        seed : int
+            The same seed gives the same subject.
+        scale : float
+            Factor on the standard deviations.
+
+        Returns
+        -------
+        identity (Ki,), expression (Ke,), albedo (Ka,) : float32
+            Normal draws; expressions are clipped to their bounds.
+        """
+        rng = np.random.default_rng(seed)
+        identity, expression, albedo = (
+            (scale * rng.standard_normal(k)).astype(np.float32)
+            for k in (self.n_identity, self.n_expression, self.n_albedo)
+        )
+        return identity, np.clip(expression, *self.expression_bounds.T), albedo
+
+    # -- derived models -----------------------------------------------------------------------------------
+
+    def subset(
+        self,
+        identity: int | slice | None = None,
+        expression: int | slice | None = None,
+        albedo: int | slice | None = None,
+        region: NDArray[np.bool_] | None = None,
+    ) -> MorphableModel:
+        """Return a model with fewer modes or a smaller photometric region.
+
+        Parameters
+        ----------
+        identity, expression, albedo : int or slice, optional
+            Modes to keep: a number of leading modes, or a slice; all by default.
+        region : (F,) bool, optional
+            Faces that may stay in ``face_mask``.
+        """
+        i, e, a = (slice(k) if isinstance(k, int) else (k or slice(None)) for k in (identity, expression, albedo))
+        return replace(
+            self,
+            identity=np.ascontiguousarray(self.identity[:, :, i]),
+            expression=np.ascontiguousarray(self.expression[:, :, e]),
+            albedo_modes=np.ascontiguousarray(self.albedo_modes[:, :, a]),
+            expression_names=self.expression_names[e],
+            expression_bounds=self.expression_bounds[e],
+            face_mask=self.face_mask if region is None else self.face_mask & region,
+        )
+
+    @cached_property
+    def degenerate_faces(self) -> NDArray[np.int64]:
+        """Indices of the mean's faces without area; reported by ``mifit model info``."""
+        area = np.linalg.norm(face_cross(self.mean.astype(np.float64), self.faces), axis=1)
+        return np.flatnonzero(area <= 1e-12 * np.ptp(self.mean, axis=0).max() ** 2)
+
+    @cached_property
+    def digest(self) -> str:
+        """Hexadecimal digest of all content but the name."""
+        h = hashlib.blake2b(digest_size=16)
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, np.ndarray):
+                h.update(f"{f.name}{value.shape}{value.dtype}".encode())
+                h.update(value.data)
+            elif f.name != "name":
+                h.update(f"{f.name}={value!r}".encode())
+        return h.hexdigest()
+
+    # -- files --------------------------------------------------------------------------------------------
+
+    @classmethod
+    def load(cls, path: str | Path) -> MorphableModel:
+        """Load a model, whatever its kind.
+
+        Parameters
+        ----------
+        path : str or Path
+            ``"builtin"`` (about 30 000 vertices), ``"builtin:coarse"`` (about 7 000), or a file or folder of
+            a known format, recognised by content.
+
+        Raises
+        ------
+        InputError
+            The file is missing, damaged or of no known kind; the message says what was found.
+        """
+        from mifit.morphable.formats import load_model
+
+        return load_model(path)
+
+    def save(self, path: str | Path) -> None:
+        """Write the model as an ``.npz`` file, whole or not at all."""
+        from mifit.morphable.formats.own import save_model
+
+        save_model(self, path)
+
+
+def _checked(name: str, key: str, value: ArrayLike, shape: tuple, dtype: type) -> NDArray:
+    """Return ``value`` as a read-only contiguous array of the given type, or raise InputError."""
+    array = np.asarray(value)
+    want = str(tuple("any" if n is None else n for n in shape)).replace("'", "")
+    if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
+        raise InputError(f"{name}: {key} has shape {array.shape}, expected {want}")
+    if array.dtype.kind not in {"f": "fiu", "i": "iu", "b": "b"}[np.dtype(dtype).kind]:
+        raise InputError(f"{name}: {key} has type {array.dtype}, expected {np.dtype(dtype)}")
+    if dtype is np.int32 and array.size and (array.min() < -(2**31) or array.max() >= 2**31):
+        raise InputError(f"{name}: {key} holds {array.max()}, expected 32-bit indices")
+    with np.errstate(over="ignore"):
+        array = np.ascontiguousarray(array, dtype=dtype)
+    if dtype is np.float32 and key != "expression_bounds" and not np.isfinite(array).all():
+        bad = np.argwhere(~np.isfinite(array))[0]
+        raise InputError(f"{name}: {key}[{', '.join(map(str, bad))}] is {array[tuple(bad)]}, expected finite values")
+    if key == "expression_bounds" and np.isnan(array).any():
+        raise InputError(f"{name}: expression_bounds holds NaN")
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def _product(basis: NDArray[np.float32], coefficients: ArrayLike, key: str, name: str) -> NDArray[np.float32]:
+    """Basis times coefficients, of which trailing ones may be missing."""
+    c = np.asarray(coefficients, dtype=np.float32)
+    if c.ndim != 1 or len(c) > basis.shape[1]:
+        raise InputError(f"{name}: {key} coefficients have shape {c.shape}, expected at most ({basis.shape[1]},)")
+    return basis @ c if len(c) == basis.shape[1] else basis[:, : len(c)] @ c
