@@ -1,0 +1,134 @@
+"""The paper's Table 1 on data that can be made: subjects, three views, the third one held out.
+
+    python -m benchmarks.table1 [--subjects 15] [--jobs 2] [--work out/table1]
+
+Each subject is a random identity with its own skin, path traced with detail that the fitted model doesn't have, under
+one of three set-ups of light. Cameras ``left`` and ``right`` are fitted, ``third`` is only compared with. A finished
+subject is not run again, so that a stopped benchmark goes on; its figures and pictures stay in the work folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from benchmarks.record import RESULTS, SHARED, record
+from mifit.core.files import write_text
+
+ENVIRONMENTS = ("apartment", "studio", "softbox")
+METHODS = ("pca", "diffuse", "full")
+PAPER = {"pca": (24.6, 15.0), "diffuse": (26.8, 11.6), "full": (28.3, 9.8)}
+FULL_SIZE = {"timesteps": 4, "width": 680, "height": 480, "spp": 64}
+REDUCED = {"timesteps": 3, "width": 340, "height": 240, "spp": 32}
+
+
+def mifit(*arguments: object) -> None:
+    """Run the command line in a process of its own; its last line of stderr is the error."""
+    done = subprocess.run(
+        [sys.executable, "-m", "mifit", *map(str, arguments), "--quiet"], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise RuntimeError(f"mifit {arguments[0]}: {(done.stderr.strip() or 'no message').splitlines()[-1]}")
+
+
+def run_subject(subject: int, work: Path, size: dict[str, int], model: str) -> dict[str, Any]:
+    """Synthesise, fit and evaluate one subject; what is done already is kept."""
+    folder = work / f"subject_{subject:02d}"
+    figures = folder / "third.json"
+    environment = SHARED / "hdri" / f"{ENVIRONMENTS[subject % len(ENVIRONMENTS)]}.hdr"
+    light = ["--env", environment] if environment.exists() else []
+    if not figures.exists():
+        if not (folder / "capture" / "transforms.json").exists():
+            options = [part for key, value in size.items() for part in (f"--{key}", value)]
+            mifit("synth", "--out", folder / "capture", "--seed", 100 + subject, "--model", model, *options, *light)
+        mifit("fit", folder / "capture", "--out", folder / "result", "--model", model, "--cameras", "left,right",
+              "--timesteps", f"0-{size['timesteps'] - 1}", "--resume")  # fmt: skip
+        mifit("evaluate", folder / "result", "--capture", folder / "capture", "--camera", "third", "--json", figures)
+    result = json.loads((folder / "result" / "result.json").read_text())
+    return {
+        "subject": subject,
+        "light": environment.stem if light else "procedural",
+        "seconds": round(result["seconds"], 1),
+        "peak_memory_mb": round(result["peak_memory_mb"]),
+        **json.loads(figures.read_text()),
+    }
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Mean and spread over the subjects, per method and measure."""
+    table = {}
+    for method in METHODS:
+        found = [row["methods"][method] for row in rows]
+        table[method] = {
+            f"{name}_{kind}": round(function([f[name] for f in found]), 3)
+            for name in found[0]
+            for kind, function in (("mean", statistics.fmean), ("spread", statistics.pstdev))
+        }
+    return table
+
+
+def markdown(rows: list[dict[str, Any]], table: dict[str, dict[str, float]]) -> str:
+    """The table as Markdown, the paper's figures (on its own data) beside it."""
+    lines = [
+        f"Held-out third view, {len(rows)} subjects. The paper's column is on its own recordings.",
+        "",
+        "| method | PSNR dB | spread | RMSE | paper PSNR | paper RMSE |",
+        "|---|---|---|---|---|---|",
+    ]
+    for method in METHODS:
+        t, (psnr, rmse) = table[method], PAPER[method]
+        lines.append(
+            f"| {method} | {t['psnr_mean']:.2f} | {t['psnr_spread']:.2f} | {t['rmse_mean']:.2f} | {psnr} | {rmse} |"
+        )
+    lines += ["", "| subject | light | pca | diffuse | full | seconds |", "|---|---|---|---|---|---|"]
+    for row in rows:
+        cells = " | ".join(f"{row['methods'][method]['psnr']:.2f}" for method in METHODS)
+        lines.append(f"| {row['subject']} | {row['light']} | {cells} | {row['seconds']:.0f} |")
+    return "\n".join(lines) + "\n"
+
+
+def run(subjects: int, jobs: int, work: Path, size: dict[str, int], model: str, name: str) -> dict[str, Any]:
+    """Run all subjects and write ``benchmarks/results/NAME.json`` and ``.md``."""
+    rows, failures = [], {}
+    with ThreadPoolExecutor(jobs) as pool:
+        waiting = {pool.submit(run_subject, i, work, size, model): i for i in range(subjects)}
+        for done in as_completed(waiting):
+            subject = waiting[done]
+            try:
+                rows.append(done.result())
+                psnr = rows[-1]["methods"]["full"]["psnr"]
+                print(f"subject {subject}: full {psnr:.2f} dB", file=sys.stderr, flush=True)
+            except RuntimeError as error:  # a subject that fails stays in the table as failing
+                failures[subject] = str(error)
+                print(f"subject {subject}: {error}", file=sys.stderr, flush=True)
+    rows.sort(key=lambda row: row["subject"])
+    figures: dict[str, Any] = {"size": size, "model": model, "subjects": rows, "failures": failures}
+    if rows:
+        figures["summary"] = summary(rows)
+        write_text(RESULTS / f"{name}.md", markdown(rows, figures["summary"]))
+    record(name, figures, seeds=[100 + i for i in range(subjects)])
+    return figures
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--subjects", type=int, default=15)
+    parser.add_argument("--jobs", type=int, default=1, help="subjects at a time, each in processes of its own")
+    parser.add_argument("--work", type=Path, default=Path("out/table1"))
+    parser.add_argument("--model", default="builtin")
+    parser.add_argument("--reduced", action="store_true", help="small images, for a quick look")
+    a = parser.parse_args()
+    size, name = (REDUCED, "table1_reduced") if a.reduced else (FULL_SIZE, "table1")
+    figures = run(a.subjects, a.jobs, a.work, size, a.model, name)
+    print((RESULTS / f"{name}.md").read_text() if figures["subjects"] else "no subject finished")
+    return 1 if figures["failures"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
