@@ -19,6 +19,15 @@ class GeometryConfig:
 
     landmark_weight: float = 10.0
     prior_weight: float = 5e-5
+    landmark_noise: float = 1.0
+    surface_points: int = 3000
+    texture_rounds: int = 2
+    texture_weight: float = 0.03
+    texture_sigma: float = 1.0
+    texture_window: float = 6.0
+    pixels: int = 5000
+    robust_colour: float = 30.0
+    albedo_prior: float = 1.0
     max_iterations: int = 30
 
 

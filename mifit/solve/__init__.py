@@ -1,1 +1,28 @@
-"""Nonlinear least squares; knows nothing of faces or rendering."""
+"""Nonlinear least squares: Gauss-Newton and Levenberg-Marquardt; knows nothing of faces or rendering.
+
+A *problem* linearises itself into a *system* (normal equations with their structure); a *descent* turns a system
+into a step; an *acceptance* judges the step and sets the size of the next one; `minimize` drives the three and
+returns a `Solution` that says in an enumerated `Outcome` how it ended.
+"""
+
+from mifit.solve.acceptance import Backtracking, TrustRatio
+from mifit.solve.descent import GaussNewton, LevenbergMarquardt
+from mifit.solve.minimize import minimize
+from mifit.solve.robust import geman_mcclure, huber
+from mifit.solve.solution import Outcome, Solution
+from mifit.solve.systems import ArrowSystem, DenseSystem, RowSystem
+
+__all__ = [
+    "ArrowSystem",
+    "Backtracking",
+    "DenseSystem",
+    "GaussNewton",
+    "LevenbergMarquardt",
+    "Outcome",
+    "RowSystem",
+    "Solution",
+    "TrustRatio",
+    "geman_mcclure",
+    "huber",
+    "minimize",
+]

@@ -1,0 +1,71 @@
+"""Accumulates the normal equations of stage 1 block by block."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.solve import ArrowSystem
+from mifit.stages.geometry.parameters import Layout
+
+
+class NormalEquations:
+    """J^T J and J^T r of rows that each touch the shared unknowns and one timestep's."""
+
+    def __init__(self, layout: Layout) -> None:
+        s, p, t = layout.shared_size, layout.local_size, layout.timesteps
+        self.layout = layout
+        self.shared = np.zeros((s, s))
+        self.shared_gradient = np.zeros(s)
+        self.local = np.zeros((t, p, p))
+        self.local_gradient = np.zeros((t, p))
+        self.coupling = np.zeros((t, s, p))
+
+    def add(self, step: int, shared: NDArray, local: NDArray, residual: NDArray, weight: NDArray) -> None:
+        """Add rows of one timestep.
+
+        Parameters
+        ----------
+        shared : (m, S), local : (m, P)
+            Jacobian; float32 rows are multiplied in float32 and accumulated in float64.
+        residual, weight : (m,)
+            Residuals and the weights of their squares.
+        """
+        root = np.sqrt(weight).astype(shared.dtype)[:, None]
+        rows = np.concatenate([shared, local, np.asarray(residual, shared.dtype)[:, None]], axis=1) * root
+        h = rows.T @ rows
+        s = self.layout.shared_size
+        self.shared += h[:s, :s]
+        self.coupling[step] += h[:s, s:-1]
+        self.local[step] += h[s:-1, s:-1]
+        self.shared_gradient += h[:s, -1]
+        self.local_gradient[step] += h[s:-1, -1]
+
+    def add_prior(self, name: str, x: NDArray, weight: float, mean: float | NDArray = 0.0) -> None:
+        """Add ``weight * |x[name] - mean|^2``, for every timestep if the group is local."""
+        steps = range(self.layout.timesteps) if name in ("expression", "rotation", "translation") else (0,)
+        for step in steps:
+            at = self.layout.at(name, step)
+            difference = x[at] - mean
+            if name in ("expression", "rotation", "translation"):
+                start = self.layout.local(step).start
+                inside = np.arange(at.start - start, at.stop - start)
+                self.local[step][inside, inside] += weight
+                self.local_gradient[step][inside] += weight * difference
+            else:
+                inside = np.arange(at.start, at.stop)
+                self.shared[inside, inside] += weight
+                self.shared_gradient[inside] += weight * difference
+
+    def system(self) -> ArrowSystem:
+        """The accumulated equations."""
+        return ArrowSystem(
+            self.shared, self.shared_gradient, list(self.local), list(self.local_gradient), list(self.coupling)
+        )
+
+
+def prior_energy(layout: Layout, x: NDArray, name: str, weight: float) -> float:
+    """Energy that `NormalEquations.add_prior` linearises, with mean 0."""
+    local = name in ("expression", "rotation", "translation")
+    steps = range(layout.timesteps) if local else (0,)
+    return weight * sum(float(x[layout.at(name, step)] @ x[layout.at(name, step)]) for step in steps)

@@ -1,0 +1,188 @@
+"""The fit by landmarks: detected points of all images, a pose per timestep, then identity and expression."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.capture import Capture
+from mifit.core.camera import Camera
+from mifit.errors import InputError
+from mifit.morphable import MorphableModel
+from mifit.solve import Solution, TrustRatio, minimize
+from mifit.stages.geometry.initial import pose_candidates, reprojection
+from mifit.stages.geometry.landmarks import LandmarkProblem, LandmarkTerm, LandmarkView, slide_contour
+from mifit.stages.geometry.parameters import Frames, Layout
+from mifit.stages.geometry.points import PointBasis
+
+FEWEST_LANDMARKS = 6
+FEW_IDENTITY_MODES = 20
+OUTLIER_PIXELS = 4.0  # in units of the landmark noise: where Geman and McClure's penalty turns
+
+
+@dataclass(frozen=True)
+class State:
+    """A point in the space of unknowns: what a flat vector means and its value."""
+
+    layout: Layout
+    frames: Frames
+    x: NDArray
+
+    def recentred(self) -> State:
+        """The same state with the rotation vectors at zero, where their derivatives are simplest."""
+        x = self.x.copy()
+        rotation = np.stack([self.frames.pose(self.layout, x, k).rotation for k in range(self.layout.timesteps)])
+        for k in range(self.layout.timesteps):
+            x[self.layout.at("rotation", k)] = 0.0
+        return State(self.layout, Frames(rotation, self.frames.scale), x)
+
+    def with_layout(self, layout: Layout) -> State:
+        """The same state under another choice of groups; new groups start at zero."""
+        x = np.zeros(layout.size)
+        for name in ("identity", "albedo", "shading", "ambient", "log_scale"):
+            old, new = self.layout.at(name), layout.at(name)
+            if getattr(self.layout, name) == getattr(layout, name):
+                x[new] = self.x[old]
+        for k in range(layout.timesteps):
+            x[layout.local(k)] = self.x[self.layout.local(k)]
+        return State(layout, self.frames, x)
+
+
+def bounds(layout: Layout, expression_bounds: NDArray) -> tuple[NDArray, NDArray]:
+    """Lower and upper bounds of the flat vector: only expressions have any."""
+    low, high = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
+    for k in range(layout.timesteps):
+        low[layout.at("expression", k)] = expression_bounds[:, 0]
+        high[layout.at("expression", k)] = expression_bounds[:, 1]
+    return low, high
+
+
+def landmark_views(
+    capture: Capture, model: MorphableModel, cameras: Sequence[str], timesteps: Sequence[int], noise: float
+) -> tuple[LandmarkView, ...]:
+    """Visible landmarks of all images; raises InputError for a timestep with fewer than six in total."""
+    views = []
+    for step, timestep in enumerate(timesteps):
+        counts = {}
+        for name in cameras:
+            frame = capture.frame(name, timestep)
+            if frame.landmarks is None:
+                counts[name] = 0
+                continue
+            pixels = np.asarray(frame.landmarks, dtype=np.float64)
+            index = np.flatnonzero(frame.visible & np.isfinite(pixels).all(1))
+            counts[name] = len(index)
+            if len(index):
+                vertices = model.landmarks[index]
+                basis = PointBasis.at_vertices(model, vertices)
+                views.append(
+                    LandmarkView(step, capture.camera(name), index, vertices, pixels[index], 1.0 / noise**2, basis)
+                )
+        if sum(counts.values()) < FEWEST_LANDMARKS:
+            found = ", ".join(f"{n} in camera {name}" for name, n in counts.items())
+            raise InputError(
+                f"timestep {timestep}: found {sum(counts.values())} visible landmarks ({found}), expected at "
+                f"least {FEWEST_LANDMARKS} in total; detect them with `mifit landmarks` or leave the timestep out"
+            )
+    return tuple(views)
+
+
+def initial_state(
+    model: MorphableModel, views: Sequence[LandmarkView], timesteps: int, layout: Layout, scale: float
+) -> State:
+    """Mean face at the pose per timestep that reprojects best among all candidates."""
+    mean = model.mean[model.landmarks].astype(np.float64)
+    x = np.zeros(layout.size)
+    rotation = np.tile(np.eye(3), (timesteps, 1, 1))
+    for step in range(timesteps):
+        mine = [v for v in views if v.step == step]
+        cameras: list[Camera] = [v.camera for v in mine]
+        pixels = []
+        for view in mine:
+            full = np.full((68, 2), np.nan)
+            full[view.index] = view.pixels
+            pixels.append(full)
+        candidates = pose_candidates(cameras, mean, pixels, scale)
+        if not candidates:  # landmarks too thinly spread for any closed form: in front of the camera, facing it
+            camera = cameras[0]
+            distance = 500.0 * scale
+            candidates = [
+                (camera.rotation.T @ np.diag([1.0, -1.0, -1.0]), camera.position + distance * camera.rotation[2])
+            ]
+        error = [reprojection(cameras, mean, pixels, scale, pose) for pose in candidates]
+        best = candidates[int(np.argmin(error))]
+        rotation[step] = best[0]
+        x[layout.at("translation", step)] = best[1]
+    return State(layout, Frames(rotation, scale), x)
+
+
+def fit_landmarks(
+    model: MorphableModel,
+    views: tuple[LandmarkView, ...],
+    state: State,
+    noise: float,
+    identity_prior: float = 1.0,
+    expression_prior: float = 1.0,
+) -> tuple[State, Solution, tuple[LandmarkView, ...]]:
+    """Levenberg-Marquardt on landmarks and prior: pose alone, then few modes, then all, then with the contour slid.
+
+    Returns
+    -------
+    state, solution of the last run, views with their slid contour points
+    """
+    layout = state.layout
+    low, high = bounds(layout, model.expression_bounds)
+    held = np.zeros(layout.size, dtype=bool)
+    solution: Solution | None = None
+    # a wide outlier scale first: the mean face is far from every landmark
+    for modes, expression, widening in (
+        (0, False, 10.0),
+        (FEW_IDENTITY_MODES, True, 3.0),
+        (None, True, 1.0),
+        (None, True, 1.0),
+    ):
+        state = state.recentred()
+        held[:] = False
+        if modes is not None:
+            held[layout.at("identity")][modes:] = True
+        if not expression:
+            for k in range(layout.timesteps):
+                held[layout.at("expression", k)] = True
+        low_now, high_now = np.where(held, state.x, low), np.where(held, state.x, high)
+        if solution is not None and modes is None:
+            vertices = object_vertices(model, state)
+            poses = [state.frames.pose(layout, state.x, k) for k in range(layout.timesteps)]
+            views = slide_contour(model, views, vertices, poses)
+        term = LandmarkTerm(views, OUTLIER_PIXELS * noise * widening)
+        problem = LandmarkProblem(layout, state.frames, term, identity_prior, expression_prior)
+        solution = minimize(
+            problem,
+            state.x,
+            lower=low_now,
+            upper=high_now,
+            max_iterations=30,
+            acceptance=TrustRatio(),
+            energy_tolerance=1e-5,
+        )
+        state = replace(state, x=solution.value)
+    assert solution is not None
+    return state, solution, views
+
+
+def object_vertices(model: MorphableModel, state: State) -> NDArray:
+    """(T, V, 3) vertices in object space."""
+    layout, x = state.layout, state.x
+    size = len(model.mean)
+    neutral = model.mean.reshape(-1) + model.identity.reshape(3 * size, -1) @ x[layout.at("identity")].astype(
+        np.float32
+    )
+    flat = model.expression.reshape(3 * size, -1)
+    return np.stack(
+        [
+            (neutral + flat @ x[layout.at("expression", k)].astype(np.float32)).reshape(size, 3)
+            for k in range(layout.timesteps)
+        ]
+    )

@@ -1,0 +1,134 @@
+"""What each image sees of the current surface: found anew by Mitsuba at every outer step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.capture import Capture
+from mifit.core.camera import Camera
+from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
+from mifit.morphable import MorphableModel
+from mifit.render.gbuffer import GBuffer, SurfaceScene
+from mifit.stages.geometry.consistency import TextureView
+from mifit.stages.geometry.images import level, texture_level
+from mifit.stages.geometry.points import PointBasis
+from mifit.stages.geometry.rendering import PixelView
+from mifit.stages.geometry.start import State, object_vertices
+
+GRAZING_COSINE = 0.25  # beyond about 75 degrees a pixel covers too much surface to place it well
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points spread evenly over the facial surface.
+
+    Attributes
+    ----------
+    face : (N,) int, weights : (N, 3) float32
+    basis : PointBasis
+    """
+
+    face: NDArray
+    weights: NDArray
+    basis: PointBasis
+
+
+def spread_points(model: MorphableModel, count: int, seed: int) -> SurfacePoints:
+    """Stratified by area: the k-th point lies in the k-th part of the summed area, so that none cluster by face."""
+    rng = np.random.default_rng(seed)
+    area = np.linalg.norm(face_cross(model.mean.astype(np.float64), model.faces), axis=1) * model.face_mask
+    cumulative = np.cumsum(area)
+    target = (np.arange(count) + rng.random(count)) / count * cumulative[-1]
+    face = np.minimum(np.searchsorted(cumulative, target, side="right"), len(area) - 1)
+    uv = rng.random((count, 2))
+    uv = np.where(uv.sum(1, keepdims=True) > 1.0, 1.0 - uv, uv)
+    weights = np.concatenate([1.0 - uv.sum(1, keepdims=True), uv], axis=1).astype(np.float32)
+    return SurfacePoints(face, weights, PointBasis.on_faces(model, face, weights))
+
+
+class Visibility:
+    """Ray-traced views of the surface at a state."""
+
+    def __init__(
+        self, capture: Capture, model: MorphableModel, cameras: Sequence[str], timesteps: Sequence[int]
+    ) -> None:
+        self.capture, self.model = capture, model
+        self.cameras: list[Camera] = [capture.camera(name) for name in cameras]
+        self.timesteps = tuple(timesteps)
+        self._scene: SurfaceScene | None = None
+
+    def world(self, state: State) -> NDArray[np.float64]:
+        """(T, V, 3) world-space vertices."""
+        objects = object_vertices(self.model, state)
+        return np.stack(
+            [
+                state.frames.pose(state.layout, state.x, k).apply(objects[k].astype(np.float64))
+                for k in range(len(self.timesteps))
+            ]
+        )
+
+    def _place(self, vertices: NDArray) -> SurfaceScene:
+        if self._scene is None:
+            self._scene = SurfaceScene(vertices, self.model.faces)
+        else:
+            self._scene.update(vertices)
+        return self._scene
+
+    def _usable(self, buffer: GBuffer, frame: object, border: int) -> NDArray[np.bool_]:
+        """Pixels on the model, not at its outline, measured and not clipped."""
+        on = (buffer.face >= 0).astype(np.uint8)
+        if border:
+            on = cv2.erode(on, np.ones((2 * border + 1,) * 2, np.uint8), borderValue=0)
+        return (on > 0) & frame.valid & ~frame.clipped  # type: ignore[attr-defined]
+
+    def textures(self, state: State, points: SurfacePoints, sigma: float, window: float) -> tuple[TextureView, ...]:
+        """Log-texture of every image and the points it sees."""
+        out = []
+        rows = points.basis
+        for step, vertices in enumerate(self.world(state)):
+            scene = self._place(vertices)
+            position = interpolate(vertices, self.model.faces, points.face, points.weights)
+            normal = interpolate(
+                vertex_normals(vertices, self.model.faces), self.model.faces, points.face, points.weights
+            )
+            normal = normalize(normal)
+            for camera in self.cameras:
+                frame = self.capture.frame(camera.name, self.timesteps[step])
+                usable = self._usable(scene.gbuffer(camera), frame, 1)
+                cosine = (normalize(camera.position - position) * normal).sum(1)
+                seen = np.flatnonzero((cosine > GRAZING_COSINE) & scene.visible_from(position, camera.position))
+                if not len(seen):
+                    continue
+                pick = (3 * seen[:, None] + np.arange(3)).ravel()
+                basis = PointBasis(rows.mean[pick], rows.identity[pick], rows.expression[pick])
+                image = texture_level(frame.image, usable, sigma, window)
+                out.append(TextureView(step, camera, image, seen, cosine[seen], basis))
+        return tuple(out)
+
+    def pixels(self, state: State, count: int, sigma: float, seed: int) -> tuple[PixelView, ...]:
+        """Up to ``count`` facial pixels of every image, chosen evenly at random."""
+        rng = np.random.default_rng(seed)
+        out = []
+        for step, vertices in enumerate(self.world(state)):
+            scene = self._place(vertices)
+            for camera in self.cameras:
+                frame = self.capture.frame(camera.name, self.timesteps[step])
+                buffer = scene.gbuffer(camera)
+                usable = self._usable(buffer, frame, 2)
+                facial = np.flatnonzero(usable & self.model.face_mask[np.maximum(buffer.face, 0)])
+                if len(facial) > count:
+                    facial = np.sort(rng.choice(facial, count, replace=False))
+                if not len(facial):
+                    continue
+                image = level(frame.image, frame.valid, sigma)
+                out.append(
+                    PixelView(
+                        step, camera, image, buffer.face.reshape(-1)[facial], buffer.weights.reshape(-1, 3)[facial]
+                    )
+                )
+        return tuple(out)
