@@ -23,12 +23,11 @@ from mifit.core.sh import basis_gradient
 from mifit.morphable import MorphableModel
 from mifit.solve import geman_mcclure
 from mifit.solve.systems import System
-
 from mifit.stages.geometry.images import SmoothImage
 from mifit.stages.geometry.landmarks import LandmarkTerm
 from mifit.stages.geometry.normal import NormalEquations, prior_energy
 from mifit.stages.geometry.parameters import Frames, Layout, Pose, cross_matrix
-from mifit.stages.geometry.points import corner_matrix, project
+from mifit.stages.geometry.points import project
 
 WHITE = 255.0
 AMBIENT_PRIOR = 1e-2  # of the squared ambient term in 0..1: fixes the gauge against the constant harmonic
