@@ -1,0 +1,222 @@
+"""Local rendering of a reconstruction: visible surface once, then the shading that the fit used.
+
+Nothing here knows how a surface reflects light: colours come from ``render.local``, which the plugins and the
+optimisers share.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.camera import Camera
+from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
+from mifit.core.sh import basis
+from mifit.core.uv import sample_map
+from mifit.output.surface import surface_maps
+
+if TYPE_CHECKING:
+    from mifit.output.reconstruction import Method, Reconstruction
+
+
+@dataclass(frozen=True)
+class VisibleSurface:
+    """What a camera sees of one timestep, supersampled; shared by all methods.
+
+    Attributes
+    ----------
+    shape : (int, int)
+        Height and width of the image.
+    oversampling : int
+        Samples along one side of a pixel.
+    index : (N,) int64
+        Flat sample index (row * width * oversampling + column) of every covered sample.
+    face : (N,) int32, weights : (N, 3) float32
+        Where on the mesh each sample lies.
+    points, view : (N, 3) float32
+        World positions and unit vectors towards the camera.
+    """
+
+    shape: tuple[int, int]
+    oversampling: int
+    index: NDArray[np.int64]
+    face: NDArray[np.int32]
+    weights: NDArray[np.float32]
+    points: NDArray[np.float32]
+    view: NDArray[np.float32]
+
+    def image(self, colour: NDArray) -> NDArray[np.float32]:
+        """Average sample colours (N, 3) into pixels: (H, W, 4), colour not premultiplied, alpha = coverage."""
+        height, width = self.shape
+        k = self.oversampling
+        row, column = self.index // (width * k) // k, self.index % (width * k) // k
+        pixel = row * width + column
+        count = np.bincount(pixel, minlength=height * width)
+        out = np.zeros((height * width, 4), dtype=np.float32)
+        for channel in range(3):
+            total = np.bincount(pixel, colour[:, channel], minlength=height * width)
+            out[:, channel] = total / np.maximum(count, 1)
+        out[:, 3] = count / (k * k)
+        return out.reshape(height, width, 4)
+
+
+def visible_surface(
+    reconstruction: Reconstruction, camera: Camera, timestep: int, oversampling: int = 2
+) -> VisibleSurface:
+    """Find the front-facing surface under every sample of a camera's pixels."""
+    i = reconstruction.index(timestep)
+    return trace_mesh(reconstruction.geometry.vertices[i], reconstruction.model.faces, camera, oversampling)
+
+
+def trace_mesh(vertices: NDArray, faces: NDArray, camera: Camera, oversampling: int) -> VisibleSurface:
+    """Find the front-facing surface of a mesh under a camera's samples.
+
+    A sample whose nearest surface shows its back (the inside of the head through an eye opening) is not covered.
+    """
+    from mifit.render.gbuffer import SurfaceScene
+
+    k = oversampling
+    fine = replace(
+        camera,
+        width=camera.width * k,
+        height=camera.height * k,
+        fx=camera.fx * k,
+        fy=camera.fy * k,
+        cx=camera.cx * k,
+        cy=camera.cy * k,
+    )
+    buffer = SurfaceScene(vertices, faces).gbuffer(fine)
+    index = np.flatnonzero(buffer.face.ravel() >= 0)
+    face = buffer.face.ravel()[index]
+    weights = buffer.weights.reshape(-1, 3)[index]
+    points = interpolate(vertices, faces, face, weights)
+    view = normalize(camera.position - points)
+    front = np.sum(face_cross(vertices, faces)[face] * view, axis=1) > 0
+    return VisibleSurface(
+        (camera.height, camera.width),
+        k,
+        index[front],
+        face[front],
+        weights[front].astype(np.float32),
+        points[front].astype(np.float32),
+        view[front].astype(np.float32),
+    )
+
+
+@dataclass(frozen=True)
+class Material:
+    """Surface properties under every sample of a `VisibleSurface`.
+
+    Attributes
+    ----------
+    normal : (N, 3) float32
+        Unit, world space.
+    diffuse : (N, 3), specular : (N,) float32
+        Albedo, 0..1.
+    """
+
+    normal: NDArray[np.float32]
+    diffuse: NDArray[np.float32]
+    specular: NDArray[np.float32]
+
+
+def surface_material(reconstruction: Reconstruction, surface: VisibleSurface, timestep: int) -> Material:
+    """Look up maps in the face area, and the fitted model's vertex albedo and the mesh's normals elsewhere."""
+    model, geometry = reconstruction.model, reconstruction.geometry
+    rotation = geometry.rotation[reconstruction.index(timestep)]
+    normal = _mesh_normals(reconstruction, surface, timestep)
+    diffuse = np.clip(interpolate(geometry.vertex_albedo, model.faces, surface.face, surface.weights), 0, 1)
+    specular = np.zeros(len(surface.face), dtype=np.float32)
+    inside = model.face_mask[surface.face]
+    maps = surface_maps(reconstruction, timestep)
+    uv = interpolate(model.uv, model.faces_uv, surface.face[inside], surface.weights[inside])
+    diffuse[inside] = sample_map(maps.diffuse, uv)
+    specular[inside] = sample_map(maps.specular, uv)
+    normal[inside] = normalize(sample_map(maps.normal, uv)) @ rotation.T
+    return Material(normal.astype(np.float32), diffuse.astype(np.float32), specular)
+
+
+def render_local(
+    reconstruction: Reconstruction, camera: Camera, timestep: int, method: Method, oversampling: int = 2
+) -> NDArray[np.float32]:
+    """Render one view by local shading; see `Reconstruction.render`."""
+    surface = visible_surface(reconstruction, camera, timestep, oversampling)
+    return shade_methods(reconstruction, surface, timestep, (method,))[method]
+
+
+def shade_methods(
+    reconstruction: Reconstruction, surface: VisibleSurface, timestep: int, methods: tuple[Method, ...]
+) -> dict[Method, NDArray[np.float32]]:
+    """Images (H, W, 4) of one visible surface by several methods."""
+    out: dict[Method, NDArray[np.float32]] = {}
+    parts = None
+    for method in methods:
+        if method == "pca":
+            out[method] = surface.image(_shade_stage_1(reconstruction, surface, timestep))
+        else:
+            if parts is None:
+                parts = shade(reconstruction, surface, timestep)
+            out[method] = surface.image(parts[0] + parts[1] if method == "full" else parts[0])
+    return out
+
+
+def shade(
+    reconstruction: Reconstruction, surface: VisibleSurface, timestep: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Diffuse (with ambient) and specular radiance (N, 3) of a visible surface, by the model that was fitted."""
+    from mifit.render.local import shade_points
+
+    reflectance = reconstruction.reflectance
+    assert reflectance is not None
+    material = surface_material(reconstruction, surface, timestep)
+    transfer = None
+    if reflectance.shading_model == "shadowed":
+        transfer = shadowed_transfer(reconstruction, surface, timestep, material.normal)
+    return shade_points(
+        material.normal,
+        surface.view,
+        material.diffuse,
+        material.specular,
+        reflectance.radiance,
+        reflectance.ambient,
+        reflectance.exponent,
+        reflectance.shading_model,
+        transfer,
+    )
+
+
+def shadowed_transfer(
+    reconstruction: Reconstruction, surface: VisibleSurface, timestep: int, normal: NDArray
+) -> NDArray[np.float32]:
+    """(N, B*B) diffuse transfer with the head's own shadows.
+
+    Shadows are traced at the vertices and interpolated; what a refined normal changes is added in closed form.
+    """
+    from mifit.render.local import diffuse_matrix
+    from mifit.render.transfer import trace_transfer
+
+    order = reconstruction.lighting.order
+    vertices = reconstruction.geometry.vertices[reconstruction.index(timestep)]
+    faces = reconstruction.model.faces
+    traced = trace_transfer(vertices, faces, vertices, vertex_normals(vertices, faces), order)
+    base = _mesh_normals(reconstruction, surface, timestep).astype(np.float32)
+    shadowed = interpolate(traced, faces, surface.face, surface.weights).astype(np.float32)
+    return shadowed + diffuse_matrix(normal, order) - diffuse_matrix(base, order)
+
+
+def _mesh_normals(reconstruction: Reconstruction, surface: VisibleSurface, timestep: int) -> NDArray:
+    """(N, 3) unit normals of the fitted mesh in world space, interpolated."""
+    faces = reconstruction.model.faces
+    normals = vertex_normals(reconstruction.geometry.vertices[reconstruction.index(timestep)], faces)
+    return normalize(interpolate(normals, faces, surface.face, surface.weights))
+
+
+def _shade_stage_1(reconstruction: Reconstruction, surface: VisibleSurface, timestep: int) -> NDArray:
+    """The paper's I_a + I_d (section 4.1) with the fitted model's albedo and normals."""
+    geometry = reconstruction.geometry
+    normal = _mesh_normals(reconstruction, surface, timestep)
+    albedo = interpolate(geometry.vertex_albedo, reconstruction.model.faces, surface.face, surface.weights)
+    return geometry.ambient + albedo * (basis(normal, 3) @ geometry.shading)

@@ -1,0 +1,306 @@
+"""``report.html``: one self-contained page about a reconstruction."""
+
+from __future__ import annotations
+
+import html
+import json
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import mifit
+from mifit.core.files import write_text
+from mifit.core.image import to_8_bit
+from mifit.output.evaluate import Comparison, compare
+from mifit.output.figures import (
+    HEAT_LIMIT,
+    bounding_box,
+    draw_landmarks,
+    energy_plot,
+    heat_map,
+    heat_scale,
+    jpeg_uri,
+    lighting_balls,
+    overlay,
+    png_uri,
+)
+from mifit.output.viewer import viewer_data
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.output.reconstruction import Reconstruction
+
+NAMES = {
+    "pca": "Stage 1 (PCA)",
+    "diffuse": "Diffuse only",
+    "full": "Full",
+}
+STAGES = {"geometry": "1 Geometry", "reflectance": "2 Reflectance", "normals": "3 Normals"}
+SHOWN_TIMESTEPS = 4
+"""Timesteps whose pictures a report holds, so that it stays small enough for a phone."""
+
+
+def write_report(
+    folder: str | Path,
+    reconstruction: Reconstruction,
+    capture: Capture,
+    evaluation: dict[str, Any] | None = None,
+) -> Path:
+    """Write ``report.html`` into a result folder, whole or not at all.
+
+    Parameters
+    ----------
+    folder : path
+    reconstruction : Reconstruction
+    capture : Capture
+        Only the fitted cameras are read, and the evaluated one when an evaluation is given.
+    evaluation : dict, optional
+        What `evaluate` returned; adds the comparison of that view.
+
+    Returns
+    -------
+    Path
+        The file.
+    """
+    shown = reconstruction.timesteps[:SHOWN_TIMESTEPS]
+    sections = [
+        ("Result", _summary(reconstruction, evaluation)),
+        ("3D view", _view3d(reconstruction, shown[0])),
+        ("Inputs and fit", _inputs(reconstruction, capture, shown)),
+        ("Maps", _maps(reconstruction, shown[0])),
+        ("Lighting", _lighting(reconstruction)),
+        ("Convergence", _convergence(reconstruction)),
+        ("Settings", _settings(reconstruction)),
+    ]
+    if evaluation is not None:
+        sections.insert(2, ("Comparison", _comparison(reconstruction, capture, evaluation)))
+    sections = [(title, body) for title, body in sections if body]
+    links = "".join(f'<a href="#s{i}">{title}</a>' for i, (title, _) in enumerate(sections))
+    body = "".join(f'<section><h2 id="s{i}">{title}</h2>{text}</section>' for i, (title, text) in enumerate(sections))
+    page = f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>mifit report</title>
+<style>{_asset("report.css")}</style>
+</head>
+<body><main>
+<h1>Face reconstruction</h1>
+<p class="soft">{_subtitle(reconstruction)}</p>
+<nav aria-label="Sections">{links}</nav>
+{body}
+<footer>Written by mifit {mifit.__version__}. Everything on this page is in the file itself.</footer>
+</main>
+<script>{_asset("report.js")}</script>
+<script>{_asset("viewer.js")}</script>
+</body></html>
+"""
+    path = Path(folder) / "report.html"
+    write_text(path, page)
+    return path
+
+
+def _asset(name: str) -> str:
+    return resources.files("mifit.output").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def _subtitle(result: Reconstruction) -> str:
+    cameras = " and ".join(c.name for c in result.cameras)
+    steps = ", ".join(map(str, result.timesteps[:12])) + (", ..." if len(result.timesteps) > 12 else "")
+    return html.escape(f"Model {result.model.name}; fitted to cameras {cameras} at timesteps {steps}.")
+
+
+def _summary(result: Reconstruction, evaluation: dict[str, Any] | None) -> str:
+    parts = []
+    if evaluation is not None:
+        held_out = evaluation["camera"] not in [c.name for c in result.cameras]
+        kind = "held out, never fitted" if held_out else "this camera was fitted, so it is no test"
+        rows = "".join(
+            f"<tr><td>{NAMES[m]}</td><td>{f['psnr']:.2f}</td><td>{f['rmse']:.2f}</td><td>{f['ssim']:.4f}</td></tr>"
+            for m, f in evaluation["methods"].items()
+        )
+        area = "fitted model" if evaluation["region"] == "model" else "ground-truth mesh"
+        parts.append(
+            f"<p>Error on camera <b>{html.escape(evaluation['camera'])}</b> ({kind}), over "
+            f"{evaluation['region_pixels']:,} pixels of the {area}'s face area.</p>"
+            '<div class="wide"><table><tr><th>Method</th><th>PSNR, dB</th><th>RMSE of 255</th><th>SSIM</th></tr>'
+            f"{rows}</table></div>"
+        )
+    else:
+        parts.append("<p>No held-out view was evaluated; <code>mifit evaluate</code> adds one to this page.</p>")
+    warnings = all_warnings(result)
+    parts += [f'<p class="warning">{html.escape(text)}</p>' for text in warnings]
+    if not warnings:
+        parts.append('<p class="soft">No warnings.</p>')
+    return "".join(parts)
+
+
+def all_warnings(result: Reconstruction) -> list[str]:
+    """Warnings of the fit and its stages, in words; a stage that did not converge counts as one."""
+    out = list(result.warnings)
+    for name, report in result.reports.items():
+        out += [f"{STAGES[name]}: {text}" for text in report.warnings]
+        if report.outcome != "converged":
+            words = report.outcome.replace("_", " ")
+            out.append(f"{STAGES[name]}: ended without convergence ({words}); see the curves below.")
+    return out
+
+
+def _view3d(result: Reconstruction, timestep: int) -> str:
+    modes = ["Full", "Diffuse only", "Diffuse albedo", "Specular albedo", "Normals", "Grey surface"]
+    if result.reflectance is None:
+        modes = ["Full", *modes[2:3], *modes[4:]]
+    values = {"Full": 0, "Diffuse only": 1, "Diffuse albedo": 2, "Specular albedo": 3, "Normals": 4, "Grey surface": 5}
+    options = "".join(f'<option value="{values[m]}">{m}</option>' for m in modes)
+    data = viewer_data(result, timestep).replace("</", "<\\/")
+    lights = '<option value="0">as recovered</option><option value="1">one lamp</option>'
+    label = "3D view of the face; drag or use the arrow keys to turn it"
+    return f"""<canvas id="view3d" tabindex="0" aria-label="{label}"></canvas>
+<div class="controls">
+<label>Light <select id="view3d-light">{lights}</select></label>
+<label>Turn light <input id="view3d-turn" type="range" min="-180" max="180" value="0" step="1"></label>
+<label>Show <select id="view3d-mode">{options}</select></label>
+</div>
+<p class="soft" id="view3d-note">Drag to turn, pinch or scroll to zoom. Shaded in the browser without cast shadows.</p>
+<script type="application/json" id="view3d-data">{data}</script>"""
+
+
+def _comparison(result: Reconstruction, capture: Capture, evaluation: dict[str, Any]) -> str:
+    camera, parts = evaluation["camera"], []
+    limit = f"{HEAT_LIMIT:.0f} of 255"
+    parts.append(
+        f'<p class="scale">Error maps: 0 <img src="{jpeg_uri(heat_scale())}" alt="black to yellow"> {limit} or more</p>'
+    )
+    for entry in evaluation["per_timestep"][:SHOWN_TIMESTEPS]:
+        found = compare(result, capture, camera, entry["timestep"], evaluation["region"])
+        parts.append(f"<h3>Timestep {found.timestep}</h3>" + _slider(found))
+        maps = "".join(
+            _figure(
+                jpeg_uri(heat_map(found.photograph, render, found.region)[bounding_box(found.region)]),
+                f"{NAMES[m]}: {entry['methods'][m]['psnr']:.2f} dB",
+                f"error map of {NAMES[m]}",
+            )
+            for m, render in found.renders.items()
+        )
+        parts.append(f'<div class="grid">{maps}</div>')
+    return "".join(parts)
+
+
+def _slider(found: Comparison) -> str:
+    """Photograph and render under one draggable divider, with a choice of methods."""
+    box = bounding_box(found.region)
+    methods = list(found.renders)[::-1]
+    name = f"slider{found.timestep}"
+    tops = ""
+    for m in methods:
+        uri = jpeg_uri(overlay(found.photograph, found.renders[m])[box], 90)
+        hidden = "" if m == methods[0] else " hidden"
+        tops += f'<img class="top" data-for="{m}" alt="render by {NAMES[m]}" src="{uri}"{hidden}>'
+    buttons = "".join(
+        f'<button type="button" value="{m}" aria-pressed="{str(m == methods[0]).lower()}">{NAMES[m]}</button>'
+        for m in methods
+    )
+    return f"""<div class="pair"><div><div class="slider" id="{name}">
+<img alt="photograph" src="{jpeg_uri(found.photograph[box], 90)}">{tops}<span class="bar"></span>
+<span class="tag" style="left:6px">Photograph</span>
+<span class="tag" data-name style="right:6px">{NAMES[methods[0]]}</span>
+<input type="range" min="0" max="100" value="50" aria-label="divider between photograph and render"></div>
+<div class="controls" data-choice="{name}">{buttons}</div></div></div>"""
+
+
+def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]) -> str:
+    parts = []
+    for timestep in timesteps:
+        figures = []
+        points = result.geometry.vertices[result.index(timestep)][result.model.landmarks]
+        for camera in (c.name for c in result.cameras):
+            found = compare(result, capture, camera, timestep)
+            frame = capture.frame(camera, timestep)
+            render = found.renders[result.methods[-1]]
+            box = bounding_box(render[..., 3] > 0)
+            marked = draw_landmarks(found.photograph, capture.camera(camera), frame.landmarks, frame.visible, points)
+            label = html.escape(camera)
+            figures.append(_figure(jpeg_uri(marked[box]), f"{label}: input with landmarks", f"input from {label}"))
+            figures.append(
+                _figure(
+                    jpeg_uri(overlay(found.photograph, render)[box]), f"{label}: fit laid over", f"fit over {label}"
+                )
+            )
+        parts.append(f'<h3>Timestep {timestep}</h3><div class="grid">{"".join(figures)}</div>')
+    rest = len(result.timesteps) - len(timesteps)
+    more = f'<p class="soft">{rest} more timesteps are in the result but not on this page.</p>' if rest else ""
+    key = '<p class="soft">Cyan rings: detected landmarks. Orange dots: the fitted model\'s.</p>'
+    return key + "".join(parts) + more
+
+
+def _maps(result: Reconstruction, timestep: int) -> str:
+    if result.reflectance is None:
+        return ""
+    reflectance = result.reflectance
+    figures = [
+        _figure(jpeg_uri(to_8_bit(reflectance.diffuse)), "Diffuse albedo", "diffuse albedo map"),
+        _grey("Specular albedo", reflectance.specular),
+        _grey("Confidence: how often and how well each texel was seen", reflectance.confidence, 1.0),
+    ]
+    refined = result.refined_normal(timestep)
+    if refined is not None:
+        colours = np.where(np.any(refined != 0, axis=-1, keepdims=True), 127.5 * (refined + 1), 0)
+        figures.append(
+            _figure(
+                jpeg_uri(np.round(colours).astype(np.uint8)),
+                f"Refined normals in object space, timestep {timestep}",
+                "normal map",
+            )
+        )
+    return f'<div class="grid">{"".join(figures)}</div>'
+
+
+def _grey(caption: str, values: NDArray, peak: float | None = None) -> str:
+    """Figure of a scalar map on a linear scale whose white is named."""
+    white = peak or max(float(np.quantile(values, 0.999)), 1e-6)
+    codes = np.round(255 * np.clip(values / white, 0, 1)).astype(np.uint8)
+    return _figure(jpeg_uri(codes), f"{caption} (white = {white:.3g})", caption.lower())
+
+
+def _lighting(result: Reconstruction) -> str:
+    lighting = result.lighting
+    matt, mirror = lighting_balls(lighting)
+    panorama = np.maximum(lighting.to_latlong(), 0)
+    codes = to_8_bit(panorama / max(float(panorama.max()), 1e-12))
+    ambient = result.geometry.ambient if result.reflectance is None else result.reflectance.ambient
+    return f"""<div class="balls">{_figure(png_uri(matt), "White matt ball", "lighting on a matt ball")}
+{_figure(png_uri(mirror), "Mirror ball", "lighting in a mirror ball")}
+{_figure(jpeg_uri(codes), "All directions, latitude by longitude", "lighting panorama")}</div>
+<p class="soft">Recovered as spherical harmonics of {lighting.order} bands, so only broad light shows.
+Ambient term {ambient:.4f}.</p>"""
+
+
+def _convergence(result: Reconstruction) -> str:
+    rows = "".join(
+        f"<tr><td>{STAGES[n]}</td><td>{html.escape(r.outcome.replace('_', ' '))}</td>"
+        f"<td>{max((len(v) for v in r.energies.values()), default=0)}</td><td>{r.seconds:.1f}</td></tr>"
+        for n, r in result.reports.items()
+    )
+    memory = f", peak memory {result.peak_memory / 2**20:.0f} MB" if result.peak_memory else ""
+    plots = ""
+    for name, report in result.reports.items():
+        plot = energy_plot(report.energies)
+        if plot:
+            plots += f"<h3>{STAGES[name]}: energy by iteration</h3>{plot}"
+    return (
+        '<div class="wide"><table><tr><th>Stage</th><th>Ended</th><th>Iterations</th><th>Seconds</th></tr>'
+        f"{rows}</table></div><p>Whole fit {result.seconds:.1f} s{memory}.</p>{plots}"
+    )
+
+
+def _settings(result: Reconstruction) -> str:
+    text = html.escape(json.dumps(result.config, indent=1, default=str))
+    return f"<details><summary>Settings of this fit</summary><pre>{text}</pre></details>"
+
+
+def _figure(uri: str, caption: str, alt: str) -> str:
+    return f'<figure><img src="{uri}" alt="{html.escape(alt)}"><figcaption>{html.escape(caption)}</figcaption></figure>'

@@ -1,0 +1,89 @@
+"""The report's interactive 3D view: mesh, maps and lighting packed for `assets/viewer.js`."""
+
+from __future__ import annotations
+
+import base64
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.image import to_8_bit
+from mifit.core.mesh import vertex_normals
+from mifit.core.sh import bands, cosine_coefficients, lobe_coefficients
+from mifit.output.figures import jpeg_uri, png_uri
+from mifit.output.surface import split_at_seams, surface_maps
+
+if TYPE_CHECKING:
+    from mifit.output.reconstruction import Reconstruction
+
+VIEW_BANDS = 3
+"""SH bands that the view shows; finer lighting is cut off there."""
+
+
+def viewer_data(reconstruction: Reconstruction, timestep: int) -> str:
+    """JSON for the 3D view of one timestep; quantised, for looking at only.
+
+    Positions have 16 bits of the bounding sphere, normals 8, texture coordinates 16; the alpha of the vertex
+    colour tells whether a face has maps.
+    """
+    model, geometry = reconstruction.model, reconstruction.geometry
+    i = reconstruction.index(timestep)
+    rotation, translation, scale = geometry.rotation[i], geometry.translation[i], geometry.scale
+    vertices = (geometry.vertices[i] - translation) @ rotation / scale
+    mesh = split_at_seams(model)
+    # A vertex on the border of the face area needs two copies: one with maps, one without.
+    mapped = np.repeat(model.face_mask, 3)
+    corner, faces = np.unique(mesh.faces.ravel() * 2 + mapped, return_inverse=True)
+    split, has_maps = corner // 2, corner % 2
+    origin = mesh.origin[split]
+    position = vertices[origin]
+    normals = vertex_normals(vertices, model.faces)[origin]
+    centre = (position.min(0) + position.max(0)) / 2
+    radius = float(np.abs(position - centre).max())
+    face_centre = vertices[np.unique(model.faces[model.face_mask])]
+    colour = np.column_stack([to_8_bit(geometry.vertex_albedo[origin]), has_maps * 255]).astype(np.uint8)
+    wide = len(corner) > 65535
+    maps = surface_maps(reconstruction, timestep)
+    peak = max(float(maps.specular.max()), 1e-3)
+    data: dict[str, Any] = {
+        "vertices": len(corner),
+        "position": _base64(np.round((position - centre) / radius * 32767), "<i2"),
+        "uv": _base64(np.round(np.clip(mesh.uv[split], 0, 1) * 65535), "<u2"),
+        "normal": _base64(np.round(normals * 127), "i1"),
+        "colour": _base64(colour, "u1"),
+        "index": _base64(faces, "<u4" if wide else "<u2"),
+        "index_bits": 32 if wide else 16,
+        "centre": centre.tolist(),
+        "radius": radius,
+        "focus": ((face_centre.min(0) + face_centre.max(0)) / 2).tolist(),
+        "rotation": rotation.ravel().tolist(),
+        "specular_scale": peak,
+        "maps": {
+            "diffuse": jpeg_uri(to_8_bit(maps.diffuse), 90),
+            "specular": jpeg_uri(np.round(255 * np.clip(maps.specular / peak, 0, 1)).astype(np.uint8), 90),
+            "normal": png_uri(np.round(127.5 * (maps.normal + 1)).astype(np.uint8)),
+        },
+        **_lighting(reconstruction),
+    }
+    return json.dumps(data)
+
+
+def _lighting(reconstruction: Reconstruction) -> dict[str, Any]:
+    """Recovered lighting as the view's shader wants it: 9 coefficients of radiance and of reflected white."""
+    radiance = reconstruction.lighting.truncate(VIEW_BANDS).coefficients
+    cosine = cosine_coefficients(VIEW_BANDS)[bands(VIEW_BANDS)] / np.pi
+    reflectance = reconstruction.reflectance
+    exponent = reflectance.exponent if reflectance else 1.0
+    return {
+        "radiance": radiance.ravel().tolist(),
+        "irradiance": (radiance * cosine[:, None]).ravel().tolist(),
+        "lobe": lobe_coefficients(exponent, VIEW_BANDS).tolist(),
+        "ambient": float(reflectance.ambient if reflectance else reconstruction.geometry.ambient),
+        "exponent": float(exponent),
+    }
+
+
+def _base64(values: NDArray, kind: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode()

@@ -1,0 +1,182 @@
+"""Local rendering against plain NumPy, and evaluation against images whose error is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from mifit.core import sh
+from mifit.core.image import srgb_to_linear
+from mifit.core.mesh import vertex_normals
+from mifit.errors import InputError
+from mifit.output.deferred import surface_material, trace_mesh, visible_surface
+from mifit.output.evaluate import compare, evaluate, face_area
+from tests.output.conftest import ball_camera, ball_result
+
+
+@dataclass(frozen=True)
+class FakeFrame:
+    image: np.ndarray
+    valid: np.ndarray
+
+
+@dataclass(frozen=True)
+class FakeCapture:
+    """Photographs made by a function of camera and timestep."""
+
+    cameras: tuple
+    images: object
+    path: object = None
+    timesteps: tuple = (0, 3)
+    hidden: tuple = field(default=())
+
+    def camera(self, name):
+        return next(c for c in self.cameras if c.name == name)
+
+    def frame(self, name, t):
+        image = self.images(self.camera(name), t)
+        valid = np.ones(image.shape[:2], bool)
+        for rows, columns in self.hidden:
+            valid[rows, columns] = False
+        return FakeFrame(image, valid)
+
+
+def test_pca_is_the_papers_equation(ball, variant):
+    camera = ball_camera()
+    surface = visible_surface(ball, camera, 3, 1)
+    image = ball.render(camera, 3, method="pca", samples=1)
+    # The paper's equation at one sample in the middle of the ball, from scratch.
+    k = np.argmin(np.abs(surface.index - (32 * 64 + 32)))
+    face = ball.model.faces[surface.face[k]]
+    w = surface.weights[k]
+    n = w @ vertex_normals(ball.geometry.vertices[1], ball.model.faces)[face]
+    n /= np.linalg.norm(n)
+    expected = 0.01 + (w @ ball.geometry.vertex_albedo[face]) * (sh.basis(n, 3) @ ball.geometry.shading)
+    np.testing.assert_allclose(image.reshape(-1, 4)[surface.index[k], :3], expected, rtol=1e-4)
+
+
+def test_diffuse_is_albedo_times_irradiance_with_refined_normals(ball, variant):
+    camera = ball_camera()
+    surface = visible_surface(ball, camera, 0, 1)
+    material = surface_material(ball, surface, 0)
+    inside = ball.model.face_mask[surface.face]
+    irradiance = ball.lighting.irradiance(material.normal.astype(np.float64))
+    expected = material.diffuse * irradiance / np.pi + 0.02
+    image = ball.render(camera, 0, method="diffuse", samples=1).reshape(-1, 4)[surface.index, :3]
+    np.testing.assert_allclose(image, expected, atol=2e-4)
+    # Outside the face area: the model's albedo, the mesh's normals, no specular.
+    assert (material.specular[~inside] == 0).all() and (material.specular[inside] > 0.1).all()
+    smooth = visible_surface(replace(ball, normals=None), camera, 0, 1)
+    base = surface_material(replace(ball, normals=None), smooth, 0)
+    np.testing.assert_allclose(material.normal[~inside], base.normal[~inside], atol=1e-6)
+    assert np.abs(material.normal[inside] - base.normal[inside]).max() > 0.05
+
+
+@pytest.mark.parametrize("model", ["paper", "prefiltered", "shadowed"])
+def test_full_adds_specular_light(variant, model):
+    result = ball_result(shading_model=model)
+    camera = ball_camera()
+    full, diffuse = (result.render(camera, 0, method=m) for m in ("full", "diffuse"))
+    assert np.isfinite(full).all() and full.dtype == np.float32 and full.shape == (64, 64, 4)
+    assert (full[..., :3] - diffuse[..., :3]).max() > 0.01
+    np.testing.assert_array_equal(full[..., 3], diffuse[..., 3])
+
+
+def test_alpha_is_coverage(ball, variant):
+    camera = ball_camera(size=128)
+    image = ball.render(camera, 0, samples=4)
+    radius = ball.geometry.scale * (9.0 + 0.3 * 0.2)
+    expected = np.pi * (radius * camera.fx / 70) ** 2
+    assert image[..., 3].sum() == pytest.approx(expected, rel=0.05)
+    assert set(np.unique(image[[0, -1], :, 3])) == {0.0} and image[64, 64, 3] == 1
+    assert (image[image[..., 3] == 0] == 0).all()
+    assert ((image[..., 3] > 0) & (image[..., 3] < 1)).any()
+
+
+def test_back_faces_are_not_covered(variant):
+    """A single triangle seen from behind."""
+    vertices, faces = np.array([[-3, -3, 0], [3, -3, 0], [0, 3, 0.0]]), np.array([[0, 1, 2]])
+    assert len(trace_mesh(vertices, faces, ball_camera(angle=0), 1).index) > 100
+    assert len(trace_mesh(vertices, faces, ball_camera(angle=180), 1).index) == 0
+
+
+def test_evaluation_of_a_perfect_photograph_and_of_a_known_error(ball, variant):
+    camera = ball_camera("third", 5.0)
+    capture = FakeCapture((camera,), lambda c, t: ball.render(c, t)[..., :3])
+    found = evaluate(ball, capture, "third")
+    assert list(found["methods"]) == ["pca", "diffuse", "full"]
+    assert found["methods"]["full"]["rmse"] == 0 and found["methods"]["full"]["ssim"] == pytest.approx(1)
+    assert found["methods"]["diffuse"]["rmse"] > 0 and found["timesteps"] == [0, 3]
+    assert found["region_pixels"] == sum(x["region_pixels"] for x in found["per_timestep"])
+    # A photograph that is 10 steps brighter in one timestep and 20 in the other: the pooled error is known.
+    shift = {0: 10, 3: 20}
+    pixels = {x["timestep"]: x["region_pixels"] for x in found["per_timestep"]}
+
+    def brighter(c, t):
+        codes = compare(ball, capture, "third", t).renders["full"][..., :3].astype(float) + shift[t]
+        return srgb_to_linear(codes / 255)
+
+    found = evaluate(ball, FakeCapture((camera,), brighter), "third")
+    expected = np.sqrt(sum(pixels[t] * shift[t] ** 2 for t in shift) / sum(pixels.values()))
+    assert found["methods"]["full"]["rmse"] == pytest.approx(expected, abs=0.2)
+    assert found["per_timestep"][1]["methods"]["full"]["rmse"] == pytest.approx(20, abs=0.2)
+
+
+def test_region_is_the_face_area_eroded_and_valid(ball, variant):
+    camera = ball_camera("third", 5.0)
+    area = face_area(ball.geometry.vertices[0], ball.model.faces, ball.model.face_mask, camera)
+    surface = trace_mesh(ball.geometry.vertices[0], ball.model.faces, camera, 1)
+    whole = np.zeros(64 * 64, bool)
+    whole[surface.index] = ball.model.face_mask[surface.face]
+    whole = whole.reshape(64, 64)
+    rows, columns = np.nonzero(area)
+    for dr in range(-2, 3):
+        for dc in range(-2, 3):
+            assert whole[rows + dr, columns + dc].all()
+    assert whole.sum() > area.sum() > 0.5 * whole.sum()
+    half = FakeCapture((camera,), lambda c, t: np.zeros((64, 64, 3)), hidden=((slice(0, 32), slice(None)),))
+    assert not compare(ball, half, "third", 0).region[:32].any()
+
+
+def test_truth_region_counts_uncovered_pixels_as_black(ball, variant, tmp_path):
+    camera = ball_camera("third", 5.0)
+    (tmp_path / "truth").mkdir()
+    moved = ball.geometry.vertices[0] + np.float32([6, 0, 0])
+    np.savez(tmp_path / "truth" / "0000.npz", vertices=moved)
+    capture = FakeCapture((camera,), lambda c, t: np.full((64, 64, 3), 1.0), tmp_path)
+    found = compare(ball, capture, "third", 0, region="truth")
+    uncovered = found.region & (found.renders["full"][..., 3] == 0)
+    assert uncovered.any() and (found.renders["full"][uncovered] == 0).all()
+
+
+def test_truth_of_another_mesh_needs_its_faces(ball, variant, tmp_path):
+    camera = ball_camera("third", 5.0)
+    (tmp_path / "truth").mkdir()
+    capture = FakeCapture((camera,), lambda c, t: np.zeros((64, 64, 3)), tmp_path)
+    with pytest.raises(InputError, match=r"0000.npz: missing; --region truth needs"):
+        compare(ball, capture, "third", 0, region="truth")
+    corners = np.array([[-4, -4, 0], [4, -4, 0], [0, 4, 0.0]])
+    np.savez(tmp_path / "truth" / "0000.npz", vertices=corners)
+    with pytest.raises(InputError, match="found 3 vertices, but the fitted model 'ball' has 408"):
+        compare(ball, capture, "third", 0, region="truth")
+    np.savez(tmp_path / "truth" / "mesh.npz", faces=np.array([[0, 1, 2]]))
+    assert compare(ball, capture, "third", 0, region="truth").region.any()
+
+
+def test_bad_requests_are_named(ball, stage_1_ball, variant):
+    camera = ball_camera()
+    with pytest.raises(InputError, match="timestep 1 is not in this result; it has 0, 3"):
+        ball.render(camera, 1)
+    with pytest.raises(InputError, match="needs reflectance"):
+        stage_1_ball.render(camera, 0, method="full")
+    with pytest.raises(InputError, match="expected one of pca, diffuse, full"):
+        ball.render(camera, 0, method="best")
+    with pytest.raises(InputError, match="expected 'local' or 'path'"):
+        ball.render(camera, 0, integrator="magic")
+    pose = camera.world_to_camera.copy()
+    pose[:3] = np.diag([-1.0, 1, -1]) @ pose[:3]
+    behind = replace(camera, name="behind", world_to_camera=pose)
+    with pytest.raises(InputError, match="face area is not visible"):
+        evaluate(ball, FakeCapture((behind,), lambda c, t: np.zeros((64, 64, 3))), "behind")
