@@ -15,19 +15,26 @@ from mifit.errors import InputError
 
 @dataclass(frozen=True)
 class GeometryConfig:
-    """Stage 1, morphable-model fitting (paper, section 4)."""
+    """Stage 1, morphable-model fitting (paper, section 4).
 
+    ``objective = "consistency"`` weights its terms by their noise and lets every surface point have its own albedo;
+    ``"paper"`` is the paper's objective, whose weights and units (0..255, pixels) the next group gives.
+    """
+
+    objective: Literal["consistency", "paper"] = "consistency"
+    rounds: int = 2  # outer steps: visibility is found anew in each
+    landmark_noise: float = 1.0  # standard deviation of a detected coordinate, pixels
+    # objective "paper"
     landmark_weight: float = 10.0
     prior_weight: float = 5e-5
-    landmark_noise: float = 1.0
-    surface_points: int = 3000
-    texture_rounds: int = 2
-    texture_weight: float = 0.03
-    texture_sigma: float = 1.0
-    texture_window: float = 6.0
-    pixels: int = 5000
-    robust_colour: float = 30.0
+    pixels: int = 2000  # facial pixels per image, chosen at random
+    robust_colour: float = 30.0  # residual (0..255) from which a pixel counts as an outlier
     albedo_prior: float = 1.0
+    # objective "consistency"
+    surface_points: int = 3000
+    texture_weight: float = 0.03  # independent measurements per surface point and image: neighbours share pixels
+    texture_sigma: float = 1.0  # fine and wide blur whose difference is the texture, pixels
+    texture_window: float = 6.0
     max_iterations: int = 30
 
 

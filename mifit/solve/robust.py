@@ -28,6 +28,9 @@ def geman_mcclure(squared: NDArray, scale: float) -> tuple[NDArray, NDArray]:
     Returns
     -------
     rho, weight : arrays like ``squared``
+        An infinite ``scale`` gives least squares.
     """
+    if np.isinf(scale):
+        return squared, np.ones_like(squared)
     q = scale * scale / (scale * scale + squared)
     return squared * q, q * q

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mifit.capture import Capture
 from mifit.config import GeometryConfig
-from mifit.core.estimate import GeometryEstimate, Report
+from mifit.core.estimate import GeometryEstimate
 from mifit.errors import ConvergenceError, InputError
 from mifit.morphable import MorphableModel
 from mifit.progress import Progress, silent
-from mifit.solve import Outcome, Solution, minimize
-from mifit.stages.geometry.consistency import ConsistencyProblem
-from mifit.stages.geometry.landmarks import LandmarkTerm, LandmarkView
+from mifit.solve import Solution
+from mifit.stages.geometry.appearance import fit_appearance, gather
+from mifit.stages.geometry.landmarks import LandmarkView
 from mifit.stages.geometry.parameters import Layout
-from mifit.stages.geometry.rendering import AMBIENT_PRIOR, WHITE, RenderingProblem
-from mifit.stages.geometry.start import (
-    OUTLIER_PIXELS,
-    State,
-    bounds,
-    fit_landmarks,
-    initial_state,
-    landmark_views,
-)
+from mifit.stages.geometry.refine import Reference, refine_by_rendering, refine_by_texture, texture_reference
+from mifit.stages.geometry.start import FEWEST_LANDMARKS, State, fit_landmarks, initial_state, landmark_views
+from mifit.stages.geometry.summary import Journal, pack
 from mifit.stages.geometry.visibility import Visibility, spread_points
+
+__all__ = ["fit_geometry", "fit_pose_expression", "texture_reference"]
 
 
 def fit_geometry(
@@ -58,7 +54,8 @@ def fit_geometry(
     Returns
     -------
     GeometryEstimate
-        ``report.details`` holds standard deviations of pose and shape, from the curvature at the solution.
+        ``report.details`` holds the phases and the standard deviations of pose and shape, from the curvature at
+        the solution.
 
     Raises
     ------
@@ -72,134 +69,151 @@ def fit_geometry(
     Gauge: the scale is ``model.unit_mm / capture.unit_mm`` and isn't estimated, so distance is; the albedo's level
     is the model's mean's, so the lighting's is estimated; ambient is held towards 0 against the constant harmonic.
     """
-    began = time.perf_counter()
     cameras, timesteps = tuple(cameras), tuple(timesteps)
     if not cameras or not timesteps:
         raise InputError("fit_geometry: found no camera or no timestep, expected at least one of each")
-    steps = 3 + config.texture_rounds
-    progress("fit geometry", 0, steps)
-    layout = Layout(len(timesteps), model.identity.shape[2], model.expression.shape[2])
+    journal = Journal("fit geometry", 2 + config.rounds, progress)
+    layout = Layout(len(timesteps), model.n_identity, model.n_expression)
     views = landmark_views(capture, model, cameras, timesteps, config.landmark_noise)
     state = initial_state(model, views, len(timesteps), layout, model.unit_mm / capture.unit_mm)
     state, solution, views = fit_landmarks(model, views, state, config.landmark_noise)
-    _check(solution, "landmarks")
-    energies = {name: list(values) for name, values in solution.energies.items()}
-    progress("fit geometry", 1, steps)
-
-    visibility = Visibility(capture, model, cameras, timesteps)
-    points = spread_points(model, config.surface_points, seed)
-    for number in range(config.texture_rounds):
-        state, solution = _refine_by_texture(model, state, views, visibility, points, config)
-        _check(solution, "texture")
-        progress("fit geometry", 2 + number, steps)
-        _append(energies, solution)
-
-    appearance, lit = _fit_appearance(model, state, views, visibility, config, seed)
-    _check(appearance, "albedo and lighting")
-    _append(energies, appearance)
-    progress("fit geometry", steps, steps)
-    return _estimate(model, lit, timesteps, visibility, solution, energies, time.perf_counter() - began)
+    journal.phase("landmarks", _usable(solution, "landmarks"))
+    return _refine_and_pack(capture, model, cameras, timesteps, config, seed, journal, state, views, None, None)
 
 
-def _check(solution: Solution, what: str) -> None:
-    """Raise ConvergenceError unless the solution can be used."""
+def fit_pose_expression(
+    capture: Capture,
+    model: MorphableModel,
+    geometry: GeometryEstimate,
+    cameras: Sequence[str],
+    timestep: int,
+    config: GeometryConfig,
+    seed: int = 0,
+    progress: Progress = silent,
+    reference: Reference | None = None,
+) -> GeometryEstimate:
+    """Fit pose and expression of one further timestep; identity, albedo and lighting stay those of ``geometry``.
+
+    Starts from the last timestep of ``geometry`` or from the landmarks, whichever reprojects better. With too few
+    landmarks the former alone is used, with a warning.
+
+    Parameters
+    ----------
+    geometry : GeometryEstimate
+        Initial fit, or that of the timestep before.
+    reference : Reference, optional
+        Texture of the surface from timesteps already fitted (`texture_reference`): the new images are compared with
+        it as well as with one another. Its surface points are used.
+    capture, model, cameras, timestep, config, seed, progress
+        As in `fit_geometry`.
+
+    Returns
+    -------
+    GeometryEstimate
+        With this one timestep.
+
+    Raises
+    ------
+    InputError
+        No camera.
+    ConvergenceError
+        No usable fit.
+    """
+    cameras = tuple(cameras)
+    if not cameras:
+        raise InputError("fit_pose_expression: found no camera, expected at least one")
+    journal = Journal("track geometry", 2 + config.rounds, progress)
+    baked = bake_identity(model, geometry.identity)
+    warm = _state_of(geometry, geometry.timesteps[-1])
+    views = landmark_views(capture, baked, cameras, (timestep,), config.landmark_noise, fewest=0)
+    if sum(len(view.index) for view in views) >= FEWEST_LANDMARKS:
+        state = initial_state(baked, views, 1, warm.layout, geometry.scale, warm)
+        state, solution, views = fit_landmarks(baked, views, state, config.landmark_noise)
+        journal.phase("landmarks", _usable(solution, "landmarks"))
+    else:
+        state = warm
+        journal.warn(f"timestep {timestep}: too few landmarks; started from timestep {geometry.timesteps[-1]} alone")
+    return _refine_and_pack(
+        capture, baked, cameras, (timestep,), config, seed, journal, state, views, reference, geometry
+    )
+
+
+def bake_identity(model: MorphableModel, identity: NDArray) -> MorphableModel:
+    """The model with one identity as its mean and no identity modes."""
+    return replace(model, mean=model.shape(identity), identity=np.zeros((model.n_vertices, 3, 0), dtype=np.float32))
+
+
+def _state_of(geometry: GeometryEstimate, timestep: int) -> State:
+    """Pose and expression of one fitted timestep, identity baked."""
+    from mifit.stages.geometry.parameters import Frames
+
+    k = geometry.index(timestep)
+    layout = Layout(1, 0, len(geometry.expression[k]))
+    x = np.zeros(layout.size)
+    x[layout.at("expression")] = geometry.expression[k]
+    x[layout.at("translation")] = geometry.translation[k]
+    return State(layout, Frames(geometry.rotation[k : k + 1], geometry.scale), x)
+
+
+def _usable(solution: Solution, what: str) -> Solution:
+    """The solution, or ConvergenceError when it can't be used."""
     if not solution.usable or not np.isfinite(solution.value).all():
         raise ConvergenceError(
             f"fit geometry: the fit of {what} ended as '{solution.outcome.value}' after {solution.iterations} "
             "iterations; check the landmarks and the calibration of the cameras"
         )
+    return solution
 
 
-def _append(energies: dict[str, list[float]], solution: Solution) -> None:
-    """Continue the history; a term that a phase doesn't have is NaN-free: it keeps its last value."""
-    length = max((len(values) for values in energies.values()), default=0)
-    added = len(next(iter(solution.energies.values())))
-    for name in set(energies) | set(solution.energies):
-        before = energies.setdefault(name, [0.0] * length)
-        before.extend(solution.energies.get(name, [before[-1]] * added))
-
-
-def _refine_by_texture(
+def _refine_and_pack(
+    capture: Capture,
     model: MorphableModel,
-    state: State,
-    views: tuple[LandmarkView, ...],
-    visibility: Visibility,
-    points: object,
+    cameras: tuple[str, ...],
+    timesteps: tuple[int, ...],
     config: GeometryConfig,
-) -> tuple[State, Solution]:
-    """One outer step: visibility, noise level, then Levenberg-Marquardt on texture, landmarks and priors."""
-    state = state.recentred()
-    layout = state.layout
-    seen = visibility.textures(state, points, config.texture_sigma, config.texture_window)
-    term = LandmarkTerm(views, OUTLIER_PIXELS * config.landmark_noise)
-    problem = ConsistencyProblem(
-        layout, state.frames, config.surface_points, seen, 1.0, 3.0, config.texture_weight, term, 1.0, 1.0
-    )
-    problem = replace(problem, noise=problem.spread(state.x))
-    low, high = bounds(layout, model.expression_bounds)
-    solution = minimize(
-        problem, state.x, lower=low, upper=high, max_iterations=config.max_iterations, energy_tolerance=1e-4
-    )
-    return replace(state, x=solution.value), solution
-
-
-def _fit_appearance(
-    model: MorphableModel,
+    seed: int,
+    journal: Journal,
     state: State,
     views: tuple[LandmarkView, ...],
+    reference: Reference | None,
+    fixed: GeometryEstimate | None,
+) -> GeometryEstimate:
+    """Photometric rounds, then albedo and lighting unless ``fixed`` has them."""
+    visibility = Visibility(capture, model, cameras, timesteps)
+    if config.objective == "paper" and fixed is None:
+        appearance = _appearance(model, state, visibility, config, seed)
+        for number in range(config.rounds):
+            state, solution, appearance = refine_by_rendering(
+                model, state, appearance, views, visibility, config, seed + number
+            )
+            journal.phase("rendering", _usable(solution, "images"))
+    else:
+        if reference is not None:
+            points = reference.points(model)
+        else:
+            points = spread_points(model, config.surface_points, seed)
+        for _ in range(config.rounds):
+            state, solution = refine_by_texture(model, state, views, visibility, points, config, reference)
+            journal.phase("texture", _usable(solution, "images"))
+    if fixed is not None:
+        coefficients = np.concatenate([fixed.albedo, fixed.shading.ravel(), [fixed.ambient]])
+    else:
+        coefficients = _appearance(model, state, visibility, config, seed, journal)
+    return pack(model, state, coefficients, timesteps, visibility.world(state), journal, views, fixed)
+
+
+def _appearance(
+    model: MorphableModel,
+    state: State,
     visibility: Visibility,
     config: GeometryConfig,
     seed: int,
-) -> tuple[Solution, State]:
-    """Albedo coefficients, lighting and ambient with the geometry held: the paper's term, robust."""
-    layout = replace(state.layout, albedo=model.albedo_modes.shape[2], shading=27, ambient=1)
-    lit = state.with_layout(layout).recentred()
-    lit.x[layout.at("shading").start : layout.at("shading").start + 3] = 1.0
-    pixels = visibility.pixels(lit, config.pixels, 1.0, seed)
-    priors = {"albedo": config.albedo_prior, "ambient": WHITE**2 * AMBIENT_PRIOR, "shading": 1e-3}
-    problem = RenderingProblem(
-        model, layout, lit.frames, pixels, LandmarkTerm(views, 1.0), config.robust_colour, priors, geometry=False
-    )
-    low, high = np.where(np.arange(layout.size) < layout.shared_size, -np.inf, lit.x), None
-    high = np.where(np.arange(layout.size) < layout.shared_size, np.inf, lit.x)
-    at = layout.at("identity")
-    low[at], high[at] = lit.x[at], lit.x[at]
-    solution = minimize(
-        problem, lit.x, lower=low, upper=high, max_iterations=config.max_iterations, energy_tolerance=1e-4
-    )
-    return solution, replace(lit, x=solution.value)
-
-
-def _estimate(
-    model: MorphableModel,
-    state: State,
-    timesteps: tuple[int, ...],
-    visibility: Visibility,
-    solution: Solution,
-    energies: dict[str, list[float]],
-    seconds: float,
-) -> GeometryEstimate:
-    """Pack the result."""
-    layout, x = state.layout, state.x
-    poses = [state.frames.pose(layout, x, k) for k in range(len(timesteps))]
-    warnings = []
-    if solution.outcome is Outcome.MAX_ITERATIONS:
-        warnings.append(f"stopped after {solution.iterations} iterations before converging")
-    modes = model.albedo_modes
-    albedo = model.mean_albedo + (
-        modes.reshape(-1, modes.shape[2]) @ x[layout.at("albedo")].astype(modes.dtype)
-    ).reshape(-1, 3)
-    return GeometryEstimate(
-        timesteps=timesteps,
-        identity=x[layout.at("identity")].copy(),
-        albedo=x[layout.at("albedo")].copy(),
-        expression=np.stack([x[layout.at("expression", k)] for k in range(len(timesteps))]),
-        rotation=np.stack([pose.rotation for pose in poses]),
-        translation=np.stack([pose.translation for pose in poses]),
-        scale=poses[0].scale,
-        vertices=visibility.world(state).astype(np.float32),
-        vertex_albedo=albedo.astype(np.float32),
-        shading=x[layout.at("shading")].reshape(9, 3).copy(),
-        ambient=float(x[layout.at("ambient")][0]),
-        report=Report(solution.outcome.value, energies, seconds, tuple(warnings)),
-    )
+    journal: Journal | None = None,
+) -> NDArray[np.float64]:
+    """Albedo coefficients, shading and ambient for a held geometry."""
+    pixels = visibility.pixels(state, config.pixels, 1.0, seed)
+    problem = gather(model, visibility.world(state), pixels, config.robust_colour, config.albedo_prior)
+    solution = _usable(fit_appearance(problem, config.max_iterations), "albedo and lighting")
+    if journal is not None:
+        journal.phase("albedo and lighting", solution, geometric=False)
+    return solution.value

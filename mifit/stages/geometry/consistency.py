@@ -67,6 +67,8 @@ class ConsistencyProblem:
         Residual, in units of ``noise``, where Geman and McClure's penalty turns: highlights, hair, occlusion.
     independence : float
         Neighbouring points share pixels; each point's squared residual counts this much.
+    known : (N, C) values and (N,) weights, optional
+        What other images, not in ``views``, have shown of the points: one more, constant view.
     """
 
     layout: Layout
@@ -79,6 +81,7 @@ class ConsistencyProblem:
     landmarks: LandmarkTerm
     identity_prior: float
     expression_prior: float
+    known: tuple[NDArray, NDArray] | None = None
 
     def _observe(self, x: NDArray, gradient: bool) -> list:
         """Per view: projection, values, gradients and weights (0 where the image has no valid pixel)."""
@@ -98,27 +101,40 @@ class ConsistencyProblem:
         -------
         mean (N, C), total weight (N,), weights per view, energy
         """
-        channels = observed[0][2].shape[1] if observed else 1
+        channels = observed[0][2].shape[1] if observed else 3
         mean = np.zeros((self.count, channels))
         total = np.zeros(self.count)
         weights = [weight for *_, weight in observed]
         energy = 0.0
         for _ in range(4):
-            mean[:], total[:] = 0.0, 0.0
+            mean[:], total[:] = self._known_sum(channels)
             for (view, _, values, _, _), weight in zip(observed, weights, strict=True):
                 total[view.points] += weight
                 mean[view.points] += weight[:, None] * values
             mean /= np.maximum(total, 1e-12)[:, None]
             energy, weights = 0.0, []
+            if self.known is not None:
+                energy = float((self.known[1] * ((self.known[0] - mean) ** 2).sum(1)).sum())
             for view, _, values, _, base in observed:
                 squared = ((values - mean[view.points]) ** 2).sum(1)
                 rho, robust = geman_mcclure(squared, self.robust * self.noise * np.sqrt(channels))
                 energy += float((base * rho).sum())
                 weights.append(base * robust)
-        total[:] = 0.0
+        total[:] = self._known_sum(channels)[1]
         for (view, *_), weight in zip(observed, weights, strict=True):
             total[view.points] += weight
         return mean, total, weights, energy * self.independence / self.noise**2
+
+    def _known_sum(self, channels: int) -> tuple[NDArray, NDArray]:
+        """Weighted sum and weight of what is known of each point beforehand."""
+        if self.known is None:
+            return np.zeros((self.count, channels)), np.zeros(self.count)
+        return self.known[1][:, None] * self.known[0], self.known[1]
+
+    def texture(self, x: NDArray) -> tuple[NDArray, NDArray]:
+        """The eliminated values a (N, C) at x and the weight (N,) behind each."""
+        mean, total, *_ = self._reweighted(self._observe(x, gradient=False))
+        return mean, total
 
     def energies(self, x: NDArray) -> dict[str, float]:
         """Energy per term."""

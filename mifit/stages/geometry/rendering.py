@@ -112,8 +112,6 @@ class RenderingProblem:
     robust : float
         Residual (0..255, over the three channels) where Geman and McClure's penalty turns; infinite for plain
         least squares.
-    geometry : bool
-        Whether shape and pose have Jacobian columns; without, only albedo and lighting move.
     priors : dict of str to float
         Weight of the squared coefficients per group.
     """
@@ -125,7 +123,6 @@ class RenderingProblem:
     landmarks: LandmarkTerm
     robust: float
     priors: dict[str, float]
-    geometry: bool = True
 
     def _vertex_albedo(self, x: NDArray) -> NDArray:
         modes = self.model.albedo_modes
@@ -166,9 +163,7 @@ class RenderingProblem:
     def _loss(self, observation: Observation) -> tuple[float, NDArray]:
         """Mean robust square over the view's pixels, and each pixel's weight in it."""
         squared = (observation.residual**2).sum(1)
-        rho, weight = (
-            geman_mcclure(squared, self.robust) if np.isfinite(self.robust) else (squared, np.ones(len(squared)))
-        )
+        rho, weight = geman_mcclure(squared, self.robust)
         count = max(int(observation.ok.sum()), 1)
         return float(rho[observation.ok].sum()) / count, np.where(observation.ok, weight, 0.0) / count
 
@@ -183,30 +178,30 @@ class RenderingProblem:
             self._loss(self._observe(view, surfaces[view.step], albedo, x, gradient=False))[0] for view in self.views
         )
         prior = sum(prior_energy(self.layout, x, name, weight) for name, weight in self.priors.items())
-        landmarks = self.landmarks.energy(self.layout, self.frames, x) if self.geometry else 0.0
+        landmarks = self.landmarks.energy(self.layout, self.frames, x)
         return {"photo": float(data), "landmarks": landmarks, "prior": prior}
 
     def linearize(self, x: NDArray) -> System:
         """Normal equations at x."""
         surfaces, albedo = self._surfaces(x), self._vertex_albedo(x)
         equations = NormalEquations(self.layout)
-        around = vertex_sum_matrix(self.model.faces, len(self.model.mean)) if self.geometry else None
+        around = vertex_sum_matrix(self.model.faces, len(self.model.mean))
         derivatives: dict[int, sp.csr_matrix] = {}
         for view in self.views:
-            if self.geometry and view.step not in derivatives:
-                derivatives = {view.step: surfaces[view.step].normal_sum_derivative(around)}
-            observation = self._observe(view, surfaces[view.step], albedo, x, gradient=self.geometry)
+            surface = surfaces[view.step]
+            if view.step not in derivatives:
+                derivatives = {view.step: surface.normal_sum_derivative(around).astype(self.model.mean.dtype)}
+            observation = self._observe(view, surface, albedo, x, gradient=True)
             _, weight = self._loss(observation)
-            shared, local = self._columns(view, surfaces[view.step], observation, x, derivatives.get(view.step))
+            shared, local = self._columns(view, surface, observation, x, derivatives[view.step])
             equations.add(view.step, shared, local, observation.residual.reshape(-1), np.repeat(weight, 3))
-        if self.geometry:
-            self.landmarks.accumulate(equations, self.layout, self.frames, x)
+        self.landmarks.accumulate(equations, self.layout, self.frames, x)
         for name, weight in self.priors.items():
             equations.add_prior(name, x, weight)
         return equations.system()
 
     def _columns(
-        self, view: PixelView, surface: Surface, o: Observation, x: NDArray, derivative: sp.csr_matrix | None
+        self, view: PixelView, surface: Surface, o: Observation, x: NDArray, derivative: sp.csr_matrix
     ) -> tuple[NDArray, NDArray]:
         """Jacobian rows (3n, shared), (3n, local) of the residuals, pixel by pixel, channel by channel."""
         layout, model = self.layout, self.model
@@ -230,9 +225,6 @@ class RenderingProblem:
             by_shading[:, c, :, c] = WHITE * o.albedo[:, c, None] * o.basis
         shared[:, layout.at("shading")] = by_shading.reshape(3 * n, 27)
         shared[:, layout.at("ambient")] = WHITE
-        if not self.geometry:
-            return shared, local
-
         pose = self.frames.pose(layout, x, view.step)
         by_pixel = -WHITE * o.slope.astype(np.float64)  # (n, 3, 2)
         by_object = by_pixel @ o.projection.by_object
@@ -254,7 +246,7 @@ class RenderingProblem:
         pointer = np.arange(0, 27 * n + 1, 9)
         through_position = sp.csr_matrix((by_vertex.astype(dtype).ravel(), columns, pointer), shape=(3 * n, size))
         through_normal = sp.csr_matrix((by_sum.astype(dtype).ravel(), columns, pointer), shape=(3 * n, size))
-        rows = through_position + through_normal @ derivative.astype(dtype)
+        rows = through_position + through_normal @ derivative
         shared[:, layout.at("identity")] = rows @ model.identity.reshape(size, -1)
         local[:, : layout.expression] = rows @ model.expression.reshape(size, -1)
         by_pose = by_pixel @ o.projection.by_pose

@@ -61,9 +61,14 @@ def bounds(layout: Layout, expression_bounds: NDArray) -> tuple[NDArray, NDArray
 
 
 def landmark_views(
-    capture: Capture, model: MorphableModel, cameras: Sequence[str], timesteps: Sequence[int], noise: float
+    capture: Capture,
+    model: MorphableModel,
+    cameras: Sequence[str],
+    timesteps: Sequence[int],
+    noise: float,
+    fewest: int = FEWEST_LANDMARKS,
 ) -> tuple[LandmarkView, ...]:
-    """Visible landmarks of all images; raises InputError for a timestep with fewer than six in total."""
+    """Visible landmarks of all images; raises InputError for a timestep with fewer than ``fewest`` in total."""
     views = []
     for step, timestep in enumerate(timesteps):
         counts = {}
@@ -81,21 +86,26 @@ def landmark_views(
                 views.append(
                     LandmarkView(step, capture.camera(name), index, vertices, pixels[index], 1.0 / noise**2, basis)
                 )
-        if sum(counts.values()) < FEWEST_LANDMARKS:
+        if sum(counts.values()) < fewest:
             found = ", ".join(f"{n} in camera {name}" for name, n in counts.items())
             raise InputError(
                 f"timestep {timestep}: found {sum(counts.values())} visible landmarks ({found}), expected at "
-                f"least {FEWEST_LANDMARKS} in total; detect them with `mifit landmarks` or leave the timestep out"
+                f"least {fewest} in total; detect them with `mifit landmarks` or leave the timestep out"
             )
     return tuple(views)
 
 
 def initial_state(
-    model: MorphableModel, views: Sequence[LandmarkView], timesteps: int, layout: Layout, scale: float
+    model: MorphableModel,
+    views: Sequence[LandmarkView],
+    timesteps: int,
+    layout: Layout,
+    scale: float,
+    warm: State | None = None,
 ) -> State:
-    """Mean face at the pose per timestep that reprojects best among all candidates."""
+    """Mean face at the pose per timestep that reprojects best among all candidates, ``warm`` one of them."""
     mean = model.mean[model.landmarks].astype(np.float64)
-    x = np.zeros(layout.size)
+    x = np.zeros(layout.size) if warm is None else warm.x.copy()
     rotation = np.tile(np.eye(3), (timesteps, 1, 1))
     for step in range(timesteps):
         mine = [v for v in views if v.step == step]
@@ -112,6 +122,9 @@ def initial_state(
             candidates = [
                 (camera.rotation.T @ np.diag([1.0, -1.0, -1.0]), camera.position + distance * camera.rotation[2])
             ]
+        if warm is not None:
+            pose = warm.frames.pose(warm.layout, warm.x, step)
+            candidates.append((pose.rotation, pose.translation))
         error = [reprojection(cameras, mean, pixels, scale, pose) for pose in candidates]
         best = candidates[int(np.argmin(error))]
         rotation[step] = best[0]

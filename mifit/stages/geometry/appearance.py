@@ -1,0 +1,146 @@
+"""Albedo coefficients, lighting and ambient of the paper's shading while the geometry is held."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.sh import basis
+from mifit.morphable import MorphableModel
+from mifit.solve import DenseSystem, Solution, geman_mcclure, minimize
+from mifit.stages.geometry.points import corner_matrix
+from mifit.stages.geometry.rendering import AMBIENT_PRIOR, WHITE, PixelView
+
+SHADING_PRIOR = 1e-4  # of the squared coefficients, 0..255: decides only what the visible normals leave open
+
+
+@dataclass(frozen=True)
+class AppearanceProblem:
+    """Mean robust square of 255 (I_a + (C + A x) * sum_k l_k phi_k - I) over each view's pixels, plus priors.
+
+    The unknowns are albedo coefficients (Ka), shading (9, 3) and ambient, in this order. All else is constant, so
+    the rows are gathered once.
+
+    Attributes
+    ----------
+    mean : (n, 3), modes : (n, 3, Ka) float32
+        Albedo of the pixels' surface points.
+    harmonics : (n, 9) float32
+        Of their normals in world space.
+    observed : (n, 3) float32
+        Linear colours.
+    weight : (n,)
+        1 / (number of the view's pixels).
+    robust : float
+        Residual in 0..255 where the penalty turns.
+    albedo_prior : float
+    """
+
+    mean: NDArray
+    modes: NDArray
+    harmonics: NDArray
+    observed: NDArray
+    weight: NDArray
+    robust: float
+    albedo_prior: float
+
+    @property
+    def albedo_size(self) -> int:
+        """Number of albedo modes."""
+        return self.modes.shape[2]
+
+    def start(self) -> NDArray[np.float64]:
+        """Mean albedo under the lighting that fits best, channel by channel (linear least squares)."""
+        x = np.zeros(self.albedo_size + 28)
+        shading = np.zeros((9, 3))
+        for c in range(3):
+            rows = self.harmonics.astype(np.float64) * (self.mean[:, c] * np.sqrt(self.weight))[:, None]
+            normal = rows.T @ rows
+            normal[np.diag_indices(9)] += 1e-6 * np.trace(normal) + 1e-12
+            shading[:, c] = np.linalg.solve(normal, rows.T @ (self.observed[:, c] * np.sqrt(self.weight)))
+        x[self.albedo_size : -1] = shading.ravel()
+        return x
+
+    def _residual(self, x: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        a = self.albedo_size
+        albedo = self.mean + self.modes @ x[:a].astype(np.float32)
+        shade = self.harmonics @ x[a:-1].reshape(9, 3).astype(np.float32)
+        return WHITE * (np.float32(x[-1]) + albedo * shade - self.observed), albedo, shade
+
+    def _priors(self) -> NDArray[np.float64]:
+        return np.concatenate(
+            [
+                np.full(self.albedo_size, self.albedo_prior),
+                np.full(27, SHADING_PRIOR),
+                [AMBIENT_PRIOR * WHITE**2],
+            ]
+        )
+
+    def energies(self, x: NDArray) -> dict[str, float]:
+        """Energy per term."""
+        squared = (self._residual(x)[0].astype(np.float64) ** 2).sum(1)
+        data = float((self.weight * geman_mcclure(squared, self.robust)[0]).sum())
+        return {"photo": data, "prior": float(self._priors() @ (x * x))}
+
+    def linearize(self, x: NDArray) -> DenseSystem:
+        """Normal equations at x."""
+        residual, albedo, shade = self._residual(x)
+        weight = self.weight * geman_mcclure((residual.astype(np.float64) ** 2).sum(1), self.robust)[1]
+        n, a = len(residual), self.albedo_size
+        rows = np.zeros((n, 3, a + 29), dtype=np.float32)
+        rows[:, :, :a] = shade[:, :, None] * self.modes
+        for c in range(3):
+            rows[:, c, a + c : a + 27 : 3] = albedo[:, c, None] * self.harmonics
+        rows[:, :, -2] = 1.0
+        rows *= WHITE
+        rows[:, :, -1] = residual
+        rows *= np.sqrt(weight).astype(np.float32)[:, None, None]
+        flat = rows.reshape(3 * n, -1)
+        normal = (flat.T @ flat).astype(np.float64)
+        prior = self._priors()
+        return DenseSystem(normal[:-1, :-1] + np.diag(prior), normal[:-1, -1] + prior * x)
+
+
+def gather(
+    model: MorphableModel, world: NDArray, views: Sequence[PixelView], robust: float, albedo_prior: float
+) -> AppearanceProblem:
+    """Collect the pixels of all views; ``world`` (T, V, 3) is the held geometry."""
+    mean, modes, harmonics, observed, weight = [], [], [], [], []
+    flat = model.albedo_modes.reshape(len(model.mean), -1)
+    normals = [vertex_normals(vertices, model.faces) for vertices in world]
+    for view in views:
+        corner = corner_matrix(model.faces, view.face, view.weights, len(model.mean))
+        normal = normalize(interpolate(normals[view.step], model.faces, view.face, view.weights))
+        position = interpolate(world[view.step], model.faces, view.face, view.weights)
+        colour, _, inside = view.image.sample(view.camera.project(position), gradient=False)
+        mean.append((corner @ model.mean_albedo)[inside])
+        modes.append((corner @ flat).reshape(len(view.face), 3, -1)[inside])
+        harmonics.append(basis(normal, 3).astype(np.float32)[inside])
+        observed.append(colour[inside])
+        weight.append(np.full(inside.sum(), 1.0 / max(inside.sum(), 1)))
+    if not views:
+        empty = np.zeros((0, 3), np.float32)
+        modes, mean, harmonics = (
+            [np.zeros((0, 3, model.albedo_modes.shape[2]), np.float32)],
+            [empty],
+            [np.zeros((0, 9), np.float32)],
+        )
+        observed, weight = [empty], [np.zeros(0)]
+    return AppearanceProblem(
+        np.concatenate(mean),
+        np.concatenate(modes),
+        np.concatenate(harmonics),
+        np.concatenate(observed),
+        np.concatenate(weight),
+        robust,
+        albedo_prior,
+    )
+
+
+def fit_appearance(problem: AppearanceProblem, max_iterations: int) -> Solution:
+    """Minimise from the problem's own start."""
+    return minimize(problem, problem.start(), max_iterations=max_iterations, energy_tolerance=1e-4)
