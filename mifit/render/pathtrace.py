@@ -1,0 +1,198 @@
+"""Path tracing with Mitsuba's own plugins: what synthetic captures are rendered with.
+
+Nothing here shares a formula with the fitted shading model, so a fit to these images is no inverse crime.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.camera import Camera
+from mifit.errors import InputError
+from mifit.render.gbuffer import make_mesh
+
+OPENGL_FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""OpenCV camera axes (x right, y down) to Mitsuba's (x left, y up), both looking along +z."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """Two microfacet lobes over a rough diffuse base.
+
+    Attributes
+    ----------
+    albedo : (S, S, 3)
+        Base colour, linear, row 0 at v = 1 (as all maps).
+    gloss : (S, S)
+        Weight of the glossy lobe against the dry one, 0..1.
+    roughness : (S, S)
+        Roughness of the dry lobe; the glossy one has 0.6 of it.
+    bump : (S, S)
+        Relief along the normal, in scene units.
+    """
+
+    albedo: NDArray[np.float32]
+    gloss: NDArray[np.float32]
+    roughness: NDArray[np.float32]
+    bump: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A mesh to render.
+
+    Attributes
+    ----------
+    vertices : (V, 3), normals : (V, 3), uv : (V, 2)
+        One UV pair per vertex: meshes are split along UV seams.
+    faces : (F, 3)
+    material : str
+        Name of a material.
+    """
+
+    vertices: NDArray
+    normals: NDArray
+    uv: NDArray
+    faces: NDArray
+    material: str
+
+
+def sensor(camera: Camera, spp: int = 16) -> Any:
+    """Mitsuba's ``perspective`` sensor of an undistorted camera with square pixels.
+
+    Raises
+    ------
+    InputError
+        The camera has lens distortion or fx differs from fy by more than a thousandth.
+    """
+    import mitsuba as mi
+
+    if any(camera.distortion):
+        raise InputError(f"camera {camera.name}: found lens distortion, expected an undistorted camera")
+    if abs(camera.fx / camera.fy - 1.0) > 1e-3:
+        raise InputError(
+            f"camera {camera.name}: found focal lengths {camera.fx:g} and {camera.fy:g}, expected square pixels"
+        )
+    to_world = np.linalg.inv(camera.world_to_camera) @ OPENGL_FLIP
+    return mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": math.degrees(2.0 * math.atan(0.5 * camera.width / camera.fx)),
+            "fov_axis": "x",
+            "principal_point_offset_x": camera.cx / camera.width - 0.5,
+            "principal_point_offset_y": camera.cy / camera.height - 0.5,
+            "near_clip": 1e-2,
+            "far_clip": 1e4,
+            "to_world": mi.ScalarTransform4f(to_world),
+            "film": {
+                "type": "hdrfilm",
+                "width": camera.width,
+                "height": camera.height,
+                "pixel_format": "rgba",
+                "component_format": "float32",
+                "rfilter": {"type": "box"},
+            },
+            "sampler": {"type": "multijitter", "sample_count": spp},
+        }
+    )
+
+
+class PathTracer:
+    """Materials and environment, loaded once; surfaces are given per image.
+
+    Parameters
+    ----------
+    materials : dict of str to Material
+    environment : (H, W, 3)
+        Lat-long radiance in Mitsuba's ``envmap`` layout: row 0 up, u = 0 along -z, u = 1/4 along +x.
+    max_depth : int
+        Longest path in segments; 4 is two bounces of light between skin and skin.
+    """
+
+    def __init__(self, materials: dict[str, Material], environment: NDArray, max_depth: int = 4) -> None:
+        import mitsuba as mi
+
+        self._bsdfs = {name: mi.load_dict(_bsdf(material)) for name, material in materials.items()}
+        bitmap = mi.Bitmap(np.ascontiguousarray(environment, dtype=np.float32))
+        self._emitter = mi.load_dict({"type": "envmap", "bitmap": bitmap})
+        self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
+
+    def render(
+        self, surfaces: Sequence[Surface], cameras: Sequence[Camera], spp: int, seed: int
+    ) -> list[NDArray[np.float32]]:
+        """Render the surfaces from each camera.
+
+        Parameters
+        ----------
+        surfaces : sequence of Surface
+        cameras : sequence of Camera
+        spp : int
+            Samples per pixel, at least; rounded up to the next k * k or k * (k + 1), which stratify well.
+        seed : int
+
+        Returns
+        -------
+        list of (H, W, 4) float32
+            Linear radiance on black, and coverage.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        spp = _stratified_count(spp)
+        content: dict[str, Any] = {"type": "scene", "environment": self._emitter}
+        for i, surface in enumerate(surfaces):
+            content[f"surface{i}"] = make_mesh(
+                surface.vertices,
+                surface.faces,
+                uv=surface.uv * (1.0, -1.0) + (0.0, 1.0),  # Mitsuba's textures have row 0 at v = 0
+                normals=surface.normals,
+                bsdf=self._bsdfs[surface.material],
+            )
+        scene = mi.load_dict(content)
+        images = []
+        for i, camera in enumerate(cameras):
+            view = sensor(camera, spp)
+            start = dr.opaque(mi.UInt32, (seed * 1000 + i) % 2**32)  # a literal would compile a kernel per seed
+            image = mi.render(scene, sensor=view, integrator=self._integrator, spp=spp, seed=start)
+            images.append(np.array(image, dtype=np.float32))
+        return images
+
+
+def _stratified_count(spp: int) -> int:
+    side = math.isqrt(spp - 1) + 1
+    return side * (side - 1) if side * (side - 1) >= spp else side * side
+
+
+def _bsdf(material: Material) -> dict[str, Any]:
+    def lobe(specular: float, roughness: NDArray) -> dict[str, Any]:
+        return {
+            "type": "principled",
+            "base_color": _texture(material.albedo),
+            "roughness": _texture(roughness),
+            "specular": specular,
+        }
+
+    return {
+        "type": "bumpmap",
+        "arbitrary": _texture(material.bump),
+        "nested": {
+            "type": "blendbsdf",
+            "weight": _texture(material.gloss),
+            "dry": lobe(0.3, material.roughness),
+            "oily": lobe(0.7, 0.6 * material.roughness),
+        },
+    }
+
+
+def _texture(values: NDArray) -> dict[str, Any]:
+    import mitsuba as mi
+
+    data = np.ascontiguousarray(values, dtype=np.float32)
+    bitmap = mi.Bitmap(data if data.ndim == 3 else data[..., None])
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "repeat", "format": "variant"}

@@ -1,0 +1,310 @@
+"""``synthesize``: subjects, cameras, light and sensor put together into a capture folder with its ground truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.capture.landmark_files import Landmarks, write_landmarks
+from mifit.capture.transforms import MIN_SIDE, Shot, View, write_transforms
+from mifit.core.camera import Camera
+from mifit.core.files import replacing, write_text
+from mifit.core.image import read_image, write_image
+from mifit.core.mesh import vertex_normals
+from mifit.core.uv import rasterize_uv
+from mifit.errors import InputError
+from mifit.morphable import MorphableModel
+from mifit.progress import Progress, silent
+from mifit.render.gbuffer import SurfaceScene
+from mifit.render.pathtrace import Material, PathTracer, Surface
+from mifit.synth import head
+from mifit.synth.skin import SkinMaps, SkinStyle, paint
+from mifit.synth.studio import studio_environment
+
+DISTANCE = 72.0
+"""Centimetres from the cameras to the head."""
+FULL_WELL = 12000.0
+"""Electrons of a pixel at linear value 1: shot noise."""
+READ_NOISE = 0.0012
+"""Standard deviation of the sensor's read noise in linear image units."""
+DETECTOR_NOISE = 0.8
+"""Pixels of landmark error at a width of 680; proportional to the width."""
+
+
+def synthesize(
+    out: str | Path,
+    subjects: int = 1,
+    timesteps: int = 4,
+    env: str | Path | None = None,
+    model: str | Path = "builtin",
+    seed: int = 0,
+    width: int = 680,
+    height: int = 480,
+    spp: int = 64,
+    progress: Progress = silent,
+) -> Path:
+    """Render a capture of an unseen subject, with ground truth beside it.
+
+    Cameras ``left``, ``right`` (20 degrees to either side) and ``third`` (above the middle) see a head that moves
+    and changes its expression under a fixed environment. Skin has painted detail and microfacet lobes, images
+    have shot and read noise and 8-bit sRGB codes. ``truth/NNNN.npz`` holds world-space vertices in the order of the
+    model with ``R``, ``t`` and ``scale``; ``truth/maps.npz`` albedo, specular, roughness and bump (millimetres).
+
+    Parameters
+    ----------
+    out : path
+        Capture folder; with several subjects the folder of ``subject_00``, ``subject_01`` ...
+    subjects, timesteps : int
+    env : path, optional
+        Lat-long HDR or EXR environment; a procedural studio by default.
+    model : str or path
+        Morphable model that heads are drawn from.
+    seed : int
+        The same seed gives the same files.
+    width, height : int
+        Image size in pixels.
+    spp : int
+        Samples per pixel.
+    progress : Progress
+
+    Returns
+    -------
+    Path
+        ``out``.
+
+    Raises
+    ------
+    InputError
+        A size, count or file that can't be used.
+    """
+    out = Path(out)
+    for name, value, low in (
+        ("subjects", subjects, 1),
+        ("timesteps", timesteps, 1),
+        ("width", width, MIN_SIDE),
+        ("height", height, MIN_SIDE),
+        ("spp", spp, 1),
+        ("seed", seed, 0),
+    ):
+        if value < low:
+            raise InputError(f"{name}: found {value}, expected at least {low}")
+    shape = MorphableModel.load(model)
+    radiance = None if env is None else _environment(env)
+    total = subjects * (timesteps + 1)
+    cameras = place_cameras(width, height)
+    map_size = 1024 if min(width / 680, height / 480) > 0.6 else 512
+    for i in range(subjects):
+        folder = out if subjects == 1 else out / f"subject_{i:02d}"
+        subject = _draw_subject(shape, seed + i, timesteps, map_size)
+        light = studio_environment(seed + i) if radiance is None else radiance
+        start = i * (timesteps + 1)
+        _write_capture(
+            folder, subject, cameras, light, spp, lambda done, start=start: progress("Rendering", start + done, total)
+        )
+    return out
+
+
+def _environment(path: str | Path) -> NDArray[np.float32]:
+    image = read_image(path)
+    if image.shape[1] != 2 * image.shape[0]:
+        raise InputError(
+            f"{path}: found {image.shape[1]} x {image.shape[0]} pixels, expected a lat-long image twice as wide as high"
+        )
+    if not np.isfinite(image).all() or image.min() < 0 or image.max() <= 0:
+        raise InputError(f"{path}: found radiance {image.min():g} to {image.max():g}, expected finite values from 0 up")
+    return image
+
+
+def place_cameras(width: int, height: int, distance: float = DISTANCE) -> list[Camera]:
+    """Cameras left, right (20 degrees off) and third (above the middle), in centimetres, looking at the origin."""
+    focal = 1530.0 * min(width / 680, height / 480)
+    return [
+        _camera(name, width, height, focal, distance, azimuth, elevation)
+        for name, azimuth, elevation in (("left", -20.0, 0.0), ("right", 20.0, 0.0), ("third", 3.0, 9.0))
+    ]
+
+
+def _camera(
+    name: str, width: int, height: int, focal: float, distance: float, azimuth: float, elevation: float
+) -> Camera:
+    a, e = math.radians(azimuth), math.radians(elevation)
+    position = distance * np.array([math.sin(a) * math.cos(e), math.sin(e), math.cos(a) * math.cos(e)])
+    forward = -position / distance
+    right = np.array([math.cos(a), 0.0, -math.sin(a)])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return Camera(name, width, height, focal, focal, width / 2, height / 2, pose)
+
+
+@dataclass(frozen=True)
+class _Subject:
+    """Everything of one capture but the pixels; lengths in the model's units unless said otherwise."""
+
+    model: MorphableModel
+    seed: int
+    neutral: NDArray[np.float64]
+    poses: list[head.Pose]
+    scale: float
+    skin: dict[str, SkinMaps]
+    parts: dict[str, head.SplitMesh]
+    eyes: list[NDArray[np.float64]]
+
+
+def _draw_subject(model: MorphableModel, seed: int, timesteps: int, map_size: int) -> _Subject:
+    scale = model.unit_mm / 10.0  # the world is in centimetres
+    mean_mm = model.mean.astype(np.float64) * model.unit_mm
+    normals = vertex_normals(mean_mm, model.faces)
+    style = SkinStyle.draw(seed)
+    skin, parts = {}, {}
+    for name, chosen in (("face", model.face_mask), ("rest", ~model.face_mask)):
+        if not chosen.any():
+            continue
+        faces, uv, faces_uv = model.faces[chosen], model.uv, model.faces_uv[chosen]
+        if name == "rest":  # its tiles may overlap or lie outside the unit square
+            uv, faces_uv = head.wrap_uv(uv, faces_uv)
+        skin[name] = paint(rasterize_uv(uv, faces_uv, map_size), mean_mm, normals, faces, model.landmarks, style)
+        parts[name] = head.split_at_seams(faces, uv, faces_uv)
+    neutral = head.neutral_shape(model, seed)
+    centre = neutral[model.landmarks[27:48]].mean(axis=0) - np.array([0.0, 0.0, 55.0 / model.unit_mm])
+    eyes = [
+        head.eye_centre(neutral[loop] * model.unit_mm) / model.unit_mm
+        for loop in head.eye_openings(neutral, model.faces, model.landmarks)
+    ]
+    poses = head.draw_motion(model, timesteps, seed, scale, centre)
+    return _Subject(model, seed, neutral, poses, scale, skin, parts, eyes)
+
+
+def _write_capture(
+    folder: Path,
+    subject: _Subject,
+    cameras: list[Camera],
+    environment: NDArray[np.float32],
+    spp: int,
+    advance: Callable[[int], None],
+) -> None:
+    """Render and write one capture; ``transforms.json`` comes last, so a broken-off folder isn't taken for whole."""
+    advance(0)
+    tracer = PathTracer(_materials(subject), environment)
+    exposure = _exposure(tracer, subject, cameras[0])
+    _write_maps(folder / "truth" / "maps.npz", subject.skin["face"])
+    visibility = SurfaceScene(subject.neutral, subject.model.faces)
+    shots = []
+    advance(1)
+    for t, pose in enumerate(subject.poses):
+        world = _world_vertices(subject, pose)
+        images = tracer.render(_surfaces(subject, pose, world), cameras, spp, seed=subject.seed * 100_003 + t)
+        visibility.update(world)
+        for c, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+            rng = np.random.default_rng([subject.seed, t, c, 21])
+            shot = Shot(
+                camera.name,
+                t,
+                folder / "images" / camera.name / f"{t:04d}.png",
+                landmarks=folder / "landmarks" / camera.name / f"{t:04d}.json",
+            )
+            assert shot.landmarks is not None
+            write_image(shot.image, expose(image[..., :3] * exposure, rng))
+            write_landmarks(shot.landmarks, _detect(subject.model, world, camera, visibility, rng))
+            shots.append(shot)
+        with replacing(folder / "truth" / f"{t:04d}.npz") as temporary:
+            np.savez_compressed(
+                temporary,
+                vertices=world.astype(np.float32),
+                R=pose.rotation,
+                t=pose.translation,
+                scale=subject.scale,
+                expression=pose.expression,
+            )
+        advance(t + 2)
+    note = {"seed": subject.seed, "exposure": exposure, "spp": spp, "model": subject.model.name}
+    write_text(folder / "truth" / "scene.json", json.dumps(note, indent=1) + "\n")
+    write_image(folder / "truth" / "environment.exr", environment)
+    write_transforms(folder / "transforms.json", [View.of(camera) for camera in cameras], shots, "cm")
+
+
+def _world_vertices(subject: _Subject, pose: head.Pose) -> NDArray[np.float64]:
+    moved = (subject.model.expression_jacobian @ pose.expression).reshape(-1, 3)
+    return subject.scale * (subject.neutral + moved) @ pose.rotation.T + pose.translation
+
+
+def _materials(subject: _Subject) -> dict[str, Material]:
+    materials = {
+        name: Material(maps.albedo, maps.specular, maps.roughness, maps.bump * np.float32(0.1))  # mm -> cm
+        for name, maps in subject.skin.items()
+    }
+    if subject.eyes:
+        albedo, flat = head.paint_eye(subject.seed), np.zeros((64, 64), dtype=np.float32)
+        materials["eye"] = Material(albedo, flat + 0.9, flat + 0.25, flat)
+    return materials
+
+
+def _surfaces(subject: _Subject, pose: head.Pose, world: NDArray) -> list[Surface]:
+    normals = vertex_normals(world, subject.model.faces)
+    surfaces = [
+        Surface(world[part.source], normals[part.source], part.uv, part.faces, name)
+        for name, part in subject.parts.items()
+    ]
+    unit, uv, faces = head.sphere()
+    for centre in subject.eyes:
+        offset = unit * (head.EYE_RADIUS / subject.model.unit_mm)
+        placed = subject.scale * (centre + offset) @ pose.rotation.T + pose.translation
+        surfaces.append(Surface(placed, unit @ pose.rotation.T, uv, faces, "eye"))
+    return surfaces
+
+
+def _exposure(tracer: PathTracer, subject: _Subject, camera: Camera) -> float:
+    """Factor that puts the brightest skin, highlights aside, near the upper end of the sensor's range."""
+    small = dataclasses.replace(
+        camera,
+        width=camera.width // 4,
+        height=camera.height // 4,
+        **{key: getattr(camera, key) / 4 for key in ("fx", "fy", "cx", "cy")},
+    )
+    pose = subject.poses[0]
+    surfaces = _surfaces(subject, pose, _world_vertices(subject, pose))
+    image = tracer.render(surfaces, [small], 16, seed=subject.seed)[0]
+    seen = image[image[..., 3] > 0.9]
+    level = float(np.percentile(seen[:, :3].max(axis=1), 97)) if len(seen) else 0.0
+    if not 0 < level < math.inf:
+        raise InputError("env: the head is black under this environment, expected some radiance above zero")
+    return 0.7 / level
+
+
+def expose(radiance: NDArray, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Shot and read noise on linear pixel values, clipped to the sensor's range 0..1."""
+    signal = np.clip(radiance, 0.0, None)
+    noisy = signal + rng.standard_normal(signal.shape) * np.sqrt(signal / FULL_WELL + READ_NOISE**2)
+    return np.clip(noisy, 0.0, 1.0).astype(np.float32)
+
+
+def _detect(
+    model: MorphableModel, world: NDArray, camera: Camera, scene: SurfaceScene, rng: np.random.Generator
+) -> Landmarks:
+    """True landmarks as a detector would find them: with noise, and knowing which are hidden."""
+    points = world[model.landmarks]
+    normals = vertex_normals(world, model.faces)[model.landmarks]
+    pixels = camera.project(points)
+    facing = np.einsum("nk,nk->n", normals, camera.position - points) > 0
+    inside = (pixels > 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    noise = DETECTOR_NOISE * camera.width / 680 * rng.standard_normal(pixels.shape)
+    return Landmarks(pixels + noise, facing & inside & scene.visible_from(points, camera.position))
+
+
+def _write_maps(path: Path, maps: SkinMaps) -> None:
+    with replacing(path) as temporary:
+        np.savez_compressed(
+            temporary,
+            albedo=maps.albedo.astype(np.float16),
+            specular=maps.specular.astype(np.float16),
+            roughness=maps.roughness.astype(np.float16),
+            bump=maps.bump.astype(np.float16),
+            cover=maps.cover,
+        )

@@ -1,0 +1,157 @@
+"""A subject's head: shape outside the model's span, expressions and motion over time, eyeballs, split meshes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
+
+from mifit.core.mesh import vertex_normals
+from mifit.morphable import MorphableModel
+from mifit.synth.noise import smooth_noise
+
+EYE_RADIUS = 12.0
+"""Millimetres."""
+IRIS_COLOURS = np.array([[0.10, 0.045, 0.02], [0.16, 0.10, 0.04], [0.14, 0.20, 0.28], [0.12, 0.18, 0.12]])
+"""Brown, hazel, blue, green; linear."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Head pose and expression at one timestep: world = scale * rotation @ object + translation."""
+
+    expression: NDArray[np.float32]
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+
+def neutral_shape(model: MorphableModel, seed: int) -> NDArray[np.float64]:
+    """(V, 3) vertices of a subject without expression, object space.
+
+    Identity coefficients are drawn from the model's prior at 0.7 standard deviations, then every vertex moves
+    along its normal by smooth noise of 0.5 mm, which no mode of the model spans.
+    """
+    rng = np.random.default_rng([seed, 11])
+    identity = 0.7 * np.clip(rng.standard_normal(model.n_identity), -2.0, 2.0)
+    shape = np.asarray(model.shape(identity), dtype=np.float64)
+    noise = smooth_noise(model.mean * model.unit_mm, 28.0, rng, octaves=2)
+    return shape + (0.5 / model.unit_mm) * noise[:, None] * vertex_normals(shape, model.faces)
+
+
+def draw_motion(model: MorphableModel, timesteps: int, seed: int, scale: float, centre: NDArray) -> list[Pose]:
+    """A pose and an expression per timestep, smooth in time.
+
+    Parameters
+    ----------
+    model : MorphableModel
+    timesteps : int
+    seed : int
+    scale : float
+        World units per model unit.
+    centre : (3,)
+        Object-space point that the head turns about and that stays near the world's origin.
+    """
+    rng = np.random.default_rng([seed, 12])
+    phase, speed = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.5, 1.1, 6)
+    swing = np.array([9.0, 5.0, 3.0, 0.8, 0.5, 0.5])  # degrees of yaw, pitch, roll; centimetres
+    bounds = np.asarray(model.expression_bounds, dtype=np.float64)
+    free = ~np.isfinite(bounds).all(axis=1)
+    active = rng.permutation(model.n_expression)[:6]
+    strength = np.where(free[active], rng.uniform(-0.9, 0.9, len(active)), rng.uniform(0.15, 0.55, len(active)))
+    poses = []
+    for t in range(timesteps):
+        yaw, pitch, roll, *shift = swing * np.sin(phase + speed * t)
+        rotation = Rotation.from_euler("yxz", [yaw, pitch, roll], degrees=True).as_matrix()
+        expression = np.zeros(model.n_expression)
+        wave = 0.5 - 0.5 * np.cos(0.9 * t + np.arange(len(active)))
+        expression[active] = strength * (wave if t else 0.0 * wave)  # the first timestep is neutral
+        expression = np.clip(expression, bounds[:, 0], bounds[:, 1])
+        translation = np.array(shift) - scale * rotation @ centre
+        poses.append(Pose(expression.astype(np.float32), rotation, translation))
+    return poses
+
+
+@dataclass(frozen=True)
+class SplitMesh:
+    """Part of a mesh with one UV pair per vertex.
+
+    Attributes
+    ----------
+    source : (W,) int
+        Vertex of the whole mesh that each split vertex copies.
+    uv : (W, 2) float32
+        Wrapped into [0, 1).
+    faces : (F, 3) int32
+    """
+
+    source: NDArray[np.int64]
+    uv: NDArray[np.float32]
+    faces: NDArray[np.int32]
+
+
+def split_at_seams(faces: NDArray, uv: NDArray, faces_uv: NDArray) -> SplitMesh:
+    """Copy vertices so that each has one UV pair."""
+    pairs = np.stack([faces.ravel(), faces_uv.ravel()], axis=1)
+    unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
+    return SplitMesh(unique[:, 0], uv[unique[:, 1]].astype(np.float32), inverse.reshape(-1, 3).astype(np.int32))
+
+
+def wrap_uv(uv: NDArray, faces_uv: NDArray) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Move every face by whole tiles so that its centre lies in the unit square -> (uv, faces_uv), unshared."""
+    corners = uv[faces_uv]
+    corners = corners - np.floor(corners.mean(axis=1, keepdims=True))
+    return corners.reshape(-1, 2).astype(np.float32), np.arange(corners.size // 2, dtype=np.int32).reshape(-1, 3)
+
+
+def eye_openings(vertices: NDArray, faces: NDArray, landmarks: NDArray) -> list[NDArray[np.int64]]:
+    """Vertices around each eye's hole in the mesh; empty when the model's eyes are closed surfaces."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    border = unique[count == 1]
+    if not len(border):
+        return []
+    graph = coo_matrix((np.ones(len(border)), (border[:, 0], border[:, 1])), shape=(len(vertices),) * 2)
+    labels = connected_components(graph, directed=False)[1]
+    loops = [np.flatnonzero(labels == label) for label in np.unique(labels[border[:, 0]])]
+    found = []
+    for eye in (range(36, 42), range(42, 48)):
+        corners = vertices[landmarks[list(eye)]]
+        width = np.linalg.norm(corners[0] - corners[3])
+        near = [loop for loop in loops if np.linalg.norm(vertices[loop].mean(0) - corners.mean(0)) < 0.5 * width]
+        found.extend(near[:1] if near else [])
+    return found
+
+
+def eye_centre(opening_mm: NDArray) -> NDArray[np.float64]:
+    """Centre of an eyeball behind an opening (N, 3), millimetres: as far forward as the lids allow."""
+    middle = opening_mm.mean(axis=0)
+    across = np.linalg.norm(opening_mm[:, :2] - middle[:2], axis=1)
+    depth = opening_mm[:, 2] - np.sqrt(np.maximum(EYE_RADIUS**2 - across**2, 0.0))
+    return np.array([middle[0], middle[1], depth.min()])
+
+
+def paint_eye(seed: int, size: int = 256) -> NDArray[np.float32]:
+    """Sclera, iris and pupil of an eye that looks along +z, for the UVs of `sphere`."""
+    rng = np.random.default_rng([seed, 13])
+    angle = np.degrees((np.arange(size) + 0.5) * np.pi / size)[:, None]  # from the pupil's centre
+    streaks = 1.0 + 0.2 * rng.standard_normal((1, size))
+    iris = rng.choice(IRIS_COLOURS) * rng.uniform(0.8, 1.25)
+    image = np.broadcast_to(np.array([0.62, 0.56, 0.52]), (size, size, 3)).copy()
+    image = np.where((angle < 29.0)[..., None], np.clip(iris * streaks[..., None], 0.01, 0.6), image)
+    image = np.where((angle < 12.0)[..., None], 0.005, image)
+    return np.broadcast_to(image, (size, size, 3)).astype(np.float32)
+
+
+def sphere(segments: int = 32) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.int32]]:
+    """Unit sphere about the z axis: vertices (V, 3), which are its normals, UVs with v = 1 at +z, and faces."""
+    theta, phi = np.meshgrid(np.linspace(0, np.pi, segments + 1), np.linspace(0, 2 * np.pi, 2 * segments + 1))
+    vertices = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
+    uv = np.stack([phi / (2 * np.pi), 1 - theta / np.pi], axis=-1)
+    index = np.arange(theta.size).reshape(theta.shape)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    return vertices.reshape(-1, 3), uv.reshape(-1, 2).astype(np.float32), faces.astype(np.int32)

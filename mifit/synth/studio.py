@@ -1,0 +1,49 @@
+"""A procedural photo studio: dim room, bright ceiling, softboxes; made from a seed, so that nothing is shipped."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def studio_environment(seed: int = 0, height: int = 128) -> NDArray[np.float32]:
+    """Lat-long radiance of a studio, (height, 2 * height, 3), linear.
+
+    Mitsuba's ``envmap`` layout: row 0 is up (+y), the centre of the top-left pixel lies half a pixel in.
+    A gradient from warm floor to cool ceiling, a large key softbox on one side in front, a dimmer fill on the
+    other, and a rim light behind; places and colours vary with the seed.
+    """
+    rng = np.random.default_rng([seed, 7])
+    width = 2 * height
+    theta = (np.arange(height) + 0.5) * np.pi / height
+    phi = (np.arange(width) + 0.5) * 2 * np.pi / width
+    sin_theta, cos_theta = np.sin(theta)[:, None], np.cos(theta)[:, None]
+    # Mitsuba: u = 0 looks along -z ... direction = (sin phi sin theta, cos theta, -cos phi sin theta)
+    direction = np.stack(np.broadcast_arrays(np.sin(phi) * sin_theta, cos_theta, -np.cos(phi) * sin_theta), axis=-1)
+    up = 0.5 + 0.5 * direction[..., 1:2]
+    image = 0.10 * ((1 - up) * np.array([1.1, 0.95, 0.8]) + up * np.array([0.8, 0.95, 1.15]))
+    side = rng.choice([-1.0, 1.0])
+    boxes = (  # azimuth from the nose, elevation, half-width, half-height (degrees), radiance
+        (side * rng.uniform(30, 50), rng.uniform(20, 40), 17.0, 22.0, rng.uniform(5.0, 7.0)),
+        (-side * rng.uniform(45, 70), rng.uniform(0, 20), 20.0, 26.0, rng.uniform(1.2, 2.0)),
+        (side * rng.uniform(130, 160), rng.uniform(15, 35), 12.0, 20.0, rng.uniform(2.5, 4.0)),
+    )
+    for azimuth, elevation, half_width, half_height, radiance in boxes:
+        tint = np.array([1.0, 0.97, 0.93]) ** rng.uniform(-1.0, 2.0)
+        image += radiance * tint * _softbox(direction, azimuth, elevation, half_width, half_height)[..., None]
+    return image.astype(np.float32)
+
+
+def _softbox(
+    direction: NDArray, azimuth: float, elevation: float, half_width: float, half_height: float
+) -> NDArray[np.float64]:
+    """0..1 coverage of directions by a rectangular light; angles in degrees, azimuth 0 is +z, 90 is +x."""
+    a, e = np.radians(azimuth), np.radians(elevation)
+    forward = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
+    right = np.array([np.cos(a), 0.0, -np.sin(a)])
+    depth = direction @ forward
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = np.abs(direction @ right) / depth / np.tan(np.radians(half_width))
+        y = np.abs(direction @ np.cross(forward, right)) / depth / np.tan(np.radians(half_height))
+    edge = np.clip((1.0 - np.maximum(x, y)) / 0.1, 0.0, 1.0)
+    return np.where(depth > 0, edge, 0.0)
