@@ -1,0 +1,142 @@
+"""The Blinn-Phong reflection model in float64: the plain form that every fast one is tested against.
+
+The BRDF is ``f = C_d / pi + C_s N(m) (n . h)^m`` with the half vector h of view and light. ``N(m)`` is either
+
+- normalised: ``(m + 2)(m + 4) / (8 pi (m + 2^(-m/2)))``, so that the lobe alone reflects all light at normal
+  incidence and less elsewhere, or
+- plain: ``1 / pi``, which leaves the paper's ``C_s (n . h)^m`` in the units of the diffuse term.
+
+Prefiltered form
+----------------
+Under smooth lighting only a few moments of the lobe matter. For a view at the cosine mu from the normal, the reflected
+lobe ``N (n . h)^m (n . l)`` has a mass (its directional albedo), a mean direction between mirror direction and normal,
+and about that direction a Legendre coefficient per band. Replacing the lobe by the zonal one with these moments gives
+its transfer vector in closed form: ``albedo * factor_l * Y_lm(mean direction)``. ``lobe_moments`` has the numbers;
+``lobe_table`` stores them as Chebyshev coefficients over mu and log m.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mifit.errors import InputError
+
+Array = NDArray[np.float64]
+
+EXPONENT_MIN, EXPONENT_MAX = 1.0, 1e4
+
+_DEGREE_COSINE, _DEGREE_EXPONENT = 7, 11
+
+
+def normalization(exponent: ArrayLike, normalized: bool = True) -> Array:
+    """The lobe's factor N(m), for both kinds."""
+    m = np.asarray(exponent, dtype=np.float64)
+    if not normalized:
+        return np.full_like(m, 1.0 / np.pi)
+    return (m + 2.0) * (m + 4.0) / (8.0 * np.pi * (m + np.exp2(-0.5 * m)))
+
+
+def specular_brdf(
+    light: ArrayLike, view: ArrayLike, normal: ArrayLike, exponent: ArrayLike, normalized: bool = True
+) -> Array:
+    """``N(m) (n . h)^m`` for unit vectors (..., 3) away from the surface; zero below the horizon."""
+    li, v, n = (np.asarray(x, dtype=np.float64) for x in (light, view, normal))
+    h = li + v
+    h = h / np.maximum(np.linalg.norm(h, axis=-1, keepdims=True), 1e-300)
+    above = ((li * n).sum(-1) > 0) & ((v * n).sum(-1) > 0)
+    lobe = np.maximum((h * n).sum(-1), 0.0) ** np.asarray(exponent, dtype=np.float64)
+    return np.where(above, normalization(exponent, normalized) * lobe, 0.0)
+
+
+def lobe_samples(cosine: float, exponent: float, count: int = 48) -> tuple[Array, Array]:
+    """Quadrature of the normalised lobe seen at one angle.
+
+    The half vectors follow their own density, so that the same count serves exponents of 1 and of 10000.
+
+    Returns
+    -------
+    directions : (N, 3)
+        Light directions in the frame with the normal along z and the view in the x-z plane.
+    weights : (N,)
+        ``f (n . l) dl``; their sum is the directional albedo.
+    """
+    x, w = np.polynomial.legendre.leggauss(count)
+    u = 0.5 * (x + 1.0)
+    # Substituting cos_h = u^(1/(m+1)) makes (n . h)^m d(cos_h) uniform, but steep at u = 0; squaring u smooths it.
+    cos_h = (u * u) ** (1.0 / (exponent + 1.0))
+    weight_h = 0.5 * w * 2.0 * u / (exponent + 1.0)
+    phi = (np.arange(2 * count) + 0.5) * (np.pi / (2 * count))  # half the circle: the lobe is symmetric
+    sin_h = np.sqrt(np.maximum(1.0 - cos_h**2, 0.0))
+    h = np.stack(
+        [np.outer(sin_h, np.cos(phi)), np.outer(sin_h, np.sin(phi)), np.outer(cos_h, np.ones_like(phi))], -1
+    ).reshape(-1, 3)
+    view = np.array([math.sqrt(max(1.0 - cosine * cosine, 0.0)), 0.0, cosine])
+    vh = h @ view
+    light = 2.0 * vh[:, None] * h - view
+    area = np.repeat(weight_h, len(phi)) * (2.0 * np.pi / len(phi))
+    inside = (vh > 0) & (light[:, 2] > 0)
+    weight = np.where(inside, area * 4.0 * vh * light[:, 2], 0.0) * normalization(exponent)
+    return light, weight
+
+
+def lobe_moments(cosine: float, exponent: float, order: int) -> Array:
+    """Moments of the normalised lobe seen at the cosine mu from the normal.
+
+    Returns
+    -------
+    (B + 1,)
+        Directional albedo; tilt t of the mean direction ``normalize((1 - t) r + t n)`` from the mirror direction r
+        towards the normal n; Legendre factors of the bands 1 .. B - 1 about the mean direction.
+    """
+    light, weight = lobe_samples(cosine, exponent)
+    albedo = weight.sum()
+    mean = weight @ light
+    mean[1] = 0.0  # by symmetry; the samples cover one half
+    mean /= np.linalg.norm(mean)
+    sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
+    if sine < 1e-6:
+        raise InputError("cosine: found 1, where the mirror direction is the normal and has no tilt")
+    # mean = a r + b n with r = (-sine, 0, cosine): the tilt is b / (a + b).
+    a = -mean[0] / sine
+    b = mean[2] - a * cosine
+    t = np.clip(light @ mean, -1.0, 1.0)
+    legendre = [np.ones_like(t), t]
+    for n in range(2, order):
+        legendre.append(((2 * n - 1) * t * legendre[-1] - (n - 1) * legendre[-2]) / n)
+    return np.array([albedo, b / (a + b), *(weight @ p / albedo for p in legendre[1:order])])
+
+
+@dataclass(frozen=True)
+class LobeTable:
+    """Chebyshev coefficients of ``lobe_moments`` over the cosine (0..1) and the exponent (1..10000, logarithmic).
+
+    Attributes
+    ----------
+    coefficients : (B + 1, K, J)
+        Moment, degree in ``2 mu - 1``, degree in ``2 log(m) / log(10000) - 1``.
+    """
+
+    coefficients: Array
+
+    def __call__(self, cosine: ArrayLike, exponent: ArrayLike) -> Array:
+        """Evaluate all moments at cosines and exponents (...) -> (B + 1, ...)."""
+        x = 2.0 * np.clip(np.asarray(cosine, dtype=np.float64), 0.0, 1.0) - 1.0
+        m = np.clip(np.asarray(exponent, dtype=np.float64), EXPONENT_MIN, EXPONENT_MAX)
+        y = 2.0 * np.log(m) / math.log(EXPONENT_MAX) - 1.0
+        x, y = np.broadcast_arrays(x, y)
+        return np.stack([np.polynomial.chebyshev.chebval2d(x, y, c) for c in self.coefficients])
+
+
+@functools.lru_cache(maxsize=8)
+def lobe_table(order: int) -> LobeTable:
+    """Tabulate the moments of the lobe for a number of bands; computed at first use, in a fraction of a second."""
+    k, j = _DEGREE_COSINE + 1, _DEGREE_EXPONENT + 1
+    x, y = (np.cos((np.arange(n) + 0.5) * np.pi / n) for n in (k, j))  # Chebyshev nodes
+    values = np.array([[lobe_moments(0.5 * (a + 1.0), EXPONENT_MAX ** (0.5 * (b + 1.0)), order) for b in y] for a in x])
+    to_x, to_y = (np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, len(nodes) - 1)) for nodes in (x, y))
+    return LobeTable(np.einsum("ka,abq,jb->qkj", to_x, values, to_y))

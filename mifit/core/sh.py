@@ -1,0 +1,349 @@
+"""Real spherical harmonics, float64, any order: the toolkit of the lighting.
+
+Conventions, the same everywhere in this project
+------------------------------------------------
+Basis: real, orthonormal over the sphere, with the Condon-Shortley phase, exactly as ``drjit.sh_eval``: for a unit
+direction (x, y, z), ``Y_1,-1 = -k y``, ``Y_1,0 = k z``, ``Y_1,1 = -k x`` with ``k = sqrt(3 / (4 pi))``.
+Index: ``l * l + l + m``. Order: the number of bands B, so l = 0 .. B - 1 and B * B functions; the paper has B = 3.
+Axes: those of the directions that are passed in, without permutation; lighting lives in world axes.
+Coefficients: (B * B, 3), of incident radiance, linear Rec. 709.
+Lat-long images: Mitsuba's ``envmap`` without ``to_world``: the middle column is +z, the top row +y; the centre of pixel
+(row, column) lies at phi = 2 pi (column + 0.5) / W, theta = pi (row + 0.5) / H and looks along
+(sin phi sin theta, cos theta, -cos phi sin theta).
+
+Sources: Ramamoorthi and Hanrahan 2001 (irradiance); Sloan, "Stupid Spherical Harmonics Tricks", 2008 (dominant
+direction, optimal linear light, windowing).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mifit.errors import InputError
+
+Array = NDArray[np.float64]
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Weights of linear Rec. 709 for one value per coefficient."""
+
+
+def basis(directions: ArrayLike, order: int) -> Array:
+    """Evaluate the basis at unit directions (..., 3) -> (..., B*B)."""
+    return _evaluate(directions, order, gradient=False)[0]
+
+
+def basis_gradient(directions: ArrayLike, order: int) -> tuple[Array, Array]:
+    """Evaluate the basis and its gradient at unit directions.
+
+    Returns
+    -------
+    values : (..., B*B)
+    gradient : (..., B*B, 3)
+        Derivatives by x, y, z of the polynomials that ``drjit.sh_eval`` computes. Only the part along the sphere has
+        a meaning; project it where the direction is a normalised vector.
+    """
+    values, gradient = _evaluate(directions, order, gradient=True)
+    assert gradient is not None
+    return values, gradient
+
+
+def _evaluate(directions: ArrayLike, order: int, gradient: bool) -> tuple[Array, Array | None]:
+    """Y = Q_lm(z) Re or Im (x + iy)^m, with the normalised recursion over l for the polynomials Q."""
+    d = np.asarray(directions, dtype=np.float64)
+    if d.shape[-1:] != (3,):
+        raise InputError(f"directions: found shape {d.shape}, expected (..., 3)")
+    check_order(order)
+    x, y, z = d[..., 0], d[..., 1], d[..., 2]
+    out = np.empty((*d.shape[:-1], order * order))
+    grad = np.zeros((*d.shape[:-1], order * order, 3)) if gradient else None
+    re, im = np.ones_like(z), np.zeros_like(z)
+    re_below, im_below = np.zeros_like(z), np.zeros_like(z)  # (x + iy)^(m-1)
+    q_mm = math.sqrt(1.0 / (4.0 * math.pi))
+    for m in range(order):
+        scale = 1.0 if m == 0 else math.sqrt(2.0)
+        q, q_below = np.full_like(z, q_mm), np.zeros_like(z)
+        dq, dq_below = np.zeros_like(z), np.zeros_like(z)
+        for degree in range(m, order):
+            centre = degree * degree + degree
+            out[..., centre + m] = scale * q * re
+            if m:
+                out[..., centre - m] = scale * q * im
+            if grad is not None:
+                grad[..., centre + m, 0] = scale * q * m * re_below
+                grad[..., centre + m, 1] = -scale * q * m * im_below
+                grad[..., centre + m, 2] = scale * dq * re
+                if m:
+                    grad[..., centre - m, 0] = scale * q * m * im_below
+                    grad[..., centre - m, 1] = scale * q * m * re_below
+                    grad[..., centre - m, 2] = scale * dq * im
+            n = degree + 1
+            a = math.sqrt((4.0 * n * n - 1.0) / (n * n - m * m))
+            b = math.sqrt((degree * degree - m * m) / (4.0 * degree * degree - 1.0)) if degree > m else 0.0
+            q, q_below, dq, dq_below = (
+                a * (z * q - b * q_below),
+                q,
+                a * (q + z * dq - b * dq_below),
+                dq,
+            )
+        re_below, im_below = re, im
+        re, im = x * re - y * im, x * im + y * re
+        q_mm *= -math.sqrt((2.0 * m + 3.0) / (2.0 * m + 2.0))
+    return out, grad
+
+
+def check_order(order: int) -> None:
+    """Raise InputError unless the number of bands is a whole number from 1."""
+    if not isinstance(order, (int, np.integer)) or order < 1:
+        raise InputError(f"order: found {order!r}, expected the number of bands, 1 or more")
+
+
+def order_of(coefficients: ArrayLike) -> int:
+    """Number of bands B of coefficients whose first axis is B*B long; InputError for another length."""
+    count = np.shape(coefficients)[0] if np.ndim(coefficients) else 0
+    order = math.isqrt(count)
+    if order < 1 or order * order != count:
+        raise InputError(f"coefficients: found {count} of them, expected a square number: 1, 4, 9 (3 bands), 16 ...")
+    return order
+
+
+def bands(order: int) -> NDArray[np.int64]:
+    """(B*B,) band l of each coefficient."""
+    return np.repeat(np.arange(order), 2 * np.arange(order) + 1)
+
+
+def quadrature(order: int) -> tuple[Array, Array]:
+    """Directions (N, 3) and weights (N,) that integrate products of two expansions of this order exactly."""
+    z, w = np.polynomial.legendre.leggauss(order)
+    count = 2 * order
+    phi = (np.arange(count) + 0.5) * (2.0 * np.pi / count)
+    r = np.sqrt(1.0 - z * z)
+    shape = (order, count)
+    d = np.stack([np.outer(r, np.cos(phi)), np.outer(r, np.sin(phi)), np.broadcast_to(z[:, None], shape)], -1)
+    return d.reshape(-1, 3), np.repeat(w * (2.0 * np.pi / count), count)
+
+
+def cosine_coefficients(order: int) -> Array:
+    """(B,) factors A_l by which the clamped cosine scales each band: pi, 2 pi / 3, pi / 4, 0, -pi / 24 ..."""
+    check_order(order)
+    out = np.zeros(order)
+    for n in range(order):
+        if n == 1:
+            out[n] = 2.0 * np.pi / 3.0
+        elif n % 2 == 0:
+            half = n // 2
+            out[n] = (-1.0) ** (half + 1) * (2.0 * np.pi / ((n + 2.0) * (n - 1.0))) * math.comb(n, half) / 2.0**n
+    return out
+
+
+def lobe_coefficients(exponent: float, order: int) -> Array:
+    """(B,) factors by which Blinn-Phong's lobe scales each band when it is convolved about the mirror direction.
+
+    At the angle alpha from the mirror direction, in the plane of incidence, the half vector is alpha / 2 off the
+    normal, so the lobe is ``cos(alpha / 2)^m = ((1 + cos alpha) / 2)^(m / 2)``. Taking this all around the mirror
+    direction is exact for a view along the normal and the approximation elsewhere (the true lobe is narrower across
+    the plane of incidence by the cosine of the angle). Near the peak it is the Phong lobe with a quarter of the
+    exponent. Its Legendre projection has the closed form ``prod_{i<l} (m/2 - i) / (m/2 + 2 + i)``, relative to l = 0.
+    """
+    check_order(order)
+    if not exponent > 0:
+        raise InputError(f"exponent: found {exponent!r}, expected a positive number")
+    a = 0.5 * float(exponent)
+    i = np.arange(order - 1)
+    return np.concatenate([[1.0], np.cumprod((a - i) / (a + 2.0 + i))])
+
+
+def window(kind: str, order: int, width: float | None = None) -> Array:
+    """(B,) factors that fade the high bands to damp ringing.
+
+    Parameters
+    ----------
+    kind : {"hann", "lanczos"}
+        Raised cosine, or sinc.
+    order : int
+        Number of bands.
+    width : float, optional
+        Band at which the window reaches zero; ``order`` by default. Smaller is smoother.
+
+    Raises
+    ------
+    InputError
+        An unknown kind or a width that isn't positive.
+    """
+    check_order(order)
+    width = float(order) if width is None else float(width)
+    if not width > 0:
+        raise InputError(f"window width: found {width}, expected a positive number of bands")
+    x = np.minimum(np.arange(order) / width, 1.0)
+    if kind == "hann":
+        return 0.5 * (1.0 + np.cos(np.pi * x))
+    if kind == "lanczos":
+        return np.sinc(x)
+    raise InputError(f"window: found {kind!r}, expected 'hann' or 'lanczos'")
+
+
+def rotation_matrix(rotation: ArrayLike, order: int) -> Array:
+    """(B*B, B*B) matrix that rotates coefficients: the rotated field at ``R d`` is the old one at ``d``."""
+    r = np.asarray(rotation, dtype=np.float64)
+    if r.shape != (3, 3) or not np.allclose(r @ r.T, np.eye(3), atol=1e-5) or np.linalg.det(r) < 0:
+        raise InputError("rotation: found a matrix that isn't a (3, 3) rotation, expected R R^T = 1 and det R = 1")
+    d, w = quadrature(order)
+    matrix = basis(d, order).T @ (w[:, None] * basis(d @ r, order))
+    band = bands(order)
+    return np.where(band[:, None] == band[None, :], matrix, 0.0)
+
+
+def latlong_directions(height: int, width: int) -> Array:
+    """(H, W, 3) world directions of the pixel centres of a lat-long image."""
+    theta = (np.arange(height) + 0.5) * (np.pi / height)
+    phi = (np.arange(width) + 0.5) * (2.0 * np.pi / width)
+    s = np.sin(theta)
+    up = np.broadcast_to(np.cos(theta)[:, None], (height, width))
+    return np.stack([np.outer(s, np.sin(phi)), up, -np.outer(s, np.cos(phi))], axis=-1)
+
+
+def latlong_solid_angles(height: int, width: int) -> Array:
+    """(H,) solid angle of a pixel in each row; they add up to 4 pi over the image."""
+    edges = np.cos(np.arange(height + 1) * (np.pi / height))
+    return (edges[:-1] - edges[1:]) * (2.0 * np.pi / width)
+
+
+def project_latlong(image: ArrayLike, order: int) -> Array:
+    """Project a lat-long radiance image (H, W, 3) onto the basis -> (B*B, 3)."""
+    check_order(order)
+    pixels = np.asarray(image)
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or min(pixels.shape[:2]) < 2:
+        raise InputError(f"environment map: found shape {pixels.shape}, expected (height, width, 3)")
+    if not np.isfinite(pixels).all():
+        raise InputError("environment map: found pixels that are not finite, expected linear radiance")
+    height, width = pixels.shape[:2]
+    if height < 2 * order:
+        raise InputError(f"environment map: found {height} rows, expected {2 * order} or more for {order} bands")
+    directions = latlong_directions(height, width)
+    angles = latlong_solid_angles(height, width)
+    out = np.zeros((order * order, 3))
+    for row in range(0, height, 32):  # a few rows at a time: the whole basis would take gigabytes
+        part = slice(row, row + 32)
+        weighted = pixels[part].astype(np.float64) * angles[part, None, None]
+        out += basis(directions[part], order).reshape(-1, order * order).T @ weighted.reshape(-1, 3)
+    return out
+
+
+@dataclass(frozen=True)
+class SHLighting:
+    """Distant lighting as real spherical harmonics of radiance, world axes (conventions at the top of this module).
+
+    Parameters
+    ----------
+    coefficients : (B*B, 3) float64
+        Linear Rec. 709 radiance.
+
+    Raises
+    ------
+    InputError
+        Another shape, or values that are not finite.
+    """
+
+    coefficients: Array
+
+    def __post_init__(self) -> None:
+        c = np.array(self.coefficients, dtype=np.float64)
+        if c.ndim != 2 or c.shape[1] != 3:
+            raise InputError(f"coefficients: found shape {c.shape}, expected (B*B, 3)")
+        order_of(c)
+        if not np.isfinite(c).all():
+            raise InputError("coefficients: found values that are not finite")
+        c.setflags(write=False)
+        object.__setattr__(self, "coefficients", c)
+
+    @classmethod
+    def from_envmap(cls, source: str | Path | ArrayLike, order: int = 3) -> SHLighting:
+        """Project a lat-long environment map, a file (.hdr, .exr) or an array (H, W, 3) of linear radiance.
+
+        Raises
+        ------
+        InputError
+            A file that can't be read, a wrong shape, or pixels that are not finite.
+        """
+        if isinstance(source, (str, Path)):
+            from mifit.core.image import read_image
+
+            pixels = read_image(source)
+            try:
+                return cls(project_latlong(pixels, order))
+            except InputError as error:
+                raise InputError(f"{source}: {error}") from None
+        return cls(project_latlong(source, order))
+
+    @property
+    def order(self) -> int:
+        """Number of bands B."""
+        return order_of(self.coefficients)
+
+    def evaluate(self, directions: ArrayLike) -> Array:
+        """Radiance (..., 3) from unit directions (..., 3); negative where the expansion rings."""
+        return basis(directions, self.order) @ self.coefficients
+
+    def irradiance(self, normals: ArrayLike) -> Array:
+        """Irradiance (..., 3) at unit normals (..., 3); a Lambertian point reflects albedo / pi of it."""
+        factors = cosine_coefficients(self.order)[bands(self.order)]
+        return basis(normals, self.order) @ (factors[:, None] * self.coefficients)
+
+    def rotate(self, rotation: ArrayLike) -> SHLighting:
+        """The lighting turned by a rotation R (3, 3): what came from d comes from R d."""
+        return SHLighting(rotation_matrix(rotation, self.order) @ self.coefficients)
+
+    def window(self, kind: str = "hann", width: float | None = None) -> SHLighting:
+        """The lighting with its high bands faded, see ``window``; damps ringing around small bright lights."""
+        return SHLighting(window(kind, self.order, width)[bands(self.order), None] * self.coefficients)
+
+    def truncate(self, order: int) -> SHLighting:
+        """The first bands only, or zeros appended up to a higher order."""
+        check_order(order)
+        out = np.zeros((order * order, 3))
+        keep = min(order, self.order) ** 2
+        out[:keep] = self.coefficients[:keep]
+        return SHLighting(out)
+
+    def dominant_direction(self) -> Array:
+        """(3,) unit direction towards the brightest side, from the linear band (Sloan 2008).
+
+        Lighting without a linear band has none; then it is (0, 0, 1).
+        """
+        if self.order < 2:
+            return np.array([0.0, 0.0, 1.0])
+        linear = self.coefficients[1:4] @ LUMINANCE
+        d = np.array([-linear[2], -linear[0], linear[1]])
+        length = np.linalg.norm(d)
+        if length <= 1e-12 * max(float(np.abs(self.coefficients[0]).max()), 1e-300):
+            return np.array([0.0, 0.0, 1.0])
+        return d / length
+
+    def linear_light(self) -> tuple[Array, Array, Array]:
+        """Replace the lighting by one directional light and a constant surrounding (Sloan 2008).
+
+        Returns
+        -------
+        direction : (3,)
+            The dominant direction.
+        intensity : (3,)
+            Irradiance of the light on a surface that faces it.
+        ambient : (3,)
+            Constant radiance from everywhere; both minimise the squared error of irradiance over all normals.
+        """
+        direction = self.dominant_direction()
+        factors = cosine_coefficients(self.order)[bands(self.order)]
+        light = factors * basis(direction, self.order)
+        constant = np.zeros_like(light)
+        constant[0] = factors[0] * math.sqrt(4.0 * math.pi)
+        columns = np.stack([light, constant], axis=1)
+        solution = np.linalg.lstsq(columns, factors[:, None] * self.coefficients, rcond=None)[0]
+        return direction, solution[0], solution[1]
+
+    def to_latlong(self, height: int = 128, width: int = 256) -> Array:
+        """Radiance as a lat-long image (H, W, 3)."""
+        return self.evaluate(latlong_directions(height, width))

@@ -1,0 +1,501 @@
+"""The optimisation of stage 3: normals per texel against images, tied to their neighbours.
+
+    E(x) = sum_images sum_texels w rho(|I - L(n(x))|) + w1 |Laplacian (n(x) - n0)|_1 + w2 |n(x) - n0 - aim|^2
+
+over the tangent-plane offsets x of `core.bend`, by Gauss-Newton or by Adam. Shading is that of `render.shading`;
+derivatives are Dr.Jit's: forward mode for the two unknowns of a texel, reverse mode for Adam. All arrays stay with
+Dr.Jit between iterations; the host reads one number per iteration, the energy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.estimate import ReflectanceEstimate
+from mifit.errors import InputError
+from mifit.progress import Progress, silent
+from mifit.render import shading
+
+Shade = Callable[[Any, Any, int], Any]
+"""Normals, view directions (Dr.Jit vectors), number of the view -> radiance (Color3f) of the texels."""
+
+L1_FLOOR = 1e-4
+"""Radians below which the L1 norm is rounded off: sqrt(c^2 + floor^2); its reweighting stays finite."""
+FACING = 0.05
+"""Smallest cosine between a refined normal and the direction to a camera that measures it."""
+
+
+@dataclass(frozen=True)
+class NormalView:
+    """What one image says about N texels.
+
+    Attributes
+    ----------
+    colour : (N, 3)
+        Linear image colour.
+    weight : (N,)
+        Weight of the squared residual; 0 where the image doesn't measure the texel.
+    direction : (N, 3)
+        Unit vectors towards the camera.
+    normal : (N, 3), tangents : (N, 2, 3)
+        Base normals and tangents when the image was taken, world space.
+    """
+
+    colour: NDArray
+    weight: NDArray
+    direction: NDArray
+    normal: NDArray
+    tangents: NDArray
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Offsets (N, 2), how the solver ended, and energies per term before and after each iteration."""
+
+    offsets: NDArray
+    converged: bool
+    energies: dict[str, list[float]] = field(default_factory=dict)
+
+    @property
+    def energy(self) -> float:
+        """Total at the end."""
+        return sum(values[-1] for values in self.energies.values())
+
+
+class NormalProblem:
+    """Normal refinement of N texels.
+
+    Parameters
+    ----------
+    normals : (N, 3), tangents : (N, 2, 3)
+        Base normals and tangents in which corrections are smoothed and measured.
+    neighbours : (N, 4)
+        `core.bend.texel_neighbours`.
+    views : sequence of NormalView
+    shade : callable
+        Shading of the texels' material.
+    laplacian_weight, magnitude_weight : float
+        w1, w2, for images in linear 0..1 and unit normals.
+    huber : float
+        Residual length from which the penalty grows linearly; infinite for plain least squares.
+    aim : (N, 3), optional
+        Correction that the magnitude term pulls to; zero by default.
+    """
+
+    def __init__(
+        self,
+        normals: NDArray,
+        tangents: NDArray,
+        neighbours: NDArray,
+        views: Sequence[NormalView],
+        shade: Shade,
+        laplacian_weight: float,
+        magnitude_weight: float,
+        huber: float = float("inf"),
+        aim: NDArray | None = None,
+    ) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        self._count = len(normals)
+        self._base = _frame(normals, tangents)
+        self._near = [mi.UInt32(np.ascontiguousarray(neighbours[:, i], dtype=np.uint32)) for i in range(4)]
+        self._degree = sum(dr.select(n != dr.arange(mi.UInt32, self._count), mi.Float(1), 0) for n in self._near)
+        self._views = [
+            (
+                _vector(mi.Color3f, v.colour),
+                mi.Float(np.ascontiguousarray(v.weight, dtype=np.float32)),
+                _vector(mi.Vector3f, v.direction),
+                _frame(v.normal, v.tangents),
+            )
+            for v in views
+        ]
+        self._shade = shade
+        self._w1, self._w2, self._huber = float(laplacian_weight), float(magnitude_weight), float(huber)
+        self._aim = _vector(mi.Vector3f, np.zeros((self._count, 3)) if aim is None else aim)
+        dr.eval(self._degree, self._aim)
+
+    def energies(self, offsets: NDArray) -> dict[str, float]:
+        """Energy per term at offsets (N, 2)."""
+        return self._totals(*self._load(offsets))
+
+    def normals(self, offsets: NDArray, view: int) -> NDArray[np.float32]:
+        """(N, 3) refined normals in the frame of one view, world space."""
+        return np.array(_bend(self._views[view][3], *self._load(offsets))).T
+
+    def gauss_newton(
+        self,
+        max_iterations: int = 20,
+        tolerance: float = 1e-3,
+        start: NDArray | None = None,
+        progress: Progress = silent,
+    ) -> Refined:
+        """Minimise by Gauss-Newton with 2 x 2 blocks per texel.
+
+        The L1 norm is replaced by its quadratic majorant at the current point (iteratively reweighted least squares);
+        the joint system is solved by conjugate gradients with block-diagonal preconditioning. A step that raises the
+        energy is taken back and damped (Levenberg-Marquardt). Ends when the energy falls by less than ``tolerance``,
+        relative.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        a, b = self._load(start)
+        terms = self._totals(a, b)
+        history = {name: [value] for name, value in terms.items()}
+        system = self._linearize(a, b)
+        damping, converged = 0.0, False
+        for iteration in range(max_iterations):
+            step = self._step(a, b, system, mi.Float(damping))
+            trial = self._facing(a + step[0], b + step[1])
+            dr.eval(trial)
+            found = self._totals(*trial)
+            before, after = sum(terms.values()), sum(found.values())
+            progress("normals", iteration + 1, max_iterations)
+            if not after <= before:  # also catches NaN
+                damping = max(4.0 * damping, 1e-2)
+                if damping > 1e5:
+                    break
+                continue
+            damping = 0.25 * damping if damping > 1e-3 else 0.0
+            (a, b), terms = trial, found
+            for name, value in terms.items():
+                history[name].append(value)
+            if before - after <= tolerance * before:
+                converged = True
+                break
+            system = self._linearize(a, b)
+        progress("normals", max_iterations, max_iterations)
+        return Refined(_store(a, b), converged, history)
+
+    def adam(
+        self, iterations: int = 100, step: float = 0.01, start: NDArray | None = None, progress: Progress = silent
+    ) -> Refined:
+        """Minimise by Adam with learning rate ``step`` (radians): the paper's solver, on the same energy."""
+        import drjit as dr
+        import mitsuba as mi
+
+        a, b = self._load(start)
+        optimizer = mi.ad.Adam(lr=step, params={"a": a, "b": b})
+        totals = []
+        for iteration in range(iterations):
+            energies = self._terms(optimizer["a"], optimizer["b"])
+            total = dr.sum(sum(energies.values()))
+            dr.backward(total)
+            totals.append(total)
+            optimizer.step()
+            dr.eval(total, optimizer["a"], optimizer["b"])
+            progress("normals (adam)", iteration + 1, iterations)
+        a, b = self._facing(dr.detach(optimizer["a"]), dr.detach(optimizer["b"]))
+        found = self._totals(a, b)
+        history = {"total": [float(t[0]) for t in totals] + [sum(found.values())]}
+        return Refined(_store(a, b), True, history)
+
+    # Energy ---------------------------------------------------------------------------------------------------------
+
+    def _terms(self, a: Any, b: Any) -> dict[str, Any]:
+        """Energy per term and texel."""
+        import drjit as dr
+        import mitsuba as mi
+
+        data = dr.zeros(mi.Float, self._count)
+        for k, (colour, weight, direction, frame) in enumerate(self._views):
+            residual = colour - self._shade(_bend(frame, a, b), direction, k)
+            square = dr.squared_norm(residual)
+            if self._huber < float("inf"):
+                length = dr.sqrt(dr.maximum(square, 1e-14))
+                square = dr.select(length <= self._huber, square, self._huber * (2 * length - self._huber))
+            data += dr.select(weight > 0, weight * square, 0)
+        delta = _bend(self._base, a, b) - self._base[0]
+        rough = dr.zeros(mi.Float, self._count)
+        if self._w1 > 0:
+            curvature = self._laplacian(delta)
+            rough = self._w1 * dr.sum(dr.sqrt(dr.square(curvature) + L1_FLOOR**2))
+        return {"data": data, "laplacian": rough, "magnitude": self._w2 * dr.squared_norm(delta - self._aim)}
+
+    def _totals(self, a: Any, b: Any) -> dict[str, float]:
+        import drjit as dr
+
+        terms = self._terms(a, b)
+        dr.eval(terms)
+        # Summed in double precision: millions of small terms, compared to a relative 1e-3 and less.
+        return {name: float(np.array(value, dtype=np.float64).sum()) for name, value in terms.items()}
+
+    def _laplacian(self, field_: Any) -> Any:
+        """Graph Laplacian (degree minus adjacency) of a vector per texel; symmetric."""
+        import drjit as dr
+
+        out = 4.0 * field_
+        for index in self._near:
+            out -= dr.gather(type(field_), field_, index)
+        return out
+
+    # Gauss-Newton ---------------------------------------------------------------------------------------------------
+
+    def _linearize(self, a: Any, b: Any) -> tuple[Any, ...]:
+        """Gradient (2) and Gauss-Newton Hessian (aa, ab, bb) of the data term, per texel."""
+        import drjit as dr
+        import mitsuba as mi
+
+        out = [dr.zeros(mi.Float, self._count) for _ in range(5)]
+        for k, (colour, weight, direction, frame) in enumerate(self._views):
+            columns = []
+            for i in range(2):
+                x = [mi.Float(a), mi.Float(b)]
+                dr.enable_grad(x[i])
+                shading = self._shade(_bend(frame, *x), direction, k)
+                dr.set_grad(x[i], 1.0)
+                dr.enqueue(dr.ADMode.Forward, x[i])
+                dr.traverse(dr.ADMode.Forward)
+                columns.append(mi.Color3f(dr.grad(shading)))
+            residual = colour - dr.detach(shading)
+            scale = 2.0 * weight
+            if self._huber < float("inf"):
+                scale *= dr.minimum(1.0, self._huber / dr.maximum(dr.norm(residual), 1e-7))
+            seen = weight > 0
+            for i, value in enumerate(
+                (
+                    -dr.dot(columns[0], residual),
+                    -dr.dot(columns[1], residual),
+                    dr.dot(columns[0], columns[0]),
+                    dr.dot(columns[0], columns[1]),
+                    dr.dot(columns[1], columns[1]),
+                )
+            ):
+                out[i] += dr.select(seen, scale * value, 0)
+        dr.eval(out)
+        return tuple(out)
+
+    def _step(self, a: Any, b: Any, system: tuple[Any, ...], damping: Any) -> tuple[Any, Any]:
+        """Solve the linearised, majorised problem for a step of the offsets."""
+        import drjit as dr
+
+        ga, gb, haa, hab, hbb = system
+        delta = _bend(self._base, a, b) - self._base[0]
+        ja, jb = _bend_jacobian(self._base, a, b)
+        # d/dx of w2 |delta - aim|^2
+        pull = 2.0 * self._w2 * (delta - self._aim)
+        irls = None
+        if self._w1 > 0:
+            # w |c| <= w / 2 (c^2 / |c0| + |c0|): the majorant's Hessian is w / |c0|.
+            curvature = self._laplacian(delta)
+            irls = self._w1 * dr.rsqrt(dr.square(curvature) + L1_FLOOR**2)
+            tension = irls * curvature
+            dr.eval(irls, tension)
+            pull += self._laplacian(tension)
+        ra, rb = -(ga + dr.dot(ja, pull)), -(gb + dr.dot(jb, pull))
+        block = [
+            haa + 2.0 * self._w2 * dr.dot(ja, ja),
+            hab + 2.0 * self._w2 * dr.dot(ja, jb),
+            hbb + 2.0 * self._w2 * dr.dot(jb, jb),
+        ]
+        lift = damping * (block[0] + block[2]) + 1e-12
+        block[0] += lift
+        block[2] += lift
+        if irls is None:
+            step = _solve(block, ra, rb)
+            dr.eval(step)
+            return step
+        diagonal = dr.square(self._degree) * irls
+        for index in self._near:
+            # Texels without a neighbour point to themselves; their share is already in the degree.
+            other = dr.gather(type(irls), irls, index)
+            diagonal += dr.select(index != dr.arange(type(index), self._count), other, 0)
+        preconditioner = [
+            block[0] + dr.dot(ja, diagonal * ja),
+            block[1] + dr.dot(ja, diagonal * jb),
+            block[2] + dr.dot(jb, diagonal * jb),
+        ]
+        dr.eval(ra, rb, block, preconditioner, ja, jb)
+
+        def apply(sa: Any, sb: Any) -> tuple[Any, Any]:
+            moved = ja * sa + jb * sb
+            dr.eval(moved)
+            tension = irls * self._laplacian(moved)
+            dr.eval(tension)
+            smooth = self._laplacian(tension)
+            return (
+                block[0] * sa + block[1] * sb + dr.dot(ja, smooth),
+                block[1] * sa + block[2] * sb + dr.dot(jb, smooth),
+            )
+
+        return _conjugate_gradients(apply, (ra, rb), lambda r: _solve(preconditioner, *r))
+
+    def _facing(self, a: Any, b: Any) -> tuple[Any, Any]:
+        """Shrink offsets until the normals face every camera that measures the texel; drop what doesn't help."""
+        import drjit as dr
+
+        finite = dr.isfinite(a) & dr.isfinite(b)
+        a, b = dr.select(finite, a, 0), dr.select(finite, b, 0)
+        for attempt in range(4):
+            good = a * a + b * b < 4.0  # half the chart: a right angle
+            for _, weight, direction, frame in self._views:
+                good &= (weight <= 0) | (dr.dot(_bend(frame, a, b), direction) >= FACING)
+            factor = dr.select(good, 1.0, 0.5 if attempt < 3 else 0.0)
+            a, b = a * factor, b * factor
+        return a, b
+
+    def _load(self, offsets: NDArray | None) -> tuple[Any, Any]:
+        import drjit as dr
+        import mitsuba as mi
+
+        if offsets is None:
+            return dr.zeros(mi.Float, self._count), dr.zeros(mi.Float, self._count)
+        return tuple(mi.Float(np.ascontiguousarray(offsets[:, i], dtype=np.float32)) for i in range(2))  # type: ignore[return-value]
+
+
+def material_shade(
+    reflectance: ReflectanceEstimate,
+    diffuse: NDArray,
+    specular: NDArray,
+    views: Sequence[NormalView],
+    traced: Sequence[NDArray] | None = None,
+) -> Shade:
+    """Shading of texels by the model that stage 2 estimated them with.
+
+    Parameters
+    ----------
+    reflectance : ReflectanceEstimate
+        Lighting, exponent and shading model; its maps aren't used.
+    diffuse : (N, 3), specular : (N,)
+        Albedos of the texels.
+    views : sequence of NormalView
+    traced : sequence of (N, B*B), optional
+        Per view the shadowed diffuse transfer at the base normal, for the ``shadowed`` model.
+
+    Notes
+    -----
+    Shadows are traced for the base normal. For a bent one the unshadowed change is added, dimmed by the part of the
+    light that reaches the point, and the lobe keeps its dimming.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    albedo = _vector(mi.Color3f, diffuse)
+    gloss = mi.Float(np.ascontiguousarray(specular, dtype=np.float32))
+    coefficients = [mi.Color3f(*map(float, row)) for row in reflectance.radiance]
+    ambient = mi.Float(float(reflectance.ambient))
+    dr.make_opaque(coefficients, ambient)
+    order = round(len(coefficients) ** 0.5)
+    model = reflectance.shading_model
+    exponent: Any = float(reflectance.exponent)
+    if model != "paper":
+        exponent = shading.lobe(exponent, order)
+    shadows: list[tuple[Any, Any, Any]] = []
+    if model == "shadowed":
+        if traced is None:
+            raise InputError("shading model 'shadowed': found no transfer vectors, expected those of trace_transfer")
+        for view, rows in zip(views, traced, strict=True):
+            columns = [mi.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in np.asarray(rows).T]
+            lit = shading.radiance(columns, coefficients)
+            n, v = _vector(mi.Vector3f, view.normal), _vector(mi.Vector3f, view.direction)
+            open_sky = shading.radiance(shading.diffuse_transfer(n, order), coefficients)
+            open_light = dr.maximum(mi.luminance(open_sky), 1e-6)
+            passed = dr.clip(mi.luminance(lit) / open_light, 0.0, 1.0)
+            axis, _ = shading.lobe_axis(n, v, exponent)
+            glint = shading.unoccluded(n, axis, columns, order)
+            base = lit - passed * open_sky
+            dr.eval(base, passed, glint)
+            shadows.append((base, passed, glint))
+
+    def shade(n: Any, v: Any, view: int) -> Any:
+        if model != "shadowed":
+            body, glint = shading.shade(n, v, coefficients, exponent, model)
+            return ambient + albedo * body + gloss * glint
+        base, passed, dimmed = shadows[view]
+        body, glint = shading.shade(n, v, coefficients, exponent, "prefiltered")
+        return ambient + albedo * (base + passed * body) + gloss * dimmed * glint
+
+    return shade
+
+
+def residual_scale(views: Sequence[NormalView], shade: Shade) -> float:
+    """Robust standard deviation of the residual's length at the base normals: 1.48 times the median."""
+    import mitsuba as mi
+
+    lengths = []
+    for k, view in enumerate(views):
+        shown = shade(_vector(mi.Vector3f, view.normal), _vector(mi.Vector3f, view.direction), k)
+        residual = view.colour - np.array(mi.Color3f(shown)).T
+        lengths.append(np.linalg.norm(residual, axis=1)[np.asarray(view.weight) > 0])
+    every = np.concatenate(lengths) if lengths else np.zeros(0)
+    return 1.48 * float(np.median(every)) if len(every) else 0.0
+
+
+def _conjugate_gradients(
+    apply: Callable[..., tuple[Any, Any]],
+    right: tuple[Any, Any],
+    precondition: Callable[[tuple[Any, Any]], tuple[Any, Any]],
+    tolerance: float = 0.03,
+    max_iterations: int = 60,
+    check: int = 4,
+) -> tuple[Any, Any]:
+    """Preconditioned conjugate gradients to a relative residual, which the host reads every ``check`` iterations."""
+    import drjit as dr
+
+    def inner(p: tuple[Any, Any], q: tuple[Any, Any]) -> Any:
+        return dr.sum(p[0] * q[0] + p[1] * q[1])
+
+    x = (dr.zeros(type(right[0]), len(right[0])), dr.zeros(type(right[0]), len(right[0])))
+    r, z = right, precondition(right)
+    p, rz = z, inner(right, z)
+    dr.eval(p, rz)
+    goal = tolerance**2 * float(rz[0])
+    for iteration in range(max_iterations):
+        q = apply(*p)
+        alpha = rz / dr.maximum(inner(p, q), 1e-30)
+        x = (x[0] + alpha * p[0], x[1] + alpha * p[1])
+        r = (r[0] - alpha * q[0], r[1] - alpha * q[1])
+        z = precondition(r)
+        before, rz = rz, inner(r, z)
+        beta = rz / dr.maximum(before, 1e-30)
+        p = (z[0] + beta * p[0], z[1] + beta * p[1])
+        dr.eval(x, r, p, rz)
+        if iteration % check == check - 1 and float(rz[0]) <= goal:
+            break
+    return x
+
+
+def _solve(block: Sequence[Any], ra: Any, rb: Any) -> tuple[Any, Any]:
+    """Solve symmetric 2 x 2 systems (aa, ab, bb)."""
+    import drjit as dr
+
+    scale = 1.0 / dr.maximum(block[0] * block[2] - block[1] * block[1], 1e-30)
+    return (block[2] * ra - block[1] * rb) * scale, (block[0] * rb - block[1] * ra) * scale
+
+
+def _bend(frame: tuple[Any, Any, Any], a: Any, b: Any) -> Any:
+    """The chart of `core.bend.bend`."""
+    n, t1, t2 = frame
+    p, q = 0.5 * a, 0.5 * b
+    square = p * p + q * q
+    return (t1 * (2.0 * p) + t2 * (2.0 * q) + n * (1.0 - square)) / (1.0 + square)
+
+
+def _bend_jacobian(frame: tuple[Any, Any, Any], a: Any, b: Any) -> tuple[Any, Any]:
+    """Derivatives of `_bend` by a and b."""
+    n, t1, t2 = frame
+    p, q = 0.5 * a, 0.5 * b
+    scale = 1.0 / (1.0 + p * p + q * q)
+    total = n + _bend(frame, a, b)
+    return (t1 - total * p) * scale, (t2 - total * q) * scale
+
+
+def _frame(normals: NDArray, tangents: NDArray) -> tuple[Any, Any, Any]:
+    import mitsuba as mi
+
+    return tuple(_vector(mi.Vector3f, v) for v in (normals, tangents[:, 0], tangents[:, 1]))  # type: ignore[return-value]
+
+
+def _store(a: Any, b: Any) -> NDArray[np.float64]:
+    return np.stack([np.array(a, dtype=np.float64), np.array(b, dtype=np.float64)], axis=1)
+
+
+def _vector(kind: Any, values: NDArray) -> Any:
+    """(N, 3) array -> Dr.Jit vector."""
+    return kind(np.ascontiguousarray(np.asarray(values, dtype=np.float32).T))
