@@ -75,8 +75,10 @@ def compress(columns: NDArray[np.float32], count: int) -> NDArray[np.float32]:
         Orthogonal modes, each as long as its standard deviation, longest first; the sign of each is fixed by
         its largest entry.
     """
-    gram = (columns.T @ columns).astype(np.float64)
-    vectors = np.linalg.eigh(gram)[1][:, ::-1][:, :count]
-    modes = columns @ vectors.astype(np.float32)
+    modes = columns
+    for sample in (columns[:: max(1, len(columns) // 30_000)], None):  # find the subspace fast, then its exact axes
+        rows = modes if sample is None else sample
+        vectors = np.linalg.eigh((rows.T @ rows).astype(np.float64))[1][:, ::-1][:, :count]
+        modes = modes @ vectors.astype(np.float32)
     peak = np.abs(modes).argmax(0)
     return modes * np.where(modes[peak, np.arange(modes.shape[1])] < 0, -1.0, 1.0).astype(np.float32)

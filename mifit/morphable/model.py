@@ -281,7 +281,7 @@ class MorphableModel:
         InputError
             The file is missing, damaged or of no known kind; the message says what was found.
         """
-        from mifit.morphable.formats import load_model
+        from mifit.morphable.recognise import load_model
 
         return load_model(path)
 

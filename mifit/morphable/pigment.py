@@ -22,7 +22,7 @@ MELANIN = np.array([1.0, 1.2, 1.4])
 HAEMOGLOBIN = np.array([0.12, 1.0, 0.72])
 """Absorption of the two pigments in the three channels, per unit of log reflectance."""
 
-_WHOLE_FACE = {"melanin": 0.27, "haemoglobin": 0.13}
+_WHOLE_FACE = {"melanin": 0.27, "haemoglobin": 0.085}
 _FIELDS = ((35.0, 40, 0.07, 0.08), (14.0, 110, 0.045, 0.05))
 """Correlation length in mm, inducing points, deviation of melanin, deviation of haemoglobin."""
 
@@ -105,7 +105,7 @@ def region_masks(points: NDArray, landmarks: NDArray) -> dict[str, NDArray[np.fl
     brows = np.zeros(len(points))
     for first in (17, 22):
         brow = p[first : first + 5] - (0.0, 1.5 * eye, 0.0)  # detectors mark the brow's upper edge
-        brows = np.maximum(brows, np.exp(-0.5 * (_polyline_distance(points, brow) / (3.2 * eye)) ** 4))
+        brows = np.maximum(brows, np.exp(-0.5 * (_polyline_distance(points, brow) / (2.9 * eye)) ** 4))
     masks["brows"] = brows
 
     masks["cheeks"] = np.maximum(

@@ -1,0 +1,5 @@
+"""The built-in head: a procedural template, its modes, and their cache."""
+
+from mifit.morphable.builtin.cache import builtin_model
+
+__all__ = ["builtin_model"]

@@ -1,0 +1,60 @@
+"""Where the built-in model is kept once it is made: in memory, and in the user's cache folder."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from functools import cache
+from pathlib import Path
+
+from mifit.errors import InputError
+from mifit.morphable.builtin.head import make_head
+from mifit.morphable.formats.own import load_own
+from mifit.morphable.model import MorphableModel
+
+
+@cache
+def builtin_model(coarse: bool = False) -> MorphableModel:
+    """Return the built-in model, made now, read from the cache folder, or still in memory.
+
+    Parameters
+    ----------
+    coarse : bool
+        About 8 000 instead of 31 000 vertices.
+    """
+    path = cache_folder() / f"builtin-{'coarse' if coarse else 'full'}-{source_digest()}.npz"
+    if path.is_file():
+        try:
+            return load_own(path)
+        except InputError:
+            pass  # damaged: make it anew and replace it
+    model = make_head(coarse)
+    try:
+        for stale in path.parent.glob(f"{path.name.rsplit('-', 1)[0]}-*.npz"):
+            stale.unlink(missing_ok=True)
+        model.save(path)
+    except (OSError, InputError):
+        pass  # a cache that can't be written only costs time
+    return model
+
+
+def cache_folder() -> Path:
+    """``$XDG_CACHE_HOME/mifit``, or ``~/.cache/mifit``."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    try:
+        return Path(base) / "mifit" if base else Path.home() / ".cache" / "mifit"
+    except RuntimeError:  # no home folder
+        return Path(os.devnull) / "mifit"
+
+
+@cache
+def source_digest() -> str:
+    """Digest of the code that makes the model: a cached file is valid for this code only."""
+    here = Path(__file__).parent
+    files = sorted(
+        [*here.glob("*.py"), *(here.parent / f for f in ("gaussian_process.py", "pigment.py", "topology.py"))]
+    )
+    h = hashlib.blake2b(digest_size=8)
+    for file in files:
+        h.update(file.read_bytes())
+    return h.hexdigest()

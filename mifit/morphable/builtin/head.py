@@ -1,0 +1,61 @@
+"""The built-in model put together: template, identity, expressions and albedo, in centimetres."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.morphable.builtin.expressions import expression_modes
+from mifit.morphable.builtin.identity import identity_modes
+from mifit.morphable.builtin.landmarks import landmark_vertices
+from mifit.morphable.builtin.template import EYEBALL, POUCH, SKIN, Template, make_template
+from mifit.morphable.model import MorphableModel
+from mifit.morphable.pigment import skin_model
+
+N_IDENTITY, N_ALBEDO = 100, 100
+_PLACE = np.array([0.0, 34.0, 10.0])  # object-space position of the template's origin in mm
+_SCLERA, _IRIS, _PUPIL, _POUCH = (0.62, 0.58, 0.54), (0.09, 0.055, 0.03), (0.01, 0.01, 0.01), (0.12, 0.03, 0.025)
+
+
+def make_head(coarse: bool = False) -> MorphableModel:
+    """Compute the built-in model: about 31 000 vertices, or 8 000 when ``coarse``; takes seconds."""
+    t = make_template(2 if coarse else 1)
+    landmarks = landmark_vertices(t)
+    mask = face_area(t)
+    identity = identity_modes(t, N_IDENTITY)
+    expression, names, bounds = expression_modes(t)
+    mean_albedo, albedo_modes = skin_model(t.vertices, t.faces[mask], landmarks, 1.0, N_ALBEDO)
+    ball = t.part == EYEBALL
+    mean_albedo[ball] = _SCLERA
+    mean_albedo[ball & (t.eye_angle < np.radians(28.5))] = _IRIS
+    mean_albedo[ball & (t.eye_angle < np.radians(10.5))] = _PUPIL
+    mean_albedo[t.part == POUCH] = _POUCH
+    albedo_modes[t.part != SKIN] = 0.0
+    return MorphableModel(
+        name="builtin:coarse" if coarse else "builtin",
+        mean=0.1 * (t.vertices + _PLACE),
+        faces=t.faces,
+        identity=np.float32(0.1) * identity,
+        expression=np.float32(0.1) * expression,
+        mean_albedo=mean_albedo,
+        albedo_modes=albedo_modes,
+        uv=t.uv,
+        faces_uv=t.faces_uv,
+        landmarks=landmarks,
+        face_mask=mask,
+        symmetry=t.symmetry,
+        unit_mm=10.0,
+        expression_names=names,
+        expression_bounds=bounds,
+    )
+
+
+def face_area(t: Template) -> NDArray[np.bool_]:
+    """(F,) faces from the hairline to under the jaw and to the ears, without the insides of lids and lips."""
+    v = t.vertices
+    inside = (v[:, 1] < 76.0) & (v[:, 1] > -120.0) & (v[:, 2] > 8.0 - 0.25 * np.maximum(v[:, 1], 0.0))
+    out = (t.face_part == SKIN) & inside[t.faces].all(1)
+    hidden = np.zeros(len(v), dtype=bool)
+    for margin in (t.upper_lids, t.lower_lids, t.upper_lip, t.lower_lip):
+        hidden[margin] = True
+    return out & ~hidden[t.faces].any(1)

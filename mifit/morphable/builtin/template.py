@@ -1,0 +1,300 @@
+"""The template mesh of the built-in head: a grid around the head with slits for eyes and mouth.
+
+Rows run from the crown to the neck, columns around the head from the nose's midline. Along the slits vertices
+are double, so lids and lips can part. A pouch behind the lips and two eyeballs close the openings; they belong
+to no face area.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.morphable.builtin import sculpt
+
+SKIN, POUCH, EYEBALL = 0, 1, 2
+_POUCH_LINES = 7
+_EYE_RINGS = np.radians([0, 5, 9, 12, 16, 20, 24, 27, 29.5, 32, 38, 46, 56, 66, 80])
+_EYE_SEGMENTS = 28
+_CHART_FLOOR = 0.04
+"""Height of the strip at the bottom of the UV square that holds eyeballs and pouch."""
+
+
+@dataclass(frozen=True)
+class Template:
+    """Vertices in mm with their place on the grid.
+
+    Attributes
+    ----------
+    vertices : (V, 3) float64
+    faces : (F, 3) int32
+    uv : (T, 2) float32
+    faces_uv : (F, 3) int32
+    symmetry : (V,) int32
+    grid : (R, N) int32
+        Vertex of each row and column; columns run from the back's midline through x < 0 to the front and on.
+        Along slits it holds the upper vertices.
+    upper_lids, lower_lids : (2, K) int32
+        Vertices on either side of the slits of the eyes at x < 0 and x > 0, corners left out.
+    upper_lip, lower_lip : (L,) int32
+        The same for the mouth.
+    part, face_part : (V,) and (F,) uint8
+        SKIN, POUCH or EYEBALL.
+    eye_row, mouth_row : int
+        Rows of the slits.
+    eye_angle : (V,) float64
+        On eyeballs the angle from the optical axis in radians; 0 elsewhere.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    uv: NDArray[np.float32]
+    faces_uv: NDArray[np.int32]
+    symmetry: NDArray[np.int32]
+    grid: NDArray[np.int32]
+    upper_lids: NDArray[np.int32]
+    lower_lids: NDArray[np.int32]
+    upper_lip: NDArray[np.int32]
+    lower_lip: NDArray[np.int32]
+    part: NDArray[np.uint8]
+    face_part: NDArray[np.uint8]
+    eye_row: int
+    mouth_row: int
+    eye_angle: NDArray[np.float64]
+
+
+def make_template(step: int = 1) -> Template:
+    """Build the head; ``step`` 2 keeps every second row and column."""
+    upper, lower, eye_row, mouth_row, corners = _half_surfaces()
+    upper, lower = upper[::step, ::step], lower[::step, ::step]
+    eye_row, mouth_row = eye_row // step, mouth_row // step
+    inner, outer, corner = (c // step for c in corners)
+    rows, half = upper.shape[0], upper.shape[1] - 1
+    n = 2 * half
+
+    # the grid: column k holds angle index |k - half|, column 0 is the back's midline
+    index = np.abs(np.arange(n) - half)
+    side = np.where(np.arange(n) < half, -1.0, 1.0)[:, None]
+    side[[0, half]] = 1.0
+    vertices = upper[:, index] * np.concatenate([side, np.ones((n, 2))], axis=1)
+    vertices[:, [0, half], 0] = 0.0
+    grid = np.arange(rows * n).reshape(rows, n)
+
+    def mirrored(k: NDArray) -> NDArray:
+        return (n - k) % n
+
+    lid_columns = np.stack([half - np.arange(inner + 1, outer), half + np.arange(inner + 1, outer)])
+    lip_columns = np.arange(half - corner + 1, half + corner)
+    copies, copy_of = [], []
+    below = grid.copy()  # what the faces under a slit use
+    count = grid.size
+    for row, columns in ((eye_row, lid_columns[0]), (eye_row, lid_columns[1]), (mouth_row, lip_columns)):
+        below[row, columns] = count + np.arange(len(columns))
+        points = lower[row, index[columns]] * np.concatenate([side[columns], np.ones((len(columns), 2))], axis=1)
+        copies.append(points)
+        copy_of.append(below[row, columns])
+        count += len(columns)
+    copies[2][:, 0][lip_columns == half] = 0.0
+
+    symmetry = [grid[:, mirrored(np.arange(n))].ravel(), copy_of[1], copy_of[0], copy_of[2][::-1]]
+    faces, faces_uv, uv = _grid_faces(grid, below)
+    parts = [np.full(count, SKIN)]
+    points = [vertices.reshape(-1, 3), *copies]
+    face_parts = [np.full(len(faces[0]) + len(faces[1]), SKIN)]
+    angles = [np.zeros(count)]
+
+    # crown
+    pole = count
+    top = grid[0]
+    faces.append(np.stack([np.full(n, pole), top, np.roll(top, -1)], axis=1))
+    faces_uv.append(np.stack([len(uv) + np.arange(n), np.arange(n), np.arange(1, n + 1)], axis=1))
+    uv = np.concatenate([uv, np.stack([(np.arange(n) + 0.5) / n, np.full(n, 1.0)], axis=1)])
+    points.append(np.array([[0.0, vertices[0, 0, 1] + 0.4, vertices[0, [0, half], 2].mean()]]))
+    symmetry.append(np.array([pole]))
+    parts.append(np.array([SKIN]))
+    angles.append(np.zeros(1))
+    face_parts.append(np.full(n, SKIN))
+    count += 1
+
+    # the pouch behind the lips: lines of vertices between the upper and the lower lip
+    a, b = grid[mouth_row, lip_columns], copy_of[2]
+    lines = [a, *(count + np.arange(_POUCH_LINES * len(a)).reshape(_POUCH_LINES, len(a))), b]
+    t = np.arange(1, _POUCH_LINES + 1)[:, None] / (_POUCH_LINES + 1)
+    across = 1 - (np.abs(lip_columns - half) / corner)[None] ** 2
+    pa, pb = vertices[mouth_row, lip_columns], copies[2]
+    pouch = pa[None] + (pb - pa)[None] * t[..., None]
+    pouch[..., 1] += 5.0 * np.sqrt(across) * np.sin(2 * np.pi * t)
+    pouch[..., 2] -= 14.0 * across * np.sin(np.pi * t)
+    pouch[..., 0] *= 1 - 0.12 * np.sin(np.pi * t)
+    points.append(pouch.reshape(-1, 3))
+    symmetry.append(np.concatenate([line[::-1] for line in lines[1:-1]]))
+    parts.append(np.full(pouch[..., 0].size, POUCH))
+    angles.append(np.zeros(pouch[..., 0].size))
+    count += pouch[..., 0].size
+    ends = (grid[mouth_row, half - corner], grid[mouth_row, half + corner])
+    quads = np.stack([np.r_[ends[0], line, ends[1]] for line in lines])
+    local = np.arange(quads.size).reshape(quads.shape)
+    tri, tri_local = _quads(quads), _quads(local)
+    keep = (tri[:, 0] != tri[:, 1]) & (tri[:, 1] != tri[:, 2]) & (tri[:, 2] != tri[:, 0])
+    faces.append(tri[keep])
+    faces_uv.append(tri_local[keep] + len(uv))
+    s = np.stack(np.meshgrid(np.linspace(0.3, 0.7, quads.shape[1]), np.linspace(0.9, 0.1, len(quads))), -1)
+    uv = np.concatenate([uv, s.reshape(-1, 2) * (1, _CHART_FLOOR)])
+    face_parts.append(np.full(keep.sum(), POUCH))
+
+    # eyeballs
+    ball, ball_faces, ball_angle = _eyeball(_EYE_RINGS[::step] if step > 1 else _EYE_RINGS, _EYE_SEGMENTS // step)
+    flat = ball[:, :2] / np.abs(ball[:, :2]).max()
+    flip = _eyeball_mirror(len(ball), _EYE_SEGMENTS // step)
+    for k, sign in enumerate((-1.0, 1.0)):
+        here = ball if sign > 0 else ball[flip] * (-1, 1, 1)
+        points.append(here + sculpt.EYE * (sign, 1, 1))
+        faces.append(ball_faces + count)
+        faces_uv.append(ball_faces + len(uv))
+        centre = (0.5 + sign * 0.4, 0.5 * _CHART_FLOOR)
+        uv = np.concatenate([uv, flat * 0.45 * _CHART_FLOOR + centre])
+        symmetry.append(flip + count + (len(ball) if k == 0 else -len(ball)))
+        parts.append(np.full(len(ball), EYEBALL))
+        angles.append(ball_angle)
+        face_parts.append(np.full(len(ball_faces), EYEBALL))
+        count += len(ball)
+
+    return Template(
+        vertices=np.concatenate(points),
+        faces=np.concatenate(faces).astype(np.int32),
+        uv=uv.astype(np.float32),
+        faces_uv=np.concatenate(faces_uv).astype(np.int32),
+        symmetry=np.concatenate(symmetry).astype(np.int32),
+        grid=grid.astype(np.int32),
+        upper_lids=grid[eye_row, lid_columns].astype(np.int32),
+        upper_lip=grid[mouth_row, lip_columns].astype(np.int32),
+        lower_lids=np.stack(copy_of[:2]).astype(np.int32),
+        lower_lip=copy_of[2].astype(np.int32),
+        part=np.concatenate(parts).astype(np.uint8),
+        face_part=np.concatenate(face_parts).astype(np.uint8),
+        eye_row=eye_row,
+        mouth_row=mouth_row,
+        eye_angle=np.concatenate(angles),
+    )
+
+
+def _half_surfaces() -> tuple[NDArray, NDArray, int, int, tuple[int, int, int]]:
+    """Points (rows, angles, 3) of the half at x >= 0, above and below the slits, and where the slits are."""
+    rows, angles, eye_row, mouth_row = sculpt.grid_lines()
+    corners = sculpt.opening_columns(angles, rows, eye_row, mouth_row)
+    angle, position = np.meshgrid(angles, rows)
+    plain = sculpt.loft(angle, position)
+    row = np.arange(len(rows))[:, None]
+    out = []
+    for above in (True, False):
+        over_eye = row <= eye_row if above else row < eye_row
+        over_mouth = row <= mouth_row if above else row < mouth_row
+        warped = sculpt.loft(angle, _warp(plain, position, eye_row, mouth_row, corners, over_eye))
+        points = sculpt.lips(sculpt.lids(sculpt.features(warped), np.broadcast_to(over_eye, angle.shape)), over_mouth)
+        out.append(sculpt.ears(_roll(points, eye_row, mouth_row, corners, over_eye, over_mouth)))
+    return out[0], out[1], eye_row, mouth_row, corners
+
+
+def _warp(
+    plain: NDArray, position: NDArray, eye_row: int, mouth_row: int, corners: tuple[int, int, int], over: NDArray
+) -> NDArray:
+    """Slide grid rows along the loft so that the slits lie on the lids' margins and on the mouth's line."""
+    x, y = plain[..., 0], plain[..., 1]
+    columns = x.shape[1]
+    front = np.arange(columns) < columns // 2
+    upper, lower = sculpt.lid_curves(x[eye_row])
+    inner, outer, _ = corners
+    beyond = np.maximum(x[eye_row, inner] - x[eye_row], x[eye_row] - x[eye_row, outer])
+    fade = front * (1 - sculpt.smooth_step(beyond, 0.0, 14.0))
+    height = np.where(over, upper, lower) - y[eye_row]
+    y_new = y + fade * height * np.clip(1 - np.abs(y - y[eye_row]) / 18.0, 0, 1) ** 2
+    fade = front * (1 - sculpt.smooth_step(x[mouth_row] - sculpt.MOUTH_HALF, 0.0, 14.0))
+    height = sculpt.mouth_line(x[mouth_row]) - y[mouth_row]
+    y_new += fade * height * np.clip(1 - np.abs(y - y[mouth_row]) / 22.0, 0, 1) ** 2
+    out = position.copy()
+    span = slice(eye_row - 40, mouth_row + 24)
+    for k in np.flatnonzero(front):
+        out[span, k] = np.interp(-y_new[span, k], -y[span, k], position[span, k])
+    return out
+
+
+def _roll(
+    points: NDArray,
+    eye_row: int,
+    mouth_row: int,
+    corners: tuple[int, int, int],
+    over_eye: NDArray,
+    over_mouth: NDArray,
+) -> NDArray:
+    """Turn the margins of lids and lips inwards, which gives them thickness."""
+    inner, outer, corner = corners
+    rows, columns = points.shape[:2]
+    row, column = np.arange(rows)[:, None], np.arange(columns)
+    at_eye = (column > inner) & (column < outer)
+    at_mouth = column < corner
+    out = points.copy()
+    x = np.abs(points[..., 0])
+    middle = np.sin(np.pi * np.clip((column - inner) / (outer - inner), 0, 1)) ** 0.5
+    for depth, distance in ((2.2, 0), (0.4, 1)):
+        here = at_eye & (np.abs(row - eye_row) == distance)
+        out[..., 2] -= np.where(here, depth * middle, 0.0)
+    taper = np.clip(1 - (x / sculpt.MOUTH_HALF) ** 2, 0, 1) ** 0.5
+    for depth, distance in ((6.0, 0), (2.2, 1), (0.5, 2)):
+        here = at_mouth & (np.abs(row - mouth_row) == distance)
+        out[..., 2] -= np.where(here, depth * taper, 0.0)
+    gap = np.where(at_mouth & (row == mouth_row), 0.15 * taper, 0.0)
+    out[..., 1] += np.where(over_mouth, gap, -gap)
+    return out
+
+
+def _quads(grid: NDArray) -> NDArray:
+    """Triangles of a grid of vertex indices; rows downwards and columns to the viewer's right face the viewer."""
+    a, b, c, d = (q.ravel() for q in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
+    return np.concatenate([np.stack([a, d, c], axis=1), np.stack([a, c, b], axis=1)])
+
+
+def _grid_faces(grid: NDArray, below: NDArray) -> tuple[list[NDArray], list[NDArray], NDArray]:
+    """Faces of the skin grid, split mirror-symmetrically, with texture indices and texture vertices."""
+    rows, n = grid.shape
+    wrap = np.arange(n + 1) % n
+    texture = np.arange(rows * (n + 1)).reshape(rows, n + 1)
+    faces: list[NDArray] = []
+    faces_uv: list[NDArray] = []
+    for flip in (False, True):
+        part = slice(n // 2, n + 1) if flip else slice(0, n // 2 + 1)
+        top, bottom = below[:, wrap][:-1, part], grid[:, wrap][1:, part]
+        tt, tb = texture[:-1, part], texture[1:, part]
+        for store, (u, w) in ((faces, (top, bottom)), (faces_uv, (tt, tb))):
+            a, b, c, d = (q.ravel() for q in (u[:, :-1], u[:, 1:], w[:, 1:], w[:, :-1]))
+            if flip:
+                store.append(np.concatenate([np.stack([a, d, b], axis=1), np.stack([d, c, b], axis=1)]))
+            else:
+                store.append(np.concatenate([np.stack([a, d, c], axis=1), np.stack([a, c, b], axis=1)]))
+    v = _CHART_FLOOR + 0.005 + (1 - _CHART_FLOOR - 0.01) * (1 - np.arange(rows) / (rows - 1))
+    u = np.arange(n + 1) / n
+    return faces, faces_uv, np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+
+
+def _eyeball(rings: NDArray, segments: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Vertices, faces and angles from the axis of the front of the eyeball at x > 0, around the origin."""
+    turn = 2 * np.pi * np.arange(segments) / segments
+    angle = np.concatenate([[0.0], np.repeat(rings[1:], segments)])
+    around = np.concatenate([[0.0], np.tile(turn, len(rings) - 1)])
+    r = sculpt.EYE_RADIUS
+    p = np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], axis=1) * r
+    stretch = np.where(p[:, 0] < 0, 0.28, 0.10)  # reach the eye's corners; the inner one is farther
+    p[:, 0] *= 1.0 + stretch * sculpt.smooth_step(angle, np.radians(32.0), np.radians(60.0))
+    k = 1 + np.arange((len(rings) - 1) * segments).reshape(-1, segments)
+    following = np.roll(k, -1, axis=1)
+    fan = np.stack([np.zeros(segments, dtype=int), k[0], following[0]], axis=1)
+    a, b, c, d = k[:-1].ravel(), k[1:].ravel(), following[1:].ravel(), following[:-1].ravel()
+    return p, np.concatenate([fan, np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]), angle
+
+
+def _eyeball_mirror(count: int, segments: int) -> NDArray:
+    """Index of each eyeball vertex's image under x -> -x within the other eyeball."""
+    k = np.arange(count - 1)
+    around = (segments // 2 - k % segments) % segments
+    return np.concatenate([[0], 1 + k // segments * segments + around])
