@@ -81,7 +81,7 @@ def rasterize_uv(uv: NDArray, faces_uv: NDArray, size: int, face_mask: NDArray |
     with np.errstate(divide="ignore", invalid="ignore"):
         w1 = ((px - a[:, 0]) * (c[:, 1] - a[:, 1]) - (py - a[:, 1]) * (c[:, 0] - a[:, 0])) / area
         w2 = ((b[:, 0] - a[:, 0]) * (py - a[:, 1]) - (b[:, 1] - a[:, 1]) * (px - a[:, 0])) / area
-    w = np.stack([1.0 - w1 - w2, w1, w2], axis=1)
+        w = np.stack([1.0 - w1 - w2, w1, w2], axis=1)  # degenerate faces give NaN or infinity, refused below
     inside = (w >= -1e-9).all(1) & np.isfinite(w).all(1)
     flat, first = np.unique((y * size + x)[inside], return_index=True)
     return TexelMap(

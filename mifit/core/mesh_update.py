@@ -1,0 +1,214 @@
+"""Vertex positions from positions and normals by sparse least squares.
+
+After Nehab, Rusinkiewicz, Davis, Ramamoorthi, "Efficiently combining positions and normals for precise 3D geometry",
+2005: positions are trusted for the coarse shape, normals for the detail. Minimised over the free vertices p is
+
+    sum_faces sum_edges w_e |(p_i - p_j) - P_f (p_i - p_j)|^2 + position_weight * sum_i a_i |p_i - q_i|^2
+
+with P_f the projection onto the plane across the wanted normal of face f, w_e the cotangent weights of a reference
+mesh, q the positions that are trusted and a_i the vertices' areas. Solving it with P_f (p_i - p_j) held from the last
+iterate leaves one matrix for x, y and z that knows the reference mesh only, not the normals: it is factorised once and
+serves all iterations, timesteps and expressions of a model. (Nehab's own form couples x, y, z and needs a new
+factorisation for every set of normals.)
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spl
+from numpy.typing import NDArray
+
+from mifit.core.mesh import face_cross, normalize
+from mifit.core.uv import TexelMap
+
+MIN_COTANGENT = 0.05
+"""Cotangent weights below are raised: obtuse and degenerate triangles would make the system indefinite."""
+
+
+class MeshUpdater:
+    """Moves the free vertices of a mesh so that its faces take wanted normals.
+
+    Parameters
+    ----------
+    vertices : (V, 3), faces : (F, 3)
+        Reference mesh, e.g. a model's mean shape; only its edge weights are used.
+    free : (V,) bool
+        Vertices that may move; all others, such as those at the boundary of the face area, stay.
+    position_weight : float
+        Trust in positions relative to normals, per unit of length: detail much smaller than
+        ``1 / sqrt(position_weight)`` comes from the normals, larger shape from the positions.
+    """
+
+    def __init__(self, vertices: NDArray, faces: NDArray, free: NDArray[np.bool_], position_weight: float) -> None:
+        self.faces = np.asarray(faces, dtype=np.int64)
+        self._count = len(vertices)
+        self.free = np.asarray(free, dtype=bool)
+        rest = np.asarray(vertices, dtype=np.float64)
+        self._corner_weight = _cotangents(rest, self.faces)
+        area = np.linalg.norm(face_cross(rest, self.faces), axis=1) / 6.0
+        self._anchor = position_weight * np.bincount(self.faces.ravel(), np.repeat(area, 3), minlength=self._count)
+        laplacian = self._stiffness()
+        matrix = (laplacian + sp.diags(self._anchor)).tocsr()[self.free]
+        self._fixed_part = matrix[:, ~self.free]
+        self._factor = spl.splu(matrix[:, self.free].tocsc()) if self.free.any() else None
+
+    def update(self, vertices: NDArray, normals: NDArray, iterations: int = 4) -> NDArray[np.float64]:
+        """New positions (V, 3) of a mesh with trusted positions (V, 3) and wanted unit face normals (F, 3).
+
+        Faces whose wanted normal is zero keep their own. No face turns by more than a right angle from where it was:
+        displacements that would do so are halved around it.
+        """
+        trusted = np.asarray(vertices, dtype=np.float64)
+        if self._factor is None:
+            return trusted.copy()
+        own = normalize(face_cross(trusted, self.faces))
+        silent = ~(np.linalg.norm(normals, axis=1) > 0.5)
+        wanted = np.where(silent[:, None], own, normals)
+        p = trusted.copy()
+        for _ in range(iterations):
+            right = self._divergence(p, wanted, own, silent) + self._anchor[:, None] * trusted
+            p[self.free] = self._factor.solve(right[self.free] - self._fixed_part @ trusted[~self.free])
+        return self._unfold(trusted, p, own)
+
+    def _stiffness(self) -> sp.csr_matrix:
+        """Cotangent Laplacian from the corner weights."""
+        f, w = self.faces, self._corner_weight
+        i = np.concatenate([f[:, (k + 1) % 3] for k in range(3)])
+        j = np.concatenate([f[:, (k + 2) % 3] for k in range(3)])
+        weight = w.T.ravel()
+        n = self._count
+        off = sp.csr_matrix((weight, (i, j)), shape=(n, n))
+        off = off + off.T
+        return (sp.diags(np.asarray(off.sum(1)).ravel()) - off).tocsr()
+
+    def _divergence(self, p: NDArray, wanted: NDArray, own: NDArray, silent: NDArray) -> NDArray:
+        """Right-hand side: weighted sums of every face's edges, projected to the wanted plane."""
+        out = np.zeros_like(p)
+        for k in range(3):
+            i, j = self.faces[:, (k + 1) % 3], self.faces[:, (k + 2) % 3]
+            edge = p[i] - p[j]
+            edge = edge - np.sum(edge * wanted, axis=1, keepdims=True) * wanted
+            edge *= self._corner_weight[:, k : k + 1]
+            for axis in range(3):
+                out[:, axis] += np.bincount(i, edge[:, axis], minlength=self._count)
+                out[:, axis] -= np.bincount(j, edge[:, axis], minlength=self._count)
+        return out
+
+    def _unfold(self, trusted: NDArray, p: NDArray, own: NDArray) -> NDArray:
+        """Halve the displacement of the vertices of folded faces until none is folded."""
+        shift = p - trusted
+        has_area = np.linalg.norm(own, axis=1) > 0
+        # Ends: from the eighth round on every round puts at least one more vertex back for good.
+        for attempt in itertools.count():
+            folded = np.sum(face_cross(trusted + shift, self.faces) * own, axis=1) <= 0
+            folded &= has_area & np.any(shift[self.faces] != 0, axis=(1, 2))
+            if not folded.any():
+                break
+            shift[np.unique(self.faces[folded])] *= 0.5 if attempt < 8 else 0.0
+        return trusted + shift
+
+
+def _cotangents(vertices: NDArray, faces: NDArray) -> NDArray:
+    """(F, 3) half cotangents of each corner, the weight of the opposite edge."""
+    out = np.empty((len(faces), 3))
+    for k in range(3):
+        a, b, c = (vertices[faces[:, (k + m) % 3]] for m in range(3))
+        u, v = b - a, c - a
+        area = np.linalg.norm(np.cross(u, v), axis=1)
+        out[:, k] = np.sum(u * v, axis=1) / np.maximum(area, 1e-12)
+    return 0.5 * np.clip(out, MIN_COTANGENT, 1.0 / MIN_COTANGENT)
+
+
+def face_average(texels: TexelMap, values: NDArray, n_faces: int) -> NDArray[np.float64]:
+    """Sums of per-texel vectors (N, 3) over the texels of each face, as unit vectors (F, 3); zero where none."""
+    total = np.stack([np.bincount(texels.face, values[:, i], minlength=n_faces) for i in range(3)], axis=1)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length > 1e-9, total / np.maximum(length, 1e-9), 0.0)
+
+
+def rotate_between(start: NDArray, end: NDArray, vectors: NDArray) -> NDArray[np.float64]:
+    """Vectors (N, 3) turned by the smallest rotation that takes unit vectors start to end (N, 3)."""
+    axis = np.cross(start, end)
+    cosine = np.sum(start * end, axis=1, keepdims=True)
+    along = np.sum(axis * vectors, axis=1, keepdims=True)
+    return vectors * cosine + np.cross(axis, vectors) + axis * along / np.maximum(1.0 + cosine, 1e-6)
+
+
+def wanted_face_normals(
+    vertices: NDArray, faces: NDArray, texels: TexelMap, base: NDArray, refined: NDArray
+) -> NDArray[np.float64]:
+    """Face normals that a refined normal map asks of a mesh.
+
+    The map's base is interpolated from vertex normals and so isn't the face's own normal; each face's normal is
+    turned by the rotation that takes the average base normal of its texels to the average refined one. A map equal
+    to its base asks for no change.
+
+    Parameters
+    ----------
+    vertices : (V, 3), faces : (F, 3)
+    texels : TexelMap
+    base, refined : (N, 3)
+        Unit normals per covered texel, in the space of the vertices.
+
+    Returns
+    -------
+    (F, 3), zero for faces without a texel.
+    """
+    own = normalize(face_cross(np.asarray(vertices, dtype=np.float64), faces))
+    before = face_average(texels, base, len(faces))
+    after = face_average(texels, refined, len(faces))
+    seen = (np.linalg.norm(before, axis=1) > 0.5) & (np.linalg.norm(after, axis=1) > 0.5)
+    return np.where(seen[:, None], normalize(rotate_between(before, after, own)), 0.0)
+
+
+@dataclass(frozen=True)
+class Subdivision:
+    """One step of midpoint subdivision.
+
+    Attributes
+    ----------
+    faces : (4F, 3) int64
+        Face f becomes faces 4f .. 4f + 3.
+    matrix : (V', V) sparse
+        Values at old vertices -> values at new ones; old vertices come first, unchanged.
+    """
+
+    faces: NDArray[np.int64]
+    matrix: sp.csr_matrix
+
+
+def subdivide(faces: NDArray, n_vertices: int) -> Subdivision:
+    """Split every face into four at the midpoints of its edges; works for positions and for texture vertices."""
+    f = np.asarray(faces, dtype=np.int64)
+    edges = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
+    unique, which = np.unique(edges, axis=0, return_inverse=True)
+    ab, bc, ca = n_vertices + which.reshape(3, len(f))
+    a, b, c = f.T
+    new = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
+    rows = np.repeat(np.arange(len(unique)), 2)
+    middle = sp.csr_matrix((np.full(2 * len(unique), 0.5), (rows, unique.ravel())), shape=(len(unique), n_vertices))
+    return Subdivision(new, sp.vstack([sp.identity(n_vertices), middle]).tocsr())
+
+
+def interior_vertices(faces: NDArray, face_mask: NDArray[np.bool_], n_vertices: int) -> NDArray[np.bool_]:
+    """(V,) vertices all of whose faces lie in the mask and none of whose edges has one face only."""
+    outside = np.zeros(n_vertices, dtype=bool)
+    outside[faces[~face_mask].ravel()] = True
+    used = np.zeros(n_vertices, dtype=bool)
+    used[faces[face_mask].ravel()] = True
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    border = np.zeros(n_vertices, dtype=bool)
+    border[unique[count == 1].ravel()] = True
+    return used & ~outside & ~border
+
+
+def displacement(texels: TexelMap, faces: NDArray, vertices: NDArray, moved: NDArray, normals: NDArray) -> NDArray:
+    """(N,) signed distance per covered texel from a mesh to its update, along unit normals (N, 3)."""
+    shift = np.asarray(moved, dtype=np.float64) - np.asarray(vertices, dtype=np.float64)
+    at = np.einsum("nk,nkc->nc", texels.weights, shift[faces[texels.face]])
+    return np.sum(at * normals, axis=1)
