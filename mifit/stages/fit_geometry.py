@@ -199,6 +199,8 @@ def _refine_and_pack(
         coefficients = np.concatenate([fixed.albedo, fixed.shading.ravel(), [fixed.ambient]])
     else:
         coefficients = _appearance(model, state, visibility, config, seed, journal)
+    for message in visibility.warnings:
+        journal.warn(message)
     return pack(model, state, coefficients, timesteps, visibility.world(state), journal, views, fixed)
 
 

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.capture import Capture
+from mifit.capture import Capture, Frame
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.morphable import MorphableModel
 from mifit.render.gbuffer import GBuffer, SurfaceScene
 from mifit.stages.geometry.consistency import TextureView
-from mifit.stages.geometry.images import level, texture_level
+from mifit.stages.geometry.images import DARKEST, level, texture_level
 from mifit.stages.geometry.points import PointBasis
 from mifit.stages.geometry.rendering import PixelView
 from mifit.stages.geometry.start import State, object_vertices
@@ -61,6 +61,7 @@ class Visibility:
         self.cameras: list[Camera] = [capture.camera(name) for name in cameras]
         self.timesteps = tuple(timesteps)
         self._scene: SurfaceScene | None = None
+        self.warnings: list[str] = []
 
     def world(self, state: State) -> NDArray[np.float64]:
         """(T, V, 3) world-space vertices."""
@@ -79,12 +80,18 @@ class Visibility:
             self._scene.update(vertices)
         return self._scene
 
-    def _usable(self, buffer: GBuffer, frame: object, border: int) -> NDArray[np.bool_]:
-        """Pixels on the model, not at its outline, measured and not clipped."""
+    def _usable(self, buffer: GBuffer, frame: Frame, border: int) -> NDArray[np.bool_]:
+        """Pixels on the model, not at its outline, measured, neither clipped nor black."""
         on = (buffer.face >= 0).astype(np.uint8)
         if border:
             on = cv2.erode(on, np.ones((2 * border + 1,) * 2, np.uint8), borderValue=0)
-        return (on > 0) & frame.valid & ~frame.clipped  # type: ignore[attr-defined]
+        return (on > 0) & frame.valid & ~frame.clipped & (frame.image.max(axis=2) > DARKEST)
+
+    def _warn_unusable(self, camera: Camera, step: int) -> None:
+        self.warnings.append(
+            f"camera {camera.name}, timestep {self.timesteps[step]}: no pixel of the face can be used (out of view, "
+            "masked, clipped or black); only landmarks count there"
+        )
 
     def textures(self, state: State, points: SurfacePoints, sigma: float, window: float) -> tuple[TextureView, ...]:
         """Log-texture of every image and the points it sees."""
@@ -102,7 +109,8 @@ class Visibility:
                 usable = self._usable(scene.gbuffer(camera), frame, 1)
                 cosine = (normalize(camera.position - position) * normal).sum(1)
                 seen = np.flatnonzero((cosine > GRAZING_COSINE) & scene.visible_from(position, camera.position))
-                if not len(seen):
+                if not len(seen) or not usable.any():
+                    self._warn_unusable(camera, step)
                     continue
                 pick = (3 * seen[:, None] + np.arange(3)).ravel()
                 basis = PointBasis(rows.mean[pick], rows.identity[pick], rows.expression[pick])
@@ -124,6 +132,7 @@ class Visibility:
                 if len(facial) > count:
                     facial = np.sort(rng.choice(facial, count, replace=False))
                 if not len(facial):
+                    self._warn_unusable(camera, step)
                     continue
                 image = level(frame.image, frame.valid, sigma)
                 out.append(

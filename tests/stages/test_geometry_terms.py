@@ -1,0 +1,286 @@
+"""Stage 1's terms on a small synthetic head in float64: analytic Jacobians against finite differences, and more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mifit.core.camera import Camera
+from mifit.core.sh import basis
+from mifit.stages.geometry.appearance import AppearanceProblem, fit_appearance
+from mifit.stages.geometry.consistency import ConsistencyProblem, TextureView
+from mifit.stages.geometry.images import SmoothImage, blur, texture_level
+from mifit.stages.geometry.initial import align, pose_candidates, reprojection, triangulate
+from mifit.stages.geometry.landmarks import LandmarkProblem, LandmarkTerm, LandmarkView
+from mifit.stages.geometry.parameters import Frames, Layout, exponential, left_jacobian, rotation_angle
+from mifit.stages.geometry.points import PointBasis
+from mifit.stages.geometry.rendering import PixelView, RenderingProblem
+
+
+def head(rng, n=9, identity=4, expression=3, albedo=2):
+    """A bumpy cap towards +z with random smooth modes; arrays are float64, which MorphableModel wouldn't keep."""
+    v, u = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n), indexing="ij")
+    mean = np.stack([7 * u, 9 * v, 8 - 4 * u**2 - 3 * v**2 + 0.5 * np.sin(4 * u) * np.cos(3 * v)], -1).reshape(-1, 3)
+    index = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (x.ravel() for x in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
+    faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
+
+    def modes(count, size):
+        wave = rng.normal(size=(count, 2)) * 2
+        phase = rng.uniform(0, 6, (count, 3))
+        uv = np.stack([u.ravel(), v.ravel()], 1) @ wave.T
+        return size * np.sin(uv[:, None, :] + phase.T[None])
+
+    return SimpleNamespace(
+        mean=mean,
+        faces=faces,
+        identity=modes(identity, 0.4),
+        expression=modes(expression, 0.3),
+        mean_albedo=np.full((n * n, 3), 0.4) + 0.1 * np.sin(mean / 3),
+        albedo_modes=modes(albedo, 0.05),
+    )
+
+
+def camera(name, degrees, size=96):
+    angle = np.radians(degrees)
+    rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    rotation = np.diag([1.0, -1.0, -1.0]) @ rotation
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ (rotation.T @ np.array([0, 0, -70.0]))
+    return Camera(name, size, size, 3.2 * size, 3.2 * size, size / 2, size / 2, pose)
+
+
+def smooth_image(rng, size=96, channels=3):
+    raw = rng.uniform(0.1, 0.6, (size, size, channels))
+    return SmoothImage(
+        blur(raw.astype(np.float32), np.ones((size, size)), 4.0).astype(np.float64), np.ones((size, size))
+    )
+
+
+def random_points(rng, model, count):
+    weights = rng.dirichlet(np.ones(3), count)
+    return rng.integers(0, len(model.faces), count), weights
+
+
+def basis_on(model, face, weights):
+    """PointBasis in float64 (the stage's own is float32)."""
+    corners = model.faces[face]
+
+    def at(values):
+        return np.einsum("nk,nkc...->nc...", weights, values[corners]).reshape(3 * len(face), *values.shape[2:])
+
+    return PointBasis(at(model.mean), at(model.identity), at(model.expression))
+
+
+@pytest.fixture
+def scene():
+    rng = np.random.default_rng(0)
+    model = head(rng)
+    layout = Layout(2, 4, 3, albedo=2, shading=27, ambient=1, log_scale=1)
+    rotation = np.stack([exponential(rng.normal(size=3) * 0.1) for _ in range(2)])
+    x = 0.3 * rng.normal(size=layout.size)
+    for k in range(2):
+        x[layout.at("rotation", k)] *= 0.3
+        x[layout.at("translation", k)] = rng.normal(size=3) * 0.5
+    x[layout.at("log_scale")] = 0.02
+    x[layout.at("ambient")] = 0.03
+    x[layout.at("shading").start] = 3.0
+    cameras = [camera("left", -20), camera("right", 20)]
+    return SimpleNamespace(rng=rng, model=model, layout=layout, frames=Frames(rotation, 1.0), x=x, cameras=cameras)
+
+
+def landmark_views(scene, count=12):
+    views = []
+    for step in range(2):
+        for cam in scene.cameras:
+            vertices = scene.rng.choice(len(scene.model.mean), count, replace=False)
+            face = np.array([np.flatnonzero(scene.model.faces == v)[0] for v in vertices])
+            corner = np.argmax(scene.model.faces[face // 3] == vertices[:, None], axis=1)
+            at_vertices = basis_on(scene.model, face // 3, np.eye(3)[corner])
+            pixels = scene.rng.uniform(30, 66, (count, 2))
+            views.append(LandmarkView(step, cam, np.arange(count), vertices, pixels, 0.7, at_vertices))
+    return tuple(views)
+
+
+def check_gradient(problem, x, tolerance, step=1e-6, columns=None):
+    """The system's gradient against central differences of the energy, relative to the largest entry."""
+    gradient = 2.0 * problem.linearize(x).gradient
+    columns = range(len(x)) if columns is None else columns
+    numeric = np.zeros(len(x))
+    for i in columns:
+        d = np.zeros(len(x))
+        d[i] = step
+        numeric[i] = (sum(problem.energies(x + d).values()) - sum(problem.energies(x - d).values())) / (2 * step)
+    columns = np.array(list(columns))
+    assert np.abs(numeric[columns]).min() > 0
+    np.testing.assert_allclose(
+        gradient[columns], numeric[columns], rtol=tolerance, atol=tolerance * np.abs(numeric).max() * 1e-2
+    )
+
+
+def test_left_jacobian_moves_the_rotation():
+    rng = np.random.default_rng(5)
+    for scale in (1e-7, 0.3, 2.0):
+        v, d = scale * rng.normal(size=3), 1e-6 * rng.normal(size=3)
+        np.testing.assert_allclose(exponential(v + d), exponential(left_jacobian(v) @ d) @ exponential(v), atol=1e-11)
+
+
+def test_spline_gradient_is_exact_and_reproduces_a_ramp():
+    rng = np.random.default_rng(1)
+    y, x = np.mgrid[0:20, 0:30] + 0.5
+    ramp = SmoothImage(np.stack([x, y, x + 2 * y], -1), np.ones((20, 30)))
+    pixels = rng.uniform(3, 17, (50, 2))
+    values, slope, inside = ramp.sample(pixels)
+    assert inside.all()
+    np.testing.assert_allclose(values[:, 0], pixels[:, 0], atol=1e-12)  # pixel centres at half-integers
+    np.testing.assert_allclose(values[:, 1], pixels[:, 1], atol=1e-12)
+    np.testing.assert_allclose(slope[:, 2], np.tile([1.0, 2.0], (50, 1)), atol=1e-12)
+    image = SmoothImage(rng.random((20, 30, 2)), np.ones((20, 30)))
+    _, slope, _ = image.sample(pixels)
+    for axis in range(2):
+        d = np.zeros(2)
+        d[axis] = 1e-6
+        numeric = (image.sample(pixels + d)[0] - image.sample(pixels - d)[0]) / 2e-6
+        np.testing.assert_allclose(slope[:, :, axis], numeric, rtol=1e-6, atol=1e-7)
+
+
+def test_samples_at_the_border_or_on_invalid_pixels_are_refused():
+    valid = np.ones((20, 30))
+    valid[10, 12] = 0
+    image = SmoothImage(np.ones((20, 30, 1)), valid)
+    pixels = np.array([[15.0, 5.0], [0.6, 5.0], [29.5, 5.0], [-5.0, 3.0], [np.nan, 2.0], [12.5, 10.5], [40.0, 50.0]])
+    assert image.sample(pixels)[2].tolist() == [True, False, False, False, False, False, False]
+
+
+def test_texture_ignores_exposure_and_smooth_shading():
+    rng = np.random.default_rng(2)
+    paint = np.exp(0.3 * rng.normal(size=(80, 80, 3))).astype(np.float32)
+    y, x = np.mgrid[0:80, 0:80]
+    light = np.exp(0.01 * x - 0.006 * y)[..., None]
+    valid = np.ones((80, 80), bool)
+    plain, lit = (texture_level(i.astype(np.float32), valid, 1.0, 5.0).values for i in (paint, 2.5 * paint * light))
+    inner = (slice(20, 60), slice(20, 60))
+    assert np.abs(plain[inner] - lit[inner]).max() < 0.01 < 0.05 < plain[inner].std()
+
+
+def test_landmark_jacobian(scene):
+    layout = replace(scene.layout, albedo=0, shading=0, ambient=0)
+    x = np.concatenate([scene.x[scene.layout.at("identity")], scene.x[scene.layout.at("log_scale")]])
+    x = np.concatenate([x, *(scene.x[scene.layout.local(k)] for k in range(2))])
+    problem = LandmarkProblem(layout, scene.frames, LandmarkTerm(landmark_views(scene), 30.0), 0.5, 0.8)
+    check_gradient(problem, x, 1e-6)
+
+
+def test_rendering_jacobian(scene):
+    """Projection through the image's gradient, normals through the one-ring, albedo, lighting, ambient, pose, scale."""
+    views = []
+    for step in range(2):
+        for cam in scene.cameras:
+            face, weights = random_points(scene.rng, scene.model, 60)
+            views.append(PixelView(step, cam, smooth_image(scene.rng), face, weights))
+    priors = {"identity": 0.3, "albedo": 0.2, "expression": 0.4, "ambient": 10.0}
+    problem = RenderingProblem(
+        scene.model, scene.layout, scene.frames, tuple(views), LandmarkTerm(landmark_views(scene), 50.0), 200.0, priors
+    )
+    check_gradient(problem, scene.x, 1e-4)
+
+
+def test_rendering_normals_matter(scene):
+    """With a constant image the data term reaches the shape only through the normals; its gradient must not vanish."""
+    face, weights = random_points(scene.rng, scene.model, 60)
+    flat = SmoothImage(np.full((96, 96, 3), 0.3), np.ones((96, 96)))
+    view = PixelView(0, scene.cameras[0], flat, face, weights)
+    problem = RenderingProblem(
+        scene.model, scene.layout, scene.frames, (view,), LandmarkTerm((), np.inf), np.inf, {"ambient": 1.0}
+    )
+    shape = [*range(*scene.layout.at("identity").indices(99)), *range(*scene.layout.at("expression", 0).indices(99))]
+    check_gradient(problem, scene.x, 1e-4, columns=shape)
+
+
+def test_consistency_jacobian(scene):
+    """Variable projection: the gradient is that of the energy with the free values at their best."""
+    layout = replace(scene.layout, albedo=0, shading=0, ambient=0, log_scale=0)
+    x = np.concatenate([scene.x[scene.layout.at("identity")], *(scene.x[scene.layout.local(k)] for k in range(2))])
+    face, weights = random_points(scene.rng, scene.model, 80)
+    views = []
+    for step in range(2):
+        for cam in scene.cameras:
+            seen = np.sort(scene.rng.choice(80, 60, replace=False))
+            points = basis_on(scene.model, face[seen], weights[seen])
+            views.append(TextureView(step, cam, smooth_image(scene.rng), seen, scene.rng.uniform(0.3, 1, 60), points))
+    problem = ConsistencyProblem(
+        layout, scene.frames, 80, tuple(views), 0.1, np.inf, 0.5, LandmarkTerm((), np.inf), 0.2, 0.3
+    )
+    check_gradient(problem, x, 1e-4)
+    # the elimination must equal explicit unknowns: a step with the values free is the step of the full system
+    known = (scene.rng.uniform(0.1, 0.6, (80, 3)), scene.rng.uniform(0.2, 1.0, 80))
+    check_gradient(replace(problem, known=known), x, 1e-4)
+
+
+def test_elimination_equals_explicit_values(scene):
+    """H after elimination is the Schur complement of the system that keeps every point's value."""
+    layout = Layout(1, 4, 3)
+    x = 0.1 * scene.rng.normal(size=layout.size)
+    face, weights = random_points(scene.rng, scene.model, 10)
+    views = tuple(
+        TextureView(0, cam, smooth_image(scene.rng), np.arange(10), np.ones(10), basis_on(scene.model, face, weights))
+        for cam in scene.cameras
+    )
+    problem = ConsistencyProblem(
+        layout, scene.frames, 10, views, 1.0, np.inf, 1.0, LandmarkTerm((), np.inf), 1e-3, 1e-3
+    )
+    rows = []
+    for i in range(layout.size):
+        d = np.zeros(layout.size)
+        d[i] = 1e-6
+        up, down = (np.stack([o[2] for o in problem._observe(x + s * d, False)]) for s in (1, -1))
+        rows.append((up - down) / 2e-6)
+    jacobian = np.stack(rows, -1)  # (views, points, channels, n)
+    centred = (jacobian - jacobian.mean(0)).reshape(-1, layout.size)
+    prior = np.zeros(layout.size)
+    prior[:7] = 1e-3
+    np.testing.assert_allclose(problem.linearize(x).hessian, centred.T @ centred + np.diag(prior), rtol=1e-4, atol=1e-6)
+
+
+def test_appearance_recovers_albedo_and_lighting():
+    rng = np.random.default_rng(3)
+    n, modes = 2000, rng.normal(size=(2000, 3, 5)).astype(np.float32) * 0.05
+    normals = rng.normal(size=(n, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    harmonics = basis(normals, 3).astype(np.float32)
+    shading = 0.3 * rng.normal(size=(9, 3))
+    shading[0] = 3.0
+    albedo, mean = rng.normal(size=5), rng.uniform(0.2, 0.6, (n, 3)).astype(np.float32)
+    observed = ((mean + modes @ albedo) * (harmonics @ shading) + 0.02).astype(np.float32)
+    observed[:100] = 1.0  # a highlight
+    problem = AppearanceProblem(mean, modes, harmonics, observed, np.full(n, 1.0 / n), 30.0, 1e-4)
+    solution = fit_appearance(problem, 50)
+    assert solution.usable
+    np.testing.assert_allclose(solution.value[:5], albedo, atol=0.02)
+    np.testing.assert_allclose(solution.value[5:-1].reshape(9, 3), shading, atol=0.02)
+    np.testing.assert_allclose(solution.value[-1], 0.02, atol=0.005)
+
+
+def test_triangulation_and_pose_are_exact_without_noise():
+    rng = np.random.default_rng(6)
+    points = rng.normal(size=(30, 3)) * [7, 9, 4]
+    rotation, translation = exponential(np.array([0.2, -0.7, 0.1])), np.array([1.0, 2.0, -3.0])
+    world = 0.1 * (10 * points) @ rotation.T + translation
+    cameras = [camera("left", -20, 480), camera("right", 20, 480)]
+    pixels = [cam.project(world) for cam in cameras]
+    pixels[0][:5] = np.nan
+    found = triangulate(cameras, pixels)
+    assert np.isnan(found[:5]).all()
+    np.testing.assert_allclose(found[5:], world[5:], atol=1e-8)
+    r, t = align(10 * points[5:], found[5:], 0.1)
+    np.testing.assert_allclose(r, rotation, atol=1e-9)
+    np.testing.assert_allclose(t, translation, atol=1e-8)
+    for cams, pix in ((cameras, pixels), (cameras[1:], pixels[1:])):
+        candidates = pose_candidates(cams, 10 * points, pix, 0.1)
+        error = [reprojection(cams, 10 * points, pix, 0.1, pose) for pose in candidates]
+        best = candidates[int(np.argmin(error))]
+        assert rotation_angle(best[0], rotation) < 1e-3 and np.abs(best[1] - translation).max() < 1e-3
