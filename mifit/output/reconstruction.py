@@ -53,6 +53,8 @@ class Reconstruction:
         known; then `load` wants the model given.
     warnings : tuple of str
         Things a person should know about the whole fit, in words.
+    environment : (H, W, 3) float32, optional
+        Lat-long radiance that `relight` put in place of the recovered lighting; path tracing uses it whole. Not saved.
     """
 
     model: MorphableModel = field(repr=False)
@@ -68,6 +70,7 @@ class Reconstruction:
     peak_memory: int = 0
     model_source: str = ""
     warnings: tuple[str, ...] = ()
+    environment: NDArray[np.float32] | None = field(default=None, repr=False)
 
     @property
     def timesteps(self) -> tuple[int, ...]:
@@ -192,3 +195,34 @@ class Reconstruction:
 
             return render_path(self, camera, timestep, method, samples or 64, seed)
         raise InputError(f"integrator: found {integrator!r}, expected 'local' or 'path'")
+
+    def relight(
+        self, environment: str | Path | NDArray, rotate: float = 0.0, exposure: float | None = None
+    ) -> Reconstruction:
+        """Put the face under another environment.
+
+        Parameters
+        ----------
+        environment : path or (H, W, 3) array
+            Lat-long linear radiance (``.hdr``, ``.exr``) in the axes of Mitsuba's ``envmap``: +y up, the middle column
+            towards +z.
+        rotate : float
+            Turns the environment about the vertical (+y) by degrees.
+        exposure : float, optional
+            Factor on its radiance. A capture doesn't tell how its exposure relates to that of an environment
+            file; by default the mean radiance stays that of the recovered lighting.
+
+        Returns
+        -------
+        Reconstruction
+            The same face; its `render` uses the environment's spherical harmonics (``local``), or all of it
+            (``path``). The ambient term grows with the mean radiance.
+
+        Raises
+        ------
+        InputError
+            No environment map, or a fit that ended before stage 2.
+        """
+        from mifit.output.relight import relit
+
+        return relit(self, environment, rotate, exposure)

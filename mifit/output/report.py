@@ -177,7 +177,6 @@ def _comparison(result: Reconstruction, capture: Capture, evaluation: dict[str, 
     )
     for entry in evaluation["per_timestep"][:SHOWN_TIMESTEPS]:
         found = compare(result, capture, camera, entry["timestep"], evaluation["region"])
-        parts.append(f"<h3>Timestep {found.timestep}</h3>" + _slider(found))
         maps = "".join(
             _figure(
                 jpeg_uri(heat_map(found.photograph, render, found.region)[bounding_box(found.region)]),
@@ -186,7 +185,8 @@ def _comparison(result: Reconstruction, capture: Capture, evaluation: dict[str, 
             )
             for m, render in found.renders.items()
         )
-        parts.append(f'<div class="grid">{maps}</div>')
+        body = f'{_slider(found)}<div class="grid">{maps}</div>'
+        parts.append(f'<h3>Timestep {found.timestep}</h3><div class="compare">{body}</div>')
     return "".join(parts)
 
 
@@ -204,12 +204,12 @@ def _slider(found: Comparison) -> str:
         f'<button type="button" value="{m}" aria-pressed="{str(m == methods[0]).lower()}">{NAMES[m]}</button>'
         for m in methods
     )
-    return f"""<div class="pair"><div><div class="slider" id="{name}">
+    return f"""<div><div class="slider" id="{name}">
 <img alt="photograph" src="{jpeg_uri(found.photograph[box], 90)}">{tops}<span class="bar"></span>
 <span class="tag" style="left:6px">Photograph</span>
 <span class="tag" data-name style="right:6px">{NAMES[methods[0]]}</span>
 <input type="range" min="0" max="100" value="50" aria-label="divider between photograph and render"></div>
-<div class="controls" data-choice="{name}">{buttons}</div></div></div>"""
+<div class="controls" data-choice="{name}">{buttons}</div></div>"""
 
 
 def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]) -> str:

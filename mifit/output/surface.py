@@ -47,6 +47,12 @@ def split_at_seams(model: MorphableModel) -> SplitMesh:
     return SplitMesh(pairs // n, model.uv[pairs % n].astype(np.float32), inverse.reshape(-1, 3).astype(np.int32))
 
 
+def part_of(mesh: SplitMesh, selected: NDArray[np.bool_]) -> SplitMesh:
+    """The selected faces (F,) of a split mesh, with the vertices that they use."""
+    kept, faces = np.unique(mesh.faces[selected].ravel(), return_inverse=True)
+    return SplitMesh(mesh.origin[kept], mesh.uv[kept], faces.reshape(-1, 3).astype(np.int32))
+
+
 @dataclass(frozen=True)
 class SurfaceMaps:
     """Maps of the face area, padded across seams; row 0 at v = 1.

@@ -13,7 +13,7 @@ from mifit.core.image import to_8_bit
 from mifit.core.mesh import vertex_normals
 from mifit.core.sh import bands, cosine_coefficients, lobe_coefficients
 from mifit.output.figures import jpeg_uri, png_uri
-from mifit.output.surface import split_at_seams, surface_maps
+from mifit.output.surface import part_of, split_at_seams, surface_maps
 
 if TYPE_CHECKING:
     from mifit.output.reconstruction import Reconstruction
@@ -33,24 +33,25 @@ def viewer_data(reconstruction: Reconstruction, timestep: int) -> str:
     rotation, translation, scale = geometry.rotation[i], geometry.translation[i], geometry.scale
     vertices = (geometry.vertices[i] - translation) @ rotation / scale
     mesh = split_at_seams(model)
-    # A vertex on the border of the face area needs two copies: one with maps, one without.
-    mapped = np.repeat(model.face_mask, 3)
-    corner, faces = np.unique(mesh.faces.ravel() * 2 + mapped, return_inverse=True)
-    split, has_maps = corner // 2, corner % 2
-    origin = mesh.origin[split]
+    # Two parts that share no vertex: with maps, and without.
+    parts = [part_of(mesh, model.face_mask), part_of(mesh, ~model.face_mask)]
+    origin = np.concatenate([p.origin for p in parts])
+    uv = np.concatenate([p.uv for p in parts])
+    has_maps = np.arange(len(origin)) < len(parts[0].origin)
+    faces = np.concatenate([parts[0].faces, parts[1].faces + len(parts[0].origin)])
     position = vertices[origin]
     normals = vertex_normals(vertices, model.faces)[origin]
     centre = (position.min(0) + position.max(0)) / 2
     radius = float(np.abs(position - centre).max())
     face_centre = vertices[np.unique(model.faces[model.face_mask])]
     colour = np.column_stack([to_8_bit(geometry.vertex_albedo[origin]), has_maps * 255]).astype(np.uint8)
-    wide = len(corner) > 65535
+    wide = len(origin) > 65535
     maps = surface_maps(reconstruction, timestep)
     peak = max(float(maps.specular.max()), 1e-3)
     data: dict[str, Any] = {
-        "vertices": len(corner),
+        "vertices": len(origin),
         "position": _base64(np.round((position - centre) / radius * 32767), "<i2"),
-        "uv": _base64(np.round(np.clip(mesh.uv[split], 0, 1) * 65535), "<u2"),
+        "uv": _base64(np.round(np.clip(uv, 0, 1) * 65535), "<u2"),
         "normal": _base64(np.round(normals * 127), "i1"),
         "colour": _base64(colour, "u1"),
         "index": _base64(faces, "<u4" if wide else "<u2"),

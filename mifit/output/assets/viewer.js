@@ -143,7 +143,7 @@
     if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
     gl.viewport(0, 0, width, height);
     gl.clearColor(0.15, 0.16, 0.18, 1); gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const field = 0.42, distance = data.radius * 3.1 / state.zoom;
+    const field = 0.42, distance = data.radius * 3.7 / state.zoom;
     const f = 1 / Math.tan(field / 2 * Math.max(1, height / width)), near = distance / 50, far = distance * 4;
     gl.uniformMatrix4fv(at("projection"), false, [
       f * height / width, 0, 0, 0, 0, f, 0, 0, 0, 0, (far + near) / (near - far), -1, 0, 0, 2 * far * near / (near - far), 0]);

@@ -1,0 +1,108 @@
+"""Geometry with its maps for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from mifit.core.files import replacing, write_text
+from mifit.core.image import encode_png, linear_to_srgb, to_8_bit, write_image
+from mifit.core.mesh import vertex_normals
+from mifit.errors import InputError
+from mifit.output.gltf import write_glb
+from mifit.output.ply import write_ply
+from mifit.output.surface import part_of, split_at_seams, surface_maps, tangent_space_map
+
+if TYPE_CHECKING:
+    from mifit.output.reconstruction import Reconstruction
+
+Format = Literal["glb", "obj", "ply", "mitsuba"]
+SUFFIXES = {"glb": ".glb", "obj": ".obj", "ply": ".ply", "mitsuba": ".xml"}
+
+
+def export(reconstruction: Reconstruction, format: Format, path: str | Path, timestep: int | None = None) -> None:
+    """Write one timestep for another program.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+    format : {"glb", "obj", "ply", "mitsuba"}
+        ``glb``: binary glTF (`write_glb`). ``obj``: mesh in world space, ``.mtl`` and maps beside it. ``ply``: mesh
+        in world space with UVs, normals and vertex colours. ``mitsuba``: a scene with mifit's plugins and, as
+        ``NAME_stock.xml``, one for plain Mitsuba, with their files in ``NAME_files``.
+    path : path
+        File to write; its suffix must be the format's.
+    timestep : int, optional
+        Default: the first that was fitted.
+
+    Raises
+    ------
+    InputError
+        Unknown format, another suffix, or a timestep that was not fitted.
+    """
+    path = Path(path)
+    if format not in SUFFIXES:
+        raise InputError(f"format: found {format!r}, expected one of {', '.join(SUFFIXES)}")
+    if path.suffix.lower() != SUFFIXES[format]:
+        raise InputError(f"{path}: found suffix {path.suffix!r}, expected {SUFFIXES[format]!r} for format {format}")
+    timestep = reconstruction.timesteps[0] if timestep is None else timestep
+    i = reconstruction.index(timestep)
+    if format == "glb":
+        write_glb(reconstruction, path, timestep)
+    elif format == "obj":
+        _write_obj(reconstruction, path, timestep)
+    elif format == "ply":
+        mesh = split_at_seams(reconstruction.model)
+        vertices = reconstruction.geometry.vertices[i]
+        normals = vertex_normals(vertices, reconstruction.model.faces)[mesh.origin]
+        albedo = reconstruction.geometry.vertex_albedo[mesh.origin]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_ply(path, vertices[mesh.origin], mesh.faces, normals, mesh.uv, albedo)
+    else:
+        from mifit.output.scene import write_scene
+
+        write_scene(reconstruction, path, timestep)
+
+
+def _write_obj(reconstruction: Reconstruction, path: Path, timestep: int) -> None:
+    """OBJ with ``vt`` and ``vn``; the face area and the rest are two groups with a material each."""
+    model, i = reconstruction.model, reconstruction.index(timestep)
+    vertices = reconstruction.geometry.vertices[i]
+    normals = vertex_normals(vertices, model.faces)
+    mesh = split_at_seams(model)
+    maps = surface_maps(reconstruction, timestep)
+    rotation = reconstruction.geometry.rotation[i]
+    bent = tangent_space_map(
+        maps.normal, (vertices @ rotation)[mesh.origin], (normals @ rotation)[mesh.origin], mesh, model.face_mask
+    )
+    stem = path.stem
+    write_image(path.with_name(f"{stem}_diffuse.png"), maps.diffuse)
+    write_image(path.with_name(f"{stem}_specular.png"), maps.specular)
+    with replacing(path.with_name(f"{stem}_normal.png")) as temporary:
+        temporary.write_bytes(encode_png(np.round(127.5 * (bent + 1)).astype(np.uint8)))
+    reflectance = reconstruction.reflectance
+    exponent = reflectance.exponent if reflectance else 1.0
+    rest = part_of(mesh, ~model.face_mask) if not model.face_mask.all() else None
+    grey = reconstruction.geometry.vertex_albedo[rest.origin].mean(0) if rest else np.full(3, 0.5)
+    colour = " ".join(f"{c:.5f}" for c in linear_to_srgb(np.clip(grey, 0, 1)))
+    write_text(
+        path.with_suffix(".mtl"),
+        f"newmtl skin\nillum 2\nKd 1 1 1\nKs 1 1 1\nNs {exponent:.6g}\n"
+        f"map_Kd {stem}_diffuse.png\nmap_Ks {stem}_specular.png\nnorm {stem}_normal.png\n\n"
+        f"newmtl rest\nillum 1\nKd {colour}\nKs 0 0 0\n",
+    )
+    codes = to_8_bit(reconstruction.geometry.vertex_albedo) / 255.0
+    lines = [f"# written by mifit; units {reconstruction.units}", f"mtllib {stem}.mtl"]
+    lines += [
+        f"v {x:.7g} {y:.7g} {z:.7g} {r:.4f} {g:.4f} {b:.4f}"
+        for (x, y, z), (r, g, b) in zip(vertices.tolist(), codes.tolist(), strict=True)
+    ]
+    lines += [f"vt {u:.7g} {v:.7g}" for u, v in model.uv.tolist()]
+    lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in normals.tolist()]
+    for name, selected in (("skin", model.face_mask), ("rest", ~model.face_mask)):
+        lines += [f"g {name}", f"usemtl {name}"]
+        for f, t in zip((model.faces[selected] + 1).tolist(), (model.faces_uv[selected] + 1).tolist(), strict=True):
+            lines.append("f " + " ".join(f"{a}/{b}/{a}" for a, b in zip(f, t, strict=True)))
+    write_text(path, "\n".join(lines) + "\n")

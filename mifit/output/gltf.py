@@ -1,0 +1,250 @@
+"""Binary glTF 2.0 of a reconstruction: maps, expressions as morph targets, cameras."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import mifit
+from mifit.core.blinn_phong import normalization
+from mifit.core.files import replacing
+from mifit.core.image import encode_png, linear_to_srgb, to_8_bit
+from mifit.core.mesh import vertex_normals
+from mifit.output.surface import (
+    SplitMesh,
+    part_of,
+    split_at_seams,
+    surface_maps,
+    tangent_space_map,
+    tangents,
+)
+
+if TYPE_CHECKING:
+    from mifit.core.camera import Camera
+    from mifit.output.reconstruction import Reconstruction
+
+_KINDS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
+_SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+DIELECTRIC_F0 = 0.04
+"""Reflectance at normal incidence of glTF's dielectric, which KHR_materials_specular scales."""
+
+
+class _Buffer:
+    """The binary chunk, and the views and accessors that describe it."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def view(self, data: bytes, target: int | None = None) -> int:
+        self.data += b"\0" * (-len(self.data) % 4)
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data)}
+        if target is not None:
+            view["target"] = target
+        self.data += data
+        self.views.append(view)
+        return len(self.views) - 1
+
+    def accessor(self, values: NDArray, kind: str, target: int | None = 34962, bounds: bool = False) -> int:
+        """Append an array (N,) or (N, C); returns the accessor's index."""
+        array = np.ascontiguousarray(values, dtype=kind)
+        entry: dict[str, Any] = {
+            "bufferView": self.view(array.tobytes(), target),
+            "componentType": _KINDS[array.dtype],
+            "count": len(array),
+            "type": _SHAPES[1 if array.ndim == 1 else array.shape[1]],
+        }
+        if bounds:
+            entry |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
+        self.accessors.append(entry)
+        return len(self.accessors) - 1
+
+
+def write_glb(reconstruction: Reconstruction, path: str | Path, timestep: int | None = None) -> None:
+    """Write one timestep as a ``.glb`` file, whole or not at all.
+
+    The head is in metres, in object space, under a node that holds its pose; the fitted cameras stand beside it.
+    The face area has the maps: base colour, tangent-space normals, and the specular albedo through
+    KHR_materials_specular. glTF has GGX lobes, so the Blinn-Phong exponent m becomes alpha = sqrt(2 / (m + 2)), the
+    usual relation, and roughness = sqrt(alpha). The other faces have vertex colours. The model's expressions are
+    morph targets, with the timestep's coefficients as weights. Recovered lighting is in the scene's ``extras``:
+    glTF has no spherical harmonics.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+    path : path
+    timestep : int, optional
+        Default: the first that was fitted.
+    """
+    model, geometry = reconstruction.model, reconstruction.geometry
+    timestep = reconstruction.timesteps[0] if timestep is None else timestep
+    i = reconstruction.index(timestep)
+    metre = reconstruction.unit_mm / 1000.0
+    rotation, scale = geometry.rotation[i], float(geometry.scale)
+    posed = (geometry.vertices[i] - geometry.translation[i]) @ rotation * metre
+    normals = vertex_normals(posed, model.faces)
+    weights = np.asarray(geometry.expression[i], dtype=np.float64)
+    targets = model.expression * (scale * metre)
+    # Base plus weighted targets is the fitted shape, to rounding.
+    base = posed - targets @ weights if len(weights) else posed
+
+    out = _Buffer()
+    mesh = split_at_seams(model)
+    primitives = []
+    for material, selected in enumerate((model.face_mask, ~model.face_mask)):
+        if selected.any():
+            part = part_of(mesh, selected)
+            primitives.append(_primitive(out, part, base, normals, targets, material, geometry.vertex_albedo))
+    images, textures, skin = _skin(out, reconstruction, timestep, mesh, posed, normals)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, geometry.translation[i] * metre
+    nodes: list[dict[str, Any]] = [{"name": "head", "mesh": 0, "matrix": pose.T.ravel().tolist()}]
+    cameras = []
+    for camera in reconstruction.cameras:
+        nodes.append(_camera_node(camera, len(cameras), metre))
+        cameras.append(_camera(camera))
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": f"mifit {mifit.__version__}"},
+        "extensionsUsed": ["KHR_materials_specular"],
+        "scene": 0,
+        "scenes": [
+            {
+                "nodes": list(range(len(nodes))),
+                "extras": {
+                    "sh_radiance": reconstruction.lighting.coefficients.tolist(),
+                    "sh_convention": "real, Condon-Shortley phase, index l*l+l+m, world axes",
+                    "timestep": timestep,
+                },
+            }
+        ],
+        "nodes": nodes,
+        "meshes": [{"name": model.name, "primitives": primitives}],
+        "materials": [
+            skin,
+            {"name": "rest", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}},
+        ],
+        "textures": textures,
+        "images": images,
+        "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
+        "accessors": out.accessors,
+        "bufferViews": out.views,
+    }
+    if len(weights):
+        document["meshes"][0] |= {"weights": weights.tolist(), "extras": {"targetNames": list(model.expression_names)}}
+    if cameras:
+        document["cameras"] = cameras
+    document["buffers"] = [{"byteLength": len(out.data)}]
+    _write(Path(path), document, bytes(out.data))
+
+
+def _primitive(
+    out: _Buffer,
+    part: SplitMesh,
+    base: NDArray,
+    normals: NDArray,
+    targets: NDArray,
+    material: int,
+    albedo: NDArray,
+) -> dict[str, Any]:
+    """One primitive: with texture coordinates and tangents (material 0), or with vertex colours (material 1)."""
+    n = normals[part.origin]
+    attributes = {
+        "POSITION": out.accessor(base[part.origin], "<f4", bounds=True),
+        "NORMAL": out.accessor(n, "<f4"),
+    }
+    if material == 0:
+        tangent, sign = tangents(base[part.origin], n, part.uv, part.faces)
+        attributes["TANGENT"] = out.accessor(np.column_stack([tangent, sign]), "<f4")
+        attributes["TEXCOORD_0"] = out.accessor(part.uv * (1, -1) + (0, 1), "<f4")
+    else:
+        attributes["COLOR_0"] = out.accessor(np.clip(albedo[part.origin], 0, 1), "<f4")
+    primitive: dict[str, Any] = {
+        "attributes": attributes,
+        "indices": out.accessor(part.faces.ravel(), "<u4", target=34963),
+        "material": material,
+    }
+    if targets.shape[2]:
+        primitive["targets"] = [
+            {"POSITION": out.accessor(targets[part.origin, :, k], "<f4", bounds=True)} for k in range(targets.shape[2])
+        ]
+    return primitive
+
+
+def _skin(
+    out: _Buffer, reconstruction: Reconstruction, timestep: int, mesh: SplitMesh, vertices: NDArray, normals: NDArray
+) -> tuple[list[dict], list[dict], dict[str, Any]]:
+    """Images, textures and material of the face area."""
+    maps = surface_maps(reconstruction, timestep)
+    bent = tangent_space_map(
+        maps.normal, vertices[mesh.origin], normals[mesh.origin], mesh, reconstruction.model.face_mask
+    )
+    peak = max(float(maps.specular.max()), 1e-6)
+    reflectance = reconstruction.reflectance
+    exponent = reflectance.exponent if reflectance else 1.0
+    # The paper's lobe is not normalised: as energy its albedo is smaller by the ratio of the lobes' factors.
+    energy = 1.0
+    if reflectance and reflectance.shading_model == "paper":
+        energy = normalization(exponent, False) / normalization(exponent)
+    planes = {
+        "baseColor": to_8_bit(maps.diffuse),
+        "normal": np.round(127.5 * (bent + 1)).astype(np.uint8),
+        "specular": np.repeat(np.round(255 * linear_to_srgb(maps.specular / peak)).astype(np.uint8)[..., None], 3, -1),
+    }
+    images = [
+        {"name": name, "mimeType": "image/png", "bufferView": out.view(encode_png(codes))}
+        for name, codes in planes.items()
+    ]
+    textures = [{"sampler": 0, "source": k} for k in range(3)]
+    alpha = math.sqrt(2.0 / (exponent + 2.0))
+    skin = {
+        "name": "skin",
+        "pbrMetallicRoughness": {
+            "baseColorTexture": {"index": 0},
+            "metallicFactor": 0.0,
+            "roughnessFactor": math.sqrt(alpha),
+        },
+        "normalTexture": {"index": 1},
+        "extensions": {
+            "KHR_materials_specular": {
+                "specularColorFactor": [energy * peak / DIELECTRIC_F0] * 3,
+                "specularColorTexture": {"index": 2},
+            }
+        },
+    }
+    return images, textures, skin
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    return {
+        "name": camera.name,
+        "type": "perspective",
+        "perspective": {
+            "yfov": 2.0 * math.atan(0.5 * camera.height / camera.fy),
+            "aspectRatio": camera.width * camera.fy / (camera.height * camera.fx),
+            "znear": 0.01,
+        },
+    }
+
+
+def _camera_node(camera: Camera, index: int, metre: float) -> dict[str, Any]:
+    pose = camera.camera_to_world_opengl.copy()
+    pose[:3, 3] *= metre
+    return {"name": camera.name, "camera": index, "matrix": pose.T.ravel().tolist()}
+
+
+def _write(path: Path, document: dict[str, Any], binary: bytes) -> None:
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
+    with replacing(path) as temporary, open(temporary, "wb") as stream:
+        stream.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary)))
+        stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        stream.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)

@@ -1,0 +1,126 @@
+"""A reconstruction under another lighting."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.files import replacing, write_text
+from mifit.core.image import encode_png, read_image, to_8_bit, write_image
+from mifit.core.metrics import psnr, rmse
+from mifit.core.sh import LUMINANCE, SHLighting
+from mifit.errors import InputError
+from mifit.output.figures import HEAT_LIMIT, heat_map
+from mifit.output.turntable import sheet
+from mifit.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from mifit.output.reconstruction import Reconstruction
+
+MAP_ROWS = 512
+"""Rows to which an environment is reduced; finer light than 0.35 degrees makes no difference on skin."""
+
+
+def relit(
+    reconstruction: Reconstruction,
+    environment: str | Path | NDArray,
+    rotate: float = 0.0,
+    exposure: float | None = None,
+) -> Reconstruction:
+    """Replace the lighting of a reconstruction; see `Reconstruction.relight`."""
+    reflectance = reconstruction.reflectance
+    if reflectance is None:
+        raise InputError("relighting needs reflectance, but this fit ended after the geometry stage; fit it further")
+    name = environment if isinstance(environment, (str, Path)) else "environment"
+    image = read_image(environment) if isinstance(environment, (str, Path)) else np.asarray(environment, np.float32)
+    if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8 or not np.isfinite(image).all():
+        raise InputError(f"{name}: found an image of shape {image.shape}, expected a finite lat-long image (H, W, 3)")
+    if (image < 0).any() or not image.any():
+        raise InputError(f"{name}: found negative or only black pixels, expected linear radiance")
+    if image.shape[0] > MAP_ROWS:
+        width = round(image.shape[1] * MAP_ROWS / image.shape[0])
+        image = cv2.resize(image, (width, MAP_ROWS), interpolation=cv2.INTER_AREA)
+    angle = np.radians(rotate)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    lighting = SHLighting.from_envmap(image, reconstruction.lighting.order).rotate(turn)
+    before = float(reconstruction.lighting.coefficients[0] @ LUMINANCE)
+    after = float(lighting.coefficients[0] @ LUMINANCE)
+    if exposure is None:
+        exposure = before / after
+    if not (np.isfinite(exposure) and exposure > 0):
+        raise InputError(f"exposure: found {exposure!r}, expected a positive number")
+    # The ambient term stands for light that the model leaves out, such as interreflection: it grows with the light.
+    ambient = reflectance.ambient * exposure * after / before
+    changed = replace(reflectance, radiance=exposure * lighting.coefficients, ambient=ambient)
+    return replace(reconstruction, reflectance=changed, environment=exposure * _turned(image, angle))
+
+
+def _turned(image: NDArray[np.float32], angle: float) -> NDArray[np.float32]:
+    """A lat-long image with the environment turned about +y: what came from azimuth phi comes from phi - angle."""
+    width = image.shape[1]
+    shift = -angle / (2 * np.pi) * width
+    whole = int(np.floor(shift))
+    part = np.float32(shift - whole)
+    rolled = np.roll(image, whole, axis=1)
+    return rolled * (1 - part) + np.roll(rolled, 1, axis=1) * part
+
+
+def write_relit(
+    reconstruction: Reconstruction,
+    environment: str | Path,
+    folder: str | Path,
+    rotate: float = 0.0,
+    exposure: float | None = None,
+    samples: int = 128,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> dict[str, float]:
+    """Write views under a measured environment: the fast path, the path-traced one, and their difference.
+
+    The first timestep is shown from every fitted camera. ``NAME_fast.png`` shades the visible surface under the
+    environment's spherical harmonics; ``NAME_path.png`` traces paths under the whole environment, with shadows and
+    interreflection; ``NAME_difference.png`` is the error between them; ``relight.png`` shows all in rows, and
+    ``relight.json`` holds exposure and figures.
+
+    Returns
+    -------
+    dict
+        ``exposure``, and ``psnr`` (dB) and ``rmse`` (0..255) between fast path and path tracing in 8-bit sRGB, over
+        the pixels that the head covers in all views.
+    """
+    folder = Path(folder)
+    lit = relit(reconstruction, environment, rotate, exposure)
+    timestep = lit.timesteps[0]
+    rows, pairs = [], []
+    total = 2 * len(lit.cameras)
+    progress("Relighting", 0, total)
+    for k, camera in enumerate(lit.cameras):
+        fast = lit.render(camera, timestep)
+        progress("Relighting", 2 * k + 1, total)
+        path = lit.render(camera, timestep, integrator="path", samples=samples, seed=seed)
+        progress("Relighting", 2 * k + 2, total)
+        write_image(folder / f"{camera.name}_fast.png", fast)
+        write_image(folder / f"{camera.name}_path.png", path)
+        covered = (fast[..., 3] == 1) & (path[..., 3] > 0.99)
+        a, b = to_8_bit(fast[..., :3]), to_8_bit(path[..., :3])
+        with replacing(folder / f"{camera.name}_difference.png") as temporary:
+            temporary.write_bytes(encode_png(heat_map(b, a, covered)))
+        rows.append([fast, path])
+        pairs.append((a[covered], b[covered]))
+    fast_codes, path_codes = (np.concatenate([p[j] for p in pairs])[None] for j in (0, 1))
+    used = float(lit.reflectance.radiance[0] @ LUMINANCE) if lit.reflectance else 0.0
+    figures = {
+        "psnr": psnr(fast_codes, path_codes),
+        "rmse": rmse(fast_codes, path_codes),
+        "mean_radiance": used / np.sqrt(4 * np.pi),
+        "difference_limit": HEAT_LIMIT,
+    }
+    write_image(folder / "relight.png", sheet(rows))
+    write_text(folder / "relight.json", json.dumps({"rotate": rotate, **figures}, indent=1) + "\n")
+    return figures

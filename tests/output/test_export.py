@@ -1,0 +1,143 @@
+"""Files for other programs, read back by trimesh and by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from mifit.core.mesh import vertex_normals
+from mifit.errors import InputError
+from mifit.output.export import export
+from mifit.output.surface import part_of, split_at_seams
+
+
+def read_glb(path):
+    """JSON document and accessor reader of a binary glTF, after checks of its container."""
+    data = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert magic == b"glTF" and version == 2 and length == len(data)
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON" and size % 4 == 0
+    document = json.loads(data[20 : 20 + size])
+    binary_size, kind = struct.unpack_from("<I4s", data, 20 + size)
+    assert kind == b"BIN\0" and binary_size % 4 == 0
+    binary = data[28 + size :]
+    assert len(binary) == binary_size >= document["buffers"][0]["byteLength"]
+
+    def read(index):
+        a = document["accessors"][index]
+        view = document["bufferViews"][a["bufferView"]]
+        kind = {5126: "<f4", 5125: "<u4"}[a["componentType"]]
+        width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[a["type"]]
+        assert view["byteOffset"] % 4 == 0
+        values = np.frombuffer(binary, kind, a["count"] * width, view["byteOffset"]).reshape(-1, width)
+        assert values.nbytes == view["byteLength"]
+        if "min" in a:
+            assert values.min(0).tolist() == a["min"] and values.max(0).tolist() == a["max"]
+        return values
+
+    return document, read, binary
+
+
+@pytest.fixture(scope="module")
+def glb(ball, tmp_path_factory):
+    path = tmp_path_factory.mktemp("export") / "ball.glb"
+    export(ball, "glb", path, timestep=3)
+    return path
+
+
+def test_gltf_weights_and_targets_give_the_fitted_shape(ball, glb):
+    document, read, _ = read_glb(glb)
+    mesh = document["meshes"][0]
+    assert mesh["extras"]["targetNames"] == ["jawOpen"] and mesh["weights"] == [0.7]
+    pose = np.array(document["nodes"][0]["matrix"]).reshape(4, 4).T
+    split = split_at_seams(ball.model)
+    for primitive, selected in zip(mesh["primitives"], (ball.model.face_mask, ~ball.model.face_mask), strict=True):
+        part = part_of(split, selected)
+        base, target = read(primitive["attributes"]["POSITION"]), read(primitive["targets"][0]["POSITION"])
+        assert np.abs(target).max() > 0
+        world = (base + 0.7 * target) @ pose[:3, :3].T + pose[:3, 3]
+        np.testing.assert_allclose(world, ball.geometry.vertices[1][part.origin] / 100, atol=1e-6)
+        np.testing.assert_array_equal(read(primitive["indices"]).reshape(-1, 3), part.faces)
+        normal = read(primitive["attributes"]["NORMAL"])
+        np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-5)
+        expected = vertex_normals(ball.geometry.vertices[1], ball.model.faces)[part.origin]
+        np.testing.assert_allclose(normal @ pose[:3, :3].T, expected, atol=1e-5)
+
+
+def test_gltf_material_holds_the_maps(ball, glb):
+    document, read, binary = read_glb(glb)
+    skin = document["materials"][0]
+    alpha = math.sqrt(2 / (12.0 + 2))
+    assert skin["pbrMetallicRoughness"]["roughnessFactor"] ** 2 == pytest.approx(alpha)
+    specular = skin["extensions"]["KHR_materials_specular"]
+    assert specular["specularColorFactor"][0] * 0.04 == pytest.approx(0.15, rel=1e-5)
+    for image, texture in zip(document["images"], document["textures"], strict=True):
+        view = document["bufferViews"][image["bufferView"]]
+        data = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        assert cv2.imdecode(np.frombuffer(data, np.uint8), 1).shape == (32, 32, 3)
+        assert texture["sampler"] == 0
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    uv = read(attributes["TEXCOORD_0"])
+    part = part_of(split_at_seams(ball.model), ball.model.face_mask)
+    np.testing.assert_allclose(uv, part.uv * (1, -1) + (0, 1), atol=1e-6)
+    tangent = read(attributes["TANGENT"])
+    assert set(np.unique(tangent[:, 3])) <= {-1.0, 1.0}
+    np.testing.assert_allclose(np.linalg.norm(tangent[:, :3], axis=1), 1, atol=1e-5)
+
+
+def test_gltf_holds_the_cameras_and_opens_in_trimesh(ball, glb):
+    document, _, _ = read_glb(glb)
+    assert [c["name"] for c in document["cameras"]] == ["left", "right"]
+    node = next(n for n in document["nodes"] if n["name"] == "right")
+    pose = np.array(node["matrix"]).reshape(4, 4).T
+    np.testing.assert_allclose(pose[:3, 3] * 100, ball.camera("right").position, atol=1e-6)
+    # The camera looks down -z at the head, which is at the origin.
+    assert pose[:3, 2] @ pose[:3, 3] > 0.99 * np.linalg.norm(pose[:3, 3])
+    scene = trimesh.load(glb)
+    assert sum(len(g.faces) for g in scene.geometry.values()) == len(ball.model.faces)
+
+
+def test_obj_opens_in_trimesh_with_its_maps(ball, tmp_path):
+    export(ball, "obj", tmp_path / "ball.obj", timestep=0)
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "ball.obj",
+        "ball.mtl",
+        "ball_diffuse.png",
+        "ball_specular.png",
+        "ball_normal.png",
+    }
+    scene = trimesh.load(tmp_path / "ball.obj", process=False)
+    meshes = list(scene.geometry.values())
+    assert sum(len(m.faces) for m in meshes) == len(ball.model.faces)
+    skin = max(meshes, key=lambda m: m.triangles_center[:, 2].mean())
+    assert len(skin.faces) == ball.model.face_mask.sum()
+    found = np.sort(skin.triangles_center, axis=0)
+    expected = ball.geometry.vertices[0][ball.model.faces[ball.model.face_mask]].mean(1)
+    np.testing.assert_allclose(found, np.sort(expected, axis=0), atol=1e-4)
+
+
+def test_ply_export(ball, tmp_path):
+    export(ball, "ply", tmp_path / "new" / "ball.ply")
+    assert len(trimesh.load(tmp_path / "new" / "ball.ply", process=False).faces) == len(ball.model.faces)
+
+
+def test_stage_1_exports_too(stage_1_ball, tmp_path):
+    export(stage_1_ball, "glb", tmp_path / "a.glb")
+    document, _, _ = read_glb(tmp_path / "a.glb")
+    assert document["materials"][0]["pbrMetallicRoughness"]["metallicFactor"] == 0
+
+
+def test_bad_requests_are_named(ball, tmp_path):
+    with pytest.raises(InputError, match=r"expected '\.glb' for format glb"):
+        export(ball, "glb", tmp_path / "x.obj")
+    with pytest.raises(InputError, match="expected one of glb, obj, ply, mitsuba"):
+        export(ball, "fbx", tmp_path / "x.fbx")
+    with pytest.raises(InputError, match="timestep 5 is not in this result"):
+        export(ball, "ply", tmp_path / "x.ply", timestep=5)
