@@ -163,8 +163,13 @@ def _draw_subject(model: MorphableModel, seed: int, timesteps: int, map_size: in
     mean_mm = model.mean.astype(np.float64) * model.unit_mm
     normals = vertex_normals(mean_mm, model.faces)
     style = SkinStyle.draw(seed)
-    skin, parts = {}, {}
-    for name, chosen in (("face", model.face_mask), ("rest", ~model.face_mask)):
+    skin: dict[str, SkinMaps] = {}
+    parts: dict[str, head.SplitMesh] = {}
+    rest = ~model.face_mask
+    for i, ball in enumerate(head.own_eyeballs(model)):
+        parts[f"eye{i}"] = head.split_eyeball(model, ball)
+        rest &= ~ball
+    for name, chosen in (("face", model.face_mask), ("rest", rest)):
         if not chosen.any():
             continue
         faces, uv, faces_uv = model.faces[chosen], model.uv, model.faces_uv[chosen]
@@ -174,10 +179,14 @@ def _draw_subject(model: MorphableModel, seed: int, timesteps: int, map_size: in
         parts[name] = head.split_at_seams(faces, uv, faces_uv)
     neutral = head.neutral_shape(model, seed)
     centre = neutral[model.landmarks[27:48]].mean(axis=0) - np.array([0.0, 0.0, 55.0 / model.unit_mm])
-    eyes = [
-        head.eye_centre(neutral[loop] * model.unit_mm) / model.unit_mm
-        for loop in head.eye_openings(neutral, model.faces, model.landmarks)
-    ]
+    eyes = (
+        []
+        if "eye0" in parts
+        else [
+            head.eye_centre(neutral[loop] * model.unit_mm) / model.unit_mm
+            for loop in head.eye_openings(neutral, model.faces, model.landmarks)
+        ]
+    )
     poses = head.draw_motion(model, timesteps, seed, scale, centre)
     return _Subject(model, seed, neutral, poses, scale, skin, parts, eyes)
 
@@ -240,7 +249,7 @@ def _materials(subject: _Subject) -> dict[str, Material]:
         name: Material(maps.albedo, maps.specular, maps.roughness, maps.bump * np.float32(0.1))  # mm -> cm
         for name, maps in subject.skin.items()
     }
-    if subject.eyes:
+    if subject.eyes or "eye0" in subject.parts:
         albedo, flat = head.paint_eye(subject.seed), np.zeros((64, 64), dtype=np.float32)
         materials["eye"] = Material(albedo, flat + 0.9, flat + 0.25, flat)
     return materials
@@ -249,7 +258,7 @@ def _materials(subject: _Subject) -> dict[str, Material]:
 def _surfaces(subject: _Subject, pose: head.Pose, world: NDArray) -> list[Surface]:
     normals = vertex_normals(world, subject.model.faces)
     surfaces = [
-        Surface(world[part.source], normals[part.source], part.uv, part.faces, name)
+        Surface(world[part.source], normals[part.source], part.uv, part.faces, name.rstrip("01"))
         for name, part in subject.parts.items()
     ]
     unit, uv, faces = head.sphere()

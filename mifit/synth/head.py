@@ -107,6 +107,36 @@ def wrap_uv(uv: NDArray, faces_uv: NDArray) -> tuple[NDArray[np.float32], NDArra
     return corners.reshape(-1, 2).astype(np.float32), np.arange(corners.size // 2, dtype=np.int32).reshape(-1, 3)
 
 
+def own_eyeballs(model: MorphableModel) -> list[NDArray[np.bool_]]:
+    """(F,) masks of the model's own eyeballs: separate pieces of its mesh beside the eye landmarks."""
+    first = np.concatenate([model.faces[:, 0], model.faces[:, 1]])
+    second = np.concatenate([model.faces[:, 1], model.faces[:, 2]])
+    graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(model.n_vertices,) * 2)
+    labels = connected_components(graph, directed=False)[1]
+    skin = np.bincount(labels).argmax()
+    found = []
+    for label in np.unique(labels[model.faces]):
+        piece = model.mean[labels == label].mean(axis=0)
+        for eye in (range(36, 42), range(42, 48)):
+            corners = model.mean[model.landmarks[list(eye)]]
+            width = np.linalg.norm(corners[0] - corners[3])
+            if label != skin and np.linalg.norm(piece - corners.mean(axis=0)) < width:
+                found.append(labels[model.faces[:, 0]] == label)
+    return found
+
+
+def split_eyeball(model: MorphableModel, chosen: NDArray[np.bool_]) -> SplitMesh:
+    """The mesh of an eyeball with the UVs of `sphere`, found from directions about its centre."""
+    source, faces = np.unique(model.faces[chosen], return_inverse=True)
+    points = model.mean[source].astype(np.float64)
+    # least squares sphere: |p|^2 = 2 p.c + (r^2 - |c|^2)
+    system = np.concatenate([2 * points, np.ones((len(points), 1))], axis=1)
+    centre = np.linalg.lstsq(system, (points**2).sum(axis=1), rcond=None)[0][:3]
+    x, y, z = (points - centre).T
+    uv = np.stack([np.arctan2(y, x) / (2 * np.pi) % 1.0, 1 - np.arctan2(np.hypot(x, y), z) / np.pi], axis=1)
+    return SplitMesh(source, uv.astype(np.float32), faces.reshape(-1, 3).astype(np.int32))
+
+
 def eye_openings(vertices: NDArray, faces: NDArray, landmarks: NDArray) -> list[NDArray[np.int64]]:
     """Vertices around each eye's hole in the mesh; empty when the model's eyes are closed surfaces."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)

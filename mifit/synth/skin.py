@@ -68,7 +68,7 @@ class SkinStyle:
         t = rng.uniform(0.0, 0.75)
         return cls(
             seed=seed,
-            tone=np.exp((1 - t) * np.log(FAIR) + t * np.log(DEEP)) * rng.uniform(0.93, 1.07, 3),
+            tone=np.exp((1 - t) * np.log(FAIR) + t * np.log(DEEP)) * rng.uniform(0.97, 1.03, 3),
             hair=np.array([0.05, 0.032, 0.022]) * rng.uniform(0.5, 2.0),
             stubble=float(rng.choice([0.0, rng.uniform(0.3, 1.0)])),
             wrinkles=float(rng.uniform(0.3, 1.0)),
