@@ -2,5 +2,6 @@
 
 from mifit.capture.capture import Capture as Capture
 from mifit.capture.capture import Frame as Frame
+from mifit.capture.importer import import_capture as import_capture
 
-__all__ = ["Capture", "Frame"]
+__all__ = ["Capture", "Frame", "import_capture"]

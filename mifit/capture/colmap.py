@@ -1,0 +1,141 @@
+"""COLMAP text models: ``cameras.txt`` and ``images.txt``.
+
+COLMAP's pixels are ours (the first centre at 0.5, 0.5), its camera axes OpenCV's, its poses world to camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mifit.capture.transforms import View
+from mifit.core.camera import Camera
+from mifit.core.files import write_text
+from mifit.errors import InputError
+
+_MODELS = {  # where fx, fy, cx, cy and OpenCV's distortion coefficients are among the parameters
+    "SIMPLE_PINHOLE": ((0, 0, 1, 2), ()),
+    "PINHOLE": ((0, 1, 2, 3), ()),
+    "SIMPLE_RADIAL": ((0, 0, 1, 2), (3,)),
+    "RADIAL": ((0, 0, 1, 2), (3, 4)),
+    "OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7)),
+    "FULL_OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11)),
+}
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """One registered image: its name in the model and its camera."""
+
+    name: str
+    view: View
+
+
+def read_colmap(folder: str | Path) -> tuple[ColmapImage, ...]:
+    """Read a text model.
+
+    Each view is named after the image: its folder (``left/0000.png`` -> ``left``), or its stem when it has none.
+
+    Raises
+    ------
+    InputError
+        A missing or malformed file, an unknown camera model, or a pose that isn't one.
+    """
+    folder = Path(folder)
+    cameras: dict[str, tuple[int, int, tuple[float, ...], tuple[float, ...]]] = {}
+    for where, words in _lines(folder / "cameras.txt"):
+        if len(words) < 5 or words[1] not in _MODELS:
+            found = words[1] if len(words) > 1 else " ".join(words)
+            raise InputError(f"{where}: found camera model {found!r}, expected one of {', '.join(_MODELS)}")
+        pinhole, lens = _MODELS[words[1]]
+        values = _floats(words[2:], where)
+        size, parameters = (int(values[0]), int(values[1])), values[2:]
+        if len(parameters) != max((*pinhole, *lens)) + 1:
+            raise InputError(
+                f"{where}: found {len(parameters)} parameters, expected {max((*pinhole, *lens)) + 1} of {words[1]}"
+            )
+        intrinsics = tuple(parameters[i] for i in pinhole)
+        if not (min(intrinsics[:2]) > 0):
+            raise InputError(f"{where}: found focal length {min(intrinsics[:2]):g}, expected a positive one")
+        distortion = tuple(parameters[i] for i in lens)
+        if len(distortion) in (1, 2):
+            distortion = (*distortion, 0.0, 0.0, 0.0)[:4]
+        cameras[words[0]] = (*size, intrinsics, distortion if any(distortion) else ())
+    images = []
+    for where, words in _lines(folder / "images.txt", every=2):
+        if len(words) < 10:
+            raise InputError(f"{where}: found {len(words)} fields, expected ID, QW QX QY QZ, TX TY TZ, CAMERA_ID, NAME")
+        pose = _floats(words[1:8], where)
+        if words[8] not in cameras:
+            raise InputError(f"{where}: camera {words[8]} is not in cameras.txt")
+        length = float(np.linalg.norm(pose[:4]))
+        if abs(length - 1.0) > 1e-3:
+            raise InputError(f"{where}: found a quaternion of length {length:.4g}, expected 1")
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_quat([*pose[1:4], pose[0]]).as_matrix()
+        matrix[:3, 3] = pose[4:]
+        width, height, intrinsics, distortion = cameras[words[8]]
+        name = " ".join(words[9:])
+        fx, fy, cx, cy = intrinsics
+        images.append(ColmapImage(name, View(view_name(name), width, height, (fx, fy, cx, cy), distortion, matrix)))
+    if not images:
+        raise InputError(f"{folder / 'images.txt'}: found no image, expected at least one")
+    return tuple(images)
+
+
+def view_name(image_name: str) -> str:
+    """Camera name of an image: its innermost folder, or its stem."""
+    path = PurePosixPath(image_name.replace("\\", "/"))
+    return path.parent.name or path.stem
+
+
+def write_colmap(folder: str | Path, cameras: Iterable[tuple[Camera, str]]) -> None:
+    """Write a text model of cameras with the names of their images; one COLMAP camera per image."""
+    folder = Path(folder)
+    intrinsics, poses = [], []
+    for i, (camera, name) in enumerate(cameras, start=1):
+        model = "FULL_OPENCV" if len(camera.distortion) > 4 else "OPENCV" if any(camera.distortion) else "PINHOLE"
+        lens = {"PINHOLE": 0, "OPENCV": 4, "FULL_OPENCV": 8}[model]
+        coefficients = (*camera.distortion, *(0.0,) * 8)[:lens]
+        numbers = (camera.fx, camera.fy, camera.cx, camera.cy, *coefficients)
+        intrinsics.append(f"{i} {model} {camera.width} {camera.height} {_text(numbers)}")
+        x, y, z, w = Rotation.from_matrix(camera.rotation).as_quat()
+        poses.append(f"{i} {_text((w, x, y, z, *camera.translation))} {i} {name}\n")
+    write_text(folder / "cameras.txt", "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n" + "\n".join(intrinsics) + "\n")
+    header = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
+    write_text(folder / "images.txt", header + "\n".join(poses) + "\n")
+    write_text(folder / "points3D.txt", "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n")
+
+
+def _text(values: Iterable[float]) -> str:
+    return " ".join(repr(float(v)) for v in values)
+
+
+def _lines(path: Path, every: int = 1) -> Iterator[tuple[str, list[str]]]:
+    """Every N-th line that is no comment, with its place for messages; blank lines count where N > 1."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; expected a COLMAP text model (cameras.txt, images.txt)") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a readable text file: {error}") from None
+    kept = [(i, line) for i, line in enumerate(text.splitlines(), start=1) if not line.startswith("#")]
+    if every == 1:
+        kept = [(i, line) for i, line in kept if line.strip()]
+    for i, line in kept[::every]:
+        if line.strip():
+            yield f"{path}: line {i}", line.split()
+
+
+def _floats(words: list[str], where: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(word) for word in words)
+    except ValueError:
+        raise InputError(f"{where}: found {' '.join(words)!r}, expected numbers") from None
+    if not np.isfinite(values).all():
+        raise InputError(f"{where}: found a NaN or infinite value, expected finite numbers")
+    return values

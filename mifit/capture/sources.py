@@ -1,0 +1,162 @@
+"""Where imported images come from: videos, folders of images, lists of files."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from mifit.core.image import SUFFIXES, encode_png, load_image
+from mifit.core.quiet import silenced_stderr
+from mifit.errors import InputError
+
+
+class Source(Protocol):
+    """One camera's images in order."""
+
+    @property
+    def name(self) -> str:
+        """Camera name."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) in pixels."""
+
+    @property
+    def length(self) -> int:
+        """Number of frames."""
+
+    def files(self, start: int, every: int) -> Iterator[tuple[str, bytes]]:
+        """(suffix, content) of every N-th frame from `start` on, each checked to decode."""
+
+
+@dataclass(frozen=True)
+class ImageFiles:
+    """A camera's images as a list of files of one size."""
+
+    name: str
+    paths: tuple[Path, ...]
+    size: tuple[int, int]
+
+    @classmethod
+    def folder(cls, path: Path, name: str) -> ImageFiles:
+        """All images of a folder in the order of the numbers in their names."""
+        if not path.is_dir():
+            raise InputError(f"{path}: no such folder of images")
+        found = sorted((p for p in path.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural)
+        if not found:
+            raise InputError(f"{path}: found no image, expected files {', '.join(SUFFIXES)}")
+        return cls.of(name, found)
+
+    @classmethod
+    def of(cls, name: str, paths: Sequence[Path]) -> ImageFiles:
+        """Images in the given order; the first one gives the size."""
+        height, width = load_image(paths[0]).pixels.shape[:2]
+        return cls(name, tuple(paths), (width, height))
+
+    @property
+    def length(self) -> int:
+        """Number of images."""
+        return len(self.paths)
+
+    def files(self, start: int, every: int) -> Iterator[tuple[str, bytes]]:
+        """Contents as they are on disk, once they have been seen to decode to the right size."""
+        for path in self.paths[start::every]:
+            height, width = load_image(path).pixels.shape[:2]
+            if (width, height) != self.size:
+                raise InputError(
+                    f"{path}: found {width} x {height} pixels, expected {self.size[0]} x {self.size[1]} as in "
+                    f"{self.paths[0].name}"
+                )
+            yield path.suffix.lower(), path.read_bytes()
+
+
+@dataclass(frozen=True)
+class Video:
+    """A video file; frames come out as 8-bit PNG."""
+
+    path: Path
+    name: str
+    size: tuple[int, int]
+    length: int
+    rate: float
+
+    @classmethod
+    def open(cls, path: Path, name: str) -> Video:
+        """Read a video's header; InputError when it isn't one."""
+        if not path.is_file():
+            raise InputError(f"{path}: no such video file")
+        with _reader(path) as reader:
+            size = (int(reader.get(cv2.CAP_PROP_FRAME_WIDTH)), int(reader.get(cv2.CAP_PROP_FRAME_HEIGHT)))
+            length, rate = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)), float(reader.get(cv2.CAP_PROP_FPS))
+        if length < 1 or min(size) < 1:
+            raise InputError(f"{path}: found {length} frames of {size[0]} x {size[1]} pixels, expected a whole video")
+        return cls(path, name, size, length, rate)
+
+    def files(self, start: int, every: int) -> Iterator[tuple[str, bytes]]:
+        """Decode in order; frames between the wanted ones are passed over without conversion."""
+        with _reader(self.path) as reader:
+            for i in range(self.length):
+                with silenced_stderr():
+                    there = reader.grab()
+                if not there:
+                    raise InputError(
+                        f"{self.path}: the header promises {self.length} frames but frame {i} can't be read: truncated "
+                        "or damaged; copy or encode it again"
+                    )
+                if i >= start and (i - start) % every == 0:
+                    ok, frame = reader.retrieve()
+                    if not ok or frame is None or frame.shape[1::-1] != self.size:
+                        raise InputError(f"{self.path}: frame {i} can't be decoded; copy or encode the video again")
+                    yield ".png", encode_png(np.asarray(frame[..., ::-1], dtype=np.uint8))
+
+
+@contextlib.contextmanager
+def _reader(path: Path) -> Iterator[cv2.VideoCapture]:
+    with silenced_stderr():
+        reader = cv2.VideoCapture(str(path))
+    try:
+        if not reader.isOpened():
+            raise InputError(f"{path}: not a readable video: truncated, damaged or of an unknown format")
+        yield reader
+    finally:
+        reader.release()
+
+
+def check_synchronous(sources: Sequence[Source]) -> None:
+    """Refuse cameras with different numbers of frames, frame rates, or videos of different sizes."""
+    first = sources[0]
+    for other in sources[1:]:
+        if other.length != first.length:
+            raise InputError(
+                f"{_place(other)}: found {other.length} frames, expected {first.length} as in {_place(first)}; "
+                "synchronised cameras have equally many"
+            )
+        if isinstance(first, Video) and isinstance(other, Video):
+            if abs(other.rate - first.rate) > 0.01 * max(first.rate, 1e-6):
+                raise InputError(
+                    f"{other.path}: found {other.rate:g} frames a second, expected {first.rate:g} as in {first.path}"
+                )
+            if other.size != first.size:
+                raise InputError(
+                    f"{other.path}: found {other.size[0]} x {other.size[1]} pixels, expected {first.size[0]} x "
+                    f"{first.size[1]} as in {first.path}"
+                )
+
+
+def _place(source: Source) -> str:
+    if isinstance(source, Video):
+        return str(source.path)
+    return str(source.paths[0].parent) if isinstance(source, ImageFiles) else source.name
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key by the numbers in a name: frame2 before frame10."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts if part]
