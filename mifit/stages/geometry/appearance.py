@@ -99,7 +99,7 @@ class AppearanceProblem:
         rows *= WHITE
         rows[:, :, -1] = residual
         rows *= np.sqrt(weight).astype(np.float32)[:, None, None]
-        flat = rows.reshape(3 * n, -1)
+        flat = rows.reshape(3 * n, a + 29)
         normal = (flat.T @ flat).astype(np.float64)
         prior = self._priors()
         return DenseSystem(normal[:-1, :-1] + np.diag(prior), normal[:-1, -1] + prior * x)
