@@ -85,8 +85,8 @@ def sensor(camera: Camera, spp: int = 16) -> Any:
             "type": "perspective",
             "fov": math.degrees(2.0 * math.atan(0.5 * camera.width / camera.fx)),
             "fov_axis": "x",
-            "principal_point_offset_x": camera.cx / camera.width - 0.5,
-            "principal_point_offset_y": camera.cy / camera.height - 0.5,
+            "principal_point_offset_x": 0.5 - camera.cx / camera.width,  # Mitsuba moves the film, not the point
+            "principal_point_offset_y": 0.5 - camera.cy / camera.height,
             "near_clip": 1e-2,
             "far_clip": 1e4,
             "to_world": mi.ScalarTransform4f(to_world),
