@@ -13,6 +13,8 @@ from mifit.core.sh import basis
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.geometry.parameters import exponential
 
+SHADING = np.array([4.0, 0.0, 0.8, -0.7, 0.0, 0.0, 0.3, 0.0, 0.0])  # the same for every channel
+
 
 @dataclass
 class MemoryCapture:
@@ -70,8 +72,6 @@ def make_capture(
     """
     rng = np.random.default_rng(seed)
     x_id = identity * rng.normal(size=model.n_identity)
-    shading = np.zeros((9, 3))
-    shading[0], shading[2], shading[3], shading[6] = 4.0, 0.8, -0.7, 0.3
     names = ("left", "right") if len(views) == 2 else tuple(f"c{i}" for i in range(len(views)))
     cameras = {n: look_at_head(n, v, width, height) for n, v in zip(names, views, strict=True)}
     frames, world, rotations = {}, [], []
@@ -92,7 +92,7 @@ def make_capture(
             albedo = interpolate(model.mean_albedo, model.faces, face, weights)
             albedo = albedo * paint(interpolate(spots, model.faces, face, weights), np.random.default_rng(7))[:, None]
             image = np.zeros((height, width, 3), np.float32)
-            image[hit] = albedo * (basis(n, 3) @ shading) * 0.8
+            image[hit] = albedo * (basis(n, 3) @ SHADING)[:, None] * 0.8
             image = np.maximum(image + 0.002 * rng.normal(size=image.shape), 0).astype(np.float32)
             marks = vertices[model.landmarks]
             facing = ((camera.position - marks) * normals[model.landmarks]).sum(1) > 0

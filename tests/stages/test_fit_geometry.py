@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from memory_capture import make_capture
+from memory_capture import SHADING, make_capture
 
 from mifit.config import GeometryConfig
+from mifit.core.mesh import vertex_normals
+from mifit.core.sh import basis
 from mifit.errors import ConvergenceError, InputError
 from mifit.morphable import MorphableModel
 from mifit.stages.fit_geometry import fit_geometry, fit_pose_expression, texture_reference
@@ -87,9 +89,12 @@ def test_same_seed_same_result(model, capture, fitted):
     assert np.array_equal(again.vertices, fitted.vertices) and np.array_equal(again.shading, fitted.shading)
 
 
-def test_lighting_is_found_up_to_the_albedos_level(fitted):
-    shading = fitted.shading[:, 0] / fitted.shading[0, 0]
-    np.testing.assert_allclose(shading[[2, 3, 6]], [0.2, -0.175, 0.075], atol=0.06)
+def test_lighting_is_found_up_to_the_albedos_level(model, capture, fitted):
+    """On the normals that were seen; towards the back the data leave it open."""
+    normals = vertex_normals(capture.vertices[0], model.faces)[np.unique(model.faces[model.face_mask])]
+    harmonics = basis(normals[normals[:, 2] > 0.4], 3)
+    ratio = (harmonics @ fitted.shading)[:, 1] / (harmonics @ SHADING)
+    assert ratio.std() < 0.06 * ratio.mean()
 
 
 def test_papers_objective_converges(model, capture):
