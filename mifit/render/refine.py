@@ -116,13 +116,17 @@ class NormalProblem:
             for v in views
         ]
         self._shade = shade
-        self._w1, self._w2, self._huber = float(laplacian_weight), float(magnitude_weight), float(huber)
+        self._smooth, self._robust = laplacian_weight > 0, huber < float("inf")
+        # Opaque: kernels are compiled once, not once per value.
+        self._w1 = dr.opaque(mi.Float, float(laplacian_weight))
+        self._w2 = dr.opaque(mi.Float, float(magnitude_weight))
+        self._huber = dr.opaque(mi.Float, float(huber))
         self._aim = _vector(mi.Vector3f, np.zeros((self._count, 3)) if aim is None else aim)
         dr.eval(self._degree, self._aim)
 
     def energies(self, offsets: NDArray) -> dict[str, float]:
         """Energy per term at offsets (N, 2)."""
-        return self._totals(*self._load(offsets))
+        return _totals(*self._terms(*self._load(offsets)))
 
     def normals(self, offsets: NDArray, view: int) -> NDArray[np.float32]:
         """(N, 3) refined normals in the frame of one view, world space."""
@@ -145,31 +149,36 @@ class NormalProblem:
         import drjit as dr
         import mitsuba as mi
 
-        a, b = self._load(start)
-        terms = self._totals(a, b)
-        history = {name: [value] for name, value in terms.items()}
-        system = self._linearize(a, b)
-        damping, converged = 0.0, False
+        a, b = self._facing(*self._load(None), *self._load(start))
+        local, system = self._linearize(a, b)
+        rough = self._rough(a, b)
+        totals = _totals(local, rough)
+        history = {name: [value] for name, value in totals.items()}
+        damping, converged = dr.zeros(mi.Float, self._count), False
         for iteration in range(max_iterations):
-            step = self._step(a, b, system, mi.Float(damping))
-            trial = self._facing(a + step[0], b + step[1])
-            dr.eval(trial)
-            found = self._totals(*trial)
-            before, after = sum(terms.values()), sum(found.values())
-            progress("normals", iteration + 1, max_iterations)
-            if not after <= before:  # also catches NaN
-                damping = max(4.0 * damping, 1e-2)
-                if damping > 1e5:
-                    break
+            progress("normals", iteration, max_iterations)
+            x, y = self._facing(a, b, *self._step(a, b, system, damping))
+            found, new_system = self._linearize(x, y)
+            # Data and magnitude are separable: a texel whose own energy rises stays, and steps shorter next time.
+            worse = ~(sum(found.values()) <= 1.0001 * sum(local.values()) + 1e-9)  # also where it is NaN
+            x, y = dr.select(worse, a, x), dr.select(worse, b, y)
+            found = {name: dr.select(worse, local[name], value) for name, value in found.items()}
+            new_rough = self._rough(x, y)
+            after = _totals(found, new_rough)
+            before = sum(totals.values())
+            risen = sum(after.values()) > before
+            damping = dr.select(worse | risen, dr.maximum(8.0 * damping, 0.05), 0.25 * damping)
+            dr.eval(damping, x, y)
+            if risen:
                 continue
-            damping = 0.25 * damping if damping > 1e-3 else 0.0
-            (a, b), terms = trial, found
-            for name, value in terms.items():
+            system = tuple(dr.select(worse, old, new) for old, new in zip(system, new_system, strict=True))
+            a, b, local, rough, totals = x, y, found, new_rough, after
+            dr.eval(system, local)
+            for name, value in totals.items():
                 history[name].append(value)
-            if before - after <= tolerance * before:
+            if before - sum(totals.values()) <= tolerance * before:
                 converged = True
                 break
-            system = self._linearize(a, b)
         progress("normals", max_iterations, max_iterations)
         return Refined(_store(a, b), converged, history)
 
@@ -184,47 +193,54 @@ class NormalProblem:
         optimizer = mi.ad.Adam(lr=step, params={"a": a, "b": b})
         totals = []
         for iteration in range(iterations):
-            energies = self._terms(optimizer["a"], optimizer["b"])
-            total = dr.sum(sum(energies.values()))
+            local, rough = self._terms(optimizer["a"], optimizer["b"])
+            total = dr.sum(sum(local.values()) + rough)
             dr.backward(total)
             totals.append(total)
             optimizer.step()
             dr.eval(total, optimizer["a"], optimizer["b"])
             progress("normals (adam)", iteration + 1, iterations)
-        a, b = self._facing(dr.detach(optimizer["a"]), dr.detach(optimizer["b"]))
-        found = self._totals(a, b)
+        a, b = self._facing(*self._load(None), dr.detach(optimizer["a"]), dr.detach(optimizer["b"]))
+        found = _totals(*self._terms(a, b))
         history = {"total": [float(t[0]) for t in totals] + [sum(found.values())]}
         return Refined(_store(a, b), True, history)
 
     # Energy ---------------------------------------------------------------------------------------------------------
 
-    def _terms(self, a: Any, b: Any) -> dict[str, Any]:
-        """Energy per term and texel."""
+    def _terms(self, a: Any, b: Any) -> tuple[dict[str, Any], Any]:
+        """Energy per texel: of the separable terms, and of the Laplacian's."""
         import drjit as dr
         import mitsuba as mi
 
         data = dr.zeros(mi.Float, self._count)
         for k, (colour, weight, direction, frame) in enumerate(self._views):
             residual = colour - self._shade(_bend(frame, a, b), direction, k)
-            square = dr.squared_norm(residual)
-            if self._huber < float("inf"):
-                length = dr.sqrt(dr.maximum(square, 1e-14))
-                square = dr.select(length <= self._huber, square, self._huber * (2 * length - self._huber))
-            data += dr.select(weight > 0, weight * square, 0)
-        delta = _bend(self._base, a, b) - self._base[0]
-        rough = dr.zeros(mi.Float, self._count)
-        if self._w1 > 0:
-            curvature = self._laplacian(delta)
-            rough = self._w1 * dr.sum(dr.sqrt(dr.square(curvature) + L1_FLOOR**2))
-        return {"data": data, "laplacian": rough, "magnitude": self._w2 * dr.squared_norm(delta - self._aim)}
+            data += self._penalty(weight, dr.squared_norm(residual))
+        return {"data": data, "magnitude": self._magnitude(a, b)}, self._rough(a, b)
 
-    def _totals(self, a: Any, b: Any) -> dict[str, float]:
+    def _penalty(self, weight: Any, square: Any) -> Any:
+        """Huber's penalty of a squared residual: r^2 up to k, 2 k r - k^2 beyond."""
         import drjit as dr
 
-        terms = self._terms(a, b)
-        dr.eval(terms)
-        # Summed in double precision: millions of small terms, compared to a relative 1e-3 and less.
-        return {name: float(np.array(value, dtype=np.float64).sum()) for name, value in terms.items()}
+        if self._robust:
+            length = dr.sqrt(dr.maximum(square, 1e-14))
+            square = dr.select(length <= self._huber, square, self._huber * (2 * length - self._huber))
+        return dr.select(weight > 0, weight * square, 0)
+
+    def _magnitude(self, a: Any, b: Any) -> Any:
+        import drjit as dr
+
+        return self._w2 * dr.squared_norm(_bend(self._base, a, b) - self._base[0] - self._aim)
+
+    def _rough(self, a: Any, b: Any) -> Any:
+        import drjit as dr
+        import mitsuba as mi
+
+        if not self._smooth:
+            return dr.zeros(mi.Float, self._count)
+        delta = _bend(self._base, a, b) - self._base[0]
+        dr.eval(delta)
+        return self._w1 * dr.sum(dr.sqrt(dr.square(self._laplacian(delta)) + L1_FLOOR**2))
 
     def _laplacian(self, field_: Any) -> Any:
         """Graph Laplacian (degree minus adjacency) of a vector per texel; symmetric."""
@@ -237,11 +253,12 @@ class NormalProblem:
 
     # Gauss-Newton ---------------------------------------------------------------------------------------------------
 
-    def _linearize(self, a: Any, b: Any) -> tuple[Any, ...]:
-        """Gradient (2) and Gauss-Newton Hessian (aa, ab, bb) of the data term, per texel."""
+    def _linearize(self, a: Any, b: Any) -> tuple[dict[str, Any], tuple[Any, ...]]:
+        """Separable energies, and gradient (2) and Gauss-Newton Hessian (aa, ab, bb) of the data, per texel."""
         import drjit as dr
         import mitsuba as mi
 
+        data = dr.zeros(mi.Float, self._count)
         out = [dr.zeros(mi.Float, self._count) for _ in range(5)]
         for k, (colour, weight, direction, frame) in enumerate(self._views):
             columns = []
@@ -254,22 +271,24 @@ class NormalProblem:
                 dr.traverse(dr.ADMode.Forward)
                 columns.append(mi.Color3f(dr.grad(shading)))
             residual = colour - dr.detach(shading)
+            square = dr.squared_norm(residual)
+            data += self._penalty(weight, square)
             scale = 2.0 * weight
-            if self._huber < float("inf"):
-                scale *= dr.minimum(1.0, self._huber / dr.maximum(dr.norm(residual), 1e-7))
+            if self._robust:
+                scale *= dr.minimum(1.0, self._huber * dr.rsqrt(dr.maximum(square, 1e-14)))
             seen = weight > 0
-            for i, value in enumerate(
-                (
-                    -dr.dot(columns[0], residual),
-                    -dr.dot(columns[1], residual),
-                    dr.dot(columns[0], columns[0]),
-                    dr.dot(columns[0], columns[1]),
-                    dr.dot(columns[1], columns[1]),
-                )
-            ):
+            products = (
+                -dr.dot(columns[0], residual),
+                -dr.dot(columns[1], residual),
+                dr.dot(columns[0], columns[0]),
+                dr.dot(columns[0], columns[1]),
+                dr.dot(columns[1], columns[1]),
+            )
+            for i, value in enumerate(products):
                 out[i] += dr.select(seen, scale * value, 0)
-        dr.eval(out)
-        return tuple(out)
+        local = {"data": data, "magnitude": self._magnitude(a, b)}
+        dr.eval(local, out)
+        return local, tuple(out)
 
     def _step(self, a: Any, b: Any, system: tuple[Any, ...], damping: Any) -> tuple[Any, Any]:
         """Solve the linearised, majorised problem for a step of the offsets."""
@@ -281,7 +300,7 @@ class NormalProblem:
         # d/dx of w2 |delta - aim|^2
         pull = 2.0 * self._w2 * (delta - self._aim)
         irls = None
-        if self._w1 > 0:
+        if self._smooth:
             # w |c| <= w / 2 (c^2 / |c0| + |c0|): the majorant's Hessian is w / |c0|.
             curvature = self._laplacian(delta)
             irls = self._w1 * dr.rsqrt(dr.square(curvature) + L1_FLOOR**2)
@@ -326,19 +345,20 @@ class NormalProblem:
 
         return _conjugate_gradients(apply, (ra, rb), lambda r: _solve(preconditioner, *r))
 
-    def _facing(self, a: Any, b: Any) -> tuple[Any, Any]:
-        """Shrink offsets until the normals face every camera that measures the texel; drop what doesn't help."""
+    def _facing(self, a: Any, b: Any, da: Any, db: Any) -> tuple[Any, Any]:
+        """Take steps from offsets that face every camera that measures the texel, halved until the ends do too."""
         import drjit as dr
 
-        finite = dr.isfinite(a) & dr.isfinite(b)
-        a, b = dr.select(finite, a, 0), dr.select(finite, b, 0)
+        finite = dr.isfinite(da) & dr.isfinite(db)
+        da, db = dr.select(finite, da, 0), dr.select(finite, db, 0)
         for attempt in range(4):
-            good = a * a + b * b < 4.0  # half the chart: a right angle
+            x, y = a + da, b + db
+            good = x * x + y * y < 4.0  # a right angle
             for _, weight, direction, frame in self._views:
-                good &= (weight <= 0) | (dr.dot(_bend(frame, a, b), direction) >= FACING)
+                good &= (weight <= 0) | (dr.dot(_bend(frame, x, y), direction) >= FACING)
             factor = dr.select(good, 1.0, 0.5 if attempt < 3 else 0.0)
-            a, b = a * factor, b * factor
-        return a, b
+            da, db = da * factor, db * factor
+        return a + da, b + db
 
     def _load(self, offsets: NDArray | None) -> tuple[Any, Any]:
         import drjit as dr
@@ -433,9 +453,8 @@ def _conjugate_gradients(
     precondition: Callable[[tuple[Any, Any]], tuple[Any, Any]],
     tolerance: float = 0.03,
     max_iterations: int = 60,
-    check: int = 4,
 ) -> tuple[Any, Any]:
-    """Preconditioned conjugate gradients to a relative residual, which the host reads every ``check`` iterations."""
+    """Preconditioned conjugate gradients to a relative residual."""
     import drjit as dr
 
     def inner(p: tuple[Any, Any], q: tuple[Any, Any]) -> Any:
@@ -446,7 +465,7 @@ def _conjugate_gradients(
     p, rz = z, inner(right, z)
     dr.eval(p, rz)
     goal = tolerance**2 * float(rz[0])
-    for iteration in range(max_iterations):
+    for _ in range(max_iterations):
         q = apply(*p)
         alpha = rz / dr.maximum(inner(p, q), 1e-30)
         x = (x[0] + alpha * p[0], x[1] + alpha * p[1])
@@ -456,9 +475,18 @@ def _conjugate_gradients(
         beta = rz / dr.maximum(before, 1e-30)
         p = (z[0] + beta * p[0], z[1] + beta * p[1])
         dr.eval(x, r, p, rz)
-        if iteration % check == check - 1 and float(rz[0]) <= goal:
+        if float(rz[0]) <= goal:
             break
     return x
+
+
+def _totals(local: dict[str, Any], rough: Any) -> dict[str, float]:
+    """Sums in double precision: millions of small terms, compared to a relative 1e-3 and less."""
+    import drjit as dr
+
+    terms = {**local, "laplacian": rough}
+    dr.eval(terms)
+    return {name: float(np.array(value, dtype=np.float64).sum()) for name, value in terms.items()}
 
 
 def _solve(block: Sequence[Any], ra: Any, rb: Any) -> tuple[Any, Any]:

@@ -1,0 +1,260 @@
+"""Stage 3: normals per timestep that explain the images better than the model's (paper, section 6).
+
+Units of the weights. The paper's images and normal maps are 8-bit: a colour of 1 is 255 steps, a unit normal spans
+127.5 steps to either side. With linear images 0..1 and unit normals its weights become
+
+    w1 * 127.5 / 255^2,    w2 * 127.5^2 / 255^2 = w2 / 4.
+
+The data term sums over the pixels of the views, each shared out among the texels that it shows.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.config import NormalsConfig
+from mifit.core.bend import bend, tangent_plane, texel_neighbours
+from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
+from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.errors import InputError
+from mifit.progress import Progress, silent
+from mifit.stages.observations import Surface
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+    from mifit.render.refine import NormalProblem, Refined
+
+IMAGE_STEPS = 255.0
+NORMAL_STEPS = 127.5
+OUTLIER = 3.0
+"""Robust standard deviations of the residual beyond which an observation's pull stops growing."""
+
+
+def refine_normals(
+    capture: Capture,
+    model: MorphableModel,
+    geometry: GeometryEstimate,
+    reflectance: ReflectanceEstimate,
+    cameras: Sequence[str],
+    config: NormalsConfig,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> NormalsEstimate:
+    """Refine the normals of every timestep of a fit, with reflectance and lighting held.
+
+    Parameters
+    ----------
+    capture, model, geometry, reflectance
+        The inputs and results of stages 1 and 2. Shading is the model that stage 2 used.
+    cameras : sequence of str
+        Cameras to read; no other camera of the capture is touched.
+    config : NormalsConfig
+    seed : int
+        Seed of the tracing of shadows, which only the ``shadowed`` shading model needs.
+    progress : Progress
+
+    Returns
+    -------
+    NormalsEstimate
+        Unit normals in object space. Texels without a measurement keep the model's normal.
+
+    Raises
+    ------
+    InputError
+        No camera or timestep, or maps that aren't square and of one size.
+
+    Notes
+    -----
+    The paper's energy: squared residuals of all views, with a linear tail for outliers, ``laplacian_weight`` times the
+    L1 norm of the correction's Laplacian, ``magnitude_weight`` times its squared length.
+    """
+    began = time.perf_counter()
+    size = check_maps(reflectance)
+    texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+    normals, energies, warnings, seconds = [], {}, [], []
+    outcome = "converged"
+    for i, timestep in enumerate(geometry.timesteps):
+        progress("refine normals", i, len(geometry.timesteps))
+        frame = refine_frame(capture, model, one_timestep(geometry, i), reflectance, cameras, config, texels, seed=seed)
+        normals.append(texels.to_map(frame.normal_object))
+        if frame.seen == 0.0:
+            warnings.append(f"timestep {timestep}: no camera measures the face; normals are the model's")
+        if not frame.solution_converged:
+            outcome = "max_iterations"
+        seconds.append(frame.seconds)
+        for name, values in frame.energies.items():
+            energies[f"{name} {timestep}"] = values
+    progress("refine normals", len(geometry.timesteps), len(geometry.timesteps))
+    longest = max((len(v) for v in energies.values()), default=0)
+    report = Report(
+        outcome,
+        {name: values + values[-1:] * (longest - len(values)) for name, values in energies.items()},
+        time.perf_counter() - began,
+        tuple(warnings),
+        {"solver": config.solver, "seconds_per_timestep": seconds},
+    )
+    return NormalsEstimate(geometry.timesteps, np.stack(normals), report)
+
+
+@dataclass(frozen=True)
+class FrameNormals:
+    """Refined normals of one timestep.
+
+    Attributes
+    ----------
+    normal_object : (N, 3) float32
+        Unit normals per covered texel, object space.
+    base_object : (N, 3) float32
+        The model's normals there.
+    seen : float
+        Part of the texels that some camera measures.
+    solution_converged : bool
+    energies : dict
+        Per term, before and after each iteration.
+    seconds : float
+        Wall time of the solver.
+    """
+
+    normal_object: NDArray[np.float32]
+    base_object: NDArray[np.float32]
+    seen: float
+    solution_converged: bool
+    energies: dict[str, list[float]]
+    seconds: float
+
+
+def refine_frame(
+    capture: Capture,
+    model: MorphableModel,
+    geometry: GeometryEstimate,
+    reflectance: ReflectanceEstimate,
+    cameras: Sequence[str],
+    config: NormalsConfig,
+    texels: TexelMap,
+    aim: NDArray | None = None,
+    seed: int = 0,
+) -> FrameNormals:
+    """Refine the normals of a geometry of one timestep; parameters as in `refine_normals`.
+
+    ``aim`` (N, 2) are offsets in the base normal's tangent plane (`core.bend`) that the correction is drawn to
+    instead of to zero, and from which it starts.
+    """
+    problem, rows, base = frame_problem(capture, model, geometry, reflectance, cameras, config, texels, aim, seed)
+    rotation = geometry.rotation[0]
+    offsets = np.zeros((len(base), 2)) if aim is None else aim.copy()
+    began = time.perf_counter()
+    solution = None
+    if problem is not None:
+        solution = solve(problem, config, None if aim is None else aim[rows])
+        offsets[rows] = solution.offsets
+    elapsed = time.perf_counter() - began
+    base_object = base @ rotation
+    found = normalize(bend(base_object, tangent_plane(base_object), offsets))
+    return FrameNormals(
+        found.astype(np.float32),
+        base_object.astype(np.float32),
+        len(rows) / max(len(base), 1),
+        solution is None or solution.converged,
+        {} if solution is None else solution.energies,
+        elapsed,
+    )
+
+
+def solve(problem: NormalProblem, config: NormalsConfig, start: NDArray | None = None) -> Refined:
+    """Run the solver that the settings name."""
+    if config.solver == "adam":
+        return problem.adam(config.max_iterations, start=start)
+    return problem.gauss_newton(config.max_iterations, start=start)
+
+
+def frame_problem(
+    capture: Capture,
+    model: MorphableModel,
+    geometry: GeometryEstimate,
+    reflectance: ReflectanceEstimate,
+    cameras: Sequence[str],
+    config: NormalsConfig,
+    texels: TexelMap,
+    aim: NDArray | None = None,
+    seed: int = 0,
+) -> tuple[NormalProblem | None, NDArray, NDArray]:
+    """The optimisation of one timestep, the texels (rows of ``texels``) that it solves for, and all base normals.
+
+    Without a measured texel there is no optimisation: None.
+    """
+    from mifit.render.refine import NormalProblem, NormalView, material_shade, residual_scale
+    from mifit.render.transfer import trace_transfer
+
+    rotation = geometry.rotation[0]
+    seen = Surface(capture, model, geometry, cameras, texels.size).observe(np.arange(len(texels.index)))
+    base = seen.normal[:, 0].astype(np.float64)
+    rows = np.flatnonzero((seen.measured > 0).any(1))
+    if not len(rows):
+        return None, rows, base
+    part = seen.take(rows)
+    object_normal = base[rows] @ rotation
+    object_tangents = tangent_plane(object_normal)
+    tangents = object_tangents @ rotation.T
+    views = [
+        NormalView(part.colour[:, j], part.measured[:, j], part.view[:, j], base[rows], tangents)
+        for j in range(len(part.step))
+    ]
+    traced = None
+    if reflectance.shading_model == "shadowed":
+        order = round(len(reflectance.radiance) ** 0.5)
+        vertices = geometry.vertices[0]
+        at_vertices = trace_transfer(
+            vertices, model.faces, vertices, vertex_normals(vertices, model.faces), order, seed=seed
+        )
+        at_texels = interpolate(at_vertices, model.faces, texels.face[rows], texels.weights[rows])
+        traced = [at_texels] * len(views)
+    diffuse, specular = (texels.from_map(m)[rows] for m in (reflectance.diffuse, reflectance.specular))
+    shade = material_shade(reflectance, diffuse, specular, views, traced)
+    patch = TexelMap(texels.size, texels.index[rows], texels.face[rows], texels.weights[rows])
+    drawn = None
+    if aim is not None:
+        drawn = bend(object_normal, object_tangents, aim[rows]) - object_normal
+    problem = NormalProblem(
+        object_normal,
+        object_tangents,
+        texel_neighbours(patch),
+        views,
+        shade,
+        config.laplacian_weight * NORMAL_STEPS / IMAGE_STEPS**2,
+        config.magnitude_weight * (NORMAL_STEPS / IMAGE_STEPS) ** 2,
+        OUTLIER * max(residual_scale(views, shade), 1e-4),
+        drawn,
+    )
+    return problem, rows, base
+
+
+def one_timestep(geometry: GeometryEstimate, index: int) -> GeometryEstimate:
+    """The part of a fit that belongs to one of its timesteps."""
+    part = slice(index, index + 1)
+    return replace(
+        geometry,
+        timesteps=geometry.timesteps[part],
+        expression=geometry.expression[part],
+        rotation=geometry.rotation[part],
+        translation=geometry.translation[part],
+        vertices=geometry.vertices[part],
+    )
+
+
+def check_maps(reflectance: ReflectanceEstimate) -> int:
+    """Side of the maps; raises InputError when they don't belong together."""
+    size = reflectance.diffuse.shape[0]
+    if reflectance.diffuse.shape != (size, size, 3) or reflectance.specular.shape != (size, size):
+        raise InputError(
+            f"reflectance maps: found shapes {reflectance.diffuse.shape} and {reflectance.specular.shape}, expected "
+            "(S, S, 3) and (S, S)"
+        )
+    return size
