@@ -40,14 +40,43 @@ class GeometryConfig:
 
 @dataclass(frozen=True)
 class ReflectanceConfig:
-    """Stage 2, reflectance inference (paper, section 5)."""
+    """Stage 2, reflectance inference (paper, section 5).
+
+    Attributes
+    ----------
+    texture_size : int
+        Side of the maps in texels.
+    solver : {"als", "adam"}
+        ``als``: lighting with the texels eliminated, then the maps by ADMM; ``adam``: the paper's gradient descent.
+    shading : {"auto", "paper", "prefiltered", "shadowed"}
+        Image-formation model; ``auto`` takes the cheapest that explains the images.
+    bands : int
+        Bands of the lighting of ``prefiltered`` and ``shadowed``, 3 to 10; ``paper`` has 3.
+    exponent : float or None
+        Blinn-Phong exponent; without one it is 5 for ``paper``, as in the paper, and estimated otherwise.
+    specular_difference_weight, smoothness_weight : float
+        The paper's lambda_S and lambda_H.
+    specular_smoothness : float
+        Factor on lambda_H for the specular map: one channel, seen only where there is a highlight.
+    robust : bool
+        Give outliers less weight, and weight by a noise model (``als``); without it ``als`` minimises the paper's
+        objective as it stands.
+    symmetric_fill : bool
+        Fill what no image shows from the other half of the face where that was seen.
+    max_iterations : int
+        Gauss-Newton iterations (``als``), or hundreds of gradient steps (``adam``).
+    """
 
     texture_size: int = 512
     solver: Literal["als", "adam"] = "als"
     shading: Literal["auto", "paper", "prefiltered", "shadowed"] = "auto"
-    exponent: float = 5.0
+    bands: int = 10
+    exponent: float | None = None
     specular_difference_weight: float = 0.1
     smoothness_weight: float = 0.001
+    specular_smoothness: float = 30.0
+    robust: bool = True
+    symmetric_fill: bool = False
     max_iterations: int = 30
 
 

@@ -1,0 +1,116 @@
+"""Stage 2: diffuse and specular albedo maps with the lighting (paper, section 5), geometry held fixed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mifit.config import ReflectanceConfig
+from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
+from mifit.core.mesh import interpolate
+from mifit.errors import ConvergenceError, InputError
+from mifit.progress import Progress, silent
+from mifit.stages.observations import Surface
+from mifit.stages.reflectance.als import fit_als
+from mifit.stages.reflectance.fill import blend_unseen
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+
+TEXTURE_SIZES = (16, 4096)
+
+
+def infer_reflectance(
+    capture: Capture,
+    model: MorphableModel,
+    geometry: GeometryEstimate,
+    cameras: Sequence[str],
+    config: ReflectanceConfig | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> ReflectanceEstimate:
+    """Recover diffuse and specular albedo maps and the lighting of a fitted face.
+
+    All timesteps of the geometry and all named cameras enter; albedo and lighting are shared by them. The product
+    of albedo and lighting is all that images show, so the scale between the two is fixed by a convention: the mean
+    diffuse albedo over the seen texels and channels is that of the fitted morphable model. Texels that no image
+    shows are filled from the model's albedo, shifted smoothly to agree with their surroundings.
+
+    Parameters
+    ----------
+    capture : Capture
+    model : MorphableModel
+    geometry : GeometryEstimate
+        Stage 1.
+    cameras : sequence of str
+        Cameras to use; no other camera of the capture is read.
+    config : ReflectanceConfig, optional
+    seed : int
+        Chooses the texels that determine the lighting.
+    progress : Progress
+
+    Returns
+    -------
+    ReflectanceEstimate
+        ``report.details`` holds the shading model chosen and why, the gauge, residuals and coverage.
+
+    Raises
+    ------
+    InputError
+        Settings out of range, no camera, or images that show nothing of the face.
+    ConvergenceError
+        The solver ended without finite maps.
+    """
+    started = time.perf_counter()
+    config = config or ReflectanceConfig()
+    _check(config)
+    surface = Surface(capture, model, geometry, cameras, config.texture_size)
+    albedo = interpolate(geometry.vertex_albedo, model.faces, surface.texels.face, surface.texels.weights)
+    albedo = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float32)
+    fitted, choice, warnings = fit_als(surface, model.faces, albedo, config, seed, progress)
+    if not (np.isfinite(fitted.maps).all() and np.isfinite(fitted.radiance).all()):
+        raise ConvergenceError("stage 2 (reflectance): the maps or the lighting are not finite; see the images' range")
+    quality = surface.quality()
+    diffuse, specular, confidence = blend_unseen(surface.texels, albedo, fitted.maps, quality)
+    if not fitted.converged:
+        warnings = (*warnings, "the lighting had not converged when the iterations ran out; raise max_iterations")
+    details = {
+        "shading": choice,
+        "gauge": "mean diffuse albedo over seen texels and channels equals the morphable model's",
+        "residual": float(fitted.sigma),
+        "seen": float((quality > 0).mean()),
+        "texels": len(surface),
+        "images": surface.image_count,
+    }
+    outcome = "converged" if fitted.converged else "max_iterations"
+    return ReflectanceEstimate(
+        diffuse=diffuse,
+        specular=specular,
+        confidence=confidence,
+        radiance=fitted.radiance,
+        ambient=float(fitted.ambient),
+        exponent=float(fitted.forward.exponent),
+        shading_model=fitted.forward.model,
+        report=Report(outcome, fitted.energies, time.perf_counter() - started, warnings, details),
+    )
+
+
+def _check(config: ReflectanceConfig) -> None:
+    """Refuse settings out of range, by name."""
+    low, high = TEXTURE_SIZES
+    if not low <= config.texture_size <= high:
+        raise InputError(f"reflectance.texture_size: found {config.texture_size}, expected {low} to {high} texels")
+    if not 3 <= config.bands <= 10:
+        raise InputError(f"reflectance.bands: found {config.bands}, expected 3 to 10")
+    if config.exponent is not None and not 1.0 <= config.exponent <= 10000.0:
+        raise InputError(f"reflectance.exponent: found {config.exponent}, expected 1 to 10000, or none to estimate it")
+    if config.max_iterations < 1:
+        raise InputError(f"reflectance.max_iterations: found {config.max_iterations}, expected 1 or more")
+    for name in ("specular_difference_weight", "smoothness_weight", "specular_smoothness"):
+        value = getattr(config, name)
+        if not (np.isfinite(value) and value >= 0):
+            raise InputError(f"reflectance.{name}: found {value}, expected a number not below 0")

@@ -1,0 +1,313 @@
+"""What the images say about each texel: colour, validity, weight, normal and view of every timestep and camera.
+
+Photometric terms are sums over pixels. Here they are sums over texels, each weighted by the number of pixels that
+it covers in a view, so that both sums agree whatever the size of the map, and a texel seen at a grazing angle or
+from far away counts for less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.camera import Camera
+from mifit.core.estimate import GeometryEstimate
+from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
+from mifit.core.uv import TexelMap, bilinear, rasterize_uv
+from mifit.errors import InputError
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+
+GRAZING = (0.1, 0.3)
+"""Cosines between which the weight of an observation fades in: below, interpolated normals and footprints mislead."""
+SECOND = np.array([[1.0, -2.0, 1.0]], dtype=np.float32)
+EDGE_STEP = 0.01
+"""Second difference of depth, relative to the diagonal of the mesh, that makes a pixel part of an occlusion edge."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Observations of N texels by J images; image j is timestep ``step[j]`` of the geometry seen by ``view[j]``.
+
+    Attributes
+    ----------
+    texel : (N,) int64
+        Position of each texel in the `TexelMap`.
+    face : (N,) int32, barycentric : (N, 3) float32
+        Where on the mesh each texel lies.
+    step, camera : (J,) int
+        Index of the timestep in the geometry and of the camera in the list of cameras.
+    colour : (N, J, 3) float32
+        Linear image colour, bilinear; 0 where not observed.
+    weight : (N, J) float32
+        Pixels that the texel covers, faded at grazing angles; 0 where occluded, outside or invalid.
+    clipped : (N, J) bool
+        The colour touches a clipped pixel: a lower bound, not a measurement.
+    point : (N, T, 3), normal : (N, T, 3) float32
+        World position and unit normal per timestep.
+    view : (N, J, 3) float32
+        Unit vectors towards the camera.
+    """
+
+    texel: NDArray[np.int64]
+    face: NDArray[np.int32]
+    barycentric: NDArray[np.float32]
+    step: NDArray[np.int64]
+    camera: NDArray[np.int64]
+    colour: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    clipped: NDArray[np.bool_]
+    point: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    view: NDArray[np.float32]
+
+    @property
+    def measured(self) -> NDArray[np.float32]:
+        """(N, J) weight of the observations that measure: clipped ones count nothing."""
+        return np.where(self.clipped, np.float32(0.0), self.weight)
+
+    @property
+    def image_normal(self) -> NDArray[np.float32]:
+        """(N, J, 3) unit normal per image."""
+        return self.normal[:, self.step]
+
+    def take(self, rows: NDArray | slice) -> Observations:
+        """The observations of some of the texels."""
+        return Observations(
+            self.texel[rows],
+            self.face[rows],
+            self.barycentric[rows],
+            self.step,
+            self.camera,
+            self.colour[rows],
+            self.weight[rows],
+            self.clipped[rows],
+            self.point[rows],
+            self.normal[rows],
+            self.view[rows],
+        )
+
+
+@dataclass(frozen=True)
+class _Image:
+    """One image with what is needed to read it at surface points."""
+
+    step: int
+    camera_index: int
+    camera: Camera
+    colour: NDArray[np.float32]
+    unusable: NDArray[np.float32]  # 1 where invalid, not the face area, or at an occlusion edge
+    clipped: NDArray[np.float32]
+    footprint: NDArray[np.float32]  # (F,) pixels per texel, 0 for faces that face away
+
+
+class Surface:
+    """The images of a capture, read at the surface points of a map.
+
+    Parameters
+    ----------
+    capture, model, geometry
+        Images, topology and fitted vertices; the timesteps are the geometry's.
+    cameras : sequence of str
+        Cameras to read; no other camera of the capture is touched.
+    size : int
+        Side of the map in texels.
+
+    Raises
+    ------
+    InputError
+        No camera, no timestep, or a face area that covers no texel.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        model: MorphableModel,
+        geometry: GeometryEstimate,
+        cameras: Sequence[str],
+        size: int,
+    ) -> None:
+        if not cameras or not geometry.timesteps:
+            raise InputError(
+                f"found {len(cameras)} cameras and {len(geometry.timesteps)} timesteps, expected 1 or more of both"
+            )
+        from mifit.render.gbuffer import SurfaceScene
+
+        self.texels: TexelMap = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+        if not len(self.texels.index):
+            raise InputError(f"model {model.name}: its face area covers no texel of a map of {size} texels a side")
+        self.faces = model.faces
+        self.vertices = [np.asarray(v, dtype=np.float64) for v in geometry.vertices]
+        self.normals = [vertex_normals(v, model.faces) for v in self.vertices]
+        self.scenes = [SurfaceScene(v, model.faces) for v in self.vertices]
+        texel_area = _texel_area(model.uv, model.faces_uv, size)
+        self._images: list[_Image] = []
+        for i, timestep in enumerate(geometry.timesteps):
+            for k, name in enumerate(cameras):
+                camera, frame = capture.camera(name), capture.frame(name, timestep)
+                covered, edge = _face_pixels(self.scenes[i], self.vertices[i], model, camera)
+                unusable = edge | ~covered | ~frame.valid | ~np.isfinite(frame.image).all(-1)
+                self._images.append(
+                    _Image(
+                        i,
+                        k,
+                        camera,
+                        np.where(np.isfinite(frame.image), frame.image, 0).astype(np.float32),
+                        unusable.astype(np.float32),
+                        frame.clipped.astype(np.float32),
+                        _footprint(self.vertices[i], model.faces, camera, texel_area),
+                    )
+                )
+
+    def __len__(self) -> int:
+        return len(self.texels.index)
+
+    @property
+    def image_count(self) -> int:
+        """Number of images J."""
+        return len(self._images)
+
+    @property
+    def pairs(self) -> NDArray[np.int64]:
+        """(P, 2) images of the same timestep: the first camera's with each other's."""
+        first = {m.step: i for i, m in reversed(list(enumerate(self._images)))}
+        pairs = [(first[m.step], i) for i, m in enumerate(self._images) if i != first[m.step]]
+        return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+    def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Random texels among those that some image measures, ascending; at most ``count``.
+
+        Raises
+        ------
+        InputError
+            No image shows the face.
+        """
+        order = rng.permutation(len(self))
+        found: list[NDArray] = []
+        total = 0
+        for start in range(0, len(order), 2 * count):
+            part = order[start : start + 2 * count]
+            part = part[self.observe(part).measured.sum(1) > 0]
+            found.append(part)
+            total += len(part)
+            if total >= count:
+                break
+        if not total:
+            raise InputError(
+                "reflectance: no image shows the fitted face; found 0 visible texels. Check the cameras' calibration "
+                "and the geometry"
+            )
+        return np.sort(np.concatenate(found)[:count])
+
+    def quality(self) -> NDArray[np.float32]:
+        """(N,) how often and how well each texel was measured: 0 never, 1 by half of the images or more."""
+        out = np.zeros(len(self), dtype=np.float32)
+        step = max(1024, (1 << 22) // self.image_count)
+        for start in range(0, len(self), step):
+            part = np.arange(start, min(start + step, len(self)))
+            seen = self.observe(part)
+            cosine = np.einsum("njk,njk->nj", seen.image_normal, seen.view)
+            good = np.where(seen.measured > 0, np.clip(cosine, 0.0, 1.0), 0.0)
+            out[part] = np.minimum(good.sum(1) / max(1.0, 0.35 * self.image_count), 1.0)
+        return out
+
+    def trace(self, order: int) -> tuple[NDArray[np.float32], ...]:
+        """(V, B*B) shadowed transfer vectors at the vertices, per timestep."""
+        from mifit.render.transfer import trace_transfer
+
+        return tuple(
+            trace_transfer(v, self.faces, v, n, order) for v, n in zip(self.vertices, self.normals, strict=True)
+        )
+
+    def observe(self, texel: NDArray[np.int64]) -> Observations:
+        """Read all images at some of the texels (positions in the `TexelMap`)."""
+        face, weights = self.texels.face[texel], self.texels.weights[texel]
+        n, j, t = len(texel), len(self._images), len(self.vertices)
+        colour = np.zeros((n, j, 3), dtype=np.float32)
+        weight = np.zeros((n, j), dtype=np.float32)
+        clipped = np.zeros((n, j), dtype=bool)
+        view = np.zeros((n, j, 3), dtype=np.float32)
+        point = np.zeros((n, t, 3), dtype=np.float32)
+        normal = np.zeros((n, t, 3), dtype=np.float32)
+        for i in range(t):
+            point[:, i] = interpolate(self.vertices[i], self.faces, face, weights)
+            normal[:, i] = normalize(interpolate(self.normals[i], self.faces, face, weights))
+        for k, image in enumerate(self._images):
+            p = point[:, image.step].astype(np.float64)
+            view[:, k] = normalize(image.camera.position - p)
+            colour[:, k], weight[:, k], clipped[:, k] = self._read(image, p, normal[:, image.step], view[:, k], face)
+        return Observations(
+            texel,
+            face,
+            weights,
+            np.array([m.step for m in self._images]),
+            np.array([m.camera_index for m in self._images]),
+            colour,
+            weight,
+            clipped,
+            point,
+            normal,
+            view,
+        )
+
+    def _read(
+        self, image: _Image, point: NDArray, normal: NDArray, view: NDArray, face: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Colour, weight and clipping of one image at surface points."""
+        camera = image.camera
+        pixel = np.nan_to_num(camera.project(point), nan=-1e6)
+        inside = (pixel >= 0.5).all(-1) & (pixel[:, 0] <= camera.width - 0.5) & (pixel[:, 1] <= camera.height - 0.5)
+        cosine = np.sum(normal * view, axis=-1)
+        fade = np.clip((cosine - GRAZING[0]) / (GRAZING[1] - GRAZING[0]), 0.0, 1.0)
+        weight = (image.footprint[face] * fade * inside).astype(np.float32)
+        rows = np.flatnonzero(weight > 0)
+        x, y = pixel[rows, 0] - 0.5, pixel[rows, 1] - 0.5
+        usable = bilinear(image.unusable, x, y) < 0.5
+        usable &= self.scenes[image.step].visible_from(point[rows], camera.position)
+        weight[rows[~usable]] = 0.0
+        rows, x, y = rows[usable], x[usable], y[usable]
+        colour = np.zeros((len(point), 3), dtype=np.float32)
+        clipped = np.zeros(len(point), dtype=bool)
+        colour[rows] = bilinear(image.colour, x, y)
+        clipped[rows] = bilinear(image.clipped, x, y) > 0.0
+        return colour, weight, clipped
+
+
+def _texel_area(uv: NDArray, faces_uv: NDArray, size: int) -> NDArray[np.float64]:
+    """(F,) area of each face in texels."""
+    a, b, c = (uv[faces_uv[:, i]].astype(np.float64) * size for i in range(3))
+    return 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+
+
+def _footprint(vertices: NDArray, faces: NDArray, camera: Camera, texel_area: NDArray) -> NDArray[np.float32]:
+    """(F,) pixels that a texel of each face covers; 0 for faces that face away or lie behind the camera."""
+    pixel = camera.project(vertices)[faces]
+    a, b, c = (pixel[:, i] for i in range(3))
+    # Image rows run down, so a face that shows its front has a negative area here.
+    area = -0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    area = np.where(np.isfinite(area), np.maximum(area, 0.0), 0.0)
+    return (area / np.maximum(texel_area, 1e-9)).astype(np.float32)
+
+
+def _face_pixels(scene, vertices: NDArray, model: MorphableModel, camera: Camera) -> tuple[NDArray, NDArray]:
+    """Pixels whose centre shows the front of the face area, and pixels at occlusion edges (two wide)."""
+    buffer = scene.gbuffer(camera)
+    face = buffer.face
+    toward = camera.position - vertices[model.faces[:, 0]]
+    front = np.sum(face_cross(vertices, model.faces) * toward, axis=1) > 0
+    covered = (face >= 0) & (front & model.face_mask)[np.maximum(face, 0)]
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    depth = np.where(covered, buffer.depth, 0.0).astype(np.float32)
+    kernel = np.ones((3, 3), dtype=np.uint8)
+    # Second differences: an oblique surface has none, however steep.
+    bend = [np.abs(cv2.filter2D(depth, -1, k)) for k in (SECOND, SECOND.T)]
+    jump = np.maximum(*bend) > EDGE_STEP * diagonal
+    edge = cv2.dilate(jump.astype(np.uint8), kernel) > 0
+    return covered, edge

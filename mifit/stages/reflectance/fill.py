@@ -1,0 +1,62 @@
+"""What to show where no image looked: the morphable model's albedo, shifted to meet its surroundings."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.uv import TexelMap
+
+BLEND = 0.05
+"""Confidence at which a texel's own estimate counts as much as its surroundings'."""
+
+
+def blend_unseen(
+    texels: TexelMap, albedo: NDArray, maps: NDArray, quality: NDArray
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Replace texels that were hardly seen by the model's albedo plus a smooth offset from the seen ones.
+
+    Parameters
+    ----------
+    texels : TexelMap
+    albedo : (N, 3)
+        Diffuse albedo of the fitted model.
+    maps : (S, S, 4)
+        Diffuse and specular albedo from the images.
+    quality : (N,)
+        How often and how well each texel was seen, 0..1.
+
+    Returns
+    -------
+    diffuse : (S, S, 3), specular : (S, S), confidence : (S, S) float32
+    """
+    confidence = texels.to_map(quality.astype(np.float32))
+    expected = texels.to_map(albedo.astype(np.float32))
+    offset = maps.copy()
+    offset[..., :3] -= expected
+    smooth = pull_push(offset, confidence)
+    share = (confidence / (confidence + BLEND))[..., None]
+    blended = share * offset + (1.0 - share) * smooth
+    blended[..., :3] += expected
+    blended = np.clip(blended, 0.0, 1.0)
+    outside = ~texels.mask
+    blended[outside] = 0.0
+    return blended[..., :3].astype(np.float32), blended[..., 3].astype(np.float32), confidence
+
+
+def pull_push(image: NDArray, weight: NDArray) -> NDArray[np.float32]:
+    """Weighted average over ever wider surroundings: the finest level that carries weight decides (S, S, C)."""
+    if image.shape[0] <= 2 or image.shape[1] <= 2:
+        total = max(float(weight.sum()), 1e-12)
+        mean = (image * weight[..., None]).sum((0, 1)) / total
+        return np.broadcast_to(mean, image.shape).astype(np.float32)
+    half = ((image.shape[1] + 1) // 2, (image.shape[0] + 1) // 2)
+    shrink = {"dsize": half, "interpolation": cv2.INTER_AREA}
+    coarse_weight = cv2.resize(weight.astype(np.float32), **shrink)
+    coarse = cv2.resize((image * weight[..., None]).astype(np.float32), **shrink)
+    coarse = coarse / np.maximum(coarse_weight, 1e-12)[..., None]
+    wide = pull_push(coarse, np.minimum(coarse_weight, 1.0))
+    wide = cv2.resize(wide, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
+    share = np.clip(weight / BLEND, 0.0, 1.0)[..., None]
+    return (share * image + (1.0 - share) * wide).astype(np.float32)

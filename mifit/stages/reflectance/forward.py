@@ -1,0 +1,92 @@
+"""The image-formation model of stage 2 at observed surface points: what maps and lighting make of a texel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.mesh import interpolate
+from mifit.stages.observations import Observations
+
+CHUNK = 1 << 19
+"""Points shaded at a time: bounds the memory of the basis functions."""
+
+
+@dataclass(frozen=True)
+class Forward:
+    """A shading model with its settings; the shading itself is `render.shading`.
+
+    Attributes
+    ----------
+    model : str
+        ``"paper"``, ``"prefiltered"`` or ``"shadowed"``.
+    order : int
+        Bands of the lighting.
+    exponent : float
+        Blinn-Phong exponent.
+    traced : tuple of (V, B*B) float32
+        Shadowed diffuse transfer per timestep, at the vertices; empty unless ``shadowed``.
+    faces : (F, 3) int
+    """
+
+    model: str
+    order: int
+    exponent: float
+    traced: tuple[NDArray[np.float32], ...] = field(default=(), repr=False)
+    faces: NDArray[np.int32] | None = field(default=None, repr=False)
+
+    def transfers(self, seen: Observations, radiance: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Diffuse (N, J, K) and specular (N, J, K) transfer vectors of observations at unit albedo.
+
+        ``radiance`` matters to the paper's model alone: its dominant direction is held fixed.
+        """
+        from mifit.render.local import diffuse_matrix, specular_matrix
+
+        n, j = seen.weight.shape
+        steps = seen.normal.shape[1]
+        traced = self._traced(seen)
+        if traced is None:
+            diffuse = diffuse_matrix(seen.normal.reshape(-1, 3), self.order).reshape(n, steps, -1)
+        else:
+            diffuse = traced
+        diffuse = diffuse[:, seen.step]
+        rows = diffuse.reshape(n * j, -1) if traced is not None else None
+        specular = specular_matrix(
+            seen.image_normal.reshape(-1, 3), seen.view.reshape(-1, 3), radiance, self.exponent, self.model, rows
+        )
+        return diffuse, specular.reshape(n, j, -1)
+
+    def shade(self, seen: Observations, radiance: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Diffuse and specular reflection (N, J, 3) at unit albedo, without ambient."""
+        from mifit.render.local import shade_points
+
+        n, j = seen.weight.shape
+        shade, glint = np.empty((n, j, 3), np.float32), np.empty((n, j, 3), np.float32)
+        step = max(1, CHUNK // j)
+        for start in range(0, n, step):
+            part = seen.take(slice(start, start + step))
+            normal, view = part.image_normal.reshape(-1, 3), part.view.reshape(-1, 3)
+            traced = self._traced(part)
+            ones = np.ones((len(normal), 3), np.float32)
+            d, s = shade_points(
+                normal,
+                view,
+                ones,
+                ones[:, 0],
+                radiance,
+                0.0,
+                self.exponent,
+                self.model,
+                None if traced is None else traced[:, part.step].reshape(len(normal), -1),
+            )
+            shade[start : start + step], glint[start : start + step] = d.reshape(-1, j, 3), s.reshape(-1, j, 3)
+        return shade, glint
+
+    def _traced(self, seen: Observations) -> NDArray[np.float32] | None:
+        """(N, T, K) traced transfer vectors at the texels, or None."""
+        if self.model != "shadowed":
+            return None
+        assert self.faces is not None
+        return np.stack([interpolate(t, self.faces, seen.face, seen.barycentric) for t in self.traced], axis=1)

@@ -1,0 +1,311 @@
+"""Lighting by Gauss-Newton with the texels eliminated.
+
+The image is bilinear in lighting and maps. Alternating between them crawls along the directions in which both can
+give way. Here both move at once: the four unknowns of a texel touch no other texel, so their blocks are
+eliminated (Schur complement) and what remains is one small dense system for the lighting. A few thousand texels
+determine a few hundred coefficients, so a random subset is enough; the maps are solved afterwards for all texels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.sh import bands, basis
+
+NEGATIVE_DIRECTIONS = 400
+"""Directions at which negative radiance is penalised."""
+DAMPING = 1e-3
+"""Levenberg-Marquardt damping, relative to the diagonal."""
+CAUCHY = 3.0
+"""Residuals of this many robust standard deviations get half the weight."""
+
+
+@dataclass(frozen=True)
+class LightingProblem:
+    """n texels seen in J images, K lighting coefficients.
+
+    Attributes
+    ----------
+    colour : (n, J, 3)
+        Observed linear colour.
+    weight : (n, J, 3)
+        Weight of each observation; 0 where there is none.
+    clipped : (n, J) bool
+        Observations that are lower bounds only.
+    diffuse : (n, J, K)
+        Transfer vectors of the diffuse reflection at unit albedo.
+    specular : (n, J, K)
+        Transfer vectors of the specular reflection at unit albedo.
+    albedo : (n, 3)
+        Diffuse albedo expected by the morphable model.
+    """
+
+    colour: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    clipped: NDArray[np.bool_]
+    diffuse: NDArray[np.float32]
+    specular: NDArray[np.float32]
+    albedo: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class LightingPriors:
+    """Weights of what is assumed where the images are silent, relative to the data's own scale.
+
+    Attributes
+    ----------
+    roughness : float
+        Penalty on (l (l + 1))^2 times the squared coefficients of band l.
+    negative : float
+        Penalty on squared negative radiance.
+    albedo : float
+        Pull of the diffuse albedo to the morphable model's: fixes the gauge between albedo and lighting.
+    specular : float
+        Pull of each texel's specular albedo to the median.
+    """
+
+    roughness: float = 1e-7
+    negative: float = 0.5
+    albedo: float = 1e-2
+    specular: float = 2e-2
+
+
+@dataclass(frozen=True)
+class LightingSolution:
+    """Lighting with the maps of the subset.
+
+    Attributes
+    ----------
+    radiance : (K, 3) float64
+    ambient : float
+        The paper's I_a; 0 unless asked for.
+    diffuse : (n, 3), specular : (n,)
+        Albedos of the subset's texels.
+    sigma : float
+        Robust standard deviation of the residuals, linear colour.
+    energy : list of float
+        Robust data energy per iteration.
+    converged : bool
+    """
+
+    radiance: NDArray[np.float64]
+    ambient: float
+    diffuse: NDArray[np.float32]
+    specular: NDArray[np.float32]
+    sigma: float
+    energy: list[float]
+    converged: bool
+
+
+def solve_lighting(
+    problem: LightingProblem,
+    radiance: NDArray | None = None,
+    specular: float = 0.05,
+    priors: LightingPriors = LightingPriors(),
+    robust: bool = True,
+    with_ambient: bool = False,
+    iterations: int = 12,
+    tolerance: float = 1e-3,
+) -> LightingSolution:
+    """Find lighting and the subset's albedos together.
+
+    Parameters
+    ----------
+    problem : LightingProblem
+    radiance : (K, 3), optional
+        Start; by default the best one for the model's albedo and the given specular albedo.
+    specular : float
+        Specular albedo to start from. Zero is a stationary point of the bands that only the specular lobe sees.
+    priors : LightingPriors
+    robust : bool
+        Give outliers less weight (Cauchy).
+    with_ambient : bool
+        Also find the paper's scalar ambient term, not below zero.
+    iterations : int
+    tolerance : float
+        Stop when no lighting coefficient moves by more than this, relative to the largest, or the energy
+        changes by less.
+    """
+    n, _, k = problem.specular.shape
+    band = bands(round(np.sqrt(k))).astype(np.float64)
+    stiffness = (band * (band + 1.0)) ** 2
+    diffuse = problem.albedo.astype(np.float32).copy()
+    gloss = np.full(n, specular, dtype=np.float32)
+    light = _initial(problem, diffuse, gloss, stiffness) if radiance is None else np.array(radiance, dtype=np.float64)
+    sphere_basis = basis(_sphere(NEGATIVE_DIRECTIONS), round(np.sqrt(k)))
+    energy: list[float] = []
+    ambient, sigma, converged = 0.0, 0.0, False
+    for _ in range(iterations):
+        shade = np.einsum("njk,kc->njc", problem.diffuse, light.astype(np.float32))
+        glint = np.einsum("njk,kc->njc", problem.specular, light.astype(np.float32))
+        residual = problem.colour - diffuse[:, None] * shade - gloss[:, None, None] * glint - np.float32(ambient)
+        weight, sigma = active_weight(problem.weight, problem.clipped, residual, robust)
+        energy.append(float((weight * residual**2).sum()))
+        if not np.isfinite(energy[-1]):
+            break
+        system = _Normal.accumulate(problem, diffuse, gloss, shade, glint, residual, weight)
+        system.add_priors(priors, light, diffuse, gloss, problem.albedo, stiffness, sphere_basis)
+        step = system.solve(with_ambient)
+        light = light + step.light
+        ambient = max(ambient + step.ambient, 0.0)
+        diffuse = np.clip(diffuse + step.diffuse, 0.0, 1.5).astype(np.float32)
+        gloss = np.clip(gloss + step.gloss, 0.0, 1.0).astype(np.float32)
+        gain = gauge(diffuse, problem.albedo, problem.weight)
+        diffuse, light = (diffuse / gain).astype(np.float32), light * gain
+        gloss = (gloss / gain).astype(np.float32)
+        small = np.abs(step.light).max() < tolerance * np.abs(light).max()
+        if small or (len(energy) > 3 and abs(energy[-2] - energy[-1]) < tolerance * energy[-1]):
+            converged = True
+            break
+    return LightingSolution(light, ambient, diffuse, gloss, sigma, energy, converged)
+
+
+def gauge(diffuse: NDArray, albedo: NDArray, weight: NDArray) -> float:
+    """Factor between lighting and albedo that makes the mean seen diffuse albedo, over all channels, the model's."""
+    seen = weight.sum(axis=1)
+    return float((seen * diffuse).sum() / max((seen * albedo).sum(), 1e-12)) or 1.0
+
+
+def active_weight(
+    weight: NDArray, clipped: NDArray, residual: NDArray, robust: bool
+) -> tuple[NDArray[np.float32], float]:
+    """Weights of this iteration: clipped observations count only where the model is too dark, outliers less."""
+    measured = (weight > 0) & ~clipped[..., None]
+    values = np.abs(residual[measured])
+    sigma = 1.4826 * float(np.median(values[:: max(1, len(values) // 200_000)])) if len(values) else 0.0
+    active = np.where(clipped[..., None] & (residual <= 0), np.float32(0.0), weight)
+    if robust:
+        active = active / (1.0 + (residual / max(CAUCHY * sigma, 1e-4)) ** 2)
+    return active.astype(np.float32), sigma
+
+
+def _initial(problem: LightingProblem, diffuse: NDArray, gloss: NDArray, stiffness: NDArray) -> NDArray[np.float64]:
+    """Linear least squares for the lighting with fixed maps."""
+    k = problem.specular.shape[-1]
+    light = np.zeros((k, 3))
+    for c in range(3):
+        rows = (diffuse[:, None, None, c] * problem.diffuse + gloss[:, None, None] * problem.specular).reshape(-1, k)
+        w = np.where(problem.clipped, 0, problem.weight[..., c]).ravel()
+        h = (rows * w[:, None]).T @ rows
+        scale = max(float(np.trace(h)) / k, 1e-12)
+        g = (rows * w[:, None]).T @ problem.colour[..., c].ravel()
+        light[:, c] = np.linalg.solve(h.astype(np.float64) + np.diag(scale * (1e-6 + 1e-4 * stiffness)), g)
+    return light
+
+
+@dataclass(frozen=True)
+class _Step:
+    light: NDArray[np.float64]
+    ambient: float
+    diffuse: NDArray[np.float32]
+    gloss: NDArray[np.float32]
+
+
+@dataclass
+class _Normal:
+    """Normal equations: lighting (3K) and ambient (1) against the texels' own blocks of four."""
+
+    system: NDArray[np.float64]  # (3K + 1, 3K + 1)
+    right: NDArray[np.float64]
+    own: NDArray[np.float32]  # (n, 4, 4)
+    own_right: NDArray[np.float32]
+    cross: NDArray[np.float32]  # (n, 4, 3K + 1)
+
+    @classmethod
+    def accumulate(
+        cls,
+        problem: LightingProblem,
+        diffuse: NDArray,
+        gloss: NDArray,
+        shade: NDArray,
+        glint: NDArray,
+        residual: NDArray,
+        weight: NDArray,
+    ) -> _Normal:
+        n, _, k = problem.specular.shape
+        system, right = np.zeros((3 * k + 1, 3 * k + 1)), np.zeros(3 * k + 1)
+        own, own_right = np.zeros((n, 4, 4), np.float32), np.zeros((n, 4), np.float32)
+        cross = np.zeros((n, 4, 3 * k + 1), np.float32)
+        for c in range(3):
+            block = slice(c * k, (c + 1) * k)
+            rows = diffuse[:, None, None, c] * problem.diffuse + gloss[:, None, None] * problem.specular
+            w, r = weight[..., c], residual[..., c]
+            jd, js = shade[..., c], glint[..., c]
+            weighted = rows * w[..., None]
+            flat = weighted.reshape(-1, k)
+            system[block, block] = flat.T @ rows.reshape(-1, k)
+            system[block, -1] = system[-1, block] = flat.sum(0)
+            system[-1, -1] += w.sum()
+            right[block] = flat.T @ r.ravel()
+            right[-1] += (w * r).sum()
+            own[:, c, c] = (w * jd * jd).sum(1)
+            own[:, c, 3] = own[:, 3, c] = (w * jd * js).sum(1)
+            own[:, 3, 3] += (w * js * js).sum(1)
+            own_right[:, c] = (w * jd * r).sum(1)
+            own_right[:, 3] += (w * js * r).sum(1)
+            cross[:, c, block] = np.matmul(jd[:, None], weighted)[:, 0]
+            cross[:, 3, block] = np.matmul(js[:, None], weighted)[:, 0]
+            cross[:, c, -1] = (w * jd).sum(1)
+            cross[:, 3, -1] += (w * js).sum(1)
+        return cls(system, right, own, own_right, cross)
+
+    def add_priors(
+        self,
+        priors: LightingPriors,
+        light: NDArray,
+        diffuse: NDArray,
+        gloss: NDArray,
+        albedo: NDArray,
+        stiffness: NDArray,
+        sphere_basis: NDArray,
+    ) -> None:
+        """Add the quadratic penalties of `LightingPriors`."""
+        k = len(stiffness)
+        scale = float(np.trace(self.system[:-1, :-1])) / (3 * k)
+        for c in range(3):
+            pull = priors.albedo * float(np.median(self.own[:, c, c]))
+            self.own[:, c, c] += pull
+            self.own_right[:, c] += pull * (albedo[:, c] - diffuse[:, c])
+        pull = priors.specular * float(np.median(self.own[:, 3, 3]))
+        self.own[:, 3, 3] += pull
+        self.own_right[:, 3] += pull * (np.median(gloss) - gloss)
+        radiance = sphere_basis @ light
+        for c in range(3):
+            block = slice(c * k, (c + 1) * k)
+            negative = radiance[:, c] < 0
+            rows = sphere_basis[negative]
+            pull = priors.negative * scale * 4.0 * np.pi / len(sphere_basis)
+            smooth = priors.roughness * scale * stiffness
+            self.system[block, block] += pull * rows.T @ rows + np.diag(smooth)
+            self.right[block] -= pull * rows.T @ radiance[negative, c] + smooth * light[:, c]
+
+    def solve(self, with_ambient: bool) -> _Step:
+        """Eliminate the texels, solve for lighting and ambient, and substitute back."""
+        size = len(self.right)
+        count = size if with_ambient else size - 1
+        diagonal = np.einsum("nii->ni", self.own)
+        floor = 1e-6 * float(np.median(diagonal)) + 1e-12
+        damped = self.own + np.eye(4, dtype=np.float32) * (DAMPING * diagonal + floor)[:, :, None]
+        inverse = np.linalg.inv(damped)
+        cross = self.cross[:, :, :count]
+        eliminated = np.matmul(inverse, cross)
+        own_diagonal = np.diag(self.system)[:count]
+        reduced = self.system[:count, :count] - cross.reshape(-1, count).T @ eliminated.reshape(-1, count)
+        reduced += np.diag(DAMPING * own_diagonal + 1e-8 * own_diagonal.mean())
+        right = self.right[:count] - np.einsum("nak,na->k", eliminated, self.own_right)
+        move = np.linalg.solve(reduced, right)
+        own_move = np.einsum("nab,nb->na", inverse, self.own_right) - eliminated @ move.astype(np.float32)
+        light = move[: size - 1].reshape(3, -1).T
+        return _Step(light, float(move[-1]) if with_ambient else 0.0, own_move[:, :3], own_move[:, 3])
+
+
+def _sphere(count: int) -> NDArray[np.float64]:
+    """Evenly spread unit directions (Fibonacci lattice)."""
+    i = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * i / count
+    phi = i * np.pi * (3.0 - np.sqrt(5.0))
+    r = np.sqrt(1.0 - z * z)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)

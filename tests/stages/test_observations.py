@@ -1,0 +1,189 @@
+"""Observations: colours, weights and visibility against a scene whose answer is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from mifit.core.camera import Camera
+from mifit.core.estimate import GeometryEstimate, Report
+from mifit.errors import InputError
+
+SIZE = 16
+
+
+@dataclass(frozen=True)
+class Quad:
+    """As much of a morphable model as the observations need: a square facing +z, 2 units wide."""
+
+    name: str = "quad"
+    faces: np.ndarray = None
+    uv: np.ndarray = None
+    faces_uv: np.ndarray = None
+    face_mask: np.ndarray = None
+
+
+@dataclass(frozen=True)
+class FakeFrame:
+    image: np.ndarray
+    valid: np.ndarray
+    clipped: np.ndarray
+
+
+class FakeCapture:
+    def __init__(self, cameras, images):
+        self._cameras, self._images = cameras, images
+        self.read = set()
+
+    def camera(self, name):
+        return self._cameras[name]
+
+    def frame(self, name, timestep):
+        self.read.add(name)
+        return self._images[name]
+
+
+VERTICES = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=np.float32)
+
+
+def quad(mask=(True, True)):
+    faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+    uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)
+    return Quad("quad", faces, uv, faces, np.array(mask))
+
+
+def geometry(vertices=VERTICES):
+    return GeometryEstimate(
+        (0,),
+        np.zeros(1),
+        np.zeros(1),
+        np.zeros((1, 1)),
+        np.eye(3)[None],
+        np.zeros((1, 3)),
+        1.0,
+        np.asarray(vertices)[None],
+        np.full((len(vertices), 3), 0.4, np.float32),
+        np.zeros((9, 3)),
+        0.0,
+        Report("converged"),
+    )
+
+
+def camera(angle=0.0, name="left", distance=4.0):
+    """Looks at the origin from ``angle`` radians about the vertical axis; the square is 32 pixels wide head on."""
+    eye = distance * np.array([np.sin(angle), 0.0, np.cos(angle)])
+    z = -eye / distance
+    x = np.cross([0.0, -1.0, 0.0], z)
+    rotation = np.stack([x, np.cross(z, x), z])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
+    return Camera(name, 48, 48, 16 * distance, 16 * distance, 24.0, 24.0, pose)
+
+
+def ramp():
+    """Colours linear in the pixel, so that bilinear reading is exact."""
+    y, x = np.mgrid[0:48, 0:48] + 0.5
+    return np.stack([x / 100, y / 100, (x + y) / 200], axis=-1).astype(np.float32)
+
+
+def capture(angles=(0.0,), image=None, valid=None, clipped=None):
+    names = ["left", "right", "third"][: len(angles)]
+    image = ramp() if image is None else image
+    frame = FakeFrame(
+        image,
+        np.ones(image.shape[:2], bool) if valid is None else valid,
+        np.zeros(image.shape[:2], bool) if clipped is None else clipped,
+    )
+    return FakeCapture({n: camera(a, n) for n, a in zip(names, angles, strict=True)}, dict.fromkeys(names, frame))
+
+
+def observe(shot, model=None, cameras=("left",), geo=None):
+    from mifit.stages.observations import Surface
+
+    surface = Surface(shot, model or quad(), geo or geometry(), cameras, SIZE)
+    return surface, surface.observe(np.arange(len(surface)))
+
+
+def test_colours_are_those_of_the_projected_points(variant):
+    _, seen = observe(capture())
+    inside = seen.weight[:, 0] > 0
+    assert inside.mean() > 0.7
+    pixel = camera().project(seen.point[:, 0].astype(float))
+    expected = np.stack([pixel[:, 0] / 100, pixel[:, 1] / 100, pixel.sum(1) / 200], axis=-1)
+    np.testing.assert_allclose(seen.colour[inside, 0], expected[inside], atol=1e-5)
+    # Row 0 of a map is v = 1: the first texels lie at the top, where the image's rows are small.
+    assert seen.point[0, 0, 1] > 0.9 and pixel[0, 1] < 10
+
+
+def test_weights_count_pixels(variant):
+    _, seen = observe(capture())
+    full = seen.weight[seen.weight > 0]
+    np.testing.assert_allclose(full, (32 / SIZE) ** 2, rtol=0.02)  # 32 pixels over 16 texels
+
+
+def test_oblique_views_weigh_less_and_see_along_the_right_direction(variant):
+    _, seen = observe(capture((0.0, 0.7)), cameras=("left", "right"))
+    both = (seen.weight > 0).all(1)
+    ratio = seen.weight[both, 1] / seen.weight[both, 0]
+    assert 0.6 < np.median(ratio) < 0.9  # cos 0.7 = 0.76
+    toward = camera(0.7).position - seen.point[:, 0]
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    np.testing.assert_allclose(seen.view[:, 1], toward, atol=1e-5)
+
+
+def test_only_named_cameras_are_read(variant):
+    shot = capture((-0.3, 0.3, 0.0))
+    observe(shot, cameras=("left", "right"))
+    assert shot.read == {"left", "right"}
+
+
+def test_back_sides_invalid_and_non_finite_pixels_count_nothing(variant):
+    _, behind = observe(capture((np.pi,)))
+    assert (behind.weight == 0).all()
+    image = ramp()
+    image[:, :24] = np.nan
+    _, seen = observe(capture(image=image))
+    left = seen.point[:, 0, 0] < -0.1
+    assert (seen.weight[left] == 0).all() and (seen.weight[seen.point[:, 0, 0] > 0.2] > 0).mean() > 0.7
+    assert np.isfinite(seen.colour).all()
+    valid = np.ones((48, 48), bool)
+    valid[:24] = False
+    _, seen = observe(capture(valid=valid))
+    assert (seen.weight[seen.point[:, 0, 1] > 0.1] == 0).all()
+
+
+def test_clipped_pixels_are_bounds_not_measurements(variant):
+    clipped = np.zeros((48, 48), bool)
+    clipped[:, 30:] = True
+    _, seen = observe(capture(clipped=clipped))
+    right = (seen.point[:, 0, 0] > 0.5) & (seen.weight[:, 0] > 0)
+    assert right.any() and seen.clipped[right].all() and (seen.measured[right] == 0).all()
+
+
+def test_an_occluder_hides_what_is_behind_it(variant):
+    near = VERTICES * 0.4 + [0.0, 0.0, 1.0]
+    model = quad((True, True, False, False))
+    model = replace(
+        model,
+        faces=np.concatenate([model.faces, model.faces + 4]),
+        faces_uv=np.concatenate([model.faces_uv, model.faces_uv]),
+    )
+    _, seen = observe(capture(), model, geo=geometry(np.concatenate([VERTICES, near]).astype(np.float32)))
+    middle = np.abs(seen.point[:, 0, :2]).max(1) < 0.4
+    rim = (np.abs(seen.point[:, 0, :2]).max(1) > 0.7) & (np.abs(seen.point[:, 0, :2]).max(1) < 0.85)
+    assert (seen.weight[middle] == 0).all()
+    assert (seen.weight[rim] > 0).mean() > 0.9
+
+
+def test_nothing_to_observe_is_an_error_with_a_reason(variant):
+    from mifit.stages.observations import Surface
+
+    with pytest.raises(InputError, match="0 cameras"):
+        Surface(capture(), quad(), geometry(), [], SIZE)
+    with pytest.raises(InputError, match="covers no texel"):
+        Surface(capture(), quad((False, False)), geometry(), ["left"], SIZE)
+    surface = Surface(capture((np.pi,)), quad(), geometry(), ["left"], SIZE)
+    with pytest.raises(InputError, match="no image shows"):
+        surface.sample(10, np.random.default_rng(0))
