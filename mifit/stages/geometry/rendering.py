@@ -27,7 +27,7 @@ from mifit.stages.geometry.images import SmoothImage
 from mifit.stages.geometry.landmarks import LandmarkTerm
 from mifit.stages.geometry.normal import NormalEquations, prior_energy
 from mifit.stages.geometry.parameters import Frames, Layout, Pose, cross_matrix
-from mifit.stages.geometry.points import project
+from mifit.stages.geometry.points import Projection, project
 
 WHITE = 255.0
 AMBIENT_PRIOR = 1e-2  # of the squared ambient term in 0..1: fixes the gauge against the constant harmonic
@@ -92,7 +92,7 @@ class Observation:
     residual: NDArray  # (n, 3), 0..255
     ok: NDArray  # (n,) bool
     slope: NDArray | None
-    projection: object
+    projection: Projection
     normal: NDArray  # (n, 3) world
     albedo: NDArray
     shade: NDArray
@@ -225,35 +225,57 @@ class RenderingProblem:
             by_shading[:, c, :, c] = WHITE * o.albedo[:, c, None] * o.basis
         shared[:, layout.at("shading")] = by_shading.reshape(3 * n, 27)
         shared[:, layout.at("ambient")] = WHITE
-        pose = self.frames.pose(layout, x, view.step)
-        by_pixel = -WHITE * o.slope.astype(np.float64)  # (n, 3, 2)
-        by_object = by_pixel @ o.projection.by_object
-        # shading through the world normal, each channel its own lighting
-        by_normal = (
-            WHITE
-            * o.albedo[:, :, None]
-            * np.einsum("nkd,kc->ncd", o.basis_slope, x[layout.at("shading")].reshape(9, 3))
-        )
-        tangent = np.eye(3) - o.unit[:, :, None] * o.unit[:, None, :]
-        by_q = (by_normal @ pose.rotation) @ tangent / o.length[:, None, None]  # d residual / d interpolated normal
-        sums = surface.normal_sum[corners]
-        long = np.maximum(np.linalg.norm(sums, axis=2, keepdims=True), 1e-30)
-        m = sums / long
-        project_corner = (np.eye(3) - m[..., :, None] * m[..., None, :]) / long[..., None]  # (n, corner, 3, 3)
-        by_sum = np.einsum("ncd,nk,nkde->ncke", by_q, w, project_corner)
-        by_vertex = by_object[:, :, None, :] * w[:, None, :, None]
-        columns = np.broadcast_to((3 * corners[:, :, None] + np.arange(3))[:, None], by_vertex.shape).ravel()
-        pointer = np.arange(0, 27 * n + 1, 9)
-        through_position = sp.csr_matrix((by_vertex.astype(dtype).ravel(), columns, pointer), shape=(3 * n, size))
-        through_normal = sp.csr_matrix((by_sum.astype(dtype).ravel(), columns, pointer), shape=(3 * n, size))
+        by_pixel, by_normal, through_position, through_normal = self.by_vertex(view, surface, o, x)
         rows = through_position + through_normal @ derivative
         shared[:, layout.at("identity")] = rows @ model.identity.reshape(size, -1)
         local[:, : layout.expression] = rows @ model.expression.reshape(size, -1)
         by_pose = by_pixel @ o.projection.by_pose
         # a rotation d w turns the normal by d w x n
+        pose = self.frames.pose(layout, x, view.step)
         by_pose[:, :, :3] -= by_normal @ cross_matrix(o.normal) @ pose.left_jacobian
         local[:, layout.expression :] = by_pose.reshape(3 * n, 6)
         if layout.log_scale:
             by_scale = np.einsum("nci,ni->nc", by_pixel, o.projection.by_log_scale)
             shared[:, layout.at("log_scale").start] = by_scale.ravel()
         return shared, local
+
+    def by_vertex(
+        self, view: PixelView, surface: Surface, o: Observation, x: NDArray
+    ) -> tuple[NDArray, NDArray, sp.csr_matrix, sp.csr_matrix]:
+        """Sparse derivatives of the residuals by what lies at the three corners of each pixel's face.
+
+        Returns
+        -------
+        by_pixel (n, 3, 2), by_normal (n, 3, 3) : by the projected position and by the world-space normal
+        through_position, through_normal : (3n, 3V)
+            By the corners' object-space positions, and by their unnormalised normals.
+        """
+        layout, model = self.layout, self.model
+        dtype = model.mean.dtype
+        n = len(view.face)
+        corners = model.faces[view.face]
+        w = view.weights.astype(np.float64)
+        pose = self.frames.pose(layout, x, view.step)
+        assert o.slope is not None
+        by_pixel = -WHITE * o.slope.astype(np.float64)
+        by_object = by_pixel @ o.projection.by_object
+        # shading through the world normal, each channel its own lighting
+        lighting = np.einsum("nkd,kc->ncd", o.basis_slope, x[layout.at("shading")].reshape(9, 3))
+        by_normal = WHITE * o.albedo[:, :, None] * lighting
+        tangent = np.eye(3) - o.unit[:, :, None] * o.unit[:, None, :]
+        by_interpolated = (by_normal @ pose.rotation) @ tangent / o.length[:, None, None]
+        sums = surface.normal_sum[corners]
+        length = np.maximum(np.linalg.norm(sums, axis=2, keepdims=True), 1e-30)
+        unit = sums / length
+        at_corner = (np.eye(3) - unit[..., :, None] * unit[..., None, :]) / length[..., None]  # (n, corner, 3, 3)
+        by_sum = np.matmul(by_interpolated[:, None], w[:, :, None, None] * at_corner).transpose(0, 2, 1, 3)
+        by_position = by_object[:, :, None, :] * w[:, None, :, None]
+        columns = np.broadcast_to((3 * corners[:, :, None] + np.arange(3))[:, None], by_position.shape).ravel()
+        pointer = np.arange(0, 27 * n + 1, 9)
+        shape = (3 * n, 3 * len(model.mean))
+        return (
+            by_pixel,
+            by_normal,
+            sp.csr_matrix((by_position.astype(dtype).ravel(), columns, pointer), shape=shape),
+            sp.csr_matrix((by_sum.astype(dtype).ravel(), columns, pointer), shape=shape),
+        )
