@@ -166,45 +166,26 @@ def shade_methods(
 def shade(
     reconstruction: Reconstruction, surface: VisibleSurface, timestep: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Diffuse (with ambient) and specular radiance (N, 3) of a visible surface, by the model that was fitted."""
-    from mifit.render.local import shade_points
+    """Diffuse (with ambient) and specular radiance (N, 3) of a visible surface, by the model that was fitted.
+
+    Shadows, where the model has them, are traced at the vertices and interpolated, as in the fit.
+    """
+    from mifit.render.bent import shade_bent
+    from mifit.render.transfer import trace_transfer
 
     reflectance = reconstruction.reflectance
     assert reflectance is not None
     material = surface_material(reconstruction, surface, timestep)
-    transfer = None
+    base = _mesh_normals(reconstruction, surface, timestep)
+    traced = None
     if reflectance.shading_model == "shadowed":
-        transfer = shadowed_transfer(reconstruction, surface, timestep, material.normal)
-    return shade_points(
-        material.normal,
-        surface.view,
-        material.diffuse,
-        material.specular,
-        reflectance.radiance,
-        reflectance.ambient,
-        reflectance.exponent,
-        reflectance.shading_model,
-        transfer,
-    )
-
-
-def shadowed_transfer(
-    reconstruction: Reconstruction, surface: VisibleSurface, timestep: int, normal: NDArray
-) -> NDArray[np.float32]:
-    """(N, B*B) diffuse transfer with the head's own shadows.
-
-    Shadows are traced at the vertices and interpolated; what a refined normal changes is added in closed form.
-    """
-    from mifit.render.local import diffuse_matrix
-    from mifit.render.transfer import trace_transfer
-
-    order = reconstruction.lighting.order
-    vertices = reconstruction.geometry.vertices[reconstruction.index(timestep)]
-    faces = reconstruction.model.faces
-    traced = trace_transfer(vertices, faces, vertices, vertex_normals(vertices, faces), order)
-    base = _mesh_normals(reconstruction, surface, timestep).astype(np.float32)
-    shadowed = interpolate(traced, faces, surface.face, surface.weights).astype(np.float32)
-    return shadowed + diffuse_matrix(normal, order) - diffuse_matrix(base, order)
+        vertices = reconstruction.geometry.vertices[reconstruction.index(timestep)]
+        faces = reconstruction.model.faces
+        at_vertices = trace_transfer(
+            vertices, faces, vertices, vertex_normals(vertices, faces), reconstruction.lighting.order
+        )
+        traced = interpolate(at_vertices, faces, surface.face, surface.weights)
+    return shade_bent(material.normal, base, surface.view, material.diffuse, material.specular, reflectance, traced)
 
 
 def _mesh_normals(reconstruction: Reconstruction, surface: VisibleSurface, timestep: int) -> NDArray:

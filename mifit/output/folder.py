@@ -18,6 +18,7 @@ from mifit.core.image import encode_png, read_image, write_image
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
 from mifit.output.ply import read_ply, write_ply
+from mifit.output.scene import write_scene
 from mifit.output.surface import split_at_seams, tangent_space_map
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def save(result: Reconstruction, folder: Path) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "result.json").unlink(missing_ok=True)
-    for pattern in ("geometry/*.ply", "maps/*", "lighting.exr", "scene*.xml"):
+    for pattern in ("geometry/*.ply", "maps/*", "lighting.exr", "scene*.xml", "scene_files/*"):
         for old in folder.glob(pattern):
             old.unlink()
     (folder / "geometry").mkdir(exist_ok=True)
@@ -66,6 +67,7 @@ def save(result: Reconstruction, folder: Path) -> None:
         for name in ("diffuse", "specular", "confidence"):
             write_image(folder / "maps" / f"{name}.exr", getattr(result.reflectance, name))
         write_image(folder / "lighting.exr", result.lighting.to_latlong())
+    write_scene(result, folder / "scene.xml", result.timesteps[0])
     write_text(folder / "result.json", json.dumps(_document(result), indent=1, allow_nan=False) + "\n")
 
 

@@ -21,6 +21,7 @@ def write_ply(
     normals: NDArray,
     uv: NDArray,
     albedo: NDArray,
+    viewer_colours: bool = True,
 ) -> None:
     """Write a triangle mesh, whole or not at all.
 
@@ -32,17 +33,19 @@ def write_ply(
     uv : (N, 2)
         Properties ``u v``, v = 0 at the last row of a map.
     albedo : (N, 3)
-        Linear reflectance 0..1: properties ``r g b`` (float32, what Mitsuba reads as ``vertex_color``) and
-        ``red green blue`` (8-bit sRGB, what mesh viewers show).
+        Linear reflectance 0..1: properties ``r g b``, float32, what Mitsuba reads as ``vertex_color``.
+    viewer_colours : bool
+        Also writes ``red green blue``, 8-bit sRGB, what mesh viewers show and Mitsuba warns of.
     """
     layout = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz", "u", "v", "r", "g", "b")]
-    layout += [(name, "u1") for name in ("red", "green", "blue")]
+    if viewer_colours:
+        layout += [(name, "u1") for name in ("red", "green", "blue")]
     table = np.empty(len(vertices), dtype=layout)
     columns = np.concatenate([vertices, normals, uv, albedo], axis=1)
     for i, (name, _) in enumerate(layout[:11]):
         table[name] = columns[:, i]
     colour = to_8_bit(albedo)
-    for i, name in enumerate(("red", "green", "blue")):
+    for i, (name, _) in enumerate(layout[11:]):
         table[name] = colour[:, i]
     rows = np.empty(len(faces), dtype=_FACE)
     rows["count"], rows["index"] = 3, faces

@@ -1,0 +1,123 @@
+"""Scene files: what a user renders from them is what mifit renders, with our plugins and with stock ones."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import mifit
+from mifit.core.estimate import NormalsEstimate
+from mifit.core.image import to_8_bit
+from mifit.core.metrics import psnr
+from mifit.errors import InputError
+from mifit.output.export import export
+from mifit.output.scene import write_scene
+from mifit.output.surface import surface_maps
+from mifit.render.scene_image import render_scene
+from tests.output.conftest import ball_camera
+from tests.output.test_views import smooth_environment
+
+
+@pytest.fixture(scope="module")
+def flat(ball):
+    """The ball without ambient term, which path tracing doesn't have."""
+    return replace(ball, reflectance=replace(ball.reflectance, ambient=0.0))
+
+
+@pytest.fixture(scope="module")
+def scene(flat, variant, tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "ball.xml"
+    export(flat, "mitsuba", path, timestep=0)
+    return path
+
+
+def test_scene_file_renders_as_mifit_renders(flat, scene):
+    ours = flat.render(flat.cameras[1], 0, integrator="path", samples=64, seed=3)
+    theirs = render_scene(scene, {}, spp=64, seed=3, sensor=1)
+    inside = (ours[..., 3] == 1) & (theirs[..., 3] == 1)
+    np.testing.assert_allclose(ours[inside][:, :3], theirs[inside][:, :3], atol=1e-6)
+    other = render_scene(scene, {}, spp=64, seed=4, sensor=1)
+    assert psnr(to_8_bit(other[..., :3]), to_8_bit(ours[..., :3]), inside) > 30
+
+
+def test_path_tracing_a_convex_diffuse_ball_is_local_shading(flat):
+    """No shadows, no interreflection: both integrators answer the same, bent normals included.
+
+    Light from the side makes irradiance change most with the normal. The bend is small: a path loses the light below
+    the mesh's horizon that a bent normal would see, by about its square.
+    """
+    camera = ball_camera(angle=10)
+    tilt = Rotation.from_euler("y", -10, degrees=True).as_matrix().astype(np.float32)
+    radiance = np.zeros((9, 3))
+    radiance[0], radiance[3] = 3.0, -1.7  # Y_1,1 = -k x
+    flat = replace(flat, reflectance=replace(flat.reflectance, radiance=radiance), normals=None)
+    base = np.stack([surface_maps(flat, t).normal for t in flat.timesteps])
+    tilted = replace(flat, normals=NormalsEstimate(flat.timesteps, base @ tilt, flat.geometry.report))
+    local = tilted.render(camera, 0, method="diffuse")
+    path = tilted.render(camera, 0, method="diffuse", integrator="path", samples=512)
+    smooth = flat.render(camera, 0, method="diffuse")
+    inside = (local[..., 3] == 1) & (path[..., 3] == 1)
+    inside[:20], inside[-20:], inside[:, :20], inside[:, -20:] = False, False, False, False
+    error = np.abs(path - local)[inside][:, :3].mean()
+    bend = np.abs(smooth - local)[inside][:, :3].mean()
+    assert bend > 0.02 and error < 0.25 * bend
+    unbent = flat.render(camera, 0, method="diffuse", integrator="path", samples=256)
+    assert unbent[inside][:, :3].mean() == pytest.approx(smooth[inside][:, :3].mean(), rel=0.005)
+
+
+def test_specular_light_of_both_integrators_is_alike(flat):
+    camera = ball_camera(angle=10)
+    glint = {}
+    for integrator, samples in (("local", 2), ("path", 512)):
+        full, diffuse = (
+            flat.render(camera, 0, method=m, integrator=integrator, samples=samples) for m in ("full", "diffuse")
+        )
+        glint[integrator] = (full - diffuse)[24:40, 24:40, :3].mean()
+    assert glint["path"] == pytest.approx(glint["local"], rel=0.1)
+
+
+def test_stock_plugins_look_alike(flat, scene):
+    ours = render_scene(scene, {}, spp=128, seed=1)
+    stock = render_scene(scene.with_name("ball_stock.xml"), {}, spp=128, seed=1)
+    inside = flat.render(flat.cameras[0], 0)[..., 3] == 1
+    assert psnr(to_8_bit(stock[..., :3]), to_8_bit(ours[..., :3]), inside) > 30
+    types = {e.get("type") for e in ET.parse(scene.with_name("ball_stock.xml")).iter()}
+    assert not types & {"blinnphong", "shenv", "shdirect"}
+    assert {e.get("type") for e in ET.parse(scene).iter()} >= {"blinnphong", "shenv", "path"}
+
+
+def test_stage_1_path_traces_as_pca(stage_1_ball, variant):
+    camera = ball_camera(angle=0)
+    path = stage_1_ball.render(camera, 0, method="pca", integrator="path", samples=256)
+    local = stage_1_ball.render(camera, 0, method="pca")
+    middle = (slice(24, 40), slice(24, 40), slice(0, 3))
+    assert path[middle].mean() == pytest.approx(local[middle].mean() - stage_1_ball.geometry.ambient, rel=0.03)
+
+
+def test_relit_scene_is_lit_by_the_environment(flat, variant, tmp_path):
+    lit = flat.relight(smooth_environment(), rotate=40)
+    path = lit.render(flat.cameras[0], 0, method="diffuse", integrator="path", samples=256)
+    local = lit.render(flat.cameras[0], 0, method="diffuse")
+    inside = local[..., 3] == 1
+    inside[:20], inside[-20:], inside[:, :20], inside[:, -20:] = False, False, False, False
+    assert path[inside][:, :3].mean() == pytest.approx(local[inside][:, :3].mean(), rel=0.05)
+    correlation = np.corrcoef(path[inside][:, 0], local[inside][:, 0])[0, 1]
+    assert correlation > 0.95
+    write_scene(lit, tmp_path / "lit.xml", 0)
+    assert 'type="envmap"' in (tmp_path / "lit.xml").read_text()
+
+
+def test_saved_result_has_a_scene_that_load_scene_renders(ball, variant, tmp_path):
+    ball.save(tmp_path)
+    scene = mifit.load_scene(tmp_path / "scene.xml", spp=4)
+    assert len(scene.sensors()) == 2 and len(scene.shapes()) == 2
+
+
+def test_cameras_that_mitsuba_lacks_are_refused(flat, tmp_path):
+    camera = replace(flat.cameras[0], fy=2 * flat.cameras[0].fx)
+    with pytest.raises(InputError, match="wants an undistorted camera with square pixels"):
+        write_scene(flat, tmp_path / "x.xml", 0, [camera])
