@@ -55,7 +55,7 @@ def run_subject(subject: int, work: Path, size: dict[str, int], model: str) -> d
         "subject": subject,
         "light": environment.stem if light else "procedural",
         "seconds": round(result["seconds"], 1),
-        "peak_memory_mb": round(result["peak_memory_mb"]),
+        "peak_memory_mb": round(result["peak_memory"] / 2**20),
         **json.loads(figures.read_text()),
     }
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -87,7 +86,6 @@ def fit(
     if until not in STAGES:
         raise InputError(f"until: found {until!r}, expected one of {', '.join(STAGES)}")
     folder = None if checkpoints is None else Path(checkpoints)
-    started = time.perf_counter()
     inputs = {
         "version": mifit.__version__,
         "capture": capture.digest(cameras, timesteps),
@@ -147,8 +145,8 @@ def fit(
         capture_digest=inputs["capture"],
         units=capture.units,
         unit_mm=capture.unit_mm,
-        seconds=time.perf_counter() - started,
-        peak_memory_mb=peak_memory_mb(),
+        seconds=sum(s.report.seconds for s in (geometry, reflectance, normals) if s is not None),
+        peak_memory=peak_memory(),
     )
 
 
@@ -164,11 +162,11 @@ def choose(kind: str, known: Sequence[T], wanted: Sequence[T] | None, default: i
     return tuple(dict.fromkeys(wanted))
 
 
-def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far, in MiB; 0 where the system doesn't tell."""
+def peak_memory() -> int:
+    """Largest resident memory of this process so far, in bytes; 0 where the system doesn't tell."""
     try:
         import resource
     except ModuleNotFoundError:  # Windows
-        return 0.0
+        return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)
+    return peak if sys.platform == "darwin" else peak * 1024
