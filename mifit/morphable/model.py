@@ -264,10 +264,39 @@ class MorphableModel:
                 h.update(f"{f.name}={value!r}".encode())
         return h.hexdigest()
 
+    @classmethod
+    def from_template(
+        cls,
+        mesh: object,
+        landmarks: ArrayLike | None = None,
+        kernels: tuple | None = None,
+        unit_mm: float = 10.0,
+        modes: int = 60,
+        name: str = "template",
+    ) -> MorphableModel:
+        """Make a model of any face mesh: Gaussian-process identity and expression modes, pigment albedo.
+
+        Parameters
+        ----------
+        mesh : (vertices, faces) or an object with these attributes, such as a trimesh
+            Upright (y up), nose along +z, counter-clockwise outwards.
+        landmarks : (68,) int, optional
+            iBUG vertices; found by registering the built-in head when not given.
+        kernels : tuple of (scale, inducing points, (sx, sy, sz)), optional
+            Correlation lengths and deviations of the identity's Gaussian process in mm.
+        unit_mm : float
+            Millimetres per unit of the mesh.
+        modes : int
+            Identity modes.
+        """
+        from mifit.morphable.from_template import model_of_template
+
+        return model_of_template(mesh, landmarks, kernels, unit_mm, modes, name)
+
     # -- files --------------------------------------------------------------------------------------------
 
     @classmethod
-    def load(cls, path: str | Path) -> MorphableModel:
+    def load(cls, path: str | Path, kind: str | None = None) -> MorphableModel:
         """Load a model, whatever its kind.
 
         Parameters
@@ -275,6 +304,8 @@ class MorphableModel:
         path : str or Path
             ``"builtin"`` (about 30 000 vertices), ``"builtin:coarse"`` (about 7 000), or a file or folder of
             a known format, recognised by content.
+        kind : str, optional
+            The format, where it is to be set rather than recognised: a key of ``recognise.KINDS``.
 
         Raises
         ------
@@ -283,7 +314,7 @@ class MorphableModel:
         """
         from mifit.morphable.recognise import load_model
 
-        return load_model(path)
+        return load_model(path, kind)
 
     def save(self, path: str | Path) -> None:
         """Write the model as an ``.npz`` file, whole or not at all."""

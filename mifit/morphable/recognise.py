@@ -2,34 +2,98 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+
+import h5py
 
 from mifit.errors import InputError
 from mifit.morphable.builtin import builtin_model
+from mifit.morphable.formats import bfm2009, deep3d, threeddfa
 from mifit.morphable.formats.archive import npz_keys
-from mifit.morphable.formats.ict import is_ict_npz, load_ict_npz
+from mifit.morphable.formats.bfm_h5 import load_bfm_h5
+from mifit.morphable.formats.eos import load_eos, looks_like_eos
+from mifit.morphable.formats.flame import KEYS as FLAME_KEYS
+from mifit.morphable.formats.flame import load_flame_npz, load_flame_pickle
+from mifit.morphable.formats.ict import is_ict_folder, is_ict_npz, load_ict_folder, load_ict_npz
+from mifit.morphable.formats.mat5 import is_mat5, mat_names
 from mifit.morphable.formats.own import FORMAT_KEY, load_own
+from mifit.morphable.formats.pickles import is_pickle
 from mifit.morphable.model import MorphableModel
 
+BUILTIN = ("builtin", "builtin:coarse")
 
-def load_model(path: str | Path) -> MorphableModel:
-    """Load ``"builtin"``, ``"builtin:coarse"``, or a file or folder of a known format.
+KINDS: dict[str, Callable[[Path], MorphableModel]] = {
+    "mifit": load_own,
+    "ict-npz": load_ict_npz,
+    "ict-folder": load_ict_folder,
+    "flame-npz": load_flame_npz,
+    "flame-pickle": load_flame_pickle,
+    "bfm2009": bfm2009.load_bfm2009,
+    "3ddfa": threeddfa.load_3ddfa,
+    "deep3d": deep3d.load_deep3d,
+    "bfm-h5": load_bfm_h5,
+    "eos": load_eos,
+}
+"""Every kind of model file and its loader; ``mifit model convert --kind`` takes these names."""
+
+
+def load_model(path: str | Path, kind: str | None = None) -> MorphableModel:
+    """Load ``"builtin"``, ``"builtin:coarse"``, or a file or folder of a known kind.
+
+    Parameters
+    ----------
+    path : str or Path
+    kind : str, optional
+        A key of ``KINDS``; recognised by content when it is not given.
 
     Raises
     ------
     InputError
         The file is missing, damaged or of no known kind.
     """
-    if str(path) in ("builtin", "builtin:coarse"):
+    if str(path) in BUILTIN:
         return builtin_model(coarse=str(path) == "builtin:coarse")
     path = Path(path)
     if not path.exists():
-        raise InputError(f"{path}: no such model; expected 'builtin', 'builtin:coarse' or an existing file or folder")
+        raise InputError(f"{path}: no such model; expected {', '.join(BUILTIN)} or an existing file or folder")
+    if kind is not None and kind not in KINDS:
+        raise InputError(f"kind '{kind}' is unknown, expected one of {', '.join(KINDS)}")
+    try:
+        return KINDS[kind or recognise(path)](path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read: {error}") from None
+
+
+def recognise(path: Path) -> str:
+    """Key of ``KINDS`` for a file or folder, by content; raises InputError when nothing fits."""
+    if path.is_dir():
+        if is_ict_folder(path):
+            return "ict-folder"
+        raise InputError(f"{path}: a folder without generic_neutral_mesh.obj and vertex_indices.json")
     keys = npz_keys(path)
     if keys is not None:
-        if FORMAT_KEY in keys:
-            return load_own(path)
-        if is_ict_npz(keys):
-            return load_ict_npz(path)
+        for kind, fits in (
+            ("mifit", FORMAT_KEY in keys),
+            ("ict-npz", is_ict_npz(keys)),
+            ("flame-npz", set(FLAME_KEYS) <= set(keys)),
+        ):
+            if fits:
+                return kind
         raise InputError(f"{path}: .npz with keys {', '.join(sorted(keys)[:8])}, expected those of a known model")
-    raise InputError(f"{path}: not a model file of a known kind")
+    if is_mat5(path):
+        names = set(mat_names(path))
+        for kind, needed in (("bfm2009", bfm2009.KEYS), ("3ddfa", threeddfa.KEYS), ("deep3d", deep3d.KEYS)):
+            if len(names & set(needed)) * 2 > len(needed):  # most keys: the loader names those that are missing
+                return kind
+        raise InputError(f"{path}: MATLAB file with {', '.join(sorted(names)[:8])}, expected keys of a known model")
+    if h5py.is_hdf5(path):
+        return "bfm-h5"
+    if is_pickle(path):
+        return "flame-pickle"
+    if looks_like_eos(path):
+        return "eos"
+    raise InputError(
+        f"{path}: not a model of a known kind ({path.stat().st_size} bytes); expected .npz, .mat (version 5), .h5, "
+        "FLAME .pkl, eos .bin or an ICT-FaceKit folder"
+    )

@@ -58,7 +58,9 @@ def opening_faces(mean: NDArray, faces: NDArray, landmarks: NDArray) -> NDArray[
             if np.linalg.norm(mean[loop] - centre, axis=1).max() > width:
                 continue
             hops = csgraph.dijkstra(graph, indices=loop, unweighted=True, min_only=True, limit=20)
-            out |= hops[faces].max(1) <= hops[landmarks[list(ring)]].min()
+            rim = hops[landmarks[list(ring)]].min()
+            if np.isfinite(rim):  # else the loop is of another piece, such as an eyeball
+                out |= hops[faces].max(1) <= rim
     return out
 
 
@@ -86,3 +88,11 @@ def farthest_points(points: NDArray, count: int, start: int = 0) -> NDArray[np.i
         chosen[k] = distance.argmax()
         np.minimum(distance, ((points - points[chosen[k]]) ** 2).sum(1), out=distance)
     return chosen
+
+
+def oriented_outwards(mean: NDArray, faces: NDArray) -> NDArray:
+    """Triangles turned so that a face's front looks along +z, the side that readers don't agree on."""
+    corners = mean[faces].astype(np.float64)
+    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    front = corners[:, :, 2].mean(1) > np.median(mean[:, 2])
+    return faces if n[front, 2].sum() >= 0 else faces[:, [1, 0, 2]]

@@ -10,8 +10,8 @@ from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
 from mifit.morphable.builtin import cache, sculpt
 from mifit.morphable.builtin.head import make_head
-from mifit.morphable.builtin.landmarks import IBUG_MIRROR
 from mifit.morphable.builtin.template import EYEBALL, SKIN, make_template
+from mifit.morphable.landmarks import IBUG_MIRROR
 from mifit.morphable.topology import boundary_loops, edges
 
 

@@ -22,6 +22,7 @@ def deformation_modes(
     count: int,
     symmetric: tuple = _SYMMETRIC,
     asymmetric: tuple = _ASYMMETRIC,
+    stretch: tuple[float, float, float] = _STRETCH,
 ) -> NDArray[np.float32]:
     """Modes (V, 3, count) in mm of smooth random deformations of points (V, 3) in mm.
 
@@ -34,6 +35,8 @@ def deformation_modes(
     count : int
     symmetric, asymmetric : tuple of (scale, inducing points, (sx, sy, sz))
         Kernels: correlation length and deviations, in mm.
+    stretch : tuple of float
+        Deviation of the relative width, height and depth of the whole.
     """
     blocks: list[tuple[int, NDArray]] = []  # axis, modes (V, k); blocks are orthogonal to one another
     for parity, kernels in ((1, symmetric), (-1, asymmetric)):
@@ -44,9 +47,11 @@ def deformation_modes(
         for axis in range(3):
             fields = fields_by_axis[-parity if axis == 0 else parity]
             columns = [np.float32(k[2][axis]) * f for k, f in zip(kernels, fields, strict=True)]
+            if not kernels:
+                continue
             if parity == 1:
                 centre = 0.0 if axis == 0 else points[:, axis].mean()
-                columns.append((_STRETCH[axis] * (points[:, axis] - centre))[:, None].astype(np.float32))
+                columns.append((stretch[axis] * (points[:, axis] - centre))[:, None].astype(np.float32))
             blocks.append((axis, compress(np.hstack(columns), count)))
     norms = np.concatenate([np.linalg.norm(block, axis=0) for _, block in blocks])
     axes = np.concatenate([np.full(block.shape[1], axis) for axis, block in blocks])

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from mifit.morphable.builtin import sculpt
 from mifit.morphable.builtin.template import SKIN, Template
+from mifit.morphable.landmarks import IBUG_MIRROR
 
 # targets on the side x > 0 in mm; mirrored for x < 0
 _JAW = [
@@ -17,11 +18,6 @@ _JAW = [
 _BROW = [(54, 14), (46, 20.5), (36, 23.5), (24, 22.5), (13, 18.5)]
 _NOSE = [(0, 1), (0, -12), (0, -24), (0, -38)]
 _NOSTRILS = [(13, -46), (7, -48.5), (0, -50)]
-IBUG_MIRROR = np.array(
-    [*range(16, -1, -1), *range(26, 16, -1), *range(27, 31), *range(35, 30, -1), 45, 44, 43, 42, 47, 46, 39, 38, 37, 36,
-     41, 40, 54, 53, 52, 51, 50, 49, 48, 59, 58, 57, 56, 55, 64, 63, 62, 61, 60, 67, 66, 65]
-)  # fmt: skip
-"""The iBUG point that is the mirror image of each iBUG point."""
 
 
 class PointFinder:

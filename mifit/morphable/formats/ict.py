@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.errors import InputError
+from mifit.morphable.assemble import N_ALBEDO, check_mesh
 from mifit.morphable.formats.archive import read_npz
 from mifit.morphable.model import MorphableModel
 from mifit.morphable.pigment import skin_model
@@ -16,7 +18,10 @@ from mifit.morphable.topology import mirror_map, opening_faces
 EXPRESSION_SIGMA = 0.3
 """One coefficient unit of an expression mode is this blend-shape weight; weights lie in 0..1."""
 
-N_ALBEDO = 60
+_SKIN_VERTICES, _FACE_VERTICES = 11248, 9409
+"""Vertices of face, head and neck skin, and of the face alone, come first in the original files."""
+
+_MAX_OBJ_BYTES = 256 << 20
 _KEYS = ("mean", "faces", "uv", "faces_uv", "identity", "expression", "expression_names", "landmarks_ibug68")
 
 
@@ -46,8 +51,100 @@ def load_ict_npz(path: Path) -> MorphableModel:
         data["uv"],
         data["faces_uv"],
         data["landmarks_ibug68"],
-        int(data["face_area_faces"]),
+        np.arange(len(data["faces"])) < int(data["face_area_faces"]),
     )
+
+
+def is_ict_folder(path: Path) -> bool:
+    """Whether a folder holds the original OBJ files."""
+    return (path / "generic_neutral_mesh.obj").is_file() and (path / "vertex_indices.json").is_file()
+
+
+def load_ict_folder(path: Path) -> MorphableModel:
+    """Read the original folder: neutral mesh, ``identityNNN.obj`` and the expressions that are there.
+
+    Only the skin of face, head and neck is kept; quads are split along their first diagonal.
+    """
+    try:
+        index = json.loads((path / "vertex_indices.json").read_text(encoding="utf-8"))
+        landmarks = np.array(index["idx_to_landmark_verts"])
+        known = [str(name) for name in index["expressions"]]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(
+            f"{path / 'vertex_indices.json'}: {type(error).__name__}: {error}; "
+            "expected idx_to_landmark_verts and expressions"
+        ) from None
+    mean, uv, faces, faces_uv = _read_obj(path / "generic_neutral_mesh.obj")
+    skin = (faces < _SKIN_VERTICES).all(1)
+    faces, faces_uv = faces[skin], faces_uv[skin]
+    if not len(faces):
+        raise InputError(f"{path / 'generic_neutral_mesh.obj'}: no face lies within the skin's vertices")
+    kept, faces_uv = np.unique(faces_uv, return_inverse=True)
+    faces_uv = faces_uv.reshape(-1, 3)
+    identities = sorted(path.glob("identity[0-9][0-9][0-9].obj"))
+    names = tuple(n for n in known if (path / f"{n}.obj").is_file())
+    files = [*identities, *(path / f"{n}.obj" for n in names)]
+    modes = np.zeros((_SKIN_VERTICES, 3, len(files)), dtype=np.float32)
+    for k, file in enumerate(files):
+        vertices = _obj_vertices(file, _obj_lines(file))
+        if vertices.shape != mean.shape:
+            raise InputError(f"{file}: {len(vertices)} vertices, expected {len(mean)} as in the neutral mesh")
+        modes[:, :, k] = (vertices - mean)[:_SKIN_VERTICES]
+    return assemble_ict(
+        "ict_facekit",
+        mean[:_SKIN_VERTICES],
+        faces,
+        modes[:, :, : len(identities)],
+        modes[:, :, len(identities) :],
+        names,
+        uv[kept],
+        faces_uv,
+        landmarks,
+        np.asarray((faces < _FACE_VERTICES).all(1) & (uv[kept][faces_uv][..., 0] <= 1.0).all(1)),
+    )
+
+
+def _obj_lines(path: Path) -> list[bytes]:
+    size = path.stat().st_size
+    if size > _MAX_OBJ_BYTES:
+        raise InputError(f"{path}: {size} bytes, expected at most {_MAX_OBJ_BYTES}")
+    return path.read_bytes().splitlines()
+
+
+def _obj_vertices(path: Path, lines: list[bytes], keyword: bytes = b"v ", columns: int = 3) -> NDArray[np.float64]:
+    """Numbers after a keyword, (N, columns)."""
+    rows = [line.split()[1 : columns + 1] for line in lines if line.startswith(keyword)]
+    try:
+        out = np.array(rows, dtype=np.float64).reshape(len(rows), columns)
+    except ValueError:
+        raise InputError(f"{path}: a '{keyword.decode().strip()}' line does not hold {columns} numbers") from None
+    if not np.isfinite(out).all():
+        raise InputError(f"{path}: a '{keyword.decode().strip()}' line holds a value that is not finite")
+    return out
+
+
+def _read_obj(path: Path) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Vertices, texture vertices, triangles and their texture indices of an OBJ file with quads."""
+    lines = _obj_lines(path)
+    vertices, uv = _obj_vertices(path, lines), _obj_vertices(path, lines, b"vt ", 2)
+    corners, texture = [], []
+    try:
+        for line in lines:
+            if line.startswith(b"f "):
+                pairs = [c.split(b"/") for c in line.split()[1:]]
+                v, t = [int(c[0]) - 1 for c in pairs], [int(c[1]) - 1 for c in pairs]
+                for k in range(1, len(v) - 1):
+                    corners.append((v[0], v[k], v[k + 1]))
+                    texture.append((t[0], t[k], t[k + 1]))
+    except (ValueError, IndexError):
+        raise InputError(f"{path}: face line {line[:60]!r}, expected vertex/texture indices") from None
+    faces, faces_uv = np.array(corners, dtype=np.int64), np.array(texture, dtype=np.int64)
+    for name, index, count in (("vertex", faces, len(vertices)), ("texture", faces_uv, len(uv))):
+        if not index.size or index.min() < 0 or index.max() >= count:
+            raise InputError(f"{path}: faces hold {name} indices outside 1..{count}, or there are none")
+    if len(vertices) < _SKIN_VERTICES:
+        raise InputError(f"{path}: {len(vertices)} vertices, expected at least {_SKIN_VERTICES}")
+    return vertices, uv, faces, faces_uv
 
 
 def assemble_ict(
@@ -60,15 +157,15 @@ def assemble_ict(
     uv: NDArray,
     faces_uv: NDArray,
     landmarks: NDArray,
-    face_area_faces: int,
+    face_area: NDArray[np.bool_],
 ) -> MorphableModel:
     """Build a model from ICT-FaceKit's arrays (modes last), with the pigment model's albedo.
 
-    The face area is the first ``face_area_faces`` faces without those inside the lids and behind the lips.
+    From ``face_area`` (F,) the faces inside the lids and behind the lips are left out.
     Texture coordinates with u > 1 belong to the back of the head and the neck, outside the face area.
     """
-    face_mask = np.arange(len(faces)) < face_area_faces
-    face_mask &= ~opening_faces(mean, faces, landmarks)
+    check_mesh(name, mean, faces, landmarks)
+    face_mask = face_area & ~opening_faces(mean, faces, landmarks)
     mean_albedo, albedo_modes = skin_model(mean, faces[face_mask], landmarks, 10.0, N_ALBEDO)
     bound = 1.0 / EXPRESSION_SIGMA
     return MorphableModel(

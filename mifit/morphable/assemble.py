@@ -1,0 +1,151 @@
+"""From what a file holds to a whole model: whatever is missing is made here.
+
+Landmarks come from registering the built-in head, the face area from the landmarks, texture coordinates from an
+unwrapping of the face area, the albedo from the pigment model.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mifit.core.mesh import vertex_normals
+from mifit.errors import InputError
+from mifit.morphable.landmarks import read_landmark_file
+from mifit.morphable.model import MorphableModel
+from mifit.morphable.pigment import skin_model
+from mifit.morphable.topology import adjacency, mirror_map, opening_faces
+from mifit.morphable.unwrap import unwrap
+
+N_ALBEDO = 60
+"""Albedo modes of the pigment model where a file has no albedo."""
+
+
+def complete(
+    name: str,
+    mean: NDArray,
+    faces: NDArray,
+    identity: NDArray,
+    expression: NDArray,
+    unit_mm: float,
+    *,
+    albedo: tuple[NDArray, NDArray] | None = None,
+    uv: tuple[NDArray, NDArray] | None = None,
+    landmarks: NDArray | None = None,
+    face_mask: NDArray | None = None,
+    expression_names: tuple[str, ...] = (),
+    expression_bounds: NDArray | None = None,
+    source: Path | None = None,
+) -> MorphableModel:
+    """Build a model; what is None is made.
+
+    Parameters
+    ----------
+    name, mean, faces, identity, expression, unit_mm
+        As in ``MorphableModel``.
+    albedo : ((V, 3), (V, 3, Ka)), optional
+        Mean and modes, linear.
+    uv : ((T, 2), (F, 3)), optional
+        Texture vertices and their indices.
+    landmarks, face_mask, expression_names, expression_bounds : optional
+        As in ``MorphableModel``.
+    source : Path, optional
+        The model's file: a file ``<name>.landmarks.json`` beside it (68 vertex indices) takes precedence over
+        landmarks found or given.
+    """
+    if source is not None:
+        beside = source.parent / f"{source.name}.landmarks.json"
+        if beside.is_file():
+            landmarks = read_landmark_file(beside)
+    mean, faces = np.asarray(mean), np.asarray(faces)
+    landmarks = None if landmarks is None else np.asarray(landmarks)
+    check_mesh(name, mean, faces, landmarks)
+    if landmarks is None:
+        landmarks = transfer_landmarks(mean.astype(np.float64) * unit_mm, faces)
+        check_mesh(name, mean, faces, landmarks)
+    if face_mask is None:
+        face_mask = face_area(mean.astype(np.float64), faces, landmarks)
+    if not np.any(face_mask):
+        raise InputError(f"{name}: no face lies in the face area that the landmarks span; expected a face mesh")
+    if albedo is None:
+        albedo = skin_model(mean, faces[face_mask], landmarks, unit_mm, N_ALBEDO)
+    if uv is None:
+        uv = unwrap(mean.astype(np.float64), faces, face_mask)
+    return MorphableModel(
+        name=name,
+        mean=mean,
+        faces=faces,
+        identity=identity,
+        expression=expression,
+        mean_albedo=albedo[0],
+        albedo_modes=albedo[1],
+        uv=uv[0],
+        faces_uv=uv[1],
+        landmarks=landmarks.astype(np.int32),
+        face_mask=face_mask,
+        symmetry=mirror_map(mean, 0.1 / unit_mm),
+        unit_mm=unit_mm,
+        expression_names=expression_names,
+        expression_bounds=expression_bounds,  # type: ignore[arg-type]
+    )
+
+
+def check_mesh(name: str, mean: NDArray, faces: NDArray, landmarks: NDArray | None) -> None:
+    """Raise InputError for a mesh that can't be computed with; the model checks the rest once it is whole."""
+    if mean.ndim != 2 or mean.shape[1] != 3 or not np.isfinite(mean).all():
+        raise InputError(f"{name}: mean of shape {mean.shape} must be (vertices, 3) and finite")
+    if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces) or faces.min() < 0 or faces.max() >= len(mean):
+        raise InputError(f"{name}: faces of shape {faces.shape} must be (faces, 3) with indices in 0..{len(mean) - 1}")
+    if landmarks is not None and (
+        landmarks.shape != (68,)
+        or landmarks.dtype.kind not in "iu"
+        or landmarks.min() < 0
+        or landmarks.max() >= len(mean)
+    ):
+        raise InputError(f"{name}: landmarks of shape {landmarks.shape} must be 68 indices in 0..{len(mean) - 1}")
+
+
+def transfer_landmarks(vertices: NDArray, faces: NDArray) -> NDArray[np.int64]:
+    """Find the 68 points on a head (V, 3) in mm, upright and facing +z, by registering the built-in head to it."""
+    from mifit.morphable.builtin import builtin_model
+    from mifit.morphable.register import register
+
+    model = builtin_model(coarse=True)
+    fit = register(model, vertices, faces)
+    normals = vertex_normals(vertices, faces)
+    target = fit.vertices[model.landmarks]
+    target_normals = vertex_normals(fit.vertices, model.faces)[model.landmarks]
+    _, near = cKDTree(vertices).query(target, k=min(12, len(vertices)))
+    distance = np.linalg.norm(vertices[near] - target[:, None], axis=2)
+    away = 1.0 - (normals[near] * target_normals[:, None]).sum(2)  # not the inside of a lip or lid
+    best = (distance + 3.0 * away).argmin(1)
+    return near[np.arange(68), best]
+
+
+def face_area(mean: NDArray, faces: NDArray, landmarks: NDArray) -> NDArray[np.bool_]:
+    """(F,) faces of the skin between ears, hairline and throat, of the piece that has the nose, openings left out."""
+    p = mean[landmarks]
+    height = p[17:27, 1].max() - p[8, 1]
+    low, high = p[8, 1] - 0.08 * height, p[17:27, 1].max() + 0.42 * height
+    side = p[[0, 16], 2].mean() - 0.05 * height
+    inside = (mean[:, 1] > low) & (mean[:, 1] < high) & (mean[:, 2] > side)
+    out = inside[faces].all(1) & ~opening_faces(mean, faces, landmarks)
+    label = connected_components(adjacency(faces[out], len(mean)), directed=False)[1] if out.any() else None
+    return out if label is None else out & (label[faces[:, 0]] == label[landmarks[30]])
+
+
+def srgb_albedo(mean: NDArray, modes: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Linear mean and modes from sRGB-encoded ones in 0..1: modes by the derivative at the mean."""
+    m = np.clip(np.asarray(mean, dtype=np.float64), 0.0, 1.0)
+    linear = np.where(m <= 0.04045, m / 12.92, ((m + 0.055) / 1.055) ** 2.4)
+    slope = np.where(m <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((m + 0.055) / 1.055) ** 1.4)
+    return linear.astype(np.float32), (slope[..., None].astype(np.float32) * modes.astype(np.float32, copy=False))
+
+
+def interleaved(values: NDArray) -> NDArray:
+    """(3V, K) with x, y, z interleaved -> (V, 3, K) in C order."""
+    return np.ascontiguousarray(values, dtype=np.float32).reshape(len(values) // 3, 3, -1)

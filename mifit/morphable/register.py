@@ -1,0 +1,164 @@
+"""Registration of a morphable model's neutral shape to a surface, by landmarks and closest points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mifit.core.mesh import face_cross, vertex_normals
+from mifit.morphable.model import MorphableModel
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A model fitted to a surface.
+
+    Attributes
+    ----------
+    identity : (Ki,) float64
+        Coefficients in standard deviations.
+    scale : float
+        Millimetres per millimetre: 1 unless the similarity was asked for.
+    rotation : (3, 3), translation : (3,)
+        ``target = scale * rotation @ model + translation`` in mm.
+    vertices : (V, 3) float64
+        The fitted model in the target's space, in mm.
+    """
+
+    identity: NDArray[np.float64]
+    scale: float
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    vertices: NDArray[np.float64]
+
+
+def register(
+    model: MorphableModel,
+    vertices: NDArray,
+    faces: NDArray,
+    landmarks: NDArray | None = None,
+    iterations: int = 20,
+    seed: int = 0,
+) -> Registration:
+    """Fit identity and pose to a surface.
+
+    Each iteration finds, for vertices of the face area, the closest target vertices with a similar normal, and
+    takes a Gauss-Newton step on point-to-plane distances, landmarks and the prior of the coefficients.
+
+    Parameters
+    ----------
+    model : MorphableModel
+    vertices : (N, 3) float
+        Target surface in mm, roughly upright (y up) and facing +z.
+    faces : (M, 3) int
+        Its triangles, counter-clockwise outwards.
+    landmarks : (68,) int, optional
+        Target vertices of the iBUG points. Without them the pose starts from the tips of the noses.
+    iterations : int
+    seed : int
+        Chooses the vertices that are compared.
+    """
+    unit = model.unit_mm
+    mean, basis = unit * model.mean.astype(np.float64), model.identity
+    target_normals = vertex_normals(vertices, faces)
+    tree = cKDTree(vertices)
+    on_face = np.unique(model.faces[model.face_mask])
+    rng = np.random.default_rng(seed)
+    sample = np.sort(rng.choice(on_face, min(4000, len(on_face)), replace=False))
+    sample_basis = unit * basis[sample].astype(np.float64)
+    lm = model.landmarks
+    lm_basis = unit * basis[lm].astype(np.float64)
+
+    c = np.zeros(model.n_identity)
+    if landmarks is not None:
+        rotation, translation = rigid_between(mean[lm], vertices[landmarks])
+    else:
+        rotation = np.eye(3)
+        translation = nose_tip(vertices) - mean[lm[30]]
+    for iteration in range(iterations):
+        progress = iteration / max(iterations - 1, 1)
+        shape = mean + unit * (model.identity_jacobian @ c.astype(np.float32)).reshape(-1, 3)
+        normals = vertex_normals(shape, model.faces)[sample] @ rotation.T
+        p = shape[sample] @ rotation.T + translation
+        distance, nearest = tree.query(p)
+        n = target_normals[nearest]
+        reach = 30.0 * (1 - progress) + 6.0 * progress
+        good = (distance < reach) & ((normals * n).sum(1) > 0.5)
+        rows, residuals = [], []
+
+        def add(jacobian: NDArray, direction: NDArray, point: NDArray, error: NDArray, weight: float) -> None:
+            turned = direction @ rotation  # noqa: B023 - used within the iteration
+            block = np.einsum("ni,nik->nk", turned, jacobian)
+            pose = np.concatenate([np.cross(point, direction), direction], axis=1)
+            rows.append(weight * np.concatenate([block, pose], axis=1))  # noqa: B023
+            residuals.append(weight * error)  # noqa: B023
+
+        weight = np.sqrt(600.0 / max(good.sum(), 1)) * (0.5 + 0.5 * progress)
+        q = vertices[nearest]
+        add(sample_basis[good], n[good], p[good], ((p - q) * n).sum(1)[good], weight)
+        if landmarks is not None:
+            lp = shape[lm] @ rotation.T + translation
+            for axis in np.eye(3):
+                direction = np.broadcast_to(axis, lp.shape)
+                add(lm_basis, direction, lp, (lp - vertices[landmarks]) @ axis, 1.0 - 0.8 * progress)
+        a, b = np.concatenate(rows), np.concatenate(residuals)
+        prior = np.concatenate([np.ones(len(c)), np.full(6, 1e-3)])
+        step = np.linalg.solve(a.T @ a + np.diag(prior), -(a.T @ b) - prior * np.concatenate([c, np.zeros(6)]))
+        c = c + step[: len(c)]
+        turn = rotation_of(step[len(c) : len(c) + 3])
+        rotation, translation = turn @ rotation, turn @ translation + step[len(c) + 3 :]
+    shape = mean + unit * (model.identity_jacobian @ c.astype(np.float32)).reshape(-1, 3)
+    return Registration(c, 1.0, rotation, translation, shape @ rotation.T + translation)
+
+
+def rigid_between(source: NDArray, target: NDArray) -> tuple[NDArray, NDArray]:
+    """Rotation and translation that best take points (N, 3) to points (N, 3) (Kabsch)."""
+    cs, ct = source.mean(0), target.mean(0)
+    u, _, vt = np.linalg.svd((target - ct).T @ (source - cs))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return rotation, ct - rotation @ cs
+
+
+def rotation_of(axis_angle: NDArray) -> NDArray:
+    """Rotation matrix of an axis-angle vector."""
+    angle = np.linalg.norm(axis_angle)
+    x, y, z = axis_angle / max(angle, 1e-12)
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
+
+
+def nose_tip(vertices: NDArray) -> NDArray:
+    """Foremost vertex near the median plane."""
+    middle = np.abs(vertices[:, 0] - np.median(vertices[:, 0])) < 0.1 * np.ptp(vertices[:, 0])
+    candidates = vertices[middle]
+    return candidates[candidates[:, 2].argmax()]
+
+
+def distance_to_surface(points: NDArray, vertices: NDArray, faces: NDArray, candidates: int = 16) -> NDArray:
+    """Distance of points (N, 3) from a surface: to the nearest of the triangles whose centres are closest."""
+    corners = vertices[faces]
+    _, near = cKDTree(corners.mean(1)).query(points, k=min(candidates, len(faces)))
+    best = np.full(len(points), np.inf)
+    normals = face_cross(vertices, faces)
+    for k in near.T:
+        a, b, c = (corners[k, i] for i in range(3))
+        best = np.minimum(best, _point_triangle(points, a, b, c, normals[k]))
+    return best
+
+
+def _point_triangle(p: NDArray, a: NDArray, b: NDArray, c: NDArray, n: NDArray) -> NDArray:
+    """Distance of each point from its own triangle."""
+    n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30)
+    height = ((p - a) * n).sum(1)
+    foot = p - height[:, None] * n
+    inside = np.ones(len(p), dtype=bool)
+    best = np.full(len(p), np.inf)
+    for u, v in ((a, b), (b, c), (c, a)):
+        edge = v - u
+        inside &= (np.cross(edge, foot - u) * n).sum(1) >= 0
+        t = np.clip(((p - u) * edge).sum(1) / np.maximum((edge * edge).sum(1), 1e-30), 0, 1)
+        best = np.minimum(best, np.linalg.norm(p - u - t[:, None] * edge, axis=1))
+    return np.where(inside, np.abs(height), best)
