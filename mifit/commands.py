@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mifit.output.reconstruction import Reconstruction
 
 CHECKPOINTS = ".checkpoint"
-DEMO = {"width": 340, "height": 240, "spp": 48, "timesteps": 4}
+DEMO = {"model": "builtin:coarse", "width": 340, "height": 240, "spp": 32, "timesteps": 3}
 """Size of the capture that ``mifit demo`` makes: small enough for seconds, large enough to show a face."""
 
 
@@ -61,7 +61,7 @@ def demo(arguments: Namespace) -> None:
 
     shutil.rmtree(capture, ignore_errors=True)
     _say(arguments, "Rendering a capture: two cameras to fit, a third to judge by")
-    synthesize(capture, seed=arguments.seed, progress=progress, **DEMO)
+    synthesize(capture, seed=arguments.seed, progress=progress, **DEMO)  # type: ignore[arg-type]
     common = {
         "quiet": arguments.quiet,
         "debug": arguments.debug,
@@ -74,7 +74,7 @@ def demo(arguments: Namespace) -> None:
             capture=capture,
             out=out,
             config=None,
-            model="builtin",
+            model=DEMO["model"],
             cameras=["left", "right"],
             timesteps=None,
             until="normals",

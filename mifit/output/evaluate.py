@@ -124,15 +124,17 @@ def compare(
     camera: str,
     timestep: int,
     region: Literal["model", "truth"] = "model",
+    methods: tuple[Method, ...] | None = None,
+    oversampling: int = 2,
 ) -> Comparison:
-    """Render one view by every method and find the region in which to compare it; see `evaluate`."""
+    """Render one view by some methods (default: all) and find the region in which to compare it; see `evaluate`."""
     view = capture.camera(camera)
     reconstruction.index(timestep)
     if timestep not in capture.timesteps:
         raise InputError(f"timestep {timestep} is not in the capture; it has {', '.join(map(str, capture.timesteps))}")
     frame = capture.frame(camera, timestep)
-    surface = visible_surface(reconstruction, view, timestep)
-    linear = shade_methods(reconstruction, surface, timestep, reconstruction.methods)
+    surface = visible_surface(reconstruction, view, timestep, oversampling)
+    linear = shade_methods(reconstruction, surface, timestep, methods or reconstruction.methods)
     if region == "model":
         model, i = reconstruction.model, reconstruction.index(timestep)
         area = face_area(reconstruction.geometry.vertices[i], model.faces, model.face_mask, view)

@@ -218,9 +218,10 @@ def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]
         figures = []
         points = result.geometry.vertices[result.index(timestep)][result.model.landmarks]
         for camera in (c.name for c in result.cameras):
-            found = compare(result, capture, camera, timestep)
+            method = result.methods[-1]
+            found = compare(result, capture, camera, timestep, methods=(method,), oversampling=1)
             frame = capture.frame(camera, timestep)
-            render = found.renders[result.methods[-1]]
+            render = found.renders[method]
             box = bounding_box(render[..., 3] > 0)
             marked = draw_landmarks(found.photograph, capture.camera(camera), frame.landmarks, frame.visible, points)
             label = html.escape(camera)
