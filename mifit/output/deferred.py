@@ -150,42 +150,38 @@ def render_local(
 def shade_methods(
     reconstruction: Reconstruction, surface: VisibleSurface, timestep: int, methods: tuple[Method, ...]
 ) -> dict[Method, NDArray[np.float32]]:
-    """Images (H, W, 4) of one visible surface by several methods."""
-    out: dict[Method, NDArray[np.float32]] = {}
-    parts = None
-    for method in methods:
-        if method == "pca":
-            out[method] = surface.image(_shade_stage_1(reconstruction, surface, timestep))
-        else:
-            if parts is None:
-                parts = shade(reconstruction, surface, timestep)
-            out[method] = surface.image(parts[0] + parts[1] if method == "full" else parts[0])
-    return out
-
-
-def shade(
-    reconstruction: Reconstruction, surface: VisibleSurface, timestep: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Diffuse (with ambient) and specular radiance (N, 3) of a visible surface, by the model that was fitted.
+    """Images (H, W, 4) of one visible surface by several methods.
 
     Shadows, where the model has them, are traced at the vertices and interpolated, as in the fit.
     """
-    from mifit.render.bent import shade_bent
+    out: dict[Method, NDArray[np.float32]] = {}
+    if "pca" in methods:
+        out["pca"] = surface.image(_shade_stage_1(reconstruction, surface, timestep))
+    finer = [m for m in methods if m != "pca"]
+    if finer:
+        from mifit.render.bent import shade_bent
+
+        reflectance = reconstruction.reflectance
+        assert reflectance is not None
+        material = surface_material(reconstruction, surface, timestep)
+        base = _mesh_normals(reconstruction, surface, timestep)
+        traced = _traced(reconstruction, surface, timestep) if reflectance.shading_model == "shadowed" else None
+        for method in finer:
+            specular = material.specular if method == "full" else np.zeros_like(material.specular)
+            out[method] = surface.image(
+                shade_bent(material.normal, base, surface.view, material.diffuse, specular, reflectance, traced)
+            )
+    return {m: out[m] for m in methods}
+
+
+def _traced(reconstruction: Reconstruction, surface: VisibleSurface, timestep: int) -> NDArray:
+    """(N, B*B) shadowed transfer at the mesh's normals."""
     from mifit.render.transfer import trace_transfer
 
-    reflectance = reconstruction.reflectance
-    assert reflectance is not None
-    material = surface_material(reconstruction, surface, timestep)
-    base = _mesh_normals(reconstruction, surface, timestep)
-    traced = None
-    if reflectance.shading_model == "shadowed":
-        vertices = reconstruction.geometry.vertices[reconstruction.index(timestep)]
-        faces = reconstruction.model.faces
-        at_vertices = trace_transfer(
-            vertices, faces, vertices, vertex_normals(vertices, faces), reconstruction.lighting.order
-        )
-        traced = interpolate(at_vertices, faces, surface.face, surface.weights)
-    return shade_bent(material.normal, base, surface.view, material.diffuse, material.specular, reflectance, traced)
+    vertices, faces = reconstruction.geometry.vertices[reconstruction.index(timestep)], reconstruction.model.faces
+    order = reconstruction.lighting.order
+    at_vertices = trace_transfer(vertices, faces, vertices, vertex_normals(vertices, faces), order)
+    return interpolate(at_vertices, faces, surface.face, surface.weights)
 
 
 def _mesh_normals(reconstruction: Reconstruction, surface: VisibleSurface, timestep: int) -> NDArray:

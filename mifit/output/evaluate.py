@@ -146,11 +146,11 @@ def compare(
     area &= frame.valid
     if not area.any():
         raise InputError(f"camera {camera}, timestep {timestep}: the face area is not visible, nothing to evaluate")
-    renders = {m: _rgba_8_bit(image) for m, image in linear.items()}
+    renders = {m: rgba_8_bit(image) for m, image in linear.items()}
     return Comparison(timestep, to_8_bit(frame.image), area, renders)
 
 
-def _rgba_8_bit(linear: NDArray) -> NDArray[np.uint8]:
+def rgba_8_bit(linear: NDArray) -> NDArray[np.uint8]:
     """Linear colour with coverage -> 8-bit sRGB with linear alpha."""
     alpha = np.round(255 * np.clip(linear[..., 3:], 0, 1)).astype(np.uint8)
     return np.concatenate([to_8_bit(linear[..., :3]), alpha], axis=-1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 import cv2
 import numpy as np
@@ -16,12 +16,15 @@ from mifit.core.image import encode_png, read_image, to_8_bit, write_image
 from mifit.core.metrics import psnr, rmse
 from mifit.core.sh import LUMINANCE, SHLighting
 from mifit.errors import InputError
+from mifit.output.evaluate import face_area
 from mifit.output.figures import HEAT_LIMIT, heat_map
 from mifit.output.turntable import sheet
 from mifit.progress import Progress, silent
 
 if TYPE_CHECKING:
-    from mifit.output.reconstruction import Reconstruction
+    from mifit.capture import Capture
+    from mifit.core.camera import Camera
+    from mifit.output.reconstruction import Method, Reconstruction
 
 MAP_ROWS = 512
 """Rows to which an environment is reduced; finer light than 0.35 degrees makes no difference on skin."""
@@ -124,3 +127,73 @@ def write_relit(
     write_image(folder / "relight.png", sheet(rows))
     write_text(folder / "relight.json", json.dumps({"rotate": rotate, **figures}, indent=1) + "\n")
     return figures
+
+
+def evaluate_relit(
+    reconstruction: Reconstruction,
+    environment: str | Path | NDArray,
+    capture: Capture,
+    camera: str,
+    rotate: float = 0.0,
+    integrator: Literal["local", "path"] = "local",
+    samples: int = 64,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Compare a relit reconstruction with photographs of the same head, in the same poses, under that environment.
+
+    The two captures' exposures are not known to each other, so each method gets one factor on its brightness: the
+    least-squares one over the cameras that were fitted, in the new capture. The judged camera must be another one.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Fitted to the head under another lighting.
+    environment, rotate
+        As in `Reconstruction.relight`.
+    capture : Capture
+        The head under the environment.
+    camera : str
+        Camera to judge by.
+    integrator, samples, seed
+        As in `Reconstruction.render`.
+
+    Returns
+    -------
+    dict
+        ``camera``, ``timesteps``, ``region_pixels`` and ``methods``: PSNR (dB), RMSE (0..255) in 8-bit sRGB over the
+        fitted model's face area, and the exposure, for ``diffuse`` and ``full``.
+
+    Raises
+    ------
+    InputError
+        The judged camera was fitted, or a camera or timestep is missing in the capture.
+    """
+    if camera in [c.name for c in reconstruction.cameras]:
+        raise InputError(f"camera {camera}: was fitted; expected another one to judge by")
+    lit = relit(reconstruction, environment, rotate)
+    steps = [t for t in lit.timesteps if t in capture.timesteps]
+    if not steps:
+        raise InputError(f"the capture has none of the timesteps {', '.join(map(str, lit.timesteps))}")
+
+    def views(name: str, timesteps: list[int], method: Method) -> tuple[NDArray, NDArray]:
+        """Photographed and rendered linear colours (N, 3) in the face area."""
+        view: Camera = capture.camera(name)
+        photographs, renders = [], []
+        for t in timesteps:
+            frame = capture.frame(name, t)
+            vertices = lit.geometry.vertices[lit.index(t)]
+            area = face_area(vertices, lit.model.faces, lit.model.face_mask, view) & frame.valid
+            render = lit.render(view, t, method, integrator, samples if integrator == "path" else None, seed)
+            photographs.append(frame.image[area])
+            renders.append(render[area][:, :3])
+        return np.concatenate(photographs), np.concatenate(renders)
+
+    methods = {}
+    for method in ("diffuse", "full"):
+        pairs = [views(c.name, steps[:1], method) for c in reconstruction.cameras]
+        photograph, render = (np.concatenate(part).astype(np.float64) for part in zip(*pairs, strict=True))
+        exposure = float((photograph * render).sum() / max(float((render * render).sum()), 1e-12))
+        photograph, render = views(camera, steps, method)
+        codes, expected = to_8_bit(exposure * render)[None], to_8_bit(photograph)[None]
+        methods[method] = {"psnr": psnr(codes, expected), "rmse": rmse(codes, expected), "exposure": exposure}
+    return {"camera": camera, "timesteps": steps, "region_pixels": len(photograph), "methods": methods}

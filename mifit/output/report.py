@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import mifit
 from mifit.core.files import write_text
 from mifit.core.image import to_8_bit
-from mifit.output.evaluate import Comparison, compare
+from mifit.output.evaluate import Comparison, compare, rgba_8_bit
 from mifit.output.figures import (
     HEAT_LIMIT,
     bounding_box,
@@ -218,18 +218,15 @@ def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]
         figures = []
         points = result.geometry.vertices[result.index(timestep)][result.model.landmarks]
         for camera in (c.name for c in result.cameras):
-            method = result.methods[-1]
-            found = compare(result, capture, camera, timestep, methods=(method,), oversampling=1)
-            frame = capture.frame(camera, timestep)
-            render = found.renders[method]
+            view, frame = capture.camera(camera), capture.frame(camera, timestep)
+            photograph = to_8_bit(frame.image)
+            render = rgba_8_bit(result.render(view, timestep, result.methods[-1], samples=1))
             box = bounding_box(render[..., 3] > 0)
-            marked = draw_landmarks(found.photograph, capture.camera(camera), frame.landmarks, frame.visible, points)
+            marked = draw_landmarks(photograph, view, frame.landmarks, frame.visible, points)
             label = html.escape(camera)
             figures.append(_figure(jpeg_uri(marked[box]), f"{label}: input with landmarks", f"input from {label}"))
             figures.append(
-                _figure(
-                    jpeg_uri(overlay(found.photograph, render)[box]), f"{label}: fit laid over", f"fit over {label}"
-                )
+                _figure(jpeg_uri(overlay(photograph, render)[box]), f"{label}: fit laid over", f"fit over {label}")
             )
         parts.append(f'<h3>Timestep {timestep}</h3><div class="grid">{"".join(figures)}</div>')
     rest = len(result.timesteps) - len(timesteps)

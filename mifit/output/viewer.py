@@ -9,17 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.blinn_phong import lobe_table, normalization
 from mifit.core.image import to_8_bit
 from mifit.core.mesh import vertex_normals
-from mifit.core.sh import bands, cosine_coefficients, lobe_coefficients
+from mifit.core.sh import SHLighting, bands, cosine_coefficients
 from mifit.output.figures import jpeg_uri, png_uri
 from mifit.output.surface import part_of, split_at_seams, surface_maps
 
 if TYPE_CHECKING:
     from mifit.output.reconstruction import Reconstruction
-
-VIEW_BANDS = 3
-"""SH bands that the view shows; finer lighting is cut off there."""
 
 
 def viewer_data(reconstruction: Reconstruction, timestep: int) -> str:
@@ -72,15 +70,28 @@ def viewer_data(reconstruction: Reconstruction, timestep: int) -> str:
 
 
 def _lighting(reconstruction: Reconstruction) -> dict[str, Any]:
-    """Recovered lighting as the view's shader wants it: 9 coefficients of radiance and of reflected white."""
-    radiance = reconstruction.lighting.truncate(VIEW_BANDS).coefficients
-    cosine = cosine_coefficients(VIEW_BANDS)[bands(VIEW_BANDS)] / np.pi
-    reflectance = reconstruction.reflectance
+    """Recovered lighting as the view's shader wants it.
+
+    9 coefficients of what white reflects, and for the lobe a lat-long picture of the lighting that is convolved with
+    it at a middling angle; the lobe's albedo and tilt follow the angle by polynomials in the cosine.
+    """
+    irradiance = reconstruction.lighting.truncate(3).coefficients * (cosine_coefficients(3)[bands(3)] / np.pi)[:, None]
+    reflectance, order = reconstruction.reflectance, reconstruction.lighting.order
     exponent = reflectance.exponent if reflectance else 1.0
+    cosines = np.linspace(0.05, 1.0, 40)
+    moments = lobe_table(order)(cosines, exponent)
+    factors = np.concatenate([[1.0], moments[2:, np.searchsorted(cosines, 0.7)]])
+    blurred = SHLighting(factors[bands(order), None] * reconstruction.lighting.coefficients).to_latlong(64, 128)
+    peak = max(float(blurred.max()), 1e-6)
+    scale = 1.0
+    if reflectance and reflectance.shading_model == "paper":
+        scale = float(normalization(exponent, False) / normalization(exponent))
     return {
-        "radiance": radiance.ravel().tolist(),
-        "irradiance": (radiance * cosine[:, None]).ravel().tolist(),
-        "lobe": lobe_coefficients(exponent, VIEW_BANDS).tolist(),
+        "irradiance": irradiance.ravel().tolist(),
+        "glossy": png_uri(np.round(255 * np.sqrt(np.clip(blurred / peak, 0, 1))).astype(np.uint8)),
+        "glossy_scale": peak * scale,
+        "lobe_albedo": np.polynomial.polynomial.polyfit(cosines, moments[0], 4).tolist(),
+        "lobe_tilt": np.polynomial.polynomial.polyfit(cosines, moments[1], 4).tolist(),
         "ambient": float(reflectance.ambient if reflectance else reconstruction.geometry.ambient),
         "exponent": float(exponent),
     }

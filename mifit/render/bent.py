@@ -17,8 +17,8 @@ def shade_bent(
     specular: NDArray,
     reflectance: ReflectanceEstimate,
     traced: NDArray | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Radiance of points as its diffuse part, ambient included, and its specular part.
+) -> NDArray[np.float32]:
+    """Radiance (N, 3) of points, ambient included.
 
     Parameters
     ----------
@@ -32,24 +32,17 @@ def shade_bent(
         Lighting, ambient term, exponent and shading model; its maps aren't used.
     traced : (N, B*B), optional
         Shadowed diffuse transfer at the mesh's normals; ``shadowed`` needs it.
-
-    Returns
-    -------
-    diffuse_part, specular_part : (N, 3) float32
     """
     import drjit as dr
     import mitsuba as mi
 
     count = len(normals)
     if not count:
-        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
+        return np.zeros((0, 3), np.float32)
     nothing = np.zeros(count, np.float32)
     points = NormalView(nothing, nothing, view, base, nothing)
     n, v = (mi.Vector3f(np.ascontiguousarray(x.T, dtype=np.float32)) for x in (normals, view))
-    parts = []
-    for gloss in (nothing, specular):
-        shade = material_shade(reflectance, diffuse, gloss, [points], None if traced is None else [traced])
-        parts.append(mi.Color3f(shade(n, v, 0)))
-    dr.eval(parts)
-    body, whole = (np.stack([np.array(c, dtype=np.float32) for c in (p.x, p.y, p.z)], axis=1) for p in parts)
-    return body, whole - body
+    shade = material_shade(reflectance, diffuse, specular, [points], None if traced is None else [traced])
+    colour = mi.Color3f(shade(n, v, 0))
+    dr.eval(colour)
+    return np.stack([np.array(c, dtype=np.float32) for c in (colour.x, colour.y, colour.z)], axis=1)

@@ -11,7 +11,10 @@ from PIL import Image
 from mifit.core.image import write_image
 from mifit.core.sh import SHLighting, latlong_directions
 from mifit.errors import InputError
+from mifit.output.relight import evaluate_relit
 from mifit.output.turntable import orbit_camera, write_sequence, write_turntable
+from tests.output.conftest import ball_camera
+from tests.output.test_render_evaluate import FakeCapture
 
 
 def test_orbit_keeps_distance_and_looks_at_the_face(ball):
@@ -88,6 +91,19 @@ def test_relit_views_change_and_files_are_read(ball, variant, tmp_path):
     lit = ball.relight(tmp_path / "studio.hdr", rotate=90)
     camera = ball.cameras[0]
     assert np.abs(lit.render(camera, 0) - ball.render(camera, 0)).max() > 0.02
+
+
+def test_relit_error_needs_one_factor_and_no_more(ball, variant):
+    """Photographs are renders under the environment, 1.7 times as bright: full is exact, diffuse is not."""
+    lit = ball.relight(smooth_environment())
+    cameras = (*ball.cameras, ball_camera("third", 5.0))
+    capture = FakeCapture(cameras, lambda c, t: 1.7 * lit.render(c, t)[..., :3])
+    found = evaluate_relit(ball, smooth_environment(), capture, "third")
+    assert found["methods"]["full"]["exposure"] == pytest.approx(1.7, rel=1e-4)
+    assert found["methods"]["full"]["psnr"] > 60 > found["methods"]["diffuse"]["psnr"]
+    assert found["timesteps"] == [0, 3]
+    with pytest.raises(InputError, match="camera left: was fitted"):
+        evaluate_relit(ball, smooth_environment(), capture, "left")
 
 
 def test_bad_environments_are_refused(ball, stage_1_ball, tmp_path):

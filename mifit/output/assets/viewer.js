@@ -21,8 +21,9 @@
     uniform sampler2D diffuseMap, specularMap, normalMap;
     uniform mat3 toWorld;         // object -> capture world, where the lighting lives
     uniform mat3 turnBack;        // world -> lighting, undoes the turn of the light
-    uniform vec3 eye, keyDirection, radiance[9], irradiance[9];
-    uniform float lobe[3], ambient, exponent;
+    uniform sampler2D glossyMap;  // lighting blurred by the lobe, lat-long, square roots
+    uniform vec3 eye, keyDirection, irradiance[9];
+    uniform float lobeAlbedo[5], lobeTilt[5], glossyScale, ambient, exponent;
     uniform int mode, light;
     vec3 expand(vec3 n, vec3 c[9]) {
       float x = n.x, y = n.y, z = n.z;
@@ -51,10 +52,13 @@
       vec3 colour;
       if (light == 0) {
         colour = albedo * max(expand(turnBack * n, irradiance), 0.0) + ambient;
-        vec3 r = turnBack * reflect(-v, n);
-        vec3 c[9];
-        for (int k = 0; k < 9; k++) c[k] = radiance[k] * (k == 0 ? lobe[0] : (k < 4 ? lobe[1] : lobe[2]));
-        colour += specular * max(expand(r, c), 0.0);
+        float mu = clamp(dot(n, v), 0.05, 1.0);
+        float reflected = lobeAlbedo[4], tilt = lobeTilt[4];
+        for (int k = 3; k >= 0; k--) { reflected = reflected * mu + lobeAlbedo[k]; tilt = tilt * mu + lobeTilt[k]; }
+        vec3 d = turnBack * normalize(mix(reflect(-v, n), n, tilt));
+        vec2 place = vec2(atan(-d.x, d.z) / 6.28318531 + 0.5, 1.0 - acos(clamp(d.y, -1.0, 1.0)) / 3.14159265);
+        vec3 root = texture2D(glossyMap, place).rgb;
+        colour += specular * reflected * glossyScale * root * root;
       } else {
         float cosine = max(dot(n, keyDirection), 0.0);
         float highlight = pow(max(dot(n, normalize(keyDirection + v)), 0.0), exponent) * (exponent + 8.0) / 8.0;
@@ -101,7 +105,7 @@
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, index, gl.STATIC_DRAW);
 
-  function texture(unit, name, source) {
+  function texture(unit, name, source, wraps) {
     gl.uniform1i(at(name), unit);
     const t = gl.createTexture(), image = new Image();
     gl.activeTexture(gl.TEXTURE0 + unit); gl.bindTexture(gl.TEXTURE_2D, t);
@@ -111,8 +115,13 @@
       gl.pixelStorei(gl.UNPACK_FLIP_Y_WEBGL, true);
       gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, gl.RGB, gl.UNSIGNED_BYTE, image);
-      gl.generateMipmap(gl.TEXTURE_2D);
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+      if (wraps) {  // no mipmaps: the seam at the back would pick the coarsest one
+        gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
+        gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+      } else {
+        gl.generateMipmap(gl.TEXTURE_2D);
+        gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+      }
       draw();
     };
     image.src = source;
@@ -120,10 +129,12 @@
   texture(0, "diffuseMap", data.maps.diffuse);
   texture(1, "specularMap", data.maps.specular);
   texture(2, "normalMap", data.maps.normal);
+  texture(3, "glossyMap", data.glossy, true);
 
-  gl.uniform3fv(at("radiance"), data.radiance);
   gl.uniform3fv(at("irradiance"), data.irradiance);
-  gl.uniform1fv(at("lobe"), data.lobe);
+  gl.uniform1fv(at("lobeAlbedo"), data.lobe_albedo);
+  gl.uniform1fv(at("lobeTilt"), data.lobe_tilt);
+  gl.uniform1f(at("glossyScale"), data.glossy_scale);
   gl.uniform1f(at("ambient"), data.ambient);
   gl.uniform1f(at("exponent"), data.exponent);
   gl.uniformMatrix3fv(at("toWorld"), false, transpose(data.rotation));
