@@ -213,7 +213,7 @@ def _appearance(
     journal: Journal | None = None,
 ) -> NDArray[np.float64]:
     """Albedo coefficients, shading and ambient for a held geometry."""
-    pixels = visibility.pixels(state, config.pixels, 1.0, seed)
+    pixels = visibility.pixels(state, config.pixels, 1.0, seed, anew=False)
     problem = gather(model, visibility.world(state), pixels, config.robust_colour, config.albedo_prior)
     solution = _usable(fit_appearance(problem, config.max_iterations), "albedo and lighting")
     if journal is not None:

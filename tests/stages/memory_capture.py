@@ -61,7 +61,15 @@ def paint(points, rng):
 
 
 def make_capture(
-    model, angles=((0.0, 0.0, 0.0),), views=(-20.0, 20.0), width=340, height=240, noise=0.4, seed=0, identity=0.6
+    model,
+    angles=((0.0, 0.0, 0.0),),
+    views=(-20.0, 20.0),
+    width=340,
+    height=240,
+    noise=0.4,
+    seed=0,
+    identity=0.6,
+    painted=True,
 ):
     """Paint, pose and photograph a random face of the model.
 
@@ -90,7 +98,10 @@ def make_capture(
             face, weights = g.face[hit], g.weights[hit]
             n = normalize(interpolate(normals, model.faces, face, weights))
             albedo = interpolate(model.mean_albedo, model.faces, face, weights)
-            albedo = albedo * paint(interpolate(spots, model.faces, face, weights), np.random.default_rng(7))[:, None]
+            if painted:
+                albedo = (
+                    albedo * paint(interpolate(spots, model.faces, face, weights), np.random.default_rng(7))[:, None]
+                )
             image = np.zeros((height, width, 3), np.float32)
             image[hit] = albedo * (basis(n, 3) @ SHADING)[:, None] * 0.8
             image = np.maximum(image + 0.002 * rng.normal(size=image.shape), 0).astype(np.float32)

@@ -18,7 +18,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
-from mifit.core.mesh import face_cross, vertex_sum_matrix
+from mifit.core.mesh import face_cross
 from mifit.core.sh import basis_gradient
 from mifit.morphable import MorphableModel
 from mifit.solve import geman_mcclure
@@ -62,7 +62,7 @@ class Surface:
         dtype = model.mean.dtype
         flat = model.mean.reshape(-1) + model.identity.reshape(size, -1) @ identity.astype(dtype)
         flat = flat + model.expression.reshape(size, -1) @ expression.astype(dtype)
-        self.faces = model.faces
+        self.faces, self.dtype = model.faces, dtype
         self.vertices = flat.reshape(-1, 3).astype(np.float64)
         cross = face_cross(self.vertices, model.faces)
         self.normal_sum = np.stack(
@@ -73,16 +73,23 @@ class Surface:
             axis=1,
         )
 
-    def normal_sum_derivative(self, around: sp.csr_matrix) -> sp.csr_matrix:
-        """(3V, 3V) d normal_sum / d vertices; ``around`` is `core.mesh.vertex_sum_matrix`."""
-        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+    def normal_sum_derivative(self, touched: NDArray[np.bool_]) -> sp.csr_matrix:
+        """(3V, 3V) d normal_sum / d vertices; only the rows of touched vertices (V,) are complete."""
+        faces = self.faces[touched[self.faces].any(axis=1)]
+        a, b, c = (self.vertices[faces[:, i]] for i in range(3))
         # cross(b - a, c - a): its derivative by one corner is the cross matrix of the opposite edge
-        blocks = np.stack([cross_matrix(c - b), cross_matrix(a - c), cross_matrix(b - a)], axis=1)  # (F, 3, 3, 3)
-        n = len(self.faces)
-        rows = np.broadcast_to(3 * np.arange(n)[:, None, None, None] + np.arange(3)[:, None], blocks.shape)
-        columns = np.broadcast_to(3 * self.faces[:, :, None, None] + np.arange(3), blocks.shape)
-        by_vertex = sp.csr_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * n, self.vertices.size))
-        return sp.kron(around, sp.identity(3), format="csr") @ by_vertex
+        blocks = np.stack(
+            [cross_matrix(c - b), cross_matrix(a - c), cross_matrix(b - a)], axis=2
+        )  # (F, row, corner, 3)
+        blocks = blocks.astype(np.float32) if self.dtype == np.float32 else blocks
+        n, size = len(faces), self.vertices.size
+        columns = np.broadcast_to((3 * faces[:, :, None] + np.arange(3)).reshape(n, 1, 9), (n, 3, 9))
+        by_vertex = sp.csr_matrix((blocks.ravel(), columns.ravel(), np.arange(0, 27 * n + 1, 9)), shape=(3 * n, size))
+        # sums face normals around each vertex, axis by axis
+        rows = (3 * faces[:, :, None] + np.arange(3)).ravel()
+        entries = np.broadcast_to((3 * np.arange(n)[:, None] + np.arange(3))[:, None], (n, 3, 3)).ravel()
+        around = sp.csr_matrix((np.ones(len(rows), blocks.dtype), (rows, entries)), shape=(size, 3 * n))
+        return around @ by_vertex
 
 
 @dataclass(frozen=True)
@@ -167,6 +174,14 @@ class RenderingProblem:
         count = max(int(observation.ok.sum()), 1)
         return float(rho[observation.ok].sum()) / count, np.where(observation.ok, weight, 0.0) / count
 
+    def _touched(self, step: int) -> NDArray[np.bool_]:
+        """(V,) vertices at a corner of some pixel's face at one timestep."""
+        touched = np.zeros(len(self.model.mean), dtype=bool)
+        for view in self.views:
+            if view.step == step:
+                touched[self.model.faces[view.face]] = True
+        return touched
+
     def _surfaces(self, x: NDArray) -> list[Surface]:
         at = self.layout.at
         return [Surface(self.model, x[at("identity")], x[at("expression", k)]) for k in range(self.layout.timesteps)]
@@ -185,12 +200,11 @@ class RenderingProblem:
         """Normal equations at x."""
         surfaces, albedo = self._surfaces(x), self._vertex_albedo(x)
         equations = NormalEquations(self.layout)
-        around = vertex_sum_matrix(self.model.faces, len(self.model.mean))
         derivatives: dict[int, sp.csr_matrix] = {}
         for view in self.views:
             surface = surfaces[view.step]
             if view.step not in derivatives:
-                derivatives = {view.step: surface.normal_sum_derivative(around).astype(self.model.mean.dtype)}
+                derivatives[view.step] = surface.normal_sum_derivative(self._touched(view.step))
             observation = self._observe(view, surface, albedo, x, gradient=True)
             _, weight = self._loss(observation)
             shared, local = self._columns(view, surface, observation, x, derivatives[view.step])

@@ -62,6 +62,7 @@ class Visibility:
         self.timesteps = tuple(timesteps)
         self._scene: SurfaceScene | None = None
         self.warnings: list[str] = []
+        self._buffers: dict[tuple[int, str], GBuffer] = {}
 
     def world(self, state: State) -> NDArray[np.float64]:
         """(T, V, 3) world-space vertices."""
@@ -106,7 +107,8 @@ class Visibility:
             normal = normalize(normal)
             for camera in self.cameras:
                 frame = self.capture.frame(camera.name, self.timesteps[step])
-                usable = self._usable(scene.gbuffer(camera), frame, 1)
+                buffer = self._buffers[step, camera.name] = scene.gbuffer(camera)
+                usable = self._usable(buffer, frame, 1)
                 cosine = (normalize(camera.position - position) * normal).sum(1)
                 seen = np.flatnonzero((cosine > GRAZING_COSINE) & scene.visible_from(position, camera.position))
                 if not len(seen) or not usable.any():
@@ -118,15 +120,22 @@ class Visibility:
                 out.append(TextureView(step, camera, image, seen, cosine[seen], basis))
         return tuple(out)
 
-    def pixels(self, state: State, count: int, sigma: float, seed: int) -> tuple[PixelView, ...]:
-        """Up to ``count`` facial pixels of every image, chosen evenly at random."""
+    def pixels(self, state: State, count: int, sigma: float, seed: int, anew: bool = True) -> tuple[PixelView, ...]:
+        """Up to ``count`` facial pixels of every image, chosen evenly at random.
+
+        ``anew=False`` takes the surface points from the last look at the surface, where there was one: enough to
+        choose points whose position will be projected again.
+        """
         rng = np.random.default_rng(seed)
         out = []
         for step, vertices in enumerate(self.world(state)):
-            scene = self._place(vertices)
+            if anew or any((step, camera.name) not in self._buffers for camera in self.cameras):
+                scene = self._place(vertices)
+                for camera in self.cameras:
+                    self._buffers[step, camera.name] = scene.gbuffer(camera)
             for camera in self.cameras:
                 frame = self.capture.frame(camera.name, self.timesteps[step])
-                buffer = scene.gbuffer(camera)
+                buffer = self._buffers[step, camera.name]
                 usable = self._usable(buffer, frame, 2)
                 facial = np.flatnonzero(usable & self.model.face_mask[np.maximum(buffer.face, 0)])
                 if len(facial) > count:
