@@ -19,7 +19,7 @@ from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
 from mifit.output.ply import read_ply, write_ply
 from mifit.output.scene import write_scene
-from mifit.output.surface import split_at_seams, tangent_space_map
+from mifit.output.surface import SplitMesh, split_at_seams, tangent_space_map
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
@@ -40,35 +40,48 @@ def save(result: Reconstruction, folder: Path) -> None:
             old.unlink()
     (folder / "geometry").mkdir(exist_ok=True)
     mesh = split_at_seams(result.model)
-    for i, timestep in enumerate(result.timesteps):
-        vertices = result.geometry.vertices[i]
-        normals = vertex_normals(vertices, result.model.faces)
-        write_ply(
-            folder / "geometry" / f"{timestep:04d}.ply",
-            vertices[mesh.origin],
-            mesh.faces,
-            normals[mesh.origin],
-            mesh.uv,
-            result.geometry.vertex_albedo[mesh.origin],
-        )
-        refined = result.refined_normal(timestep)
-        if refined is not None:
-            rotation = result.geometry.rotation[i]
-            tangent = tangent_space_map(
-                refined,
-                (vertices @ rotation)[mesh.origin],
-                (normals @ rotation)[mesh.origin],
-                mesh,
-                result.model.face_mask,
-            )
-            write_image(folder / "maps" / f"normal_object_{timestep:04d}.exr", refined)
-            write_data_png(folder / "maps" / f"normal_tangent_{timestep:04d}.png", 0.5 + 0.5 * tangent)
+    for timestep in result.timesteps:
+        _write_timestep(result, folder, timestep, mesh)
     if result.reflectance is not None:
         for name in ("diffuse", "specular", "confidence"):
             write_image(folder / "maps" / f"{name}.exr", getattr(result.reflectance, name))
         write_image(folder / "lighting.exr", result.lighting.to_latlong())
     write_scene(result, folder / "scene.xml", result.timesteps[0])
     write_text(folder / "result.json", json.dumps(_document(result), indent=1, allow_nan=False) + "\n")
+
+
+def add_timestep(result: Reconstruction, folder: Path, timestep: int) -> None:
+    """Write the files of one timestep of a result into its folder, then ``result.json`` anew."""
+    (folder / "geometry").mkdir(exist_ok=True)
+    _write_timestep(result, folder, timestep, split_at_seams(result.model))
+    write_text(folder / "result.json", json.dumps(_document(result), indent=1, allow_nan=False) + "\n")
+
+
+def _write_timestep(result: Reconstruction, folder: Path, timestep: int, mesh: SplitMesh) -> None:
+    """Mesh and normal maps of one timestep."""
+    i = result.index(timestep)
+    vertices = result.geometry.vertices[i]
+    normals = vertex_normals(vertices, result.model.faces)
+    write_ply(
+        folder / "geometry" / f"{timestep:04d}.ply",
+        vertices[mesh.origin],
+        mesh.faces,
+        normals[mesh.origin],
+        mesh.uv,
+        result.geometry.vertex_albedo[mesh.origin],
+    )
+    refined = result.refined_normal(timestep)
+    if refined is not None:
+        rotation = result.geometry.rotation[i]
+        tangent = tangent_space_map(
+            refined,
+            (vertices @ rotation)[mesh.origin],
+            (normals @ rotation)[mesh.origin],
+            mesh,
+            result.model.face_mask,
+        )
+        write_image(folder / "maps" / f"normal_object_{timestep:04d}.exr", refined)
+        write_data_png(folder / "maps" / f"normal_tangent_{timestep:04d}.png", 0.5 + 0.5 * tangent)
 
 
 def write_data_png(path: Path, values: NDArray) -> None:

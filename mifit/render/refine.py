@@ -193,9 +193,12 @@ class NormalProblem:
         optimizer = mi.ad.Adam(lr=step, params={"a": a, "b": b})
         totals = []
         for iteration in range(iterations):
-            local, rough = self._terms(optimizer["a"], optimizer["b"])
-            total = dr.sum(sum(local.values()) + rough)
-            dr.backward(total)
+            x = optimizer["a"], optimizer["b"]
+            total = dr.zeros(mi.Float, 1)
+            for k in range(len(self._views)):  # one kernel, compiled once for all views
+                total += _descend(self._data(*x, k))
+                dr.eval(total, *(dr.grad(v) for v in x))
+            total += _descend(self._magnitude(*x) + self._rough(*x))
             totals.append(total)
             optimizer.step()
             dr.eval(total, optimizer["a"], optimizer["b"])
@@ -213,10 +216,18 @@ class NormalProblem:
         import mitsuba as mi
 
         data = dr.zeros(mi.Float, self._count)
-        for k, (colour, weight, direction, frame) in enumerate(self._views):
-            residual = colour - self._shade(_bend(frame, a, b), direction, k)
-            data += self._penalty(weight, dr.squared_norm(residual))
+        for k in range(len(self._views)):
+            data += self._data(a, b, k)
+            dr.eval(data)
         return {"data": data, "magnitude": self._magnitude(a, b)}, self._rough(a, b)
+
+    def _data(self, a: Any, b: Any, view: int) -> Any:
+        """Energy of one view per texel."""
+        import drjit as dr
+
+        colour, weight, direction, frame = self._views[view]
+        residual = colour - self._shade(_bend(frame, a, b), direction, view)
+        return self._penalty(weight, dr.squared_norm(residual))
 
     def _penalty(self, weight: Any, square: Any) -> Any:
         """Huber's penalty of a squared residual: r^2 up to k, 2 k r - k^2 beyond."""
@@ -286,8 +297,8 @@ class NormalProblem:
             )
             for i, value in enumerate(products):
                 out[i] += dr.select(seen, scale * value, 0)
+            dr.eval(data, out)  # one kernel, compiled once for all views
         local = {"data": data, "magnitude": self._magnitude(a, b)}
-        dr.eval(local, out)
         return local, tuple(out)
 
     def _step(self, a: Any, b: Any, system: tuple[Any, ...], damping: Any) -> tuple[Any, Any]:
@@ -405,7 +416,7 @@ def material_shade(
     model = reflectance.shading_model
     exponent: Any = float(reflectance.exponent)
     if model != "paper":
-        exponent = shading.lobe(exponent, order)
+        exponent = shading.lobe(exponent, order, fresnel=reflectance.fresnel)
     shadows: list[tuple[Any, Any, Any]] = []
     if model == "shadowed":
         if traced is None:
@@ -478,6 +489,15 @@ def _conjugate_gradients(
         if float(rz[0]) <= goal:
             break
     return x
+
+
+def _descend(energy: Any) -> Any:
+    """Sum an energy and add its gradient to that of the variables it depends on."""
+    import drjit as dr
+
+    total = dr.sum(energy)
+    dr.backward(total)
+    return dr.detach(total)
 
 
 def _totals(local: dict[str, Any], rough: Any) -> dict[str, float]:

@@ -1,0 +1,365 @@
+"""Further timesteps with reflectance and lighting fixed: pose and expression, then normals (paper, section 6).
+
+Each new timestep starts where the last one ended. Its surface texture is compared with that of the fitted timesteps,
+so that nothing drifts. Its normals are drawn to the mean correction of the last frames, carried along in the tangent
+planes of the moving face: where the images say little the detail stays, where they say much it follows at once.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.config import GeometryConfig, NormalsConfig
+from mifit.core.bend import bend, tangent_plane, transport, unbend
+from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
+from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.errors import ConvergenceError, InputError
+from mifit.progress import Progress, silent
+from mifit.stages.fit_geometry import fit_pose_expression
+from mifit.stages.geometry.refine import texture_reference
+from mifit.stages.refine_normals import check_maps, one_timestep, refine_frame
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+    from mifit.output.reconstruction import Reconstruction
+
+MEMORY = 4
+"""Frames whose corrections make the prior of the next."""
+LOST_PIXELS = 6.0
+"""Median distance of visible landmarks from the model's, beyond which a frame counts as lost."""
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """One timestep as tracking leaves it.
+
+    Attributes
+    ----------
+    timestep : int
+    geometry : GeometryEstimate
+        Of this timestep alone.
+    normal_object : (S, S, 3) float32
+        Unit normals in object space; zero outside the covered texels.
+    seconds : float
+    refound : bool
+        The last pose led nowhere and landmarks found the face again.
+    warnings : tuple of str
+    """
+
+    timestep: int
+    geometry: GeometryEstimate
+    normal_object: NDArray[np.float32]
+    seconds: float
+    refound: bool
+    warnings: tuple[str, ...]
+
+
+def track(
+    capture: Capture,
+    model: MorphableModel,
+    geometry: GeometryEstimate,
+    reflectance: ReflectanceEstimate,
+    normals: NormalsEstimate | None,
+    cameras: Sequence[str],
+    timesteps: Sequence[int],
+    config: NormalsConfig | None = None,
+    geometry_config: GeometryConfig | None = None,
+    fitted: Sequence[int] | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Iterator[TrackedFrame]:
+    """Follow a fitted face through further timesteps, one frame at a time.
+
+    Parameters
+    ----------
+    capture, model
+        Images, and the model that was fitted.
+    geometry, reflectance, normals
+        Results of the three stages, and of timesteps tracked before.
+    cameras : sequence of str
+        Cameras to read; no other camera of the capture is touched.
+    timesteps : sequence of int
+        Timesteps to track, in this order.
+    config, geometry_config : optional
+        Settings of stages 3 and 1.
+    fitted : sequence of int, optional
+        Timesteps of ``geometry`` that were fitted jointly and give the reference texture; all by default.
+    seed : int
+    progress : Progress
+        ``done`` counts frames.
+
+    Yields
+    ------
+    TrackedFrame
+        As soon as it is done; the caller may stop at any frame and go on later with the frames so far.
+
+    Raises
+    ------
+    InputError
+        A timestep that the fit has or the capture lacks, or no camera.
+    ConvergenceError
+        A frame in which neither the last pose nor the landmarks find the face.
+    """
+    config, geometry_config = config or NormalsConfig(), geometry_config or GeometryConfig()
+    check_timesteps(capture.timesteps, geometry.timesteps, timesteps)
+    texels = rasterize_uv(model.uv, model.faces_uv, check_maps(reflectance), model.face_mask)
+    home = _subset(geometry, geometry.timesteps if fitted is None else fitted)
+    reference = texture_reference(capture, model, home, cameras, geometry_config, seed)
+    last = one_timestep(geometry, len(geometry.timesteps) - 1)
+    memory = _Memory(model, texels)
+    if normals is not None:
+        for timestep in [t for t in geometry.timesteps if t in normals.timesteps][-MEMORY:]:
+            memory.add(
+                one_timestep(geometry, geometry.index(timestep)),
+                texels.from_map(normals.normal_object[normals.timesteps.index(timestep)]),
+            )
+    progress("track", 0, len(timesteps))
+    for done, timestep in enumerate(timesteps):
+        began = time.perf_counter()
+
+        def fit(start: GeometryEstimate, t: int = timestep) -> GeometryEstimate:
+            return fit_pose_expression(
+                capture, model, start, cameras, t, geometry_config, seed=seed, reference=reference
+            )
+
+        found, refound = _follow(fit, lambda g: landmark_error(capture, model, g, cameras), last, home)
+        warnings = list(found.report.warnings)
+        if refound:
+            warnings.append(f"timestep {timestep}: lost the face and found it again by its landmarks")
+        aim = memory.offsets(found)
+        frame = refine_frame(capture, model, found, reflectance, cameras, config, texels, aim, seed)
+        if frame.seen == 0.0:
+            warnings.append(f"timestep {timestep}: no camera measures the face; normals are those of the frames before")
+        memory.add(found, frame.normal_object)
+        last = found
+        progress("track", done + 1, len(timesteps))
+        yield TrackedFrame(
+            timestep,
+            found,
+            texels.to_map(frame.normal_object),
+            time.perf_counter() - began,
+            refound,
+            tuple(warnings),
+        )
+
+
+def track_into(
+    folder: str | Path,
+    result: Reconstruction,
+    capture: Capture,
+    timesteps: Sequence[int],
+    config: NormalsConfig | None = None,
+    geometry_config: GeometryConfig | None = None,
+    seed: int = 0,
+    resume: bool = False,
+    progress: Progress = silent,
+) -> Reconstruction:
+    """Track timesteps and write each into the result folder as it is done.
+
+    Parameters
+    ----------
+    folder : path
+        Folder of ``result``; extended in place.
+    result : Reconstruction
+        With reflectance.
+    capture, timesteps, config, geometry_config, seed, progress
+        As in `track`.
+    resume : bool
+        Keep the timesteps that an earlier run has tracked; they are tracked anew otherwise.
+
+    Returns
+    -------
+    Reconstruction
+        With the new timesteps.
+
+    Raises
+    ------
+    InputError
+        As in `track`, or a result without reflectance.
+
+    Notes
+    -----
+    The files of a frame are written before ``result.json`` names it, and ``result.json`` is replaced as a whole, so
+    a run that is killed leaves a folder with the frames finished so far. Frames depend on those before alone:
+    going on later gives what an uninterrupted run gives.
+    """
+    from mifit.output.folder import add_timestep
+
+    if result.reflectance is None:
+        raise InputError(f"{folder}: found a result without reflectance, expected one of 'mifit fit' with all stages")
+    tracked = [] if result.normals is None else list(result.normals.report.details.get("tracked", []))
+    fitted = [t for t in result.timesteps if t not in tracked]
+    if resume:
+        timesteps = [t for t in timesteps if t not in tracked]
+    else:
+        result = _without(result, [t for t in tracked if t in timesteps])
+    frames = track(
+        capture,
+        result.model,
+        result.geometry,
+        result.reflectance,
+        result.normals,
+        [camera.name for camera in result.cameras],
+        timesteps,
+        config,
+        geometry_config,
+        fitted,
+        seed,
+        progress,
+    )
+    for frame in frames:
+        result = extend(result, frame)
+        add_timestep(result, Path(folder), frame.timestep)
+    return result
+
+
+def extend(result: Reconstruction, frame: TrackedFrame) -> Reconstruction:
+    """A result with one more timestep; its normals' report lists it under ``tracked``."""
+    a, b = result.geometry, frame.geometry
+    geometry = replace(
+        a,
+        timesteps=(*a.timesteps, frame.timestep),
+        **{
+            name: np.concatenate([getattr(a, name), getattr(b, name)])
+            for name in ("expression", "rotation", "translation", "vertices")
+        },
+    )
+    before = result.normals or NormalsEstimate((), frame.normal_object[None][:0], Report("converged"))
+    details = {**before.report.details, "tracked": [*before.report.details.get("tracked", []), frame.timestep]}
+    report = replace(
+        before.report,
+        seconds=before.report.seconds + frame.seconds,
+        warnings=(*before.report.warnings, *frame.warnings),
+        details=details,
+    )
+    normals = NormalsEstimate(
+        (*before.timesteps, frame.timestep),
+        np.concatenate([before.normal_object, frame.normal_object[None]]),
+        report,
+    )
+    return replace(result, geometry=geometry, normals=normals)
+
+
+def check_timesteps(known: Sequence[int], fitted: Sequence[int], wanted: Sequence[int]) -> None:
+    """Refuse timesteps that can't be tracked; InputError names them."""
+    for timestep in wanted:
+        if timestep not in known:
+            raise InputError(f"timestep {timestep}: not in the capture; it has {', '.join(map(str, known))}")
+        if timestep in fitted:
+            raise InputError(f"timestep {timestep}: the result has it already; name timesteps that weren't fitted")
+
+
+def landmark_error(
+    capture: Capture, model: MorphableModel, geometry: GeometryEstimate, cameras: Sequence[str]
+) -> float:
+    """Median distance in pixels of the visible landmarks from the model's, over all cameras; 0 without landmarks.
+
+    Jaw-line points slide along the silhouette and are left out.
+    """
+    distances = []
+    for name in cameras:
+        frame = capture.frame(name, geometry.timesteps[0])
+        if frame.landmarks is None:
+            continue
+        shown = np.flatnonzero(frame.visible[17:]) + 17
+        pixels = capture.camera(name).project(geometry.vertices[0][model.landmarks[shown]])
+        distances.append(np.linalg.norm(pixels - frame.landmarks[shown], axis=1))
+    every = np.concatenate(distances) if distances else np.zeros(0)
+    return float(np.median(np.nan_to_num(every, nan=np.inf))) if len(every) else 0.0
+
+
+def _follow(
+    fit: Callable[[GeometryEstimate], GeometryEstimate],
+    error: Callable[[GeometryEstimate], float],
+    last: GeometryEstimate,
+    home: GeometryEstimate,
+) -> tuple[GeometryEstimate, bool]:
+    """Fit from the last frame; when that is lost, from the fitted timesteps, and keep the better of the two."""
+    first: GeometryEstimate | None = None
+    failure: ConvergenceError | None = None
+    try:
+        first = fit(last)
+        if error(first) <= LOST_PIXELS:
+            return first, False
+    except ConvergenceError as found:
+        failure = found
+    try:
+        second = fit(home)
+    except ConvergenceError:
+        if first is None:
+            assert failure is not None
+            raise failure from None
+        return first, False
+    if first is not None and error(first) <= error(second):
+        return first, False
+    return second, True
+
+
+class _Memory:
+    """Corrections of the last frames, in tangent planes that move with the face."""
+
+    def __init__(self, model: MorphableModel, texels: TexelMap) -> None:
+        self._model, self._texels = model, texels
+        self._home = self._base(model.mean)
+        self._home_tangents = tangent_plane(self._home)
+        self._frames: list[NDArray] = []
+
+    def add(self, geometry: GeometryEstimate, normals: NDArray) -> None:
+        """Remember refined normals (N, 3) of a timestep, object space."""
+        base, tangents = self._frame(geometry)
+        self._frames = [*self._frames, unbend(base, tangents, normals.astype(np.float64))][-MEMORY:]
+
+    def offsets(self, geometry: GeometryEstimate) -> NDArray | None:
+        """(N, 2) mean correction in the tangent planes of `refine_frame` for a new timestep; None without a past."""
+        if not self._frames:
+            return None
+        base, tangents = self._frame(geometry)
+        wanted = bend(base, tangents, np.mean(self._frames, axis=0))
+        return unbend(base, tangent_plane(base), wanted)
+
+    def _frame(self, geometry: GeometryEstimate) -> tuple[NDArray, NDArray]:
+        """Base normals of a timestep and the home tangents carried to them."""
+        base = self._base(geometry.vertices[0].astype(np.float64) @ geometry.rotation[0])
+        return base, transport(self._home, self._home_tangents, base)
+
+    def _base(self, vertices: NDArray) -> NDArray:
+        faces, texels = self._model.faces, self._texels
+        return normalize(interpolate(vertex_normals(vertices, faces), faces, texels.face, texels.weights))
+
+
+def _subset(geometry: GeometryEstimate, timesteps: Sequence[int]) -> GeometryEstimate:
+    """Some timesteps of a fit."""
+    rows = [geometry.index(t) for t in timesteps]
+    return replace(
+        geometry,
+        timesteps=tuple(timesteps),
+        expression=geometry.expression[rows],
+        rotation=geometry.rotation[rows],
+        translation=geometry.translation[rows],
+        vertices=geometry.vertices[rows],
+    )
+
+
+def _without(result: Reconstruction, dropped: Sequence[int]) -> Reconstruction:
+    """A result less some of its tracked timesteps."""
+    if not dropped or result.normals is None:
+        return result
+    normals, report = result.normals, result.normals.report
+    rows = [i for i, t in enumerate(normals.timesteps) if t not in dropped]
+    details = {**report.details, "tracked": [t for t in report.details["tracked"] if t not in dropped]}
+    return replace(
+        result,
+        geometry=_subset(result.geometry, [t for t in result.timesteps if t not in dropped]),
+        normals=NormalsEstimate(
+            tuple(normals.timesteps[i] for i in rows), normals.normal_object[rows], replace(report, details=details)
+        ),
+    )
