@@ -148,4 +148,5 @@ def srgb_albedo(mean: NDArray, modes: NDArray) -> tuple[NDArray[np.float32], NDA
 
 def interleaved(values: NDArray) -> NDArray:
     """(3V, K) with x, y, z interleaved -> (V, 3, K) in C order."""
-    return np.ascontiguousarray(values, dtype=np.float32).reshape(len(values) // 3, 3, -1)
+    with np.errstate(over="ignore"):  # what overflows becomes infinite, which the model refuses
+        return np.ascontiguousarray(values, dtype=np.float32).reshape(len(values) // 3, 3, -1)

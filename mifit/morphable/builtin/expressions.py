@@ -57,13 +57,15 @@ def expression_modes(template: Template) -> tuple[NDArray[np.float32], tuple[str
     modes["jawOpen"] = influence @ (share[:, None] * (_rotate_x(anchors - _TMJ, 17.0) + _TMJ - anchors))
     bounds["jawOpen"] = (0.0, ACTION_BOUND)
     modes["jawForward"] = influence @ (share[:, None] * np.array([0.0, 0.0, 5.0]))
-    modes["jawSideways"] = influence @ (share[:, None] * np.array([6.0, 0.0, 0.0]))
+    # lips that touch slide together
+    upper = np.array([n.startswith(("up_", "in_up")) for n in names])
+    modes["jawSideways"] = influence @ (np.where(upper, 0.75, share)[:, None] * np.array([5.0, 0.0, 0.0]))
     mouth = np.array([n.startswith(("up_", "in_", "low_", "corner", "beyond")) for n in names])
     modes["mouthSideways"] = influence @ (mouth[:, None] * np.array([5.0, 0.4, 0.0]))
     for name in ("jawForward", "jawSideways", "mouthSideways"):
         bounds[name] = (-ACTION_BOUND, ACTION_BOUND)
 
-    for name, upper, lower in (("blink", 0.88, 0.12), ("squint", 0.2, 0.25), ("eyeWide", -0.22, -0.05)):
+    for name, upper, lower in (("blink", 0.86, 0.12), ("squint", 0.2, 0.25), ("eyeWide", -0.22, -0.05)):
         field = _lid_motion(template, upper, lower)
         modes[f"{name}_L"], modes[f"{name}_R"] = field * left, field * (1 - left)
         bounds[f"{name}_L"] = bounds[f"{name}_R"] = (0.0, ACTION_BOUND)
@@ -128,7 +130,10 @@ def _influences(template: Template) -> tuple[NDArray[np.float64], list[str]]:
     out = np.zeros((len(v), len(points)))
     out[free] = splu(bilaplacian[free][:, free].tocsc()).solve(rhs)
     out[points, np.arange(len(points))] = 1.0
-    # the pouch follows its two rims
+    # the margins that are rolled inwards follow the visible rows beside them, the pouch follows its two rims
+    for margin, row in ((template.upper_lip, -1), (template.lower_lip, 1)):
+        columns = np.searchsorted(template.grid[template.mouth_row], template.upper_lip)
+        out[margin] = out[template.grid[template.mouth_row + row, columns]]
     pouch = np.flatnonzero(template.part == POUCH).reshape(-1, len(template.upper_lip))
     t = (np.arange(1, len(pouch) + 1) / (len(pouch) + 1))[:, None, None]
     out[pouch] = (1 - t) * out[template.upper_lip] + t * out[template.lower_lip]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -70,7 +71,7 @@ def read_npz(path: str | Path, keys: Iterable[str] | None = None) -> dict[str, N
         raise InputError(f"{path}: no such file") from None
     except (
         zipfile.BadZipFile, zlib.error, OSError, ValueError, EOFError, KeyError, struct.error,
-        NotImplementedError, RuntimeError, SyntaxError, TypeError,
+        NotImplementedError, RuntimeError, SyntaxError, TypeError, MemoryError, tokenize.TokenError,
     ) as error:  # fmt: skip
         raise InputError(f"{path}: damaged .npz file: {error}") from None
     return out

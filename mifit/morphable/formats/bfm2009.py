@@ -91,7 +91,10 @@ def vector(path: Path, values: NDArray, key: str, count: int) -> NDArray[np.floa
     """Flatten a (count, 1) or (1, count) array."""
     if values.size != count:
         raise InputError(f"{path}: {key} has shape {values.shape}, expected {count} values")
-    return values.ravel().astype(np.float64)
+    out = values.ravel().astype(np.float64)
+    if not (np.abs(out) < 1e20).all():  # also false for NaN
+        raise InputError(f"{path}: {key} holds values that are not finite or beyond 1e20")
+    return out
 
 
 def triangles(path: Path, values: NDArray, key: str, n: int) -> NDArray[np.int64]:

@@ -40,15 +40,18 @@ def save_model(model: MorphableModel, path: str | Path) -> None:
 def load_own(path: Path) -> MorphableModel:
     """Read a model written by ``save_model``."""
     data = read_npz(path)
-    version = int(data.pop(FORMAT_KEY))
-    if version != _VERSION:
+    version = data.pop(FORMAT_KEY)
+    if version.shape != () or version != _VERSION:
         raise InputError(f"{path}: {FORMAT_KEY} version {version}, expected {_VERSION}")
     known = {f.name for f in fields(MorphableModel)}
     missing = sorted(known - {"symmetry"} - set(data))
     if missing:
         raise InputError(f"{path}: lacks {', '.join(missing)}; expected every field of a mifit model")
+    unit = data["unit_mm"]
+    if unit.shape != () or unit.dtype.kind not in "fiu":
+        raise InputError(f"{path}: unit_mm is {unit}, expected a number")
     values: dict = {k: v for k, v in data.items() if k in known}
     values["name"] = str(data["name"])
-    values["unit_mm"] = float(data["unit_mm"])
-    values["expression_names"] = tuple(str(n) for n in data["expression_names"])
+    values["unit_mm"] = float(unit)
+    values["expression_names"] = tuple(str(n) for n in data["expression_names"].ravel())
     return MorphableModel(**values)
