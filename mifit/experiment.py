@@ -1,0 +1,634 @@
+"""Scene-file driven experiments: one TOML file names inputs, stages, a sweep, metrics and outputs.
+
+The file is validated whole before anything runs. Every run has a folder of its own, named by the digest of all
+that it is computed from; a run whose folder holds a finished ``run.json`` is not computed again. Runs go through
+processes of this machine or through a Dask cluster, by the same function. docs/formats.md lists the keys.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+import json
+import multiprocessing
+import os
+import platform
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+import mifit
+from mifit import checkpoint
+from mifit.config import GeometryConfig, NormalsConfig, ReflectanceConfig, from_mapping, read_toml
+from mifit.core.files import replacing, write_text
+from mifit.errors import InputError
+from mifit.progress import Progress, silent
+
+FORMAT_VERSION = 1
+BUILTIN = ("builtin", "builtin:coarse")
+
+
+@dataclass(frozen=True)
+class SynthRun:
+    """A capture made for the experiment (``mifit synth``)."""
+
+    timesteps: int = 4
+    width: int = 340
+    height: int = 240
+    spp: int = 48
+    seed: int = 0
+    env: str | None = None
+    model: str = "builtin"
+
+
+@dataclass(frozen=True)
+class FitRun:
+    """Fit a capture; the settings of ``mifit fit``."""
+
+    capture: str | None = None
+    synth: SynthRun | None = None
+    model: str = "builtin"
+    cameras: tuple[str, ...] = ("left", "right")
+    timesteps: tuple[int, ...] | None = None
+    until: Literal["geometry", "reflectance", "normals"] = "normals"
+    seed: int = 0
+    geometry: GeometryConfig = field(default_factory=GeometryConfig)
+    reflectance: ReflectanceConfig = field(default_factory=ReflectanceConfig)
+    normals: NormalsConfig = field(default_factory=NormalsConfig)
+
+
+@dataclass(frozen=True)
+class EvaluateRun:
+    """Judge the fit on a view; the settings of ``mifit evaluate``."""
+
+    camera: str
+    region: Literal["model", "truth"] = "model"
+    timesteps: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True)
+class RelightRun:
+    """Light the fit by an environment and compare the fast path with path tracing.
+
+    With ``capture``, photographs of the same head under the environment, the relit views are judged by its ``camera``;
+    with ``synth``, that capture is made (``synth.env`` must be the environment).
+    """
+
+    env: str
+    rotate: float = 0.0
+    capture: str | None = None
+    synth: SynthRun | None = None
+    camera: str = "third"
+
+
+@dataclass(frozen=True)
+class RenderRun:
+    """Render a Mitsuba scene; its ``<default>`` names take values from ``parameters``."""
+
+    scene: str
+    parameters: dict = field(default_factory=dict)
+    spp: int = 64
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class ReferenceRun:
+    """The render of the same scene that a `RenderRun` is compared with."""
+
+    parameters: dict = field(default_factory=dict)
+    spp: int = 1024
+    seed: int = 1
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What a run leaves in its folder besides ``run.json``."""
+
+    result: bool = True
+    report: bool = False
+    images: bool = True
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One run: either ``fit`` with ``evaluate`` and ``relight``, or ``render`` with ``reference``."""
+
+    name: str
+    fit: FitRun | None = None
+    evaluate: EvaluateRun | None = None
+    relight: RelightRun | None = None
+    render: RenderRun | None = None
+    reference: ReferenceRun | None = None
+    outputs: Outputs = field(default_factory=Outputs)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One point of a sweep.
+
+    Attributes
+    ----------
+    experiment : Experiment
+        All settings, paths absolute.
+    swept : dict
+        The keys that the sweep sets and their values.
+    digest : str
+        Digest of the settings, the inputs' contents and mifit's version.
+    """
+
+    experiment: Experiment
+    swept: dict[str, Any]
+    digest: str
+
+    @property
+    def folder(self) -> str:
+        """Name of the run's folder: its swept values, readable, and its digest."""
+        words = [f"{key.rsplit('.', 1)[-1]}={_plain(value)}" for key, value in self.swept.items()]
+        return "_".join([*words, self.digest[:10]])[-120:]
+
+
+def _plain(value: Any) -> str:
+    text = "-".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+    return "".join(c if c.isalnum() or c in ".-+" else "-" for c in Path(text).name)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A validated experiment file.
+
+    Attributes
+    ----------
+    name : str
+    runs : tuple of Run
+    jobs : int
+        Processes at a time on one machine.
+    """
+
+    name: str
+    runs: tuple[Run, ...]
+    jobs: int
+
+
+def load_plan(path: str | Path, overrides: Sequence[str] = (), seed: int = 0) -> Plan:
+    """Read and validate an experiment file: every run of the sweep, every input that it names.
+
+    Parameters
+    ----------
+    path : path
+    overrides : sequence of str
+        ``KEY=VALUE`` with a dotted key and a TOML value (a bare word is a string).
+    seed : int
+        Seed of the runs where the file gives none.
+
+    Raises
+    ------
+    InputError
+        The file, a key, a value, a sweep or an input is not what it must be.
+    """
+    path = Path(path)
+    table = read_toml(path)
+    for text in overrides:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            raise InputError(f"--set {text}: expected KEY=VALUE, such as --set fit.reflectance.exponent=8")
+        _assign(table, key.strip(), _toml_value(value.strip()), f"--set {text}")
+    sweep = table.pop("sweep", {})
+    jobs = table.pop("jobs", 1)
+    if isinstance(jobs, bool) or not isinstance(jobs, int) or jobs < 1:
+        raise InputError(f"{path}: jobs: found {jobs!r}, expected a whole number of at least 1")
+    table.setdefault("name", path.stem)
+    digests: dict[tuple[str, ...], str] = {}
+    runs = []
+    for swept in _points(sweep, str(path)):
+        point = json.loads(json.dumps(table, default=str))
+        where = f"{path}: sweep {swept}" if swept else str(path)
+        for key, value in swept.items():
+            _assign(point, key, value, where)
+        for kind in ("fit", "render"):
+            if isinstance(point.get(kind), dict):
+                point[kind].setdefault("seed", seed)
+        experiment = _resolved(from_mapping(Experiment, point, where), path.parent, where)
+        inputs = _check_inputs(experiment, where, digests)
+        key = checkpoint.digest({"version": mifit.__version__, "settings": dataclasses.asdict(experiment), **inputs})
+        runs.append(Run(experiment, swept, key))
+    if len({run.digest for run in runs}) != len(runs):
+        raise InputError(f"{path}: sweep: two runs have the same settings; remove the repeated value")
+    return Plan(runs[0].experiment.name, tuple(runs), jobs)
+
+
+def _toml_value(text: str) -> Any:
+    try:
+        import tomllib
+    except ModuleNotFoundError:  # Python 3.10
+        import tomli as tomllib  # type: ignore[no-redef]
+    try:
+        return tomllib.loads(f"x = {text}")["x"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _assign(table: dict, key: str, value: Any, where: str) -> None:
+    """Set a dotted key in nested tables, which are made as needed."""
+    *parents, last = key.split(".")
+    for name in parents:
+        table = table.setdefault(name, {})
+        if not isinstance(table, dict):
+            raise InputError(f"{where}: {key}: {name} is a value, expected a table")
+    table[last] = value
+
+
+def _points(sweep: Any, where: str) -> Iterator[dict[str, Any]]:
+    """The points of a sweep: the product of ``grid``'s lists, or the tables of ``list``; one point without a sweep."""
+    if not isinstance(sweep, dict) or set(sweep) - {"grid", "list"} or len(sweep) > 1:
+        raise InputError(f"{where}: sweep: found {sweep!r}, expected one table 'grid' or one list 'list'")
+    if "grid" in sweep:
+        grid = sweep["grid"]
+        if not isinstance(grid, dict):
+            raise InputError(f"{where}: sweep.grid: found {grid!r}, expected a table of lists")
+        grid = dict(_flatten(grid))
+        for key, values in grid.items():
+            if not isinstance(values, list) or not values:
+                raise InputError(f"{where}: sweep.grid: {key}: found {values!r}, expected a list of values")
+        for values in itertools.product(*grid.values()):
+            yield dict(zip(grid, values, strict=True))
+    elif "list" in sweep:
+        points = sweep["list"]
+        if not isinstance(points, list) or not points or not all(isinstance(p, dict) for p in points):
+            raise InputError(f"{where}: sweep.list: found {points!r}, expected a list of tables")
+        yield from (dict(_flatten(p)) for p in points)
+    else:
+        yield {}
+
+
+def _flatten(table: dict, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Nested tables -> dotted keys, so that both ``a.b = [1]`` and ``"a.b" = [1]`` work in TOML."""
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _resolved(experiment: Experiment, folder: Path, where: str) -> Experiment:
+    """Check how the parts go together, and make paths absolute (relative ones are from the file's folder)."""
+    e = experiment
+    if (e.fit is None) == (e.render is None):
+        raise InputError(f"{where}: expected one of the tables [fit] and [render]")
+    if e.fit is None and (e.evaluate or e.relight):
+        raise InputError(f"{where}: [evaluate] and [relight] need [fit]")
+    if e.render is None and e.reference:
+        raise InputError(f"{where}: [reference] needs [render]")
+
+    def absolute(text: str) -> str:
+        return str((folder / text).resolve())
+
+    def model(text: str) -> str:
+        return text if text.startswith("builtin") else absolute(text)
+
+    def synthetic(synth: SynthRun) -> SynthRun:
+        env = absolute(synth.env) if synth.env else None
+        return dataclasses.replace(synth, env=env, model=model(synth.model))
+
+    if e.render:
+        e = dataclasses.replace(e, render=dataclasses.replace(e.render, scene=absolute(e.render.scene)))
+    if e.fit:
+        if (e.fit.capture is None) == (e.fit.synth is None):
+            raise InputError(f"{where}: fit: expected one of 'capture' and 'synth'")
+        if e.evaluate and e.evaluate.camera in e.fit.cameras:
+            raise InputError(
+                f"{where}: evaluate.camera: found {e.evaluate.camera!r}, which fit.cameras names too; "
+                "expected a camera that is not fitted"
+            )
+        fit = dataclasses.replace(e.fit, model=model(e.fit.model))
+        if fit.capture is not None:
+            fit = dataclasses.replace(fit, capture=absolute(fit.capture))
+        if fit.synth is not None:
+            fit = dataclasses.replace(fit, synth=synthetic(fit.synth))
+        e = dataclasses.replace(e, fit=fit)
+    if e.relight:
+        relight = dataclasses.replace(e.relight, env=absolute(e.relight.env))
+        if relight.capture is not None:
+            relight = dataclasses.replace(relight, capture=absolute(relight.capture))
+        if relight.synth is not None:
+            relight = dataclasses.replace(relight, synth=synthetic(relight.synth))
+            if relight.capture is not None or relight.synth.env != relight.env:
+                raise InputError(f"{where}: relight.synth: expected its 'env' to be relight.env, and no 'capture'")
+        e = dataclasses.replace(e, relight=relight)
+    return e
+
+
+def _check_inputs(e: Experiment, where: str, digests: dict[tuple[str, ...], str]) -> dict[str, str]:
+    """Open every input that a run names; returns digests of their contents (cached over the runs)."""
+    from mifit.capture import Capture
+
+    def cached(key: tuple[str, ...], compute: Any) -> str:
+        if key not in digests:
+            try:
+                digests[key] = compute()
+            except InputError as error:
+                raise InputError(f"{where}: {error}") from None
+        return digests[key]
+
+    def file(name: str) -> str:
+        def compute() -> str:
+            try:
+                return checkpoint.digest(Path(name).read_bytes().hex())
+            except OSError as error:
+                raise InputError(f"{name}: can't be read: {error.strerror}") from None
+
+        return cached(("file", name), compute)
+
+    out = {}
+    if e.render:
+        out["scene"] = file(e.render.scene)
+    if e.relight:
+        out["env"] = file(e.relight.env)
+        if e.relight.capture is not None:
+            lit = e.relight.capture
+            out["lit_capture"] = cached(("lit", lit), lambda: Capture.load(lit).digest())
+    if e.fit:
+        out["model"] = cached(("model", e.fit.model), lambda: _model_digest(e.fit.model))
+        cameras = [*e.fit.cameras, *([e.evaluate.camera] if e.evaluate else [])]
+        if e.fit.capture is not None:
+            name, wanted = e.fit.capture, e.fit.timesteps
+
+            def capture() -> str:
+                from mifit.pipeline import choose
+
+                found = Capture.load(name)
+                steps = choose("timestep", found.timesteps, wanted, 4)
+                return found.digest(choose("camera", found.cameras, cameras, 2), steps)
+
+            out["capture"] = cached(("capture", name, *cameras, str(wanted)), capture)
+        elif e.fit.synth is not None and e.fit.synth.env:
+            out["synth_env"] = file(e.fit.synth.env)
+    return out
+
+
+def _model_digest(source: str) -> str:
+    """Digest of a model; the built-in ones are known by mifit's version, which every digest holds anyway."""
+    if source in BUILTIN:
+        return source
+    path = Path(source)
+    stamp = path.stat() if path.exists() else None
+    return _loaded_digest(source, stamp and (stamp.st_mtime_ns, stamp.st_size))
+
+
+@functools.lru_cache(maxsize=32)
+def _loaded_digest(source: str, stamp: tuple[int, int] | None) -> str:
+    from mifit.morphable import MorphableModel
+
+    return MorphableModel.load(source).digest
+
+
+def run_experiment(
+    path: str | Path,
+    overrides: Sequence[str] = (),
+    out: str | Path | None = None,
+    dask: str | None = None,
+    variant: str = "auto",
+    seed: int = 0,
+    progress: Progress = silent,
+) -> str:
+    """Run an experiment file, or what is left of it.
+
+    Parameters
+    ----------
+    path : path
+        Experiment file.
+    overrides : sequence of str
+        ``KEY=VALUE`` settings that replace the file's.
+    out : path, optional
+        Folder for the runs and the table; default ``out/NAME``.
+    dask : str, optional
+        Address of a Dask scheduler whose workers see the same files; default: processes of this machine.
+    variant : str
+        Mitsuba variant of the runs.
+    seed : int
+        Seed where the file gives none.
+    progress : Progress
+
+    Returns
+    -------
+    str
+        The table of all runs in Markdown, also written as ``summary.md`` and ``summary.json``.
+
+    Raises
+    ------
+    InputError
+        Bad file or input, before anything runs, or runs that failed (after all others have finished).
+    """
+    plan = load_plan(path, overrides, seed)
+    folder = Path(out) if out is not None else Path("out") / plan.name
+    todo = [run for run in plan.runs if finished(folder / "runs" / run.folder, run) is None]
+    total = len(plan.runs)
+    progress("Runs", total - len(todo), total)
+    failures = []
+    for done, (run, error) in enumerate(_execute_all(todo, folder, plan.jobs, dask, variant)):
+        if error is not None:
+            failures.append(f"{run.folder}: {error}")
+        progress("Runs", total - len(todo) + done + 1, total)
+    summary = _summary(plan, folder)
+    write_text(folder / "summary.md", summary + "\n")
+    if failures:
+        raise InputError(f"{len(failures)} of {total} runs failed; the others are in {folder}; " + "; ".join(failures))
+    return summary
+
+
+def finished(folder: Path, run: Run) -> dict[str, Any] | None:
+    """The record of a run that ended well, or None."""
+    try:
+        record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return record if isinstance(record, dict) and record.get("digest") == run.digest else None
+
+
+def _execute_all(
+    runs: Sequence[Run], folder: Path, jobs: int, dask: str | None, variant: str
+) -> Iterator[tuple[Run, str | None]]:
+    """Execute runs and yield each with its error, or None, as it ends."""
+    if not runs:
+        return
+    arguments = [(run, str((folder / "runs" / run.folder).resolve()), str(folder.resolve()), variant) for run in runs]
+    for run in runs:
+        for part in (run.experiment.fit, run.experiment.relight):
+            if part and part.synth:
+                _synthetic_capture(part.synth, folder, variant)
+    if dask is not None:
+        yield from _execute_on_dask(arguments, dask)
+        return
+    # A process per run, never a forked one: Mitsuba's threads don't survive a fork, and its memory goes with it.
+    context = multiprocessing.get_context("spawn")
+    workers = min(jobs, len(runs))
+    with ProcessPoolExecutor(workers, mp_context=context, max_tasks_per_child=1) as pool:
+        waiting: dict[Future, Run] = {pool.submit(execute, *a): a[0] for a in arguments}
+        while waiting:
+            ended, _ = wait(waiting, return_when=FIRST_COMPLETED)
+            for future in ended:
+                yield waiting.pop(future), _error_of(future.exception())
+
+
+def _execute_on_dask(arguments: Sequence[tuple], address: str) -> Iterator[tuple[Run, str | None]]:
+    try:
+        from distributed import Client, as_completed
+    except ModuleNotFoundError:
+        raise InputError('--dask needs Dask: install it with pip install "mifit[cluster]"') from None
+    try:
+        client = Client(address, timeout=20)
+    except (OSError, ValueError) as error:
+        raise InputError(f"--dask {address}: no Dask scheduler answers there ({error})") from None
+    with client:
+        futures = {client.submit(execute, *a, pure=False, key=f"mifit-{a[0].digest}"): a[0] for a in arguments}
+        for future in as_completed(list(futures)):
+            yield futures[future], _error_of(future.exception())
+
+
+def _error_of(error: BaseException | None) -> str | None:
+    return None if error is None else " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def _synthetic_capture(synth: SynthRun, folder: Path, variant: str) -> Path:
+    """The synthetic capture of some settings, made once and shared by all runs that name it."""
+    path = folder / "captures" / checkpoint.digest(dataclasses.asdict(synth))[:10]
+    if not (path / "transforms.json").exists():
+        mifit.set_variant(variant)
+        from mifit.synth import synthesize
+
+        synthesize(path, **dataclasses.asdict(synth))
+    return path
+
+
+def execute(run: Run, folder: str, experiment_folder: str, variant: str) -> None:
+    """Execute one run in this process and write its ``run.json`` last."""
+    started = time.perf_counter()
+    where = Path(folder)
+    where.mkdir(parents=True, exist_ok=True)
+    active = mifit.set_variant(variant)
+    job = _execute_fit if run.experiment.fit else _execute_render
+    metrics = job(run.experiment, where, Path(experiment_folder), active)
+    record = {
+        "format_version": FORMAT_VERSION,
+        "digest": run.digest,
+        "swept": run.swept,
+        "settings": dataclasses.asdict(run.experiment),
+        "metrics": metrics,
+        "seconds": time.perf_counter() - started,
+        "versions": {
+            "mifit": mifit.__version__,
+            "python": platform.python_version(),
+            **{name: metadata.version(name) for name in ("mitsuba", "drjit", "numpy")},
+            "variant": active,
+        },
+        "machine": f"{platform.machine()}, {os.cpu_count()} processors",
+    }
+    write_text(where / "run.json", json.dumps(record, indent=1) + "\n")
+
+
+def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: str) -> dict[str, float]:
+    """Fit, evaluate and relight; returns the figures of the table."""
+    from mifit.config import FitConfig
+    from mifit.output.evaluate import evaluate
+    from mifit.output.relight import evaluate_relit, write_relit
+    from mifit.output.report import write_report
+
+    fit = e.fit
+    assert fit is not None
+    source = fit.capture or _synthetic_capture(fit.synth, experiment_folder, variant)  # type: ignore[arg-type]
+    capture = mifit.Capture.load(source)
+    result = mifit.fit(
+        capture,
+        mifit.MorphableModel.load(fit.model),
+        cameras=fit.cameras,
+        timesteps=fit.timesteps,
+        config=FitConfig(fit.geometry, fit.reflectance, fit.normals),
+        until=fit.until,
+        seed=fit.seed,
+        checkpoints=folder / ".checkpoint",
+    )
+    result = dataclasses.replace(result, model_source=fit.model)
+    metrics = {"fit_seconds": result.seconds}
+    evaluation = None
+    if e.outputs.result:
+        result.save(folder / "result")
+    if e.evaluate:
+        evaluation = evaluate(result, capture, e.evaluate.camera, e.evaluate.timesteps, e.evaluate.region)
+        write_text(folder / "evaluation.json", json.dumps(evaluation, indent=1) + "\n")
+        for method, figures in evaluation["methods"].items():
+            metrics |= {f"psnr_{method}": figures["psnr"], f"rmse_{method}": figures["rmse"]}
+    if e.relight:
+        found = write_relit(result, e.relight.env, folder / "relit", rotate=e.relight.rotate, seed=fit.seed)
+        metrics["relight_fast_vs_path_psnr"] = found["psnr"]
+        lit_capture = e.relight.capture
+        if e.relight.synth:
+            lit_capture = str(_synthetic_capture(e.relight.synth, experiment_folder, variant))
+        if lit_capture is not None:
+            judged = evaluate_relit(
+                result, e.relight.env, mifit.Capture.load(lit_capture), e.relight.camera, e.relight.rotate
+            )
+            for method, figures in judged["methods"].items():
+                metrics[f"relit_psnr_{method}"] = figures["psnr"]
+    if e.outputs.report:
+        write_report(folder, result, capture, evaluation)
+    return metrics
+
+
+def _execute_render(e: Experiment, folder: Path, experiment_folder: Path, variant: str) -> dict[str, float]:
+    """Render a scene and compare it with its reference; returns the figures of the table."""
+    import numpy as np
+
+    from mifit.core.image import write_image
+    from mifit.core.metrics import psnr, rmse
+    from mifit.render.scene_image import render_scene
+
+    run = e.render
+    assert run is not None
+    render_scene(run.scene, run.parameters, spp=1, seed=run.seed)  # compiles, so that the time below is steady
+    started = time.perf_counter()
+    image = render_scene(run.scene, run.parameters, spp=run.spp, seed=run.seed)
+    metrics = {"render_seconds": time.perf_counter() - started}
+    if e.outputs.images:
+        write_image(folder / "image.exr", image)
+        write_image(folder / "image.png", image)
+    if e.reference:
+        key = checkpoint.digest(
+            [run.scene, Path(run.scene).read_text(), run.parameters, dataclasses.asdict(e.reference)]
+        )
+        cache = experiment_folder / "references" / f"{key[:10]}.npy"
+        if not cache.exists():
+            made = render_scene(
+                run.scene, {**run.parameters, **e.reference.parameters}, spp=e.reference.spp, seed=e.reference.seed
+            )
+            with replacing(cache) as temporary:
+                np.save(temporary, made)
+        reference = np.load(cache)
+        peak = float(np.quantile(reference[..., :3], 0.999))
+        metrics["rmse"] = rmse(image[..., :3], reference[..., :3])
+        metrics["psnr"] = psnr(image[..., :3], reference[..., :3], peak=peak)
+    return metrics
+
+
+def _summary(plan: Plan, folder: Path) -> str:
+    """Markdown table of all finished runs in the order of the sweep; also writes ``summary.json``."""
+    rows = []
+    for run in plan.runs:
+        record = finished(folder / "runs" / run.folder, run)
+        if record is not None:
+            rows.append({"run": run.folder, "swept": run.swept, "metrics": record["metrics"]})
+    write_text(folder / "summary.json", json.dumps({"name": plan.name, "runs": rows}, indent=1) + "\n")
+    swept = list(dict.fromkeys(key for row in rows for key in row["swept"]))
+    metrics = list(dict.fromkeys(key for row in rows for key in row["metrics"]))
+    lines = [f"# {plan.name}: {len(rows)} of {len(plan.runs)} runs", ""]
+    if rows:
+        lines.append("| " + " | ".join([*swept, *metrics]) + " |")
+        lines.append("|" + " --- |" * len(swept) + " ---: |" * len(metrics))
+    for row in rows:
+        cells = [str(row["swept"].get(key, "")) for key in swept]
+        cells += [f"{row['metrics'][key]:.4g}" if key in row["metrics"] else "" for key in metrics]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
