@@ -105,6 +105,7 @@ def _document(result: Reconstruction) -> dict[str, Any]:
             "ambient": float(reflectance.ambient),
             "exponent": float(reflectance.exponent),
             "shading_model": reflectance.shading_model,
+            "fresnel": reflectance.fresnel,
         }
     return _finite(
         {
@@ -341,6 +342,7 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
         exponent=float(lighting["exponent"]),
         shading_model=str(lighting["shading_model"]),
         report=_report(document, "reflectance"),
+        fresnel=None if lighting.get("fresnel") is None else float(lighting["fresnel"]),
     )
 
 

@@ -7,6 +7,7 @@ shown with the fitted model's vertex albedo, without specular, by the mesh's nor
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -82,7 +83,7 @@ def surface_maps(reconstruction: Reconstruction, timestep: int) -> SurfaceMaps:
     model, geometry = reconstruction.model, reconstruction.geometry
     reflectance = reconstruction.reflectance
     size = 512 if reflectance is None else reflectance.diffuse.shape[0]
-    texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+    texels, nearest = _face_texels(model, size)
     corners = (model.faces, texels.face, texels.weights)
     if reflectance is None:
         diffuse = texels.to_map(np.clip(interpolate(geometry.vertex_albedo, *corners), 0, 1).astype(np.float32))
@@ -96,14 +97,15 @@ def surface_maps(reconstruction: Reconstruction, timestep: int) -> SurfaceMaps:
     if refined is not None:
         filled = np.any(refined != 0, axis=-1)
         normal[filled] = refined[filled]
-    nearest = _nearest_inside(texels)
     return SurfaceMaps(diffuse[nearest], specular[nearest], normal[nearest])
 
 
-def _nearest_inside(texels: TexelMap) -> tuple[NDArray, NDArray]:
-    """Row and column of the nearest covered texel, for every texel."""
+@lru_cache(maxsize=4)
+def _face_texels(model: MorphableModel, size: int) -> tuple[TexelMap, tuple[NDArray, NDArray]]:
+    """Texels of the face area, and for every texel of the map the row and column of the nearest of them."""
+    texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
     rows, columns = distance_transform_edt(~texels.mask, return_distances=False, return_indices=True)
-    return rows, columns
+    return texels, (rows, columns)
 
 
 def tangents(
