@@ -30,8 +30,9 @@ from mifit.morphable.register import distance_to_surface
 from mifit.solve import minimize
 from mifit.stages.fit_geometry import fit_geometry
 from mifit.stages.geometry.appearance import fit_appearance, gather
+from mifit.stages.geometry.normal import NormalEquations, prior_energy
 from mifit.stages.geometry.parameters import Layout, cross_matrix, exponential, rotation_angle
-from mifit.stages.geometry.refine import paper_problem, refine_by_texture
+from mifit.stages.geometry.refine import paper_problem, priors_of, refine_by_texture
 from mifit.stages.geometry.start import State, bounds, fit_landmarks, initial_state, landmark_views
 from mifit.stages.geometry.visibility import Visibility, spread_points
 
@@ -147,9 +148,10 @@ def basin(starts: int, seed: int = 0) -> dict[str, Any]:
     points = spread_points(model, config.surface_points, seed)
 
     def run(state: State) -> float:
-        state, _, slid = fit_landmarks(model, views, state, config.landmark_noise)
+        found = fit_landmarks(model, views, state, config.landmark_noise, priors_of(config))
+        state = found.state
         for _ in range(2):
-            state, solution = refine_by_texture(model, state, slid, visibility, points, config)
+            state, solution = refine_by_texture(model, state, found.views, visibility, points, config)
         return solution.energy
 
     def moved(rng: np.random.Generator, degrees: float, shift: float) -> State:
@@ -186,7 +188,8 @@ def speed() -> dict[str, Any]:
     layout = Layout(1, model.n_identity, model.n_expression)
     views = landmark_views(capture, model, BOTH, (0,), config.landmark_noise)
     state = initial_state(model, views, 1, layout, model.unit_mm / capture.unit_mm)
-    state, _, views = fit_landmarks(model, views, state, config.landmark_noise)
+    found = fit_landmarks(model, views, state, config.landmark_noise, priors_of(config))
+    state, views, config = found.state, found.views, replace(config, landmark_noise=found.noise)
     visibility = Visibility(capture, model, BOTH, (0,))
     pixels = visibility.pixels(state, config.pixels, 1.0, 0)
     lit = fit_appearance(gather(model, visibility.world(state), pixels, 30.0, 1.0), 30).value
@@ -303,14 +306,11 @@ def value_and_gradient(problem: Any, x: np.ndarray) -> tuple[float, np.ndarray]:
         local[:3] -= np.einsum("ni,nij->j", turning, cross_matrix(o.normal)) @ pose.left_jacobian
         g[layout.at("rotation", view.step)] += local[:3]
         g[layout.at("translation", view.step)] += local[3:]
-    from mifit.stages.geometry.normal import NormalEquations, prior_energy
-
     equations = NormalEquations(layout)
     problem.landmarks.accumulate(equations, layout, problem.frames, x)
     energy += problem.landmarks.energy(layout, problem.frames, x)
-    for name, weight in problem.priors.items():
-        equations.add_prior(name, x, weight)
-        energy += prior_energy(layout, x, name, weight)
+    equations.add_priors(x, problem.priors)
+    energy += prior_energy(layout, x, problem.priors)
     return energy, g + 2.0 * equations.system().gradient
 
 

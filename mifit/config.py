@@ -23,7 +23,8 @@ class GeometryConfig:
 
     objective: Literal["consistency", "paper"] = "consistency"
     rounds: int = 2  # outer steps: visibility is found anew in each
-    landmark_noise: float = 1.0  # standard deviation of a detected coordinate, pixels
+    landmark_noise: float = 1.0  # least standard deviation of a landmark coordinate, pixels; residuals may raise it
+    scale_deviation: float = 0.0  # standard deviation of the model's log scale; 0: the units are trusted
     # objective "paper"
     landmark_weight: float = 10.0
     prior_weight: float = 5e-5
@@ -82,12 +83,29 @@ class ReflectanceConfig:
 
 @dataclass(frozen=True)
 class NormalsConfig:
-    """Stage 3, normal refinement (paper, section 6)."""
+    """Stage 3, normal refinement (paper, section 6).
+
+    Attributes
+    ----------
+    solver : {"gauss_newton", "adam"}
+        ``adam`` is the paper's; both minimise the same energy.
+    laplacian_weight, magnitude_weight : float
+        The paper's w1 and w2, for images and normal maps in 8-bit steps (``stages.refine_normals``). The paper has
+        w2 = 0.3; with ten times that, path-traced captures keep the accuracy of the model's normals.
+    max_iterations : int
+    """
 
     solver: Literal["gauss_newton", "adam"] = "gauss_newton"
     laplacian_weight: float = 1e-3
-    magnitude_weight: float = 0.3
+    magnitude_weight: float = 3.0
     max_iterations: int = 100
+
+    def __post_init__(self) -> None:
+        for name in ("laplacian_weight", "magnitude_weight"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"normals.{name}: found {getattr(self, name)}, expected a number not below 0")
+        if self.max_iterations < 1:
+            raise ValueError(f"normals.max_iterations: found {self.max_iterations}, expected 1 or more")
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from mifit.solve import Solution
 from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.landmarks import LandmarkView
 from mifit.stages.geometry.parameters import Layout
-from mifit.stages.geometry.refine import Reference, refine_by_rendering, refine_by_texture, texture_reference
+from mifit.stages.geometry.refine import Reference, priors_of, refine_by_rendering, refine_by_texture, texture_reference
 from mifit.stages.geometry.start import FEWEST_LANDMARKS, State, fit_landmarks, initial_state, landmark_views
 from mifit.stages.geometry.summary import Journal, pack
 from mifit.stages.geometry.visibility import Visibility, spread_points
@@ -66,19 +66,23 @@ def fit_geometry(
 
     Notes
     -----
-    Gauge: the scale is ``model.unit_mm / capture.unit_mm`` and isn't estimated, so distance is; the albedo's level
-    is the model's mean's, so the lighting's is estimated; ambient is held towards 0 against the constant harmonic.
+    Gauge: the scale is ``model.unit_mm / capture.unit_mm``, and estimated around that only when
+    ``config.scale_deviation`` is above 0, so that distance is; the albedo's level is the model's mean's, so the
+    lighting's is estimated; ambient is held towards 0 against the constant harmonic.
     """
     cameras, timesteps = tuple(cameras), tuple(timesteps)
     if not cameras or not timesteps:
         raise InputError("fit_geometry: found no camera or no timestep, expected at least one of each")
     journal = Journal("fit geometry", 2 + config.rounds, progress)
-    layout = Layout(len(timesteps), model.n_identity, model.n_expression)
+    layout = Layout(len(timesteps), model.n_identity, model.n_expression, log_scale=int(config.scale_deviation > 0.0))
     views = landmark_views(capture, model, cameras, timesteps, config.landmark_noise)
     state = initial_state(model, views, len(timesteps), layout, model.unit_mm / capture.unit_mm)
-    state, solution, views = fit_landmarks(model, views, state, config.landmark_noise)
-    journal.phase("landmarks", _usable(solution, "landmarks"))
-    return _refine_and_pack(capture, model, cameras, timesteps, config, seed, journal, state, views, None, None)
+    start = fit_landmarks(model, views, state, config.landmark_noise, priors_of(config))
+    journal.phase("landmarks", _usable(start.solution, "landmarks"))
+    config = replace(config, landmark_noise=start.noise)
+    return _refine_and_pack(
+        capture, model, cameras, timesteps, config, seed, journal, start.state, start.views, None, None
+    )
 
 
 def fit_pose_expression(
@@ -128,8 +132,9 @@ def fit_pose_expression(
     views = landmark_views(capture, baked, cameras, (timestep,), config.landmark_noise, fewest=0)
     if sum(len(view.index) for view in views) >= FEWEST_LANDMARKS:
         state = initial_state(baked, views, 1, warm.layout, geometry.scale, warm)
-        state, solution, views = fit_landmarks(baked, views, state, config.landmark_noise)
-        journal.phase("landmarks", _usable(solution, "landmarks"))
+        start = fit_landmarks(baked, views, state, config.landmark_noise, priors_of(config))
+        journal.phase("landmarks", _usable(start.solution, "landmarks"))
+        state, views, config = start.state, start.views, replace(config, landmark_noise=start.noise)
     else:
         state = warm
         journal.warn(f"timestep {timestep}: too few landmarks; started from timestep {geometry.timesteps[-1]} alone")
@@ -201,7 +206,9 @@ def _refine_and_pack(
         coefficients = _appearance(model, state, visibility, config, seed, journal)
     for message in visibility.warnings:
         journal.warn(message)
-    return pack(model, state, coefficients, timesteps, visibility.world(state), journal, views, fixed)
+    return pack(
+        model, state, coefficients, timesteps, visibility.world(state), journal, views, config.landmark_noise, fixed
+    )
 
 
 def _appearance(

@@ -171,7 +171,12 @@ def test_landmark_jacobian(scene):
     layout = replace(scene.layout, albedo=0, shading=0, ambient=0)
     x = np.concatenate([scene.x[scene.layout.at("identity")], scene.x[scene.layout.at("log_scale")]])
     x = np.concatenate([x, *(scene.x[scene.layout.local(k)] for k in range(2))])
-    problem = LandmarkProblem(layout, scene.frames, LandmarkTerm(landmark_views(scene), 30.0), 0.5, 0.8)
+    problem = LandmarkProblem(
+        layout,
+        scene.frames,
+        LandmarkTerm(landmark_views(scene), 30.0),
+        {"identity": 0.5, "expression": 0.8, "log_scale": 2.0},
+    )
     check_gradient(problem, x, 1e-6)
 
 
@@ -213,7 +218,15 @@ def test_consistency_jacobian(scene):
             points = basis_on(scene.model, face[seen], weights[seen])
             views.append(TextureView(step, cam, smooth_image(scene.rng), seen, scene.rng.uniform(0.3, 1, 60), points))
     problem = ConsistencyProblem(
-        layout, scene.frames, 80, tuple(views), 0.1, np.inf, 0.5, LandmarkTerm((), np.inf), 0.2, 0.3
+        layout,
+        scene.frames,
+        80,
+        tuple(views),
+        0.1,
+        np.inf,
+        0.5,
+        LandmarkTerm((), np.inf),
+        {"identity": 0.2, "expression": 0.3},
     )
     check_gradient(problem, x, 1e-4)
     # the elimination must equal explicit unknowns: a step with the values free is the step of the full system
@@ -231,7 +244,15 @@ def test_elimination_equals_explicit_values(scene):
         for cam in scene.cameras
     )
     problem = ConsistencyProblem(
-        layout, scene.frames, 10, views, 1.0, np.inf, 1.0, LandmarkTerm((), np.inf), 1e-3, 1e-3
+        layout,
+        scene.frames,
+        10,
+        views,
+        1.0,
+        np.inf,
+        1.0,
+        LandmarkTerm((), np.inf),
+        {"identity": 1e-3, "expression": 1e-3},
     )
     rows = []
     for i in range(layout.size):

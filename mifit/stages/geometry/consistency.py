@@ -79,8 +79,7 @@ class ConsistencyProblem:
     robust: float
     independence: float
     landmarks: LandmarkTerm
-    identity_prior: float
-    expression_prior: float
+    priors: dict[str, float]
     known: tuple[NDArray, NDArray] | None = None
 
     def _observe(self, x: NDArray, gradient: bool) -> list:
@@ -141,8 +140,7 @@ class ConsistencyProblem:
         return {
             "consistency": self._reweighted(self._observe(x, gradient=False))[3],
             "landmarks": self.landmarks.energy(self.layout, self.frames, x),
-            "prior": prior_energy(self.layout, x, "identity", self.identity_prior)
-            + prior_energy(self.layout, x, "expression", self.expression_prior),
+            "prior": prior_energy(self.layout, x, self.priors),
         }
 
     def linearize(self, x: NDArray) -> DenseSystem:
@@ -166,8 +164,7 @@ class ConsistencyProblem:
             pooled[view.points, :, :s] += (w * shared).reshape(n, channels, s)
             pooled[view.points, :, layout.local(view.step)] += (w * local).reshape(n, channels, -1)
         self.landmarks.accumulate(equations, layout, self.frames, x)
-        equations.add_prior("identity", x, self.identity_prior)
-        equations.add_prior("expression", x, self.expression_prior)
+        equations.add_priors(x, self.priors)
         system = equations.system()
         used = total > 1e-9
         rows = pooled[used]

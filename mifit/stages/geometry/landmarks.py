@@ -96,23 +96,20 @@ class LandmarkProblem:
     layout: Layout
     frames: Frames
     term: LandmarkTerm
-    identity_prior: float
-    expression_prior: float
+    priors: dict[str, float]
 
     def energies(self, x: NDArray) -> dict[str, float]:
         """Energy per term."""
         return {
             "landmarks": self.term.energy(self.layout, self.frames, x),
-            "prior": prior_energy(self.layout, x, "identity", self.identity_prior)
-            + prior_energy(self.layout, x, "expression", self.expression_prior),
+            "prior": prior_energy(self.layout, x, self.priors),
         }
 
     def linearize(self, x: NDArray) -> System:
         """Normal equations at x."""
         equations = NormalEquations(self.layout)
         self.term.accumulate(equations, self.layout, self.frames, x)
-        equations.add_prior("identity", x, self.identity_prior)
-        equations.add_prior("expression", x, self.expression_prior)
+        equations.add_priors(x, self.priors)
         return equations.system()
 
 

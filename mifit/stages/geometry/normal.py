@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.solve import ArrowSystem
-from mifit.stages.geometry.parameters import Layout
+from mifit.stages.geometry.parameters import LOCAL, Layout
 
 
 class NormalEquations:
@@ -41,21 +41,20 @@ class NormalEquations:
         self.shared_gradient += h[:s, -1]
         self.local_gradient[step] += h[s:-1, -1]
 
-    def add_prior(self, name: str, x: NDArray, weight: float, mean: float | NDArray = 0.0) -> None:
-        """Add ``weight * |x[name] - mean|^2``, for every timestep if the group is local."""
-        steps = range(self.layout.timesteps) if name in ("expression", "rotation", "translation") else (0,)
-        for step in steps:
-            at = self.layout.at(name, step)
-            difference = x[at] - mean
-            if name in ("expression", "rotation", "translation"):
-                start = self.layout.local(step).start
+    def add_priors(self, x: NDArray, priors: dict[str, float]) -> None:
+        """Add ``weight * |x[name]|^2`` per group, for every timestep if the group is local."""
+        for name, weight in priors.items():
+            for step in range(self.layout.timesteps) if name in LOCAL else (0,):
+                at = self.layout.at(name, step)
+                start = self.layout.local(step).start if name in LOCAL else 0
                 inside = np.arange(at.start - start, at.stop - start)
-                self.local[step][inside, inside] += weight
-                self.local_gradient[step][inside] += weight * difference
-            else:
-                inside = np.arange(at.start, at.stop)
-                self.shared[inside, inside] += weight
-                self.shared_gradient[inside] += weight * difference
+                block, gradient = (
+                    (self.local[step], self.local_gradient[step])
+                    if name in LOCAL
+                    else (self.shared, self.shared_gradient)
+                )
+                block[inside, inside] += weight
+                gradient[inside] += weight * x[at]
 
     def system(self) -> ArrowSystem:
         """The accumulated equations."""
@@ -64,8 +63,11 @@ class NormalEquations:
         )
 
 
-def prior_energy(layout: Layout, x: NDArray, name: str, weight: float) -> float:
-    """Energy that `NormalEquations.add_prior` linearises, with mean 0."""
-    local = name in ("expression", "rotation", "translation")
-    steps = range(layout.timesteps) if local else (0,)
-    return weight * sum(float(x[layout.at(name, step)] @ x[layout.at(name, step)]) for step in steps)
+def prior_energy(layout: Layout, x: NDArray, priors: dict[str, float]) -> float:
+    """Energy that `NormalEquations.add_priors` linearises."""
+    total = 0.0
+    for name, weight in priors.items():
+        for step in range(layout.timesteps) if name in LOCAL else (0,):
+            values = x[layout.at(name, step)]
+            total += weight * float(values @ values)
+    return total

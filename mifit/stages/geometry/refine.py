@@ -49,6 +49,12 @@ class Reference:
         return SurfacePoints(self.face, self.weights, PointBasis.on_faces(model, self.face, self.weights))
 
 
+def priors_of(config: GeometryConfig) -> dict[str, float]:
+    """Weights of the squared unknowns where every term is in units of its noise: coefficients have deviation 1."""
+    priors = {"identity": 1.0, "expression": 1.0}
+    return priors if config.scale_deviation == 0.0 else {**priors, "log_scale": config.scale_deviation**-2}
+
+
 def texture_reference(
     capture: Capture,
     model: MorphableModel,
@@ -78,7 +84,7 @@ def texture_reference(
     visibility = Visibility(capture, model, cameras, geometry.timesteps)
     views = visibility.textures(state, points, config.texture_sigma, config.texture_window)
     problem = ConsistencyProblem(
-        layout, state.frames, len(points.face), views, 1.0, np.inf, 1.0, LandmarkTerm((), np.inf), 0.0, 0.0
+        layout, state.frames, len(points.face), views, 1.0, np.inf, 1.0, LandmarkTerm((), np.inf), {}
     )
     problem = replace(problem, noise=problem.spread(x), robust=ROBUST_DEVIATIONS)
     values, confidence = problem.texture(x)
@@ -106,8 +112,7 @@ def refine_by_texture(
         robust=np.inf,
         independence=config.texture_weight,
         landmarks=LandmarkTerm(views, OUTLIER_PIXELS * config.landmark_noise),
-        identity_prior=1.0,
-        expression_prior=1.0,
+        priors=priors_of(config),
         known=None if reference is None else (reference.values, reference.confidence),
     )
     problem = replace(problem, noise=problem.spread(state.x), robust=ROBUST_DEVIATIONS)
@@ -179,6 +184,8 @@ def paper_problem(
     weighted = tuple(replace(view, weight=config.landmark_weight / max(len(view.index), 1)) for view in views)
     priors = {name: config.prior_weight for name in ("identity", "albedo", "expression")}
     priors["ambient"] = AMBIENT_PRIOR * WHITE**2
+    if layout.log_scale:
+        priors["log_scale"] = priors_of(config)["log_scale"]
     pixels = visibility.pixels(full, config.pixels, config.texture_sigma, seed)
     term = LandmarkTerm(weighted, OUTLIER_PIXELS * config.landmark_noise)
     return RenderingProblem(model, layout, full.frames, pixels, term, config.robust_colour, priors), x

@@ -192,7 +192,7 @@ class RenderingProblem:
         data = sum(
             self._loss(self._observe(view, surfaces[view.step], albedo, x, gradient=False))[0] for view in self.views
         )
-        prior = sum(prior_energy(self.layout, x, name, weight) for name, weight in self.priors.items())
+        prior = prior_energy(self.layout, x, self.priors)
         landmarks = self.landmarks.energy(self.layout, self.frames, x)
         return {"photo": float(data), "landmarks": landmarks, "prior": prior}
 
@@ -210,8 +210,7 @@ class RenderingProblem:
             shared, local = self._columns(view, surface, observation, x, derivatives[view.step])
             equations.add(view.step, shared, local, observation.residual.reshape(-1), np.repeat(weight, 3))
         self.landmarks.accumulate(equations, self.layout, self.frames, x)
-        for name, weight in self.priors.items():
-            equations.add_prior(name, x, weight)
+        equations.add_priors(x, self.priors)
         return equations.system()
 
     def _columns(

@@ -132,31 +132,46 @@ def initial_state(
     return State(layout, Frames(rotation, scale), x)
 
 
+@dataclass(frozen=True)
+class LandmarkFit:
+    """Result of the fit by landmarks.
+
+    Attributes
+    ----------
+    state : State
+    solution : Solution
+        Of the last run.
+    views : tuple of LandmarkView
+        With slid contour points and weights by the noise found.
+    noise : float
+        Standard deviation of a landmark's coordinate in pixels: what was assumed, or what the residuals show if
+        that is more. Detectors and models disagree about where a landmark lies by more than the detector's scatter.
+    """
+
+    state: State
+    solution: Solution
+    views: tuple[LandmarkView, ...]
+    noise: float
+
+
 def fit_landmarks(
     model: MorphableModel,
     views: tuple[LandmarkView, ...],
     state: State,
     noise: float,
-    identity_prior: float = 1.0,
-    expression_prior: float = 1.0,
-) -> tuple[State, Solution, tuple[LandmarkView, ...]]:
-    """Levenberg-Marquardt on landmarks and prior: pose alone, then few modes, then all, then with the contour slid.
+    priors: dict[str, float],
+) -> LandmarkFit:
+    """Levenberg-Marquardt on landmarks and prior: pose alone, then few modes, then all, then all once more.
 
-    Returns
-    -------
-    state, solution of the last run, views with their slid contour points
+    Before the last two runs the contour slides; before the last one the noise is raised to what the residuals show.
     """
     layout = state.layout
     low, high = bounds(layout, model.expression_bounds)
     held = np.zeros(layout.size, dtype=bool)
     solution: Solution | None = None
     # a wide outlier scale first: the mean face is far from every landmark
-    for modes, expression, widening in (
-        (0, False, 10.0),
-        (FEW_IDENTITY_MODES, True, 3.0),
-        (None, True, 1.0),
-        (None, True, 1.0),
-    ):
+    runs = ((0, False, 10.0), (FEW_IDENTITY_MODES, True, 3.0), (None, True, 1.0), (None, True, 1.0))
+    for number, (modes, expression, widening) in enumerate(runs):
         state = state.recentred()
         held[:] = False
         if modes is not None:
@@ -169,8 +184,11 @@ def fit_landmarks(
             vertices = object_vertices(model, state)
             poses = [state.frames.pose(layout, state.x, k) for k in range(layout.timesteps)]
             views = slide_contour(model, views, vertices, poses)
+        if number == 3:
+            noise = max(noise, _coordinate_deviation(state, views))
+            views = tuple(replace(view, weight=noise**-2) for view in views)
         term = LandmarkTerm(views, OUTLIER_PIXELS * noise * widening)
-        problem = LandmarkProblem(layout, state.frames, term, identity_prior, expression_prior)
+        problem = LandmarkProblem(layout, state.frames, term, priors)
         solution = minimize(
             problem,
             state.x,
@@ -182,7 +200,14 @@ def fit_landmarks(
         )
         state = replace(state, x=solution.value)
     assert solution is not None
-    return state, solution, views
+    return LandmarkFit(state, solution, views, noise)
+
+
+def _coordinate_deviation(state: State, views: tuple[LandmarkView, ...]) -> float:
+    """Robust standard deviation of a landmark coordinate's residual, pixels."""
+    term = LandmarkTerm(views, np.inf)
+    residual = [term.distances(view, state.layout, state.frames, state.x).ravel() for view in views]
+    return 1.4826 * float(np.median(np.abs(np.concatenate(residual))))
 
 
 def object_vertices(model: MorphableModel, state: State) -> NDArray:

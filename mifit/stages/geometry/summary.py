@@ -68,6 +68,7 @@ def pack(
     world: NDArray,
     journal: Journal,
     views: tuple[LandmarkView, ...],
+    noise: float,
     fixed: GeometryEstimate | None,
 ) -> GeometryEstimate:
     """Turn a state into the stage's result.
@@ -77,6 +78,8 @@ def pack(
     appearance : (Ka + 28,)
         Albedo coefficients, shading, ambient.
     world : (T, V, 3)
+    noise : float
+        Standard deviation of a landmark coordinate that the fit used, pixels.
     fixed : GeometryEstimate, optional
         Where identity and albedo come from when they weren't fitted.
     """
@@ -84,7 +87,11 @@ def pack(
     poses = [state.frames.pose(layout, x, k) for k in range(len(timesteps))]
     albedo, shading, ambient = np.split(appearance, [model.n_albedo, model.n_albedo + 27])
     expression = np.stack([x[layout.at("expression", k)] for k in range(len(timesteps))])
-    details = {"phases": journal.phases, "landmark_rms_pixels": _landmark_rms(state, views)}
+    details = {
+        "phases": journal.phases,
+        "landmark_rms_pixels": _landmark_rms(state, views),
+        "landmark_noise_pixels": noise,
+    }
     if journal.last is not None and journal.last.system is not None:
         details["standard_deviations"] = _deviations(state, journal.last)
     identity = x[layout.at("identity")].copy() if fixed is None else fixed.identity
