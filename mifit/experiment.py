@@ -541,6 +541,8 @@ def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: 
     assert fit is not None
     source = fit.capture or _synthetic_capture(fit.synth, experiment_folder, variant)  # type: ignore[arg-type]
     capture = mifit.Capture.load(source)
+    # Runs that differ only in what comes after the fit share it.
+    key = checkpoint.digest(dataclasses.asdict(fit))
     result = mifit.fit(
         capture,
         mifit.MorphableModel.load(fit.model),
@@ -549,7 +551,7 @@ def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: 
         config=FitConfig(fit.geometry, fit.reflectance, fit.normals),
         until=fit.until,
         seed=fit.seed,
-        checkpoints=folder / ".checkpoint",
+        checkpoints=experiment_folder / "fits" / key[:10],
     )
     result = dataclasses.replace(result, model_source=fit.model)
     metrics = {"fit_seconds": result.seconds}

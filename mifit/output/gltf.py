@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import mifit
 from mifit.core.blinn_phong import normalization
 from mifit.core.files import replacing
-from mifit.core.image import encode_png, linear_to_srgb, to_8_bit
+from mifit.core.image import encode_png, to_8_bit
 from mifit.core.mesh import vertex_normals
 from mifit.output.surface import (
     SplitMesh,
@@ -196,7 +196,10 @@ def _skin(
     planes = {
         "baseColor": to_8_bit(maps.diffuse),
         "normal": np.round(127.5 * (bent + 1)).astype(np.uint8),
-        "specular": np.repeat(np.round(255 * linear_to_srgb(maps.specular / peak)).astype(np.uint8)[..., None], 3, -1),
+        # KHR_materials_specular reads the alpha channel.
+        "specular": np.dstack([np.full((*maps.specular.shape, 3), 255), 255 * maps.specular / peak])
+        .round()
+        .astype(np.uint8),
     }
     images = [
         {"name": name, "mimeType": "image/png", "bufferView": out.view(encode_png(codes))}
@@ -214,8 +217,10 @@ def _skin(
         "normalTexture": {"index": 1},
         "extensions": {
             "KHR_materials_specular": {
-                "specularColorFactor": [energy * peak / DIELECTRIC_F0] * 3,
-                "specularColorTexture": {"index": 2},
+                "specularFactor": min(energy * peak, 1.0),
+                "specularTexture": {"index": 2},
+                # Reflectance is then specularFactor at every angle: Blinn-Phong has no Fresnel rise.
+                "specularColorFactor": [1.0 / DIELECTRIC_F0] * 3,
             }
         },
     }

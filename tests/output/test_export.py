@@ -77,11 +77,13 @@ def test_gltf_material_holds_the_maps(ball, glb):
     alpha = math.sqrt(2 / (12.0 + 2))
     assert skin["pbrMetallicRoughness"]["roughnessFactor"] ** 2 == pytest.approx(alpha)
     specular = skin["extensions"]["KHR_materials_specular"]
-    assert specular["specularColorFactor"][0] * 0.04 == pytest.approx(0.15, rel=1e-5)
+    assert specular["specularFactor"] == pytest.approx(0.15, rel=1e-5)
+    assert specular["specularColorFactor"] == pytest.approx([25] * 3)
     for image, texture in zip(document["images"], document["textures"], strict=True):
         view = document["bufferViews"][image["bufferView"]]
         data = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
-        assert cv2.imdecode(np.frombuffer(data, np.uint8), 1).shape == (32, 32, 3)
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert picture.shape == (32, 32, 4 if image["name"] == "specular" else 3)
         assert texture["sampler"] == 0
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
     uv = read(attributes["TEXCOORD_0"])
