@@ -23,6 +23,7 @@ def shade_points(
     model: str,
     diffuse_transfer: ArrayLike | None = None,
     normalized: bool = True,
+    fresnel: float | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Radiance of points under SH lighting, as its diffuse and its specular part.
 
@@ -44,6 +45,8 @@ def shade_points(
         Traced transfer vectors; ``shadowed`` needs them.
     normalized : bool
         Kind of lobe of the prefiltered models.
+    fresnel : float, optional
+        Rise of their lobe towards grazing views, see ``render.shading.Lobe``.
 
     Returns
     -------
@@ -70,7 +73,8 @@ def shade_points(
         rows = _expect(diffuse_transfer, (len(n), order * order), "diffuse_transfer")
         traced = [mi.Float(np.ascontiguousarray(column)) for column in rows.T]
     coefficients = [mi.Color3f(*map(float, row)) for row in np.asarray(radiance, dtype=np.float64)]
-    d, s = shading.shade(_vector(n), _vector(v), _opaque(coefficients), float(exponent), model, normalized, traced)
+    normal, toward = _vector(n), _vector(v)
+    d, s = shading.shade(normal, toward, _opaque(coefficients), float(exponent), model, normalized, traced, fresnel)
     return (albedo * _rows(d, len(n)) + np.float32(ambient), gloss[:, None] * _rows(s, len(n)))
 
 
@@ -88,6 +92,7 @@ def specular_matrix(
     model: str,
     diffuse_transfer: ArrayLike | None = None,
     normalized: bool = True,
+    fresnel: float | None = None,
 ) -> NDArray[np.float32]:
     """(N, B*B) transfer of a point with unit specular albedo: the specular part = C_s * (matrix @ coefficients).
 
@@ -105,7 +110,7 @@ def specular_matrix(
         direction = shading.dominant_direction(_opaque(coefficients))
         factor = shading.paper_specular(normal, toward, direction, float(exponent))
         return _columns([factor * t for t in shading.diffuse_transfer(normal, order)], len(n))
-    lobe = shading.lobe(float(exponent), order, normalized)
+    lobe = shading.lobe(float(exponent), order, normalized, fresnel)
     matrix = _columns(shading.specular_transfer(normal, toward, lobe), len(n))
     if model == "prefiltered":
         return matrix

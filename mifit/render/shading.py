@@ -50,6 +50,25 @@ def sh_basis(d: Any, order: int) -> list[Any]:
     return dr.sh_eval(d, order - 1)
 
 
+def colours(flat: Any, order: int, width: int = 1) -> list[Any]:
+    """Flat coefficients (B*B*3) -> B*B colours, repeated for ``width`` points.
+
+    Repeated ones have the same values but a cheaper gradient: the sums over all points are taken in the kernel that
+    shades, in copies per thread, whereas the gradient of values of width one is a kernel per number, each of which
+    shades everything again.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    if not dr.is_jit_v(mi.Float):
+        return [mi.Color3f(*(flat[3 * k + c] for c in range(3))) for k in range(order * order)]
+
+    def entry(index: int) -> Any:
+        return dr.gather(mi.Float, flat, dr.full(mi.UInt32, index, width), mode=dr.ReduceMode.Expand)
+
+    return [mi.Color3f(*(entry(3 * k + c) for c in range(3))) for k in range(order * order)]
+
+
 def radiance(transfer: Sequence[Any], coefficients: Sequence[Any]) -> Any:
     """Dot product of a transfer vector with SH coefficients (B*B colours)."""
     total = transfer[0] * coefficients[0]
@@ -76,14 +95,18 @@ class Lobe:
         Per moment of ``core.blinn_phong.lobe_moments`` its Chebyshev coefficients in ``2 n.v - 1``.
     scale : float or Float
         Factor on the albedo: 1 for the normalised lobe.
+    fresnel : float or None
+        None: Blinn-Phong as it is. A number: the lobe that a view along the normal has, carried about the mirror
+        direction whatever the view, and rising as ``1 + fresnel (1 - n.v)^5``: what microfacet surfaces do.
     """
 
     order: int
     polynomials: list[list[Any]]
     scale: Any
+    fresnel: float | None = None
 
 
-def lobe(exponent: Any, order: int, normalized: bool = True) -> Lobe:
+def lobe(exponent: Any, order: int, normalized: bool = True, fresnel: float | None = None) -> Lobe:
     """Prepare the lobe of an exponent: a Python float, or a Dr.Jit one (differentiable, of any width)."""
     import drjit as dr
     import mitsuba as mi
@@ -95,12 +118,14 @@ def lobe(exponent: Any, order: int, normalized: bool = True) -> Lobe:
         # Opaque: a kernel is compiled once, not once per exponent.
         polynomials = [[dr.opaque(mi.Float, float(a)) for a in row] for row in values]
         ratio = blinn_phong.normalization(exponent, normalized) / blinn_phong.normalization(exponent)
-        return Lobe(order, polynomials, dr.opaque(mi.Float, float(ratio)))
+        return Lobe(order, polynomials, dr.opaque(mi.Float, float(ratio)), fresnel)
     m = dr.clip(exponent, blinn_phong.EXPONENT_MIN, blinn_phong.EXPONENT_MAX)
     y = dr.log(m) * (2.0 / float(np.log(blinn_phong.EXPONENT_MAX))) - 1.0
     t = _chebyshev(y, table.shape[2])
     polynomials = [[_dot(row, t) for row in moment] for moment in table]
-    return Lobe(order, polynomials, 1.0 if normalized else 1.0 / (dr.pi * normalization(exponent)))
+    if dr.width(exponent) == 1 and not dr.grad_enabled(exponent):
+        dr.eval(polynomials)  # computed once; with a gradient it is cheaper per point, with one sum at the end
+    return Lobe(order, polynomials, 1.0 if normalized else 1.0 / (dr.pi * normalization(exponent)), fresnel)
 
 
 def _clamped(exponent: float) -> float:
@@ -145,9 +170,13 @@ def lobe_axis(n: Any, v: Any, lobe: Lobe) -> tuple[Any, list[Any]]:
     import drjit as dr
 
     cosine = dr.dot(n, v)
+    mirror = 2.0 * cosine * n - v
+    if lobe.fresnel is not None:
+        moments = [sum(row[1:], row[0]) for row in lobe.polynomials]  # the polynomials at n.v = 1
+        moments[0] = moments[0] * (1.0 + lobe.fresnel * (1.0 - dr.clip(cosine, 0.0, 1.0)) ** 5)
+        return mirror, moments
     t = _chebyshev(2.0 * dr.clip(cosine, 0.0, 1.0) - 1.0, len(lobe.polynomials[0]))
     moments = [_dot(row, t) for row in lobe.polynomials]
-    mirror = 2.0 * cosine * n - v
     axis = mirror + moments[1] * (n - mirror)
     return axis * dr.rsqrt(dr.maximum(dr.squared_norm(axis), 1e-12)), moments
 
@@ -195,6 +224,7 @@ def shade(
     model: str,
     normalized: bool = True,
     traced: Sequence[Any] | None = None,
+    fresnel: float | None = None,
 ) -> tuple[Any, Any]:
     """Radiance of a white diffuse and of a fully specular point under SH lighting.
 
@@ -212,6 +242,8 @@ def shade(
         Kind of lobe of the prefiltered models; ``paper`` always has the plain one.
     traced : B*B Floats, optional
         Shadowed diffuse transfer vectors; ``shadowed`` needs them.
+    fresnel : float, optional
+        See ``Lobe``; not for ``paper``, nor where a prepared lobe is given.
 
     Returns
     -------
@@ -222,7 +254,7 @@ def shade(
     if model == "paper":
         shading = radiance(diffuse_transfer(n, order), coefficients)
         return shading, shading * paper_specular(n, v, dominant_direction(coefficients), exponent)
-    prepared = exponent if isinstance(exponent, Lobe) else lobe(exponent, order, normalized)
+    prepared = exponent if isinstance(exponent, Lobe) else lobe(exponent, order, normalized, fresnel)
     axis, moments = lobe_axis(n, v, prepared)
     specular = radiance(_lobe_transfer(prepared, axis, moments), coefficients)
     if model == "prefiltered":

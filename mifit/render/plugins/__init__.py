@@ -1,1 +1,39 @@
-"""plugins"""
+"""Mitsuba plugins, one per file; each file's ``make`` defines the class for the variant that is active.
+
+A class derived from a Mitsuba base belongs to the variant in which it was defined: under another one it would register
+without an error and misbehave. So the classes are made once per variant.
+"""
+
+from __future__ import annotations
+
+_CLASSES: dict[str, dict[str, type]] = {}
+
+
+def register_plugins() -> dict[str, type]:
+    """Register ``blinnphong``, ``shenv`` and ``shdirect`` with the current variant; harmless to repeat.
+
+    Returns
+    -------
+    dict of str to type
+        The plugin classes of this variant by name.
+
+    Raises
+    ------
+    VariantError
+        No variant is active.
+    """
+    import mitsuba as mi
+
+    from mifit.errors import VariantError
+    from mifit.render.plugins import blinnphong, shdirect, shenv
+
+    variant = mi.variant()
+    if variant is None:
+        raise VariantError("no Mitsuba variant is active; call mifit.set_variant() first")
+    if variant not in _CLASSES:
+        made = {"blinnphong": blinnphong.make(), "shenv": shenv.make(), "shdirect": shdirect.make()}
+        mi.register_bsdf("blinnphong", made["blinnphong"])
+        mi.register_emitter("shenv", made["shenv"])
+        mi.register_integrator("shdirect", made["shdirect"])
+        _CLASSES[variant] = made
+    return _CLASSES[variant]

@@ -1,0 +1,192 @@
+"""The Blinn-Phong BSDF as a Mitsuba plugin."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mifit.core.blinn_phong import EXPONENT_MAX, EXPONENT_MIN
+
+
+def make() -> type:
+    """Define the plugin class for the current variant."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from mifit.render.shading import normalization
+
+    class BlinnPhong(mi.BSDF):
+        r"""
+        Blinn-Phong reflection (`blinnphong`)
+        -------------------------------------
+
+        A diffuse base and a specular lobe about the half vector $h$ of view and light:
+
+        $$f = \frac{C_d}{\pi} + C_s\, N(m)\, (n' \cdot h)^m$$
+
+        - `diffuse_reflectance` (texture, default 0.5): $C_d$, reflectance 0..1
+        - `specular_reflectance` (texture, default 0.04): $C_s$, reflectance 0..1
+        - `exponent` (float or texture, default 20): $m$, 1..10000; values outside are clamped
+        - `normal_correction` (texture, optional): its channels $(a, b)$ turn the normal to
+          $n' = \mathrm{normalize}(n + a\,s + b\,t)$ in the shading frame $(s, t, n)$; raw slopes of either sign; a
+          third channel is ignored
+        - `normalized` (bool, default true): which $N(m)$
+
+        Normalised, $N(m) = \frac{(m+2)(m+4)}{8\pi\,(m + 2^{-m/2})}$: the lobe alone reflects all light at normal
+        incidence and less elsewhere; where $C_d + C_s > 1$ both are divided by their sum, so that no energy is gained.
+        Otherwise $N = 1/\pi$: the paper's plain $C_s\,(n \cdot h)^m$ in the units of the diffuse term, which doesn't
+        conserve energy.
+
+        The normal correction is the paper's $\delta_n$ as slopes in the tangent plane instead of spherical coordinates:
+        those have a pole where the azimuth means nothing and its derivative vanishes, and for a small correction that
+        pole is the uncorrected normal itself. Slopes are zero there, linear around it, and can't turn the normal over.
+        The shading frame's $s$ follows the UV parametrisation.
+
+        Reflects on the side of the normal; wrap it in Mitsuba's `twosided` for both. `sample` draws half vectors in
+        proportion to $(n' \cdot h)^m$ and cosine-weighted directions, in proportion to the albedos. All parameters are
+        differentiable.
+        """
+
+        def __init__(self, props: mi.Properties) -> None:
+            super().__init__(props)
+            self.diffuse = props.get_texture("diffuse_reflectance", 0.5)
+            self.specular = props.get_texture("specular_reflectance", 0.04)
+            self.exponent = props.get_unbounded_texture("exponent", 20.0)
+            corrected = "normal_correction" in props
+            self.correction = props.get_unbounded_texture("normal_correction") if corrected else None
+            self.normalized = bool(props.get("normalized", True))
+            self._set_flags()
+
+        def _set_flags(self) -> None:
+            textures = [self.diffuse, self.specular, self.exponent]
+            varying = self.correction is not None or any(t.is_spatially_varying() for t in textures)
+            common = mi.BSDFFlags.FrontSide | (mi.BSDFFlags.SpatiallyVarying if varying else mi.BSDFFlags.Empty)
+            self.m_components = [
+                mi.BSDFFlags.GlossyReflection | common,
+                mi.BSDFFlags.DiffuseReflection | common,
+            ]
+            self.m_flags = self.m_components[0] | self.m_components[1]
+
+        def traverse(self, callback: mi.TraversalCallback) -> None:
+            callback.put("diffuse_reflectance", self.diffuse, mi.ParamFlags.Differentiable)
+            callback.put("specular_reflectance", self.specular, mi.ParamFlags.Differentiable)
+            callback.put("exponent", self.exponent, mi.ParamFlags.Differentiable)
+            if self.correction is not None:
+                callback.put("normal_correction", self.correction, mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys: list[str]) -> None:
+            self._set_flags()
+
+        def parameters(self, si: mi.SurfaceInteraction3f, active: Any = True) -> tuple[Any, Any, Any, Any]:
+            """Diffuse and specular albedo, exponent and corrected local normal at a surface point."""
+            diffuse = self.diffuse.eval(si, active)
+            specular = self.specular.eval(si, active)
+            if self.normalized:
+                total = dr.maximum(diffuse + specular, 1.0)
+                diffuse, specular = diffuse / total, specular / total
+            exponent = dr.clip(self.exponent.eval_1(si, active), EXPONENT_MIN, EXPONENT_MAX)
+            if self.correction is None:
+                return diffuse, specular, exponent, mi.Normal3f(0.0, 0.0, 1.0)
+            slopes = self.correction.eval_3(si, active)
+            return diffuse, specular, exponent, mi.Normal3f(dr.normalize(mi.Vector3f(slopes.x, slopes.y, 1.0)))
+
+        def _lobe(self, wi: Any, wo: Any, n: Any, exponent: Any) -> tuple[Any, Any]:
+            """``(n . h)^m`` and ``wi . h``."""
+            h = wi + wo
+            h = h * dr.rsqrt(dr.maximum(dr.squared_norm(h), 1e-12))
+            cos_h = dr.dot(h, n)
+            # The power of a floor instead of zero keeps the derivative by the exponent finite.
+            power = dr.select(cos_h > 0.0, dr.power(dr.clip(cos_h, 1e-4, 1.0), exponent), 0.0)
+            return power, dr.dot(wi, h)
+
+        def _specular_probability(self, ctx: Any, diffuse: Any, specular: Any) -> Any:
+            """Probability of sampling the lobe: the share of its albedo."""
+            has_specular = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
+            has_diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1)
+            if not has_diffuse:
+                return mi.Float(1.0)
+            if not has_specular:
+                return mi.Float(0.0)
+            s, d = dr.mean(dr.detach(specular)), dr.mean(dr.detach(diffuse))
+            return dr.select(s + d > 0.0, s / dr.maximum(s + d, 1e-12), 0.5)
+
+        def _reflects(self, wi: Any, wo: Any, n: Any) -> tuple[Any, Any]:
+            """Whether both directions are above the surface and its corrected normal; the corrected cosine of wo."""
+            cosine = dr.dot(wo, n)
+            above = (mi.Frame3f.cos_theta(wi) > 0.0) & (mi.Frame3f.cos_theta(wo) > 0.0)
+            return above & (dr.dot(wi, n) > 0.0) & (cosine > 0.0), cosine
+
+        def _value(self, ctx: Any, wi: Any, wo: Any, parameters: Any, active: Any) -> Any:
+            diffuse, specular, exponent, n = parameters
+            reflects, cosine = self._reflects(wi, wo, n)
+            value = mi.Spectrum(0.0)
+            if ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
+                factor = normalization(exponent) if self.normalized else dr.inv_pi
+                value += specular * (factor * self._lobe(wi, wo, n, exponent)[0])
+            if ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1):
+                value += diffuse * dr.inv_pi
+            return dr.select(active & reflects, value * cosine, 0.0)
+
+        def _density(self, ctx: Any, wi: Any, wo: Any, parameters: Any, active: Any) -> Any:
+            diffuse, specular, exponent, n = parameters
+            reflects, cosine = self._reflects(wi, wo, n)
+            p = self._specular_probability(ctx, diffuse, specular)
+            power, wi_h = self._lobe(wi, wo, n, exponent)
+            half = (exponent + 1.0) * dr.inv_two_pi * power
+            lobe = dr.select(wi_h > 0.0, half / dr.maximum(4.0 * wi_h, 1e-8), 0.0)
+            return dr.select(active & reflects, dr.lerp(cosine * dr.inv_pi, lobe, p), 0.0)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self._value(ctx, si.wi, wo, self.parameters(si, active), active)
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self._density(ctx, si.wi, wo, self.parameters(si, active), active)
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+            parameters = self.parameters(si, active)
+            return (
+                self._value(ctx, si.wi, wo, parameters, active),
+                self._density(ctx, si.wi, wo, parameters, active),
+            )
+
+        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+            parameters = self.parameters(si, active)
+            diffuse, specular, exponent, n = parameters
+            p = self._specular_probability(ctx, diffuse, specular)
+            frame = mi.Frame3f(dr.detach(n))
+            take_lobe = sample1 < p
+
+            cos_h = dr.power(dr.maximum(sample2.x, 1e-30), 1.0 / (dr.detach(exponent) + 1.0))
+            sin_h = dr.safe_sqrt(1.0 - dr.square(cos_h))
+            sin_phi, cos_phi = dr.sincos(dr.two_pi * sample2.y)
+            h = frame.to_world(mi.Vector3f(sin_h * cos_phi, sin_h * sin_phi, cos_h))
+            about_h = dr.fma(h, 2.0 * dr.dot(si.wi, h), -si.wi)
+            about_n = frame.to_world(mi.warp.square_to_cosine_hemisphere(sample2))
+
+            bs = dr.zeros(mi.BSDFSample3f)
+            bs.wo = dr.select(take_lobe, about_h, about_n)
+            bs.eta = 1.0
+            bs.sampled_component = dr.select(take_lobe, mi.UInt32(0), mi.UInt32(1))
+            bs.sampled_type = dr.select(
+                take_lobe,
+                mi.UInt32(+mi.BSDFFlags.GlossyReflection),
+                mi.UInt32(+mi.BSDFFlags.DiffuseReflection),
+            )
+            bs.pdf = dr.detach(self._density(ctx, si.wi, bs.wo, parameters, active))
+            value = self._value(ctx, si.wi, bs.wo, parameters, active)
+            valid = active & (bs.pdf > 0.0)
+            return bs, dr.select(valid, value / dr.select(valid, bs.pdf, 1.0), 0.0)
+
+        def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
+            return self.parameters(si, active)[0]
+
+        def to_string(self) -> str:
+            correction = "" if self.correction is None else f"  normal_correction = {self.correction},\n"
+            return (
+                "BlinnPhong[\n"
+                f"  diffuse_reflectance = {self.diffuse},\n"
+                f"  specular_reflectance = {self.specular},\n"
+                f"  exponent = {self.exponent},\n{correction}"
+                f"  normalized = {self.normalized}\n]"
+            )
+
+    return BlinnPhong

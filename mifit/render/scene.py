@@ -1,0 +1,81 @@
+"""Loading of Mitsuba scenes that use the plugins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mifit.errors import InputError
+from mifit.render.plugins import register_plugins
+
+
+def load_scene(source: str | Path | Mapping[str, Any], **parameters: Any) -> Any:
+    """Load a Mitsuba scene from an XML file or a dictionary, with mifit's plugins registered.
+
+    Equal objects are not merged, so parameters keep the names that the scene gives them. The ``radius`` of each
+    ``shenv`` is set to hold the scene.
+
+    Parameters
+    ----------
+    source : path or dict
+        An XML file, or a scene dictionary (``{"type": "scene", ...}``).
+    **parameters
+        Values for the ``$name`` parameters of an XML file.
+
+    Returns
+    -------
+    mi.Scene
+
+    Raises
+    ------
+    InputError
+        The file is missing or isn't a scene, or a plugin refuses its parameters.
+    """
+    import mitsuba as mi
+
+    register_plugins()
+    if isinstance(source, Mapping):
+        where = "scene dictionary"
+    else:
+        where = str(source)
+        path = Path(source)
+        if not path.is_file():
+            raise InputError(f"{where}: no such scene file")
+        if path.suffix.lower() != ".xml":
+            raise InputError(f"{where}: found a file of the kind '{path.suffix}', expected a scene in XML")
+    try:
+        # Not in parallel: plugins written in Python are built one at a time in any case.
+        if isinstance(source, Mapping):
+            scene = mi.load_dict(dict(source), parallel=False, optimize=False)
+        else:
+            values = {name: str(value) for name, value in parameters.items()}
+            scene = mi.load_file(str(source), parallel=False, optimize=False, **values)
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise InputError(f"{where}: {_one_line(str(error))}") from error
+    if not isinstance(scene, mi.Scene):
+        raise InputError(f"{where}: found {type(scene).__name__}, expected a scene")
+    fit_environment(scene)
+    return scene
+
+
+def fit_environment(scene: Any) -> None:
+    """Give each ``shenv`` a radius about the origin that holds the scene and its sensors."""
+    import mitsuba as mi
+
+    box = scene.bbox()
+    corners = [np.array(box.corner(i)).ravel() for i in range(8)] if box.valid() else []
+    reach = max((float(np.linalg.norm(corner)) for corner in corners), default=1.0)
+    for emitter in scene.emitters():
+        if type(emitter).__name__ == "SHEnvironment":
+            emitter.radius = mi.Float(max(1.1 * reach, 1e-3))
+
+
+def _one_line(message: str) -> str:
+    """The parts of Mitsuba's message that say what is wrong, without the traceback of a Python plugin."""
+    lines = [line.strip() for line in message.splitlines() if line.strip()]
+    kept = [line for line in lines if not line.startswith(("File ", "Traceback", "raise ", "^", "~"))]
+    causes = [line.split("Error: ", 1)[1] for line in kept if "Error: " in line]
+    return causes[-1] if causes else "; ".join(kept)
