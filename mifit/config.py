@@ -38,6 +38,22 @@ class GeometryConfig:
     texture_window: float = 6.0
     max_iterations: int = 30
 
+    def __post_init__(self) -> None:
+        for name in ("landmark_noise", "robust_colour", "texture_weight", "texture_window"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"geometry.{name}: found {getattr(self, name)}, expected a number above 0")
+        for name in ("scale_deviation", "landmark_weight", "prior_weight", "albedo_prior", "rounds"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"geometry.{name}: found {getattr(self, name)}, expected a number not below 0")
+        for name in ("pixels", "surface_points", "max_iterations"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"geometry.{name}: found {getattr(self, name)}, expected 1 or more")
+        if not 0 <= self.texture_sigma < self.texture_window:
+            raise ValueError(
+                f"geometry.texture_sigma: found {self.texture_sigma}, expected 0 or more and below texture_window, "
+                f"{self.texture_window}"
+            )
+
 
 @dataclass(frozen=True)
 class ReflectanceConfig:

@@ -147,14 +147,13 @@ class NormalProblem:
         relative.
         """
         import drjit as dr
-        import mitsuba as mi
 
         a, b = self._facing(*self._load(None), *self._load(start))
         local, system = self._linearize(a, b)
         rough = self._rough(a, b)
         totals = _totals(local, rough)
         history = {name: [value] for name, value in totals.items()}
-        damping, converged = dr.zeros(mi.Float, self._count), False
+        damping, converged = self._zeros(), False
         for iteration in range(max_iterations):
             progress("normals", iteration, max_iterations)
             x, y = self._facing(a, b, *self._step(a, b, system, damping))
@@ -269,8 +268,7 @@ class NormalProblem:
         import drjit as dr
         import mitsuba as mi
 
-        data = dr.zeros(mi.Float, self._count)
-        out = [dr.zeros(mi.Float, self._count) for _ in range(5)]
+        data, *out = (self._zeros() for _ in range(6))
         for k, (colour, weight, direction, frame) in enumerate(self._views):
             columns = []
             for i in range(2):
@@ -371,12 +369,20 @@ class NormalProblem:
             da, db = da * factor, db * factor
         return a + da, b + db
 
-    def _load(self, offsets: NDArray | None) -> tuple[Any, Any]:
+    def _zeros(self) -> Any:
+        """Zeros in memory: a literal would be folded into the kernel and make it another one to compile."""
         import drjit as dr
         import mitsuba as mi
 
+        zeros = dr.zeros(mi.Float, self._count)
+        dr.make_opaque(zeros)
+        return zeros
+
+    def _load(self, offsets: NDArray | None) -> tuple[Any, Any]:
+        import mitsuba as mi
+
         if offsets is None:
-            return dr.zeros(mi.Float, self._count), dr.zeros(mi.Float, self._count)
+            return self._zeros(), self._zeros()
         return tuple(mi.Float(np.ascontiguousarray(offsets[:, i], dtype=np.float32)) for i in range(2))  # type: ignore[return-value]
 
 

@@ -66,6 +66,7 @@ class Scene:
     frames: dict[tuple[str, int], Frame]
     cameras: dict[str, Camera]
     requested: set[str] = field(default_factory=set)
+    timesteps: tuple[int, ...] = ()
 
     def camera(self, name: str) -> Camera:
         return self.cameras[name]

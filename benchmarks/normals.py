@@ -1,0 +1,192 @@
+"""Stage 3: speed of the solvers at equal energy, accuracy of normals and meshes, tracking.
+
+    python -m benchmarks.normals --result out/captures/soft [--capture soft] [--track 4,5,6,7]
+
+The result is one of ``mifit fit --model ../shared/models/ict_facekit/ict_facekit_head.npz``; it isn't changed. Writes
+``benchmarks/results/normals.json``. Times are of warm kernels: every problem is solved once before it is timed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.record import SHARED, record
+from mifit import Capture, Reconstruction, set_variant
+from mifit.config import NormalsConfig
+from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.output.evaluate import evaluate
+from mifit.stages.refine_mesh import refine_mesh
+from mifit.stages.refine_normals import frame_problem, one_timestep, refine_normals
+from mifit.stages.track import extend, track
+
+WEIGHTS = (0.3, 3.0)
+
+
+def bumped_normals(result: Reconstruction, capture: Path, timestep: int, texels: TexelMap) -> NDArray:
+    """(N, 3) true world normals with the painted bump: its map is a height along the normal in centimetres.
+
+    The gradient of the bump is taken at the map's full size and averaged down to the texels.
+    """
+    with np.load(capture / "truth" / f"{timestep:04d}.npz") as truth, np.load(capture / "truth" / "maps.npz") as maps:
+        vertices, bump = truth["vertices"].astype(np.float64), maps["bump"].astype(np.float64)
+    model, size = result.model, texels.size
+    k = len(bump) // size
+    slope = np.stack([np.gradient(bump, axis=1), -np.gradient(bump, axis=0)], axis=-1) * len(bump)
+    slope = texels.from_map(slope.reshape(size, k, size, k, 2).mean((1, 3)))
+    p, t = vertices[model.faces], model.uv[model.faces_uv].astype(np.float64)
+    e, d = p[:, 1:] - p[:, :1], t[:, 1:] - t[:, :1]
+    by_uv = np.einsum("fij,fjc->fic", np.linalg.pinv(d), e)[texels.face]  # dp/du, dp/dv
+    n = normalize(interpolate(vertex_normals(vertices, model.faces), model.faces, texels.face, texels.weights))
+    by_uv -= np.einsum("nic,nc->ni", by_uv, n)[..., None] * n[:, None]
+    bent = np.cross(by_uv[:, 0] + slope[:, :1] * n, by_uv[:, 1] + slope[:, 1:] * n)
+    return normalize(bent * np.sign(np.sum(bent * n, axis=1, keepdims=True)))
+
+
+def angle(a: NDArray, b: NDArray) -> float:
+    return float(np.degrees(np.arccos(np.clip(np.sum(a * b, axis=-1), -1, 1))).mean())
+
+
+def solver_speed(result: Reconstruction, capture: Capture, texels: TexelMap) -> dict[str, Any]:
+    """Gauss-Newton's time to the energy of the paper's 100 Adam iterations, in one run on one problem."""
+    figures = {}
+    for weight in WEIGHTS:
+        problem, rows, _ = frame_problem(
+            capture,
+            result.model,
+            one_timestep(result.geometry, 0),
+            result.reflectance,
+            [c.name for c in result.cameras],
+            NormalsConfig(magnitude_weight=weight),
+            texels,
+        )
+        problem.adam(2)
+        problem.gauss_newton(2)
+        began = time.perf_counter()
+        slow = problem.adam(100)
+        adam = time.perf_counter() - began
+        for iterations in range(1, 20):
+            began = time.perf_counter()
+            fast = problem.gauss_newton(iterations, tolerance=0.0)
+            gauss_newton = time.perf_counter() - began
+            if fast.energy <= slow.energy:
+                break
+        figures[f"w2={weight}"] = {
+            "texels": len(rows),
+            "adam_seconds": round(adam, 3),
+            "adam_energy": slow.energy,
+            "gauss_newton_seconds": round(gauss_newton, 3),
+            "gauss_newton_iterations": iterations,
+            "gauss_newton_energy": fast.energy,
+            "ratio": round(adam / gauss_newton, 1),
+        }
+        print("speed", weight, figures[f"w2={weight}"], flush=True)
+    return figures
+
+
+def accuracy(result: Reconstruction, capture: Capture, folder: Path, texels: TexelMap) -> dict[str, Any]:
+    """Normal, position and third-view error, unrefined and for several weights."""
+    plain = replace(result, normals=None)
+    steps = result.timesteps
+    truth = [bumped_normals(result, folder, t, texels) for t in steps]
+    area = np.unique(result.model.faces[result.model.face_mask])
+
+    def positions(vertices: NDArray) -> float:
+        errors = []
+        for k, t in enumerate(steps):
+            with np.load(folder / "truth" / f"{t:04d}.npz") as true:
+                errors.append(np.linalg.norm(vertices[k][area] - true["vertices"][area], axis=1).mean())
+        return float(np.mean(errors)) * result.unit_mm
+
+    base = [
+        normalize(interpolate(vertex_normals(v, result.model.faces), result.model.faces, texels.face, texels.weights))
+        for v in result.geometry.vertices
+    ]
+    figures: dict[str, Any] = {
+        "stage 1": {
+            "normal_degrees": float(np.mean([angle(b, t) for b, t in zip(base, truth, strict=True)])),
+            "mesh_mm": positions(result.geometry.vertices),
+            "third_full_db": evaluate(plain, capture, "third")["methods"]["full"]["psnr"],
+        }
+    }
+    for weight in WEIGHTS:
+        found = refine_normals(
+            capture,
+            result.model,
+            result.geometry,
+            result.reflectance,
+            [c.name for c in result.cameras],
+            NormalsConfig(magnitude_weight=weight),
+        )
+        world = [texels.from_map(n) @ result.geometry.rotation[k].T for k, n in enumerate(found.normal_object)]
+        refined = replace(result, normals=found)
+        figures[f"w2={weight}"] = {
+            "normal_degrees": float(np.mean([angle(n, t) for n, t in zip(world, truth, strict=True)])),
+            "mesh_mm": positions(refine_mesh(result.model, result.geometry, found).vertices),
+            "third_full_db": evaluate(refined, capture, "third")["methods"]["full"]["psnr"],
+            "seconds_per_timestep": round(found.report.seconds / len(steps), 2),
+        }
+        print("accuracy", weight, figures[f"w2={weight}"], flush=True)
+    print("stage 1", figures["stage 1"], flush=True)
+    return figures
+
+
+def tracking(result: Reconstruction, capture: Capture, timesteps: list[int]) -> dict[str, Any]:
+    """Third-view error of timesteps whose reflectance was never fitted, against those that were."""
+    fitted = evaluate(result, capture, "third")["methods"]["full"]["psnr"]
+    frames, seconds, errors = result, [], {}
+    for frame in track(
+        capture,
+        result.model,
+        result.geometry,
+        result.reflectance,
+        result.normals,
+        [c.name for c in result.cameras],
+        timesteps,
+    ):
+        frames = extend(frames, frame)
+        seconds.append(round(frame.seconds, 2))
+        errors[frame.timestep] = evaluate(frames, capture, "third", [frame.timestep])["methods"]["full"]["psnr"]
+        print("track", frame.timestep, errors[frame.timestep], seconds[-1], flush=True)
+    mean = evaluate(frames, capture, "third", timesteps)["methods"]["full"]["psnr"]
+    return {
+        "fitted_db": fitted,
+        "tracked_db": mean,
+        "per_timestep_db": errors,
+        "seconds_per_pair": seconds,
+        "fit_seconds": round(result.seconds, 1),
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--result", type=Path, required=True)
+    parser.add_argument("--capture", default="soft")
+    parser.add_argument("--track", default="4,5,6,7")
+    a = parser.parse_args()
+    variant = set_variant("auto")
+    folder = SHARED / "captures" / a.capture
+    capture, result = Capture.load(folder), Reconstruction.load(a.result)
+    model = result.model
+    texels = rasterize_uv(model.uv, model.faces_uv, len(result.reflectance.diffuse), model.face_mask)
+    figures = {"capture": a.capture, "variant": variant, "size": texels.size}
+    parts = {
+        "speed": lambda: solver_speed(result, capture, texels),
+        "accuracy": lambda: accuracy(result, capture, folder, texels),
+        "tracking": lambda: tracking(result, capture, [int(t) for t in a.track.split(",")]),
+    }
+    for name, run in parts.items():  # written after each part: the run takes minutes
+        figures[name] = run()
+        print(record("normals", figures), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
