@@ -193,6 +193,8 @@ def _skin(
     energy = 1.0
     if reflectance and reflectance.shading_model == "paper":
         energy = normalization(exponent, False) / normalization(exponent)
+    # Plain Blinn-Phong reflects alike at all angles; a fitted Fresnel rise has Schlick's form, as glTF's has.
+    rise = 1.0 + (reflectance.fresnel or 0.0 if reflectance else 0.0)
     planes = {
         "baseColor": to_8_bit(maps.diffuse),
         "normal": np.round(127.5 * (bent + 1)).astype(np.uint8),
@@ -217,10 +219,10 @@ def _skin(
         "normalTexture": {"index": 1},
         "extensions": {
             "KHR_materials_specular": {
-                "specularFactor": min(energy * peak, 1.0),
+                # Reflectance is specularFactor at grazing angles, and that times 0.04 colours along the normal.
+                "specularFactor": min(energy * peak * rise, 1.0),
                 "specularTexture": {"index": 2},
-                # Reflectance is then specularFactor at every angle: Blinn-Phong has no Fresnel rise.
-                "specularColorFactor": [1.0 / DIELECTRIC_F0] * 3,
+                "specularColorFactor": [1.0 / (DIELECTRIC_F0 * rise)] * 3,
             }
         },
     }

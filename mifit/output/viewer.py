@@ -80,7 +80,13 @@ def _lighting(reconstruction: Reconstruction) -> dict[str, Any]:
     exponent = reflectance.exponent if reflectance else 1.0
     cosines = np.linspace(0.05, 1.0, 40)
     moments = lobe_table(order)(cosines, exponent)
-    factors = np.concatenate([[1.0], moments[2:, np.searchsorted(cosines, 0.7)]])
+    albedo, tilt = moments[0], moments[1]
+    middling = np.searchsorted(cosines, 0.7)
+    if reflectance and reflectance.fresnel is not None:
+        # The lobe of a view along the normal about the mirror direction, rising towards grazing views.
+        albedo, tilt = albedo[-1] * (1 + reflectance.fresnel * (1 - cosines) ** 5), np.zeros_like(tilt)
+        middling = -1
+    factors = np.concatenate([[1.0], moments[2:, middling]])
     blurred = SHLighting(factors[bands(order), None] * reconstruction.lighting.coefficients).to_latlong(64, 128)
     peak = max(float(blurred.max()), 1e-6)
     scale = 1.0
@@ -90,8 +96,8 @@ def _lighting(reconstruction: Reconstruction) -> dict[str, Any]:
         "irradiance": irradiance.ravel().tolist(),
         "glossy": png_uri(np.round(255 * np.sqrt(np.clip(blurred / peak, 0, 1))).astype(np.uint8)),
         "glossy_scale": peak * scale,
-        "lobe_albedo": np.polynomial.polynomial.polyfit(cosines, moments[0], 4).tolist(),
-        "lobe_tilt": np.polynomial.polynomial.polyfit(cosines, moments[1], 4).tolist(),
+        "lobe_albedo": np.polynomial.polynomial.polyfit(cosines, albedo, 5).tolist(),
+        "lobe_tilt": np.polynomial.polynomial.polyfit(cosines, tilt, 5).tolist(),
         "ambient": float(reflectance.ambient if reflectance else reconstruction.geometry.ambient),
         "exponent": float(exponent),
     }

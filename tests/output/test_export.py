@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -92,6 +93,14 @@ def test_gltf_material_holds_the_maps(ball, glb):
     tangent = read(attributes["TANGENT"])
     assert set(np.unique(tangent[:, 3])) <= {-1.0, 1.0}
     np.testing.assert_allclose(np.linalg.norm(tangent[:, :3], axis=1), 1, atol=1e-5)
+
+
+def test_gltf_takes_the_fresnel_rise_over(ball, tmp_path):
+    """Schlick's form in both: C_s along the normal, C_s (1 + fresnel) at grazing angles."""
+    export(replace(ball, reflectance=replace(ball.reflectance, fresnel=4.0)), "glb", tmp_path / "a.glb")
+    specular = read_glb(tmp_path / "a.glb")[0]["materials"][0]["extensions"]["KHR_materials_specular"]
+    assert specular["specularFactor"] == pytest.approx(0.15 * 5)
+    assert specular["specularFactor"] * 0.04 * specular["specularColorFactor"][0] == pytest.approx(0.15)
 
 
 def test_gltf_holds_the_cameras_and_opens_in_trimesh(ball, glb):

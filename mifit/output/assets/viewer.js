@@ -23,7 +23,7 @@
     uniform mat3 turnBack;        // world -> lighting, undoes the turn of the light
     uniform sampler2D glossyMap;  // lighting blurred by the lobe, lat-long, square roots
     uniform vec3 eye, keyDirection, irradiance[9];
-    uniform float lobeAlbedo[5], lobeTilt[5], glossyScale, ambient, exponent;
+    uniform float lobeAlbedo[6], lobeTilt[6], glossyScale, ambient, exponent;
     uniform int mode, light;
     vec3 expand(vec3 n, vec3 c[9]) {
       float x = n.x, y = n.y, z = n.z;
@@ -53,8 +53,8 @@
       if (light == 0) {
         colour = albedo * max(expand(turnBack * n, irradiance), 0.0) + ambient;
         float mu = clamp(dot(n, v), 0.05, 1.0);
-        float reflected = lobeAlbedo[4], tilt = lobeTilt[4];
-        for (int k = 3; k >= 0; k--) { reflected = reflected * mu + lobeAlbedo[k]; tilt = tilt * mu + lobeTilt[k]; }
+        float reflected = lobeAlbedo[5], tilt = lobeTilt[5];
+        for (int k = 4; k >= 0; k--) { reflected = reflected * mu + lobeAlbedo[k]; tilt = tilt * mu + lobeTilt[k]; }
         vec3 d = turnBack * normalize(mix(reflect(-v, n), n, tilt));
         vec2 place = vec2(atan(-d.x, d.z) / 6.28318531 + 0.5, 1.0 - acos(clamp(d.y, -1.0, 1.0)) / 3.14159265);
         vec3 root = texture2D(glossyMap, place).rgb;

@@ -1,0 +1,132 @@
+"""Tracking into a result folder: frames are written as they finish, so that a killed run goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mifit.config import GeometryConfig, NormalsConfig
+from mifit.core.estimate import NormalsEstimate, Report
+from mifit.errors import InputError
+from mifit.output.folder import add_timestep
+from mifit.progress import Progress, silent
+from mifit.stages.track import TrackedFrame, subset, track
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.output.reconstruction import Reconstruction
+
+
+def track_into(
+    folder: str | Path,
+    result: Reconstruction,
+    capture: Capture,
+    timesteps: Sequence[int],
+    config: NormalsConfig | None = None,
+    geometry_config: GeometryConfig | None = None,
+    seed: int = 0,
+    resume: bool = False,
+    progress: Progress = silent,
+) -> Reconstruction:
+    """Track timesteps and write each into the result folder as it is done.
+
+    Parameters
+    ----------
+    folder : path
+        Folder of ``result``; extended in place.
+    result : Reconstruction
+        With reflectance.
+    capture, timesteps, config, geometry_config, seed, progress
+        As in `track`.
+    resume : bool
+        Keep the timesteps that an earlier run has tracked; they are tracked anew otherwise.
+
+    Returns
+    -------
+    Reconstruction
+        With the new timesteps.
+
+    Raises
+    ------
+    InputError
+        As in `track`, or a result without reflectance.
+
+    Notes
+    -----
+    The files of a frame are written before ``result.json`` names it, and ``result.json`` is replaced as a whole, so
+    a run that is killed leaves a folder with the frames finished so far. Frames depend on those before alone:
+    going on later gives what an uninterrupted run gives.
+    """
+    if result.reflectance is None:
+        raise InputError(f"{folder}: found a result without reflectance, expected one of 'mifit fit' with all stages")
+    tracked = [] if result.normals is None else list(result.normals.report.details.get("tracked", []))
+    fitted = [t for t in result.timesteps if t not in tracked]
+    if resume:
+        timesteps = [t for t in timesteps if t not in tracked]
+    else:
+        result = _without(result, [t for t in tracked if t in timesteps])
+    frames = track(
+        capture,
+        result.model,
+        result.geometry,
+        result.reflectance,
+        result.normals,
+        [camera.name for camera in result.cameras],
+        timesteps,
+        config,
+        geometry_config,
+        fitted,
+        seed,
+        progress,
+    )
+    for frame in frames:
+        result = extend(result, frame)
+        add_timestep(result, Path(folder), frame.timestep)
+    return result
+
+
+def extend(result: Reconstruction, frame: TrackedFrame) -> Reconstruction:
+    """A result with one more timestep; its normals' report lists it under ``tracked``."""
+    a, b = result.geometry, frame.geometry
+    geometry = replace(
+        a,
+        timesteps=(*a.timesteps, frame.timestep),
+        **{
+            name: np.concatenate([getattr(a, name), getattr(b, name)])
+            for name in ("expression", "rotation", "translation", "vertices")
+        },
+    )
+    before = result.normals or NormalsEstimate((), frame.normal_object[None][:0], Report("converged"))
+    details = {**before.report.details, "tracked": [*before.report.details.get("tracked", []), frame.timestep]}
+    report = replace(
+        before.report,
+        seconds=before.report.seconds + frame.seconds,
+        warnings=(*before.report.warnings, *frame.warnings),
+        details=details,
+    )
+    normals = NormalsEstimate(
+        (*before.timesteps, frame.timestep),
+        np.concatenate([before.normal_object, frame.normal_object[None]]),
+        report,
+    )
+    return replace(result, geometry=geometry, normals=normals)
+
+
+def _without(result: Reconstruction, dropped: Sequence[int]) -> Reconstruction:
+    """A result less some of its tracked timesteps."""
+    if not dropped or result.normals is None:
+        return result
+    normals, report = result.normals, result.normals.report
+    rows = [i for i, t in enumerate(normals.timesteps) if t not in dropped]
+    details = {**report.details, "tracked": [t for t in report.details["tracked"] if t not in dropped]}
+    return replace(
+        result,
+        geometry=subset(result.geometry, [t for t in result.timesteps if t not in dropped]),
+        normals=NormalsEstimate(
+            tuple(normals.timesteps[i] for i in rows), normals.normal_object[rows], replace(report, details=details)
+        ),
+    )
