@@ -17,7 +17,7 @@ from mifit.progress import Progress, silent
 from mifit.solve import Solution
 from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.landmarks import LandmarkView
-from mifit.stages.geometry.parameters import Layout
+from mifit.stages.geometry.parameters import Frames, Layout
 from mifit.stages.geometry.refine import Reference, priors_of, refine_by_rendering, refine_by_texture, texture_reference
 from mifit.stages.geometry.start import FEWEST_LANDMARKS, State, fit_landmarks, initial_state, landmark_views
 from mifit.stages.geometry.summary import Journal, pack
@@ -150,8 +150,6 @@ def bake_identity(model: MorphableModel, identity: NDArray) -> MorphableModel:
 
 def _state_of(geometry: GeometryEstimate, timestep: int) -> State:
     """Pose and expression of one fitted timestep, identity baked."""
-    from mifit.stages.geometry.parameters import Frames
-
     k = geometry.index(timestep)
     layout = Layout(1, 0, len(geometry.expression[k]))
     x = np.zeros(layout.size)

@@ -270,10 +270,30 @@ def test_nothing_to_fit_is_refused(model, capture):
         fit_pose_expression(capture, model, None, (), 0, QUICK)
 
 
-def test_landmarks_that_are_not_finite_never_become_a_result(model, capture):
-    broken = capture.changed(lambda n, t, f: replace(f, landmarks=np.full((68, 2), 1e300)))
-    with pytest.raises((ConvergenceError, InputError)):
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300, -1e6])
+def test_absurd_landmarks_never_become_a_result(model, capture, value):
+    broken = capture.changed(lambda n, t, f: replace(f, landmarks=np.full((68, 2), value)))
+    with pytest.raises(InputError, match="found 0 visible landmarks"):
         fit_geometry(broken, model, BOTH, (0,), QUICK)
+
+
+def test_collapsed_landmarks_never_become_a_result(model, capture):
+    """All 68 at one pixel: either an error or a finite fit with a warning, never NaN."""
+    broken = capture.changed(lambda n, t, f: replace(f, landmarks=np.full((68, 2), 100.0), visible=np.ones(68, bool)))
+    try:
+        estimate = fit_geometry(broken, model, BOTH, (0,), QUICK)
+    except ConvergenceError:
+        return
+    assert np.isfinite(estimate.vertices).all()
+    assert estimate.report.warnings
+
+
+@pytest.mark.parametrize(
+    "settings", [{"landmark_noise": 0.0}, {"rounds": -1}, {"surface_points": 0}, {"texture_sigma": 7.0}]
+)
+def test_settings_out_of_range_are_named(settings):
+    with pytest.raises(ValueError, match=f"geometry.{next(iter(settings))}: found"):
+        GeometryConfig(**settings)
 
 
 def test_landmark_noise_is_raised_to_what_the_residuals_show(model, capture, fitted):

@@ -24,16 +24,13 @@ class SmoothImage:
     values : (H, W, C) float32
     valid : (H, W) float32
         1 where the value may be used.
-    step : float
-        Full-resolution pixels per pixel of this image.
     """
 
     values: NDArray[np.float32]
     valid: NDArray[np.float32]
-    step: float = 1.0
 
     def sample(self, pixels: NDArray, gradient: bool = True) -> tuple[NDArray, NDArray | None, NDArray]:
-        """Look up values at full-resolution pixel coordinates.
+        """Look up values at pixel coordinates.
 
         Parameters
         ----------
@@ -44,13 +41,13 @@ class SmoothImage:
         -------
         values : (N, C)
         gradient : (N, C, 2) or None
-            Derivative by the full-resolution pixel coordinate.
+            Derivative by the pixel coordinate.
         inside : (N,) bool
             Whether all pixels that the spline touches exist and are valid.
         """
         h, w = self.valid.shape
         dtype = self.values.dtype
-        position = np.asarray(pixels, dtype=np.float64) / self.step - 0.5
+        position = np.asarray(pixels, dtype=np.float64) - 0.5
         finite = np.isfinite(position).all(1)
         position = np.clip(np.where(finite[:, None], position, -10.0), -10.0, max(h, w) + 10.0)
         corner = np.floor(position).astype(np.int64)
@@ -71,7 +68,7 @@ class SmoothImage:
         values = blend(wy, wx)
         if not gradient:
             return values, None, inside
-        slope = np.stack([blend(wy, dx), blend(dy, wx)], axis=-1) / dtype.type(self.step)
+        slope = np.stack([blend(wy, dx), blend(dy, wx)], axis=-1)
         return values, slope, inside
 
 
@@ -92,14 +89,10 @@ def blur(values: NDArray, valid: NDArray, sigma: float) -> NDArray:
     return out / np.maximum(total if values.ndim == 2 else total[..., None], 1e-4)
 
 
-def level(image: NDArray, valid: NDArray, sigma: float, step: int = 1) -> SmoothImage:
-    """Image blurred by ``sigma`` full-resolution pixels and reduced by an integer ``step``; invalid pixels ignored."""
+def level(image: NDArray, valid: NDArray, sigma: float) -> SmoothImage:
+    """Image blurred by ``sigma`` pixels; invalid pixels ignored."""
     values = blur(image, valid, sigma) if sigma > 0 else image
-    if step > 1:  # average whole blocks: pixel (i, j) of the result covers step x step pixels
-        h, w = (n // step * step for n in values.shape[:2])
-        values = values[:h, :w].reshape(h // step, step, w // step, step, -1).mean((1, 3), dtype=np.float32)
-        valid = valid[:h, :w].reshape(h // step, step, w // step, step).min((1, 3))
-    return SmoothImage(np.ascontiguousarray(values, np.float32), valid.astype(np.float32), float(step))
+    return SmoothImage(np.ascontiguousarray(values, np.float32), valid.astype(np.float32))
 
 
 def texture_level(image: NDArray, valid: NDArray, sigma: float, window: float) -> SmoothImage:

@@ -80,14 +80,17 @@ def pose_candidates(
         if seen.sum() < 6:
             continue
         # a robust reprojection count first, so that outliers don't decide; the exact solution follows by LM
-        ok, vector, shift, _ = cv2.solvePnPRansac(
-            scale * points[seen],
-            pixel[seen],
-            camera.matrix,
-            None,
-            reprojectionError=0.03 * max(camera.width, camera.height),
-            flags=cv2.SOLVEPNP_SQPNP,
-        )
+        try:
+            ok, vector, shift, _ = cv2.solvePnPRansac(
+                scale * points[seen],
+                pixel[seen],
+                camera.matrix,
+                None,
+                reprojectionError=0.03 * max(camera.width, camera.height),
+                flags=cv2.SOLVEPNP_SQPNP,
+            )
+        except cv2.error:  # points that coincide
+            continue
         if not ok or not np.isfinite(vector).all():
             continue
         head_to_camera = cv2.Rodrigues(vector)[0]

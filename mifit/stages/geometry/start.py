@@ -20,6 +20,7 @@ from mifit.stages.geometry.points import PointBasis
 
 FEWEST_LANDMARKS = 6
 FEW_IDENTITY_MODES = 20
+FARTHEST_PIXEL = 10.0  # in image sizes
 OUTLIER_PIXELS = 4.0  # in units of the landmark noise: where Geman and McClure's penalty turns
 
 
@@ -78,7 +79,9 @@ def landmark_views(
                 counts[name] = 0
                 continue
             pixels = np.asarray(frame.landmarks, dtype=np.float64)
-            index = np.flatnonzero(frame.visible & np.isfinite(pixels).all(1))
+            # far outside the image is no detection but an error of whatever wrote the file
+            near = (np.abs(pixels) < FARTHEST_PIXEL * max(frame.image.shape)).all(1)
+            index = np.flatnonzero(frame.visible & near)
             counts[name] = len(index)
             if len(index):
                 vertices = model.landmarks[index]

@@ -14,6 +14,8 @@ from mifit.solve import Outcome, Solution
 from mifit.stages.geometry.landmarks import LandmarkTerm, LandmarkView
 from mifit.stages.geometry.start import State
 
+SCATTER_OF_WIDTH = 0.015  # landmark noise, as part of the image's width, that deserves a warning
+
 
 class Journal:
     """What happened, phase by phase; reports progress as phases end."""
@@ -94,6 +96,11 @@ def pack(
     }
     if journal.last is not None and journal.last.system is not None:
         details["standard_deviations"] = _deviations(state, journal.last)
+    width = min((view.camera.width for view in views), default=np.inf)
+    if noise > SCATTER_OF_WIDTH * width:
+        journal.warn(
+            f"landmarks scatter by {noise:.1f} pixels about the fitted face: check the detector and the calibration"
+        )
     identity = x[layout.at("identity")].copy() if fixed is None else fixed.identity
     if len(identity) and np.abs(identity).max() > 5.0:
         journal.warn(
