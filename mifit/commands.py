@@ -182,7 +182,7 @@ def track(arguments: Namespace) -> None:
     result = mifit.Reconstruction.load(arguments.result)
     capture = mifit.Capture.load(arguments.capture)
     _use_variant(arguments)
-    from mifit.stages.track import track_into
+    from mifit.output.tracking import track_into
 
     rest = [t for t in capture.timesteps if t not in result.geometry.timesteps]
     timesteps = choose("timestep", capture.timesteps, arguments.timesteps, len(capture.timesteps))

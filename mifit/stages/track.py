@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from mifit.config import GeometryConfig, NormalsConfig
 from mifit.core.bend import bend, tangent_plane, transport, unbend
-from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
+from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.errors import ConvergenceError, InputError
@@ -30,7 +29,6 @@ from mifit.stages.refine_normals import check_maps, one_timestep, refine_frame
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
-    from mifit.output.reconstruction import Reconstruction
 
 MEMORY = 4
 """Frames whose corrections make the prior of the next."""
@@ -112,7 +110,7 @@ def track(
     config, geometry_config = config or NormalsConfig(), geometry_config or GeometryConfig()
     check_timesteps(capture.timesteps, geometry.timesteps, timesteps)
     texels = rasterize_uv(model.uv, model.faces_uv, check_maps(reflectance), model.face_mask)
-    home = _subset(geometry, geometry.timesteps if fitted is None else fitted)
+    home = subset(geometry, geometry.timesteps if fitted is None else fitted)
     reference = texture_reference(capture, model, home, cameras, geometry_config, seed)
     last = one_timestep(geometry, len(geometry.timesteps) - 1)
     memory = _Memory(model, texels)
@@ -150,103 +148,6 @@ def track(
             refound,
             tuple(warnings),
         )
-
-
-def track_into(
-    folder: str | Path,
-    result: Reconstruction,
-    capture: Capture,
-    timesteps: Sequence[int],
-    config: NormalsConfig | None = None,
-    geometry_config: GeometryConfig | None = None,
-    seed: int = 0,
-    resume: bool = False,
-    progress: Progress = silent,
-) -> Reconstruction:
-    """Track timesteps and write each into the result folder as it is done.
-
-    Parameters
-    ----------
-    folder : path
-        Folder of ``result``; extended in place.
-    result : Reconstruction
-        With reflectance.
-    capture, timesteps, config, geometry_config, seed, progress
-        As in `track`.
-    resume : bool
-        Keep the timesteps that an earlier run has tracked; they are tracked anew otherwise.
-
-    Returns
-    -------
-    Reconstruction
-        With the new timesteps.
-
-    Raises
-    ------
-    InputError
-        As in `track`, or a result without reflectance.
-
-    Notes
-    -----
-    The files of a frame are written before ``result.json`` names it, and ``result.json`` is replaced as a whole, so
-    a run that is killed leaves a folder with the frames finished so far. Frames depend on those before alone:
-    going on later gives what an uninterrupted run gives.
-    """
-    from mifit.output.folder import add_timestep
-
-    if result.reflectance is None:
-        raise InputError(f"{folder}: found a result without reflectance, expected one of 'mifit fit' with all stages")
-    tracked = [] if result.normals is None else list(result.normals.report.details.get("tracked", []))
-    fitted = [t for t in result.timesteps if t not in tracked]
-    if resume:
-        timesteps = [t for t in timesteps if t not in tracked]
-    else:
-        result = _without(result, [t for t in tracked if t in timesteps])
-    frames = track(
-        capture,
-        result.model,
-        result.geometry,
-        result.reflectance,
-        result.normals,
-        [camera.name for camera in result.cameras],
-        timesteps,
-        config,
-        geometry_config,
-        fitted,
-        seed,
-        progress,
-    )
-    for frame in frames:
-        result = extend(result, frame)
-        add_timestep(result, Path(folder), frame.timestep)
-    return result
-
-
-def extend(result: Reconstruction, frame: TrackedFrame) -> Reconstruction:
-    """A result with one more timestep; its normals' report lists it under ``tracked``."""
-    a, b = result.geometry, frame.geometry
-    geometry = replace(
-        a,
-        timesteps=(*a.timesteps, frame.timestep),
-        **{
-            name: np.concatenate([getattr(a, name), getattr(b, name)])
-            for name in ("expression", "rotation", "translation", "vertices")
-        },
-    )
-    before = result.normals or NormalsEstimate((), frame.normal_object[None][:0], Report("converged"))
-    details = {**before.report.details, "tracked": [*before.report.details.get("tracked", []), frame.timestep]}
-    report = replace(
-        before.report,
-        seconds=before.report.seconds + frame.seconds,
-        warnings=(*before.report.warnings, *frame.warnings),
-        details=details,
-    )
-    normals = NormalsEstimate(
-        (*before.timesteps, frame.timestep),
-        np.concatenate([before.normal_object, frame.normal_object[None]]),
-        report,
-    )
-    return replace(result, geometry=geometry, normals=normals)
 
 
 def check_timesteps(known: Sequence[int], fitted: Sequence[int], wanted: Sequence[int]) -> None:
@@ -336,7 +237,7 @@ class _Memory:
         return normalize(interpolate(vertex_normals(vertices, faces), faces, texels.face, texels.weights))
 
 
-def _subset(geometry: GeometryEstimate, timesteps: Sequence[int]) -> GeometryEstimate:
+def subset(geometry: GeometryEstimate, timesteps: Sequence[int]) -> GeometryEstimate:
     """Some timesteps of a fit."""
     rows = [geometry.index(t) for t in timesteps]
     return replace(
@@ -346,20 +247,4 @@ def _subset(geometry: GeometryEstimate, timesteps: Sequence[int]) -> GeometryEst
         rotation=geometry.rotation[rows],
         translation=geometry.translation[rows],
         vertices=geometry.vertices[rows],
-    )
-
-
-def _without(result: Reconstruction, dropped: Sequence[int]) -> Reconstruction:
-    """A result less some of its tracked timesteps."""
-    if not dropped or result.normals is None:
-        return result
-    normals, report = result.normals, result.normals.report
-    rows = [i for i, t in enumerate(normals.timesteps) if t not in dropped]
-    details = {**report.details, "tracked": [t for t in report.details["tracked"] if t not in dropped]}
-    return replace(
-        result,
-        geometry=_subset(result.geometry, [t for t in result.timesteps if t not in dropped]),
-        normals=NormalsEstimate(
-            tuple(normals.timesteps[i] for i in rows), normals.normal_object[rows], replace(report, details=details)
-        ),
     )

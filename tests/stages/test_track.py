@@ -197,7 +197,7 @@ def reload(folder):
 
 def test_each_frame_is_on_disk_when_it_is_done(scene, fit_truth, saved, monkeypatch):
     from mifit.output import folder as folder_module
-    from mifit.stages.track import track_into
+    from mifit.output.tracking import track_into
 
     seen = []
     write = folder_module.add_timestep
@@ -220,7 +220,7 @@ def test_a_killed_run_resumes_to_the_same_result(scene, fit_truth, saved, tmp_pa
     import shutil
 
     from mifit.output import folder as folder_module
-    from mifit.stages.track import track_into
+    from mifit.output.tracking import track_into
 
     whole = tmp_path / "whole"
     shutil.copytree(saved, whole)
@@ -252,7 +252,7 @@ def test_a_killed_run_resumes_to_the_same_result(scene, fit_truth, saved, tmp_pa
 
 
 def test_without_resume_frames_are_tracked_anew(scene, fit_truth, saved):
-    from mifit.stages.track import track_into
+    from mifit.output.tracking import track_into
 
     track_into(saved, reload(saved), scene, (1,), CONFIG)
     assert len(fit_truth) == 1
@@ -264,7 +264,7 @@ def test_without_resume_frames_are_tracked_anew(scene, fit_truth, saved):
 
 
 def test_a_result_without_reflectance_is_refused(scene, saved):
-    from mifit.stages.track import track_into
+    from mifit.output.tracking import track_into
 
     with pytest.raises(InputError, match="without reflectance"):
         track_into(saved, replace(reload(saved), reflectance=None, normals=None), scene, (1,), CONFIG)
