@@ -62,7 +62,7 @@
       } else {
         float cosine = max(dot(n, keyDirection), 0.0);
         float highlight = pow(max(dot(n, normalize(keyDirection + v)), 0.0), exponent) * (exponent + 8.0) / 8.0;
-        colour = albedo * (0.9 * cosine + 0.08) + specular * highlight * cosine;
+        colour = albedo * (2.0 * cosine + 0.12) + 2.0 * specular * highlight * cosine;
       }
       gl_FragColor = vec4(code(colour), 1.0);
     }`.replace(/SPECULAR_SCALE/g, data.specular_scale.toFixed(6));
