@@ -78,10 +78,8 @@ class ReflectanceConfig:
     robust : bool
         Give outliers less weight, and weight by a noise model (``als``); without it ``als`` minimises the paper's
         objective as it stands.
-    symmetric_fill : bool
-        Fill what no image shows from the other half of the face where that was seen.
     max_iterations : int
-        Gauss-Newton iterations (``als``), or hundreds of gradient steps (``adam``).
+        Gauss-Newton iterations (``als``), or tens of gradient steps (``adam``).
     """
 
     texture_size: int = 512
@@ -93,7 +91,6 @@ class ReflectanceConfig:
     smoothness_weight: float = 0.001
     specular_smoothness: float = 30.0
     robust: bool = True
-    symmetric_fill: bool = False
     max_iterations: int = 30
 
 

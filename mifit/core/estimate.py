@@ -97,6 +97,8 @@ class ReflectanceEstimate:
         Blinn-Phong exponent.
     shading_model : str
         ``"paper"``, ``"prefiltered"`` or ``"shadowed"``: how maps and lighting make an image.
+    fresnel : float or None
+        Rise of the specular lobe towards grazing views, see ``render.shading.Lobe``; None for plain Blinn-Phong.
     """
 
     diffuse: NDArray
@@ -107,6 +109,7 @@ class ReflectanceEstimate:
     exponent: float
     shading_model: str
     report: Report
+    fresnel: float | None = None
 
 
 @dataclass(frozen=True)

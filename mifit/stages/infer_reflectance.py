@@ -15,7 +15,9 @@ from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.als import fit_als
+from mifit.stages.reflectance.descent import fit_adam
 from mifit.stages.reflectance.fill import blend_unseen
+from mifit.stages.reflectance.objective import energies
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -71,14 +73,15 @@ def infer_reflectance(
     surface = Surface(capture, model, geometry, cameras, config.texture_size)
     albedo = interpolate(geometry.vertex_albedo, model.faces, surface.texels.face, surface.texels.weights)
     albedo = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float32)
-    fitted, choice, warnings = fit_als(surface, model.faces, albedo, config, seed, progress)
+    solve = fit_adam if config.solver == "adam" else fit_als
+    fitted, choice, warnings = solve(surface, model.faces, albedo, config, seed, progress)
     if not (np.isfinite(fitted.maps).all() and np.isfinite(fitted.radiance).all()):
         raise ConvergenceError("stage 2 (reflectance): the maps or the lighting are not finite; see the images' range")
     quality = surface.quality()
     diffuse, specular, confidence = blend_unseen(surface.texels, albedo, fitted.maps, quality)
     if not fitted.converged:
         warnings = (*warnings, "the lighting had not converged when the iterations ran out; raise max_iterations")
-    details = {
+    details: dict = {
         "shading": choice,
         "gauge": "mean diffuse albedo over seen texels and channels equals the morphable model's",
         "residual": float(fitted.sigma),
@@ -86,6 +89,9 @@ def infer_reflectance(
         "texels": len(surface),
         "images": surface.image_count,
     }
+    if config.solver == "adam" or not config.robust:
+        terms = energies(surface, fitted.forward, fitted.radiance, fitted.ambient, fitted.maps, albedo, config)
+        details["objective"] = {**terms, "total": sum(terms.values())}
     outcome = "converged" if fitted.converged else "max_iterations"
     return ReflectanceEstimate(
         diffuse=diffuse,
@@ -95,6 +101,7 @@ def infer_reflectance(
         ambient=float(fitted.ambient),
         exponent=float(fitted.forward.exponent),
         shading_model=fitted.forward.model,
+        fresnel=fitted.forward.fresnel,
         report=Report(outcome, fitted.energies, time.perf_counter() - started, warnings, details),
     )
 

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
+CHUNK_VALUES = 1 << 22
+"""Texels x images that are held at a time."""
 GRAZING = (0.1, 0.3)
 """Cosines between which the weight of an observation fades in: below, interpolated normals and footprints mislead."""
 SECOND = np.array([[1.0, -2.0, 1.0]], dtype=np.float32)
@@ -181,6 +183,11 @@ class Surface:
         pairs = [(first[m.step], i) for i, m in enumerate(self._images) if i != first[m.step]]
         return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
+    def chunks(self, values: int = 8) -> list[NDArray[np.int64]]:
+        """All texels in parts that bound the memory of so many values per observation."""
+        step = max(256, 8 * CHUNK_VALUES // (self.image_count * max(values, 8)))
+        return [np.arange(i, min(i + step, len(self))) for i in range(0, len(self), step)]
+
     def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
         """Random texels among those that some image measures, ascending; at most ``count``.
 
@@ -209,9 +216,7 @@ class Surface:
     def quality(self) -> NDArray[np.float32]:
         """(N,) how often and how well each texel was measured: 0 never, 1 by half of the images or more."""
         out = np.zeros(len(self), dtype=np.float32)
-        step = max(1024, (1 << 22) // self.image_count)
-        for start in range(0, len(self), step):
-            part = np.arange(start, min(start + step, len(self)))
+        for part in self.chunks():
             seen = self.observe(part)
             cosine = np.einsum("njk,njk->nj", seen.image_normal, seen.view)
             good = np.where(seen.measured > 0, np.clip(cosine, 0.0, 1.0), 0.0)

@@ -26,6 +26,8 @@ class Forward:
         Bands of the lighting.
     exponent : float
         Blinn-Phong exponent.
+    fresnel : float or None
+        Rise of the lobe towards grazing views; None for plain Blinn-Phong.
     traced : tuple of (V, B*B) float32
         Shadowed diffuse transfer per timestep, at the vertices; empty unless ``shadowed``.
     faces : (F, 3) int
@@ -34,6 +36,7 @@ class Forward:
     model: str
     order: int
     exponent: float
+    fresnel: float | None = None
     traced: tuple[NDArray[np.float32], ...] = field(default=(), repr=False)
     faces: NDArray[np.int32] | None = field(default=None, repr=False)
 
@@ -46,7 +49,7 @@ class Forward:
 
         n, j = seen.weight.shape
         steps = seen.normal.shape[1]
-        traced = self._traced(seen)
+        traced = self.traced_at(seen)
         if traced is None:
             diffuse = diffuse_matrix(seen.normal.reshape(-1, 3), self.order).reshape(n, steps, -1)
         else:
@@ -54,7 +57,13 @@ class Forward:
         diffuse = diffuse[:, seen.step]
         rows = diffuse.reshape(n * j, -1) if traced is not None else None
         specular = specular_matrix(
-            seen.image_normal.reshape(-1, 3), seen.view.reshape(-1, 3), radiance, self.exponent, self.model, rows
+            seen.image_normal.reshape(-1, 3),
+            seen.view.reshape(-1, 3),
+            radiance,
+            self.exponent,
+            self.model,
+            rows,
+            fresnel=self.fresnel,
         )
         return diffuse, specular.reshape(n, j, -1)
 
@@ -68,7 +77,7 @@ class Forward:
         for start in range(0, n, step):
             part = seen.take(slice(start, start + step))
             normal, view = part.image_normal.reshape(-1, 3), part.view.reshape(-1, 3)
-            traced = self._traced(part)
+            traced = self.traced_at(part)
             ones = np.ones((len(normal), 3), np.float32)
             d, s = shade_points(
                 normal,
@@ -80,11 +89,12 @@ class Forward:
                 self.exponent,
                 self.model,
                 None if traced is None else traced[:, part.step].reshape(len(normal), -1),
+                fresnel=self.fresnel,
             )
             shade[start : start + step], glint[start : start + step] = d.reshape(-1, j, 3), s.reshape(-1, j, 3)
         return shade, glint
 
-    def _traced(self, seen: Observations) -> NDArray[np.float32] | None:
+    def traced_at(self, seen: Observations) -> NDArray[np.float32] | None:
         """(N, T, K) traced transfer vectors at the texels, or None."""
         if self.model != "shadowed":
             return None

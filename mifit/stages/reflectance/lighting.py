@@ -17,8 +17,12 @@ from mifit.core.sh import bands, basis
 
 NEGATIVE_DIRECTIONS = 400
 """Directions at which negative radiance is penalised."""
-DAMPING = 1e-3
-"""Levenberg-Marquardt damping, relative to the diagonal."""
+DAMPING = 1e-5
+"""Levenberg-Marquardt damping at the least, relative to the diagonal."""
+SLACK = 1.02
+"""A step may raise the energy by this factor: robust weights and the gauge move between steps."""
+GROSS = 0.1
+"""Linear colour beyond which a residual tells of something that no shading model here explains."""
 CAUCHY = 3.0
 """Residuals of this many robust standard deviations get half the weight."""
 
@@ -86,6 +90,8 @@ class LightingSolution:
         Albedos of the subset's texels.
     sigma : float
         Robust standard deviation of the residuals, linear colour.
+    unexplained : float
+        Root of the mean squared residual, each bounded by `GROSS`: comparable between shading models.
     energy : list of float
         Robust data energy per iteration.
     converged : bool
@@ -96,6 +102,7 @@ class LightingSolution:
     diffuse: NDArray[np.float32]
     specular: NDArray[np.float32]
     sigma: float
+    unexplained: float
     energy: list[float]
     converged: bool
 
@@ -126,8 +133,7 @@ def solve_lighting(
         Also find the paper's scalar ambient term, not below zero.
     iterations : int
     tolerance : float
-        Stop when no lighting coefficient moves by more than this, relative to the largest, or the energy
-        changes by less.
+        Stop when the energy changes by less than this part.
     """
     n, _, k = problem.specular.shape
     band = bands(round(np.sqrt(k))).astype(np.float64)
@@ -137,30 +143,43 @@ def solve_lighting(
     light = _initial(problem, diffuse, gloss, stiffness) if radiance is None else np.array(radiance, dtype=np.float64)
     sphere_basis = basis(_sphere(NEGATIVE_DIRECTIONS), round(np.sqrt(k)))
     energy: list[float] = []
-    ambient, sigma, converged = 0.0, 0.0, False
+    ambient, sigma, unexplained, converged, damping = 0.0, 0.0, np.inf, False, 1e-3
+    state = light, ambient, diffuse, gloss
+    best = state
     for _ in range(iterations):
+        light, ambient, diffuse, gloss = state
         shade = np.einsum("njk,kc->njc", problem.diffuse, light.astype(np.float32))
         glint = np.einsum("njk,kc->njc", problem.specular, light.astype(np.float32))
         residual = problem.colour - diffuse[:, None] * shade - gloss[:, None, None] * glint - np.float32(ambient)
-        weight, sigma = active_weight(problem.weight, problem.clipped, residual, robust)
-        energy.append(float((weight * residual**2).sum()))
-        if not np.isfinite(energy[-1]):
-            break
-        system = _Normal.accumulate(problem, diffuse, gloss, shade, glint, residual, weight)
-        system.add_priors(priors, light, diffuse, gloss, problem.albedo, stiffness, sphere_basis)
-        step = system.solve(with_ambient)
+        weight, spread = active_weight(problem.weight, problem.clipped, residual, robust)
+        current = float((weight * residual**2).sum())
+        if energy and not current < SLACK * energy[-1]:
+            damping *= 10.0  # the step made it worse: take a shorter one from where it started
+            if damping > 1e3:
+                break
+        else:
+            if energy and abs(energy[-1] - current) < tolerance * energy[-1]:
+                converged = True
+            energy.append(current)
+            best, sigma = state, spread
+            bounded = problem.weight * residual**2 / (1.0 + (residual / GROSS) ** 2)
+            bounded = np.where(problem.clipped[..., None] & (residual <= 0), np.float32(0.0), bounded)
+            unexplained = float(np.sqrt(bounded.sum() / max(float(problem.weight.sum()), 1e-12)))
+            damping = max(0.1 * damping, DAMPING)
+            system = _Normal.accumulate(problem, diffuse, gloss, shade, glint, residual, weight)
+            system.add_priors(priors, light, diffuse, gloss, problem.albedo, stiffness, sphere_basis)
+            if converged:
+                break
+        step = system.solve(with_ambient, damping)
+        light, ambient, diffuse, gloss = best
         light = light + step.light
         ambient = max(ambient + step.ambient, 0.0)
         diffuse = np.clip(diffuse + step.diffuse, 0.0, 1.5).astype(np.float32)
         gloss = np.clip(gloss + step.gloss, 0.0, 1.0).astype(np.float32)
         gain = gauge(diffuse, problem.albedo, problem.weight)
-        diffuse, light = (diffuse / gain).astype(np.float32), light * gain
-        gloss = (gloss / gain).astype(np.float32)
-        small = np.abs(step.light).max() < tolerance * np.abs(light).max()
-        if small or (len(energy) > 3 and abs(energy[-2] - energy[-1]) < tolerance * energy[-1]):
-            converged = True
-            break
-    return LightingSolution(light, ambient, diffuse, gloss, sigma, energy, converged)
+        state = light * gain, ambient, (diffuse / gain).astype(np.float32), (gloss / gain).astype(np.float32)
+    light, ambient, diffuse, gloss = best
+    return LightingSolution(light, ambient, diffuse, gloss, sigma, unexplained, energy, converged)
 
 
 def gauge(diffuse: NDArray, albedo: NDArray, weight: NDArray) -> float:
@@ -176,9 +195,11 @@ def active_weight(
     measured = (weight > 0) & ~clipped[..., None]
     values = np.abs(residual[measured])
     sigma = 1.4826 * float(np.median(values[:: max(1, len(values) // 200_000)])) if len(values) else 0.0
-    active = np.where(clipped[..., None] & (residual <= 0), np.float32(0.0), weight)
+    bound = clipped[..., None]
+    active = np.where(bound & (residual <= 0), np.float32(0.0), weight)
     if robust:
-        active = active / (1.0 + (residual / max(CAUCHY * sigma, 1e-4)) ** 2)
+        # Not for bounds: a highlight far below its bound is missing, not an outlier.
+        active = np.where(bound, active, active / (1.0 + (residual / max(CAUCHY * sigma, 1e-4)) ** 2))
     return active.astype(np.float32), sigma
 
 
@@ -282,19 +303,19 @@ class _Normal:
             self.system[block, block] += pull * rows.T @ rows + np.diag(smooth)
             self.right[block] -= pull * rows.T @ radiance[negative, c] + smooth * light[:, c]
 
-    def solve(self, with_ambient: bool) -> _Step:
+    def solve(self, with_ambient: bool, damping: float) -> _Step:
         """Eliminate the texels, solve for lighting and ambient, and substitute back."""
         size = len(self.right)
         count = size if with_ambient else size - 1
         diagonal = np.einsum("nii->ni", self.own)
         floor = 1e-6 * float(np.median(diagonal)) + 1e-12
-        damped = self.own + np.eye(4, dtype=np.float32) * (DAMPING * diagonal + floor)[:, :, None]
+        damped = self.own + np.eye(4, dtype=np.float32) * (damping * diagonal + floor)[:, :, None]
         inverse = np.linalg.inv(damped)
         cross = self.cross[:, :, :count]
         eliminated = np.matmul(inverse, cross)
         own_diagonal = np.diag(self.system)[:count]
         reduced = self.system[:count, :count] - cross.reshape(-1, count).T @ eliminated.reshape(-1, count)
-        reduced += np.diag(DAMPING * own_diagonal + 1e-8 * own_diagonal.mean())
+        reduced += np.diag(damping * own_diagonal + 1e-8 * own_diagonal.mean())
         right = self.right[:count] - np.einsum("nak,na->k", eliminated, self.own_right)
         move = np.linalg.solve(reduced, right)
         own_move = np.einsum("nab,nb->na", inverse, self.own_right) - eliminated @ move.astype(np.float32)

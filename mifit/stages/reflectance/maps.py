@@ -71,16 +71,24 @@ class TexelSystems:
     def solve(self, x0: NDArray, y0: NDArray, px: NDArray | float, py: NDArray | float) -> tuple[NDArray, NDArray]:
         """Minimise each block plus ``px |x - x0|^2 + py (y - y0)^2`` within 0..1, in closed form.
 
-        y is found with x eliminated and clipped to the box, then x for that y, clipped: exact unless a diffuse bound
-        is active, and then exact in x for that y.
+        y is found with x eliminated; where that drives a diffuse value out of the box, the value is held at the bound
+        and y found anew with the others.
         """
         dd = self.dd + px
         dr = self.dr + px * x0
-        ss = self.ss + py - (self.ds**2 / dd).sum(1)
-        sr = self.sr + py * y0 - (self.ds * dr / dd).sum(1)
-        y = np.clip(sr / np.maximum(ss, 1e-12), 0.0, 1.0)
-        x = np.clip((dr - self.ds * y[:, None]) / dd, 0.0, 1.0)
-        return x, y
+        slope, offset = self.ds / dd, dr / dd
+        y = self._specular(np.ones_like(dd), slope, offset, py, y0)
+        x = offset - slope * y[:, None]
+        free = ((x >= 0.0) & (x <= 1.0)).astype(dd.dtype)
+        held = np.clip(x, 0.0, 1.0)
+        y = self._specular(free, slope, np.where(free > 0, offset, held), py, y0)
+        return np.clip(offset - slope * y[:, None], 0.0, 1.0), y
+
+    def _specular(self, free: NDArray, slope: NDArray, offset: NDArray, py: NDArray | float, y0: NDArray) -> NDArray:
+        """y for x = offset - slope y where free, x = offset elsewhere."""
+        ss = self.ss + py - (free * self.ds * slope).sum(1)
+        sr = self.sr + py * y0 - (self.ds * offset).sum(1)
+        return np.clip(sr / np.maximum(ss, 1e-12), 0.0, 1.0)
 
 
 def laplacian(image: NDArray) -> NDArray:

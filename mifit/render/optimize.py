@@ -1,0 +1,308 @@
+"""The paper's own optimisation of stage 2: Adam over bounded variables, by differentiating the shading functions.
+
+One iteration updates, in the paper's order, lighting and ambient, then the specular map, then the diffuse offset,
+each by one Adam step along the gradient of the whole objective at the values of that moment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.sh import order_of
+from mifit.errors import InputError
+from mifit.render import shading
+
+HISTORY = ("data", "difference", "smoothness")
+
+
+@dataclass
+class Variable:
+    """A differentiable array with bounds and Adam's moments.
+
+    Attributes
+    ----------
+    value : Float
+        Flat Dr.Jit array; the variable owns it.
+    rate : float
+        Step length.
+    lower, upper : Float or float
+        Box that each step ends in.
+    """
+
+    value: Any
+    rate: float
+    lower: Any = -np.inf
+    upper: Any = np.inf
+    _first: Any = None
+    _second: Any = None
+    _steps: int = 0
+
+    def step(self, energy: Callable[[Any], Any], beta: tuple[float, float] = (0.9, 0.999)) -> Any:
+        """Differentiate an energy at the current value, take one Adam step, and return the energy before it."""
+        import drjit as dr
+
+        x = type(self.value)(self.value)
+        dr.enable_grad(x)
+        value = energy(x)
+        dr.backward(value)
+        gradient = dr.detach(dr.grad(x))
+        if self._first is None:
+            self._first, self._second = dr.zeros(type(gradient), len(x)), dr.zeros(type(gradient), len(x))
+        self._steps += 1
+        self._first = beta[0] * self._first + (1.0 - beta[0]) * gradient
+        self._second = beta[1] * self._second + (1.0 - beta[1]) * dr.square(gradient)
+        # The bias correction is opaque, or every iteration would compile a kernel of its own.
+        scale = dr.opaque(
+            type(gradient), self.rate * np.sqrt(1.0 - beta[1] ** self._steps) / (1.0 - beta[0] ** self._steps)
+        )
+        moved = dr.detach(self.value) - scale * self._first / (dr.sqrt(self._second) + 1e-10)
+        self.value = dr.clip(moved, self.lower, self.upper)
+        dr.eval(self.value, self._first, self._second)
+        return dr.detach(value)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """M weighted observations of N texels on an S x S map.
+
+    Attributes
+    ----------
+    normal, view, colour, weight : (M, 3) float32
+        Unit normal and view vector, observed colour, weight per channel.
+    texel : (M,) int
+        Texel of each observation, 0 .. N - 1.
+    first, second : (P,) int
+        Rows of the same texel and timestep in two views: their difference is specular.
+    index : (N,) int
+        Flat position of each texel in the map.
+    size : int
+    albedo : (N, 3) float32
+        Diffuse albedo C_d of the morphable model.
+    traced : (M, K) float32 or None
+        Shadowed transfer vectors, for ``shadowed``.
+    """
+
+    normal: NDArray[np.float32]
+    view: NDArray[np.float32]
+    colour: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    texel: NDArray[np.int64]
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    index: NDArray[np.int64]
+    size: int
+    albedo: NDArray[np.float32]
+    traced: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True)
+class AdamResult:
+    """Where Adam ended: radiance (K, 3), ambient, diffuse (N, 3), specular (N,), and the energies on the way."""
+
+    radiance: NDArray[np.float64]
+    ambient: float
+    diffuse: NDArray[np.float32]
+    specular: NDArray[np.float32]
+    history: dict[str, list[float]] = field(default_factory=dict)
+
+
+def fit_adam(
+    samples: Samples,
+    radiance: NDArray,
+    ambient: float,
+    model: str,
+    exponent: float,
+    difference_weight: float,
+    smoothness: tuple[float, float],
+    iterations: int,
+    specular: NDArray | None = None,
+    rates: tuple[float, float, float] = (0.01, 0.005, 0.005),
+    with_ambient: bool = True,
+    fresnel: float | None = None,
+    on_iteration: Callable[[int], None] | None = None,
+) -> AdamResult:
+    """Minimise E_O + lambda_S E_S + lambda_H E_H (paper, section 5) from zero specular albedo.
+
+    Parameters
+    ----------
+    samples : Samples
+    radiance : (B*B, 3)
+        Lighting to start from.
+    ambient : float
+    model, exponent
+        See ``render.shading``.
+    difference_weight : float
+        lambda_S.
+    smoothness : (float, float)
+        lambda_H of the diffuse offset and of the specular map.
+    iterations : int
+    specular : (N,), optional
+        Specular map to start from; zero by default, as in the paper.
+    rates : (float, float, float)
+        Step lengths of lighting (relative to its largest coefficient), specular map and diffuse offset.
+    with_ambient : bool
+        Whether I_a is an unknown.
+    fresnel : float, optional
+        See ``render.shading.Lobe``.
+    on_iteration : callable, optional
+        Called with the number of iterations done.
+
+    Raises
+    ------
+    InputError
+        No observation.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    if not len(samples.colour):
+        raise InputError("found 0 observations, expected some: no image shows the face")
+    problem = _Objective(samples, model, exponent, difference_weight, smoothness, fresnel)
+    k = order_of(radiance) ** 2
+    scale = max(float(np.abs(radiance).max()), 1e-6)
+    start = np.concatenate([np.asarray(radiance, dtype=np.float64).ravel() / scale, [ambient / scale]])
+    # One vector for lighting and ambient, relative to the lighting's size, so that one step length fits any exposure.
+    lower = np.full(3 * k + 1, -np.inf)
+    lower[-1] = 0.0
+    upper = np.full(3 * k + 1, np.inf)
+    if not with_ambient:
+        upper[-1] = 0.0
+    n = len(samples.albedo)
+    light = Variable(mi.Float(start.astype(np.float32)), rates[0], mi.Float(lower), mi.Float(upper))
+    begin = np.zeros(n, np.float32) if specular is None else np.asarray(specular, dtype=np.float32)
+    gloss = Variable(mi.Float(begin), rates[1], 0.0, 1.0)
+    base = mi.Float(np.ascontiguousarray(samples.albedo, dtype=np.float32).ravel())
+    offset = Variable(dr.zeros(mi.Float, 3 * n), rates[2], -base, 1.0 - base)
+    history: dict[str, list[float]] = {name: [] for name in HISTORY}
+
+    def unpack(x: Any) -> tuple[list[Any], Any]:
+        values = [mi.Color3f(*(scale * dr.gather(mi.Float, x, 3 * i + c) for c in range(3))) for i in range(k)]
+        return values, scale * dr.gather(mi.Float, x, 3 * k)
+
+    for iteration in range(iterations):
+        light.step(lambda x: problem.total(problem.shade(*unpack(x)), gloss.value, base, offset.value))
+        shaded = problem.shade(*unpack(light.value))
+        dr.eval(shaded)
+        gloss.step(lambda x, s=shaded: problem.total(s, x, base, offset.value))
+        offset.step(lambda x, s=shaded: problem.total(s, gloss.value, base, x))
+        for name, value in zip(HISTORY, problem.terms(shaded, gloss.value, base, offset.value), strict=True):
+            history[name].append(float(value[0]))
+        if on_iteration is not None:
+            on_iteration(iteration + 1)
+    final = np.array(light.value, dtype=np.float64) * scale
+    diffuse = np.array(base + offset.value, dtype=np.float32).reshape(n, 3)
+    return AdamResult(
+        final[:-1].reshape(k, 3), float(final[-1]), diffuse, np.array(gloss.value, dtype=np.float32), history
+    )
+
+
+class _Objective:
+    """The paper's objective over one set of observations."""
+
+    def __init__(
+        self,
+        samples: Samples,
+        model: str,
+        exponent: float,
+        difference: float,
+        smoothness: tuple[float, float],
+        fresnel: float | None,
+    ) -> None:
+        import mitsuba as mi
+
+        shading.check_model(model)
+        self.model, self.exponent, self.fresnel = model, float(exponent), fresnel
+        self.difference, self.smoothness = difference, smoothness
+        self.normal, self.view = _vector(samples.normal), _vector(samples.view)
+        self.colour, self.weight = _colour(samples.colour), _colour(samples.weight)
+        self.texel = mi.UInt(samples.texel.astype(np.uint32))
+        self.first, self.second = (mi.UInt(x.astype(np.uint32)) for x in (samples.first, samples.second))
+        self.traced = None
+        if samples.traced is not None:
+            self.traced = [mi.Float(np.ascontiguousarray(column)) for column in samples.traced.T]
+        self.neighbours = _neighbours(samples.index, samples.size)
+
+    def shade(self, coefficients: list[Any], ambient: Any) -> tuple[Any, Any, Any]:
+        """Diffuse and specular reflection at unit albedo, and ambient."""
+        import drjit as dr
+
+        if not dr.grad_enabled(coefficients):
+            dr.make_opaque(coefficients)
+        lobe: Any = self.exponent
+        if self.model != "paper":
+            lobe = shading.lobe(self.exponent, round(len(coefficients) ** 0.5), fresnel=self.fresnel)
+        d, s = shading.shade(self.normal, self.view, coefficients, lobe, self.model, True, self.traced)
+        return d, s, ambient
+
+    def terms(self, shaded: tuple[Any, Any, Any], gloss: Any, base: Any, offset: Any) -> tuple[Any, Any, Any]:
+        """Data, specular difference and smoothness terms, weighted."""
+        import drjit as dr
+        import mitsuba as mi
+
+        d, s, ambient = shaded
+        y = dr.gather(mi.Float, gloss, self.texel)
+        x = mi.Color3f(*(dr.gather(mi.Float, base + offset, 3 * self.texel + c) for c in range(3)))
+        residual = self.colour - x * d - y * s - ambient
+        data = dr.sum(_total(self.weight * dr.square(residual)))
+        pair = mi.Float(0.0)
+        if self.difference > 0 and len(self.first):
+            observed = _at(self.colour, self.first) - _at(self.colour, self.second)
+            shown = _at(s, self.first) - _at(s, self.second)
+            both = dr.minimum(_at(self.weight, self.first), _at(self.weight, self.second))
+            at = dr.gather(mi.Float, y, self.first)
+            pair = self.difference * dr.sum(_total(both * dr.square(observed - at * shown)))
+        rough = mi.Float(0.0)
+        for values, stride, shift, weight in [(gloss, 1, 0, self.smoothness[1])] + [
+            (offset, 3, c, self.smoothness[0]) for c in range(3)
+        ]:
+            if weight > 0:
+                centre, *around = (dr.gather(mi.Float, values, stride * i + shift) for i in self.neighbours)
+                rough += weight * dr.sum(dr.abs(sum(around) - 4.0 * centre))
+        return data, pair, rough
+
+    def total(self, shaded: tuple[Any, Any, Any], gloss: Any, base: Any, offset: Any) -> Any:
+        """The whole objective."""
+        data, pair, rough = self.terms(shaded, gloss, base, offset)
+        return data + pair + rough
+
+
+def _neighbours(index: NDArray, size: int) -> list[Any]:
+    """Texel numbers of each texel and of its four neighbours; itself where there is none."""
+    import mitsuba as mi
+
+    own = np.full((size + 2, size + 2), -1, dtype=np.int64)
+    row, column = index // size + 1, index % size + 1
+    own[row, column] = np.arange(len(index))
+    out = [np.arange(len(index))]
+    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        other = own[row + dy, column + dx]
+        out.append(np.where(other < 0, np.arange(len(index)), other))
+    return [mi.UInt(x.astype(np.uint32)) for x in out]
+
+
+def _vector(values: NDArray) -> Any:
+    import mitsuba as mi
+
+    return mi.Vector3f(np.ascontiguousarray(values.T, dtype=np.float32))
+
+
+def _colour(values: NDArray) -> Any:
+    import mitsuba as mi
+
+    return mi.Color3f(np.ascontiguousarray(values.T, dtype=np.float32))
+
+
+def _at(colour: Any, index: Any) -> Any:
+    import drjit as dr
+    import mitsuba as mi
+
+    return mi.Color3f(*(dr.gather(mi.Float, channel, index) for channel in (colour.x, colour.y, colour.z)))
+
+
+def _total(colour: Any) -> Any:
+    return colour.x + colour.y + colour.z

@@ -1,0 +1,104 @@
+"""The paper's solver: Adam on the whole objective, through the shading functions that the plugins use."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.config import ReflectanceConfig
+from mifit.progress import Progress
+from mifit.stages.observations import Observations, Surface
+from mifit.stages.reflectance.als import FRESNEL, PAPER_EXPONENT, Fitted, fit_lighting, noise_weight
+from mifit.stages.reflectance.forward import Forward
+
+STEPS_PER_ITERATION = 10
+"""Gradient steps that stand for one of ``max_iterations``: a Gauss-Newton step costs and does as much."""
+
+
+def fit_adam(
+    surface: Surface,
+    faces: NDArray,
+    albedo: NDArray,
+    config: ReflectanceConfig,
+    seed: int,
+    progress: Progress,
+) -> tuple[Fitted, dict, tuple[str, ...]]:
+    """Minimise the paper's objective by Adam; ``shading = auto`` means the paper's model.
+
+    Lighting starts from a Lambertian least-squares fit with the model's albedo, as stage 1 leaves it, and the
+    specular map from zero.
+    """
+    from mifit.render import optimize
+
+    name = "paper" if config.shading == "auto" else config.shading
+    order = 3 if name == "paper" else config.bands
+    traced = surface.trace(order) if name == "shadowed" else ()
+    fresnel = None if name == "paper" else FRESNEL
+    forward = Forward(name, order, config.exponent or PAPER_EXPONENT, fresnel, traced, faces)
+    seen = surface.observe(np.arange(len(surface)))
+    subset = surface.sample(2000, np.random.default_rng(seed))
+    lambert = Forward("prefiltered", 3, PAPER_EXPONENT)
+    start = fit_lighting(seen.take(subset), lambert, albedo[subset], config, 1, specular=0.0)
+    radiance = np.zeros((order * order, 3))
+    radiance[:9] = start.radiance
+    steps = config.max_iterations * STEPS_PER_ITERATION
+    result = optimize.fit_adam(
+        gather_samples(surface, seen, forward, albedo, config),
+        radiance,
+        0.0,
+        name,
+        forward.exponent,
+        config.specular_difference_weight,
+        (config.smoothness_weight, config.smoothness_weight * config.specular_smoothness),
+        steps,
+        with_ambient=name == "paper",
+        fresnel=fresnel,
+        on_iteration=lambda done: progress("Reflectance by Adam", done, steps),
+    )
+    maps = np.zeros((surface.texels.size**2, 4), dtype=np.float32)
+    maps[surface.texels.index, :3], maps[surface.texels.index, 3] = result.diffuse, result.specular
+    total = np.sum([result.history[k] for k in optimize.HISTORY], axis=0)
+    tail = total[-max(2, len(total) // 20) :]
+    converged = bool(abs(tail[0] - tail[-1]) < 1e-2 * abs(tail[-1]))
+    sigma = float(np.sqrt(result.history["data"][-1] / max(3.0 * float(seen.measured.sum()), 1e-12)))
+    fitted = Fitted(
+        forward,
+        result.radiance,
+        result.ambient,
+        maps.reshape(surface.texels.size, surface.texels.size, 4),
+        sigma,
+        result.history,
+        converged,
+    )
+    why = "as configured" if config.shading != "auto" else "the paper's model: it is the paper's solver"
+    return fitted, {"chosen": name, "why": why, "exponent": forward.exponent}, ()
+
+
+def gather_samples(surface: Surface, seen: Observations, forward: Forward, albedo: NDArray, config: ReflectanceConfig):
+    """Flatten the measured observations for Dr.Jit."""
+    from mifit.render.optimize import Samples
+
+    weight = seen.measured
+    texel, image = np.nonzero(weight > 0)
+    row = np.full(weight.shape, -1, dtype=np.int64)
+    row[texel, image] = np.arange(len(texel))
+    first, second = [], []
+    for a, b in surface.pairs:
+        both = (row[:, a] >= 0) & (row[:, b] >= 0)
+        first.append(row[both, a])
+        second.append(row[both, b])
+    traced = forward.traced_at(seen)
+    colour = seen.colour[texel, image]
+    return Samples(
+        seen.normal[texel, seen.step[image]],
+        seen.view[texel, image],
+        colour,
+        weight[texel, image][:, None] * noise_weight(colour, config.robust),
+        texel,
+        np.concatenate(first) if first else np.zeros(0, np.int64),
+        np.concatenate(second) if second else np.zeros(0, np.int64),
+        surface.texels.index,
+        surface.texels.size,
+        albedo,
+        None if traced is None else traced[texel, seen.step[image]],
+    )

@@ -1,0 +1,61 @@
+"""The paper's objective, term by term, for any lighting and maps: the judge of every solver."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.config import ReflectanceConfig
+from mifit.stages.observations import Surface
+from mifit.stages.reflectance.forward import Forward
+from mifit.stages.reflectance.maps import laplacian
+
+
+def energies(
+    surface: Surface,
+    forward: Forward,
+    radiance: NDArray,
+    ambient: float,
+    maps: NDArray,
+    albedo: NDArray,
+    config: ReflectanceConfig,
+) -> dict[str, float]:
+    """Data, specular difference and smoothness terms (paper, section 5), weighted by their lambdas.
+
+    Every measured pixel has the weight of its area, clipped ones have none, nothing is robust.
+
+    Parameters
+    ----------
+    surface : Surface
+    forward : Forward
+    radiance : (K, 3)
+    ambient : float
+    maps : (S, S, 4)
+        Diffuse and specular albedo.
+    albedo : (N, 3)
+        Diffuse albedo of the model, from which the offset is counted.
+    config : ReflectanceConfig
+        Its lambdas.
+    """
+    values = maps.reshape(-1, 4)[surface.texels.index]
+    data = difference = 0.0
+    for chunk in surface.chunks():
+        seen = surface.observe(chunk)
+        shade, glint = forward.shade(seen, radiance)
+        weight = seen.measured[..., None]
+        x, y = values[chunk, None, :3], values[chunk, 3, None, None]
+        data += float((weight * (seen.colour - x * shade - y * glint - np.float32(ambient)) ** 2).sum())
+        for a, b in surface.pairs:
+            both = np.minimum(weight[:, a], weight[:, b])
+            shown = y[:, 0] * (glint[:, a] - glint[:, b])
+            difference += float((both * (seen.colour[:, a] - seen.colour[:, b] - shown) ** 2).sum())
+    offset = maps.copy()
+    offset[..., :3] -= surface.texels.to_map(albedo.astype(maps.dtype))
+    mask = surface.texels.mask
+    rough = np.abs(laplacian(offset))[mask].sum(0)
+    smooth = config.smoothness_weight * (rough[:3].sum() + config.specular_smoothness * rough[3])
+    return {
+        "data": data,
+        "difference": config.specular_difference_weight * difference,
+        "smoothness": float(smooth),
+    }
