@@ -96,7 +96,9 @@ def capture(angles=(0.0,), image=None, valid=None, clipped=None, distance=4.0):
         np.ones(image.shape[:2], bool) if valid is None else valid,
         np.zeros(image.shape[:2], bool) if clipped is None else clipped,
     )
-    return FakeCapture({n: camera(a, n, distance) for n, a in zip(names, angles, strict=True)}, dict.fromkeys(names, frame))
+    return FakeCapture(
+        {n: camera(a, n, distance) for n, a in zip(names, angles, strict=True)}, dict.fromkeys(names, frame)
+    )
 
 
 def observe(shot, model=None, cameras=("left",), geo=None):
