@@ -1,0 +1,216 @@
+"""Cameras of an uncalibrated capture, from landmarks and the face model's landmark positions.
+
+A bundle adjustment over focal lengths, camera poses, one head pose per timestep and the subject's shape, with the
+model's modes as prior. World space is the first camera's frame with OpenGL axes. The result is an estimate that stage 1
+may refine; `Capture.calibrated` stays False.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from mifit.capture.capture import Capture
+from mifit.capture.landmark_files import COUNT
+from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
+from mifit.errors import InputError
+
+MIN_VISIBLE = 6
+FOCAL_RANGE = (0.6, 8.0)
+"""Focal lengths that are searched, in multiples of the longer image side."""
+
+_WEIGHT = np.concatenate([np.full(17, 0.3), np.ones(31), np.full(20, 0.4)])
+"""Jaw contours slide and mouths move; brows, nose and eyes carry the pose."""
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Landmarks of C cameras and T timesteps, and what is known of the cameras."""
+
+    points: NDArray[np.float64]  # (C, T, 68, 2)
+    weight: NDArray[np.float64]  # (C, T, 68), 0 where invisible
+    mean: NDArray[np.float64]  # (68, 3)
+    modes: NDArray[np.float64]  # (68, 3, K)
+    centre: NDArray[np.float64]  # (C, 2) principal points
+    side: NDArray[np.float64]  # (C,) longer image sides
+    known: NDArray[np.float64]  # (C,) focal lengths, NaN where they are looked for
+    noise: float  # standard deviation of a landmark in pixels
+
+    @property
+    def shared_focal(self) -> bool:
+        """Whether one focal length serves all cameras that lack one: equal image sizes suggest equal cameras."""
+        return bool(np.ptp(self.side) == 0)
+
+
+def calibrate(
+    capture: Capture,
+    landmarks3d: NDArray,
+    modes: NDArray | None = None,
+    cameras: Sequence[str] | None = None,
+    timesteps: Sequence[int] | None = None,
+    noise: float = 0.004,
+) -> Capture:
+    """Estimate the cameras of a capture that came without calibration.
+
+    Parameters
+    ----------
+    capture : Capture
+        With landmarks. Intrinsics that are known stay as they are.
+    landmarks3d : (68, 3)
+        The model's mean landmarks in the capture's unit of length.
+    modes : (68, 3, K), optional
+        Identity modes at the landmarks in the same unit, premultiplied by their standard deviations.
+    cameras, timesteps : sequence, optional
+        What to use; all by default. Only landmarks of these cameras are read.
+    noise : float
+        Standard deviation of a landmark as a part of the image's longer side.
+
+    Returns
+    -------
+    Capture
+        The same capture whose `camera` now answers for the named cameras; `calibrated` stays False.
+
+    Raises
+    ------
+    InputError
+        No landmarks, or fewer than 6 visible ones in some image.
+    """
+    names = tuple(cameras) if cameras is not None else capture.cameras
+    steps = tuple(timesteps) if timesteps is not None else capture.timesteps
+    mean = np.asarray(landmarks3d, dtype=np.float64)
+    if mean.shape != (COUNT, 3):
+        raise InputError(f"landmarks3d: found shape {mean.shape}, expected (68, 3)")
+    problem = _gather(capture, names, steps, mean, modes, noise)
+    focal, poses = _solve(problem)
+    found = []
+    for i, name in enumerate(names):
+        view = capture.views[name]
+        cx, cy = (float(value) for value in problem.centre[i])
+        fx, fy = (focal[i], focal[i]) if view.intrinsics is None else view.intrinsics[:2]
+        found.append(Camera(name, view.width, view.height, float(fx), float(fy), cx, cy, poses[i]))
+    return capture.with_estimate(found)
+
+
+def _gather(
+    capture: Capture,
+    names: tuple[str, ...],
+    steps: tuple[int, ...],
+    mean: NDArray[np.float64],
+    modes: NDArray | None,
+    noise: float,
+) -> _Problem:
+    points = np.zeros((len(names), len(steps), COUNT, 2))
+    weight = np.zeros(points.shape[:3])
+    for i, name in enumerate(names):
+        for j, step in enumerate(steps):
+            marks = capture.landmarks(name, step)
+            if marks is None or marks.visible.sum() < MIN_VISIBLE:
+                count = 0 if marks is None else int(marks.visible.sum())
+                raise InputError(
+                    f"{capture.path}: camera {name!r}, timestep {step}: found {count} visible landmarks, expected at "
+                    f"least {MIN_VISIBLE} to estimate an uncalibrated camera; run mifit landmarks, or leave it out"
+                )
+            points[i, j], weight[i, j] = marks.points, marks.visible * _WEIGHT
+    views = [capture.views[name] for name in names]
+    centre = [(v.width / 2, v.height / 2) if v.intrinsics is None else v.intrinsics[2:] for v in views]
+    known = [np.nan if v.intrinsics is None else math.sqrt(v.intrinsics[0] * v.intrinsics[1]) for v in views]
+    for i, view in enumerate(views):  # square pixels from here on: fy is brought to the mean of both
+        if view.intrinsics is not None:
+            fx, fy, cx, cy = view.intrinsics
+            points[i] = (points[i] - (cx, cy)) * (known[i] / fx, known[i] / fy) + (cx, cy)
+    basis = np.zeros((COUNT, 3, 0)) if modes is None else np.asarray(modes, dtype=np.float64)
+    side = np.array([max(v.width, v.height) for v in views], dtype=np.float64)
+    return _Problem(points, weight, mean, basis, np.array(centre), side, np.array(known), noise * float(side.max()))
+
+
+def _solve(problem: _Problem) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
+    """Focal lengths (C,) and world-to-camera matrices."""
+    grid = np.geomspace(*FOCAL_RANGE, 12)
+    starts = [_start(problem, factor) for factor in (grid if np.isnan(problem.known).any() else (1.0,))]
+    _, best = min(starts, key=lambda start: start[0])
+    solution = least_squares(
+        _residuals, best, args=(problem,), loss="soft_l1", x_scale="jac", ftol=1e-6, xtol=1e-6, max_nfev=40
+    )
+    focal, cameras, _, _ = _unpack(solution.x, problem)
+    return focal, [pose @ OPENGL_FROM_OPENCV for pose in cameras]
+
+
+def _start(problem: _Problem, factor: float) -> tuple[float, NDArray[np.float64]]:
+    """Pose of the mean shape in every image for one guess of the focal lengths, and how well it explains them."""
+    count, steps = problem.points.shape[:2]
+    focal = np.where(np.isnan(problem.known), factor * problem.side, problem.known)
+    heads = np.zeros((count, steps, 4, 4))
+    for i in range(count):
+        matrix = np.array([[focal[i], 0, problem.centre[i, 0]], [0, focal[i], problem.centre[i, 1]], [0, 0, 1]])
+        for j in range(steps):
+            seen = problem.weight[i, j] > 0
+            heads[i, j] = _pnp(problem.mean[seen], problem.points[i, j, seen], matrix)
+    relative = [_mean_pose(heads[i] @ np.linalg.inv(heads[0])) for i in range(count)]
+    log_focal = np.log(focal / problem.side)
+    free = np.isnan(problem.known)
+    parts = [log_focal[free][:1] if problem.shared_focal else log_focal[free]]
+    parts += [_pack_pose(pose) for pose in relative[1:]]
+    parts += [_pack_pose(heads[0, j]) for j in range(steps)]
+    x = np.concatenate([*parts, np.zeros(problem.modes.shape[2])])
+    residual = _residuals(x, problem)
+    return float(np.sum(np.sqrt(1 + residual**2) - 1)), x
+
+
+def _pnp(points: NDArray, pixels: NDArray, matrix: NDArray) -> NDArray[np.float64]:
+    ok, rotation, translation = cv2.solvePnP(points, pixels, matrix, np.zeros(4), flags=cv2.SOLVEPNP_SQPNP)
+    if not ok:
+        raise InputError("landmarks: no pose of a head explains them; check their order (iBUG-68)")
+    rotation, translation = cv2.solvePnPRefineLM(points, pixels, matrix, np.zeros(4), rotation, translation)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
+    return pose
+
+
+def _mean_pose(poses: NDArray) -> NDArray[np.float64]:
+    mean = np.eye(4)
+    mean[:3, :3] = Rotation.from_matrix(poses[:, :3, :3]).mean().as_matrix()
+    mean[:3, 3] = np.median(poses[:, :3, 3], axis=0)
+    return mean
+
+
+def _pack_pose(pose: NDArray) -> NDArray[np.float64]:
+    return np.concatenate([Rotation.from_matrix(pose[:3, :3]).as_rotvec(), pose[:3, 3]])
+
+
+def _unpack_poses(values: NDArray) -> NDArray[np.float64]:
+    poses = np.tile(np.eye(4), (len(values), 1, 1))
+    if len(values):
+        poses[:, :3, :3] = Rotation.from_rotvec(values[:, :3]).as_matrix()
+        poses[:, :3, 3] = values[:, 3:]
+    return poses
+
+
+def _unpack(x: NDArray, problem: _Problem) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Variables -> focal lengths (C,), camera poses (C, 4, 4), head poses (T, 4, 4), shape coefficients (K,)."""
+    count, steps = problem.points.shape[:2]
+    free = np.isnan(problem.known)
+    n = (1 if problem.shared_focal else int(free.sum())) if free.any() else 0
+    focal = problem.known.copy()
+    focal[free] = np.exp(x[:n]) * problem.side[free]
+    poses = _unpack_poses(x[n : n + 6 * (count - 1 + steps)].reshape(-1, 6))
+    cameras = np.concatenate([np.eye(4)[None], poses[: count - 1]])
+    return focal, cameras, poses[count - 1 :], x[n + 6 * (count - 1 + steps) :]
+
+
+def _residuals(x: NDArray, problem: _Problem) -> NDArray[np.float64]:
+    focal, cameras, heads, shape = _unpack(x, problem)
+    model = problem.mean + problem.modes @ shape
+    world = np.einsum("tij,nj->tni", heads[:, :3, :3], model) + heads[:, None, :3, 3]
+    p = np.einsum("cij,tnj->ctni", cameras[:, :3, :3], world) + cameras[:, None, None, :3, 3]
+    depth = np.maximum(p[..., 2:], 1e-3)
+    pixels = focal[:, None, None, None] * p[..., :2] / depth + problem.centre[:, None, None]
+    error = (pixels - problem.points) * (np.sqrt(problem.weight)[..., None] / problem.noise)
+    prior_focal = (np.log(focal / problem.side) - math.log(1.8)) / 0.7  # portrait lenses, loosely
+    return np.concatenate([error.ravel(), shape, prior_focal[np.isnan(problem.known)]])

@@ -1,0 +1,183 @@
+"""Detection: what detectors find is judged, written and read back."""
+
+from __future__ import annotations
+
+import json
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mifit.capture import Capture, detect_landmarks
+from mifit.capture.detectors import open_detector
+from mifit.capture.face_mesh import REQUIREMENTS, environment_python, landmark_map
+from mifit.capture.outliers import epipolar_outliers, fundamental_matrix, temporal_outliers
+from mifit.core.image import load_image
+from mifit.errors import InputError, MifitError
+from mifit.synth.compose import place_cameras
+
+CAMERAS = place_cameras(680, 480)
+
+
+def head_landmarks(timesteps: int, noise: float = 0.8) -> tuple[np.ndarray, np.ndarray]:
+    """Noisy landmarks (T, 68, 2) of a moving rigid head in the first two cameras."""
+    rng = np.random.default_rng(8)
+    shape = rng.uniform((-7, -8, 3), (7, 8, 9), (68, 3))
+    views: tuple[list, list] = ([], [])
+    for t in range(timesteps):
+        turn = Rotation.from_euler("yx", [6 * np.sin(t), 3 * np.cos(t)], degrees=True).as_matrix()
+        for camera, seen in zip(CAMERAS, views, strict=False):
+            seen.append(camera.project(shape @ turn.T) + noise * rng.standard_normal((68, 2)))
+    return np.array(views[0]), np.array(views[1])
+
+
+def test_a_landmark_that_jumps_is_found_and_no_other() -> None:
+    points, _ = head_landmarks(9)
+    assert not temporal_outliers(points).any()
+    points[4, 30] += (40.0, 0.0)
+    points[0, 50] += (0.0, -45.0)
+    assert np.argwhere(temporal_outliers(points)).tolist() == [[0, 50], [4, 30]]
+    assert not temporal_outliers(points[:2]).any()
+
+
+def test_frames_without_a_face_are_passed_over() -> None:
+    points, other = head_landmarks(6)
+    points[2] = np.nan
+    assert not temporal_outliers(points).any()
+    assert not epipolar_outliers(points, other, (CAMERAS[0], CAMERAS[1])).any()
+
+
+def test_a_landmark_off_its_epipolar_line_is_found_and_no_other() -> None:
+    left, right = head_landmarks(4)
+    pair = (CAMERAS[0], CAMERAS[1])
+    assert not epipolar_outliers(left, right, pair).any()
+    right[2, 17] += (0.0, 25.0)
+    assert np.argwhere(epipolar_outliers(left, right, pair)).tolist() == [[2, 17]]
+
+
+def test_the_fundamental_matrix_vanishes_on_true_pairs() -> None:
+    points = np.random.default_rng(1).uniform(-8, 8, (40, 3))
+    first, second = (np.column_stack([camera.project(points), np.ones(40)]) for camera in (CAMERAS[0], CAMERAS[2]))
+    matrix = fundamental_matrix(CAMERAS[0], CAMERAS[2])
+    line = first @ matrix.T
+    distance = np.einsum("nk,nk->n", line, second) / np.linalg.norm(line[:, :2], axis=1)
+    assert np.abs(distance).max() < 1e-9
+
+
+class Fake:
+    """Finds prepared landmarks; no face where the image is black."""
+
+    name = "fake"
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        self.points = rng.uniform(4, 28, (68, 2))
+
+    def detect(self, image: np.ndarray) -> np.ndarray | None:
+        assert image.dtype == np.uint8
+        return None if image.max() == 0 else self.points
+
+
+def test_landmarks_are_written_and_images_without_a_face_named(folder: Path) -> None:
+    from mifit.core.image import write_image
+
+    write_image(folder / "images/right/0001.png", np.zeros((32, 48, 3)))
+    seen = []
+    text = detect_landmarks(folder, Fake(), progress=lambda *a: seen.append(a))
+    assert "landmarks in 3 of 4 images" in text
+    assert f"no face found: {folder / 'images/right/0001.png'}" in text
+    assert seen[-1] == ("Finding landmarks", 4, 4)
+    capture = Capture.load(folder)
+    assert capture.frame("right", 1).landmarks is None
+    np.testing.assert_allclose(capture.frame("left", 1).landmarks, Fake().points, atol=1e-3)
+
+
+def test_a_capture_without_any_face_is_refused(folder: Path) -> None:
+    class Blind(Fake):
+        def detect(self, image: np.ndarray) -> None:
+            return None
+
+    before = (folder / "transforms.json").read_bytes()
+    with pytest.raises(InputError, match="detector fake finds no face in any of 4 images"):
+        detect_landmarks(folder, Blind())
+    assert (folder / "transforms.json").read_bytes() == before
+
+
+def test_detectors_that_cannot_start_say_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match=r"found 'magic', expected one of mediapipe, face-alignment, lbf:FOLDER"):
+        with open_detector("magic"):
+            pass
+    with pytest.raises(InputError, match=r"found 0 lbfmodel.yaml and 0 face finders"):
+        with open_detector(f"lbf:{tmp_path}"):
+            pass
+    monkeypatch.setitem(sys.modules, "face_alignment", None)
+    with pytest.raises(InputError, match=r"face-alignment: can't be imported .* pip install face-alignment"):
+        with open_detector("face-alignment"):
+            pass
+    monkeypatch.setenv("MIFIT_CACHE", str(tmp_path))
+    python = environment_python()
+    python.parent.mkdir(parents=True)
+    python.write_text("#!/bin/sh\necho 'no module named mediapipe' >&2\nexit 3\n")
+    python.chmod(0o755)
+    with pytest.raises(MifitError, match=r"its process ended early \(no module named mediapipe\); remove .*mediapipe"):
+        with open_detector("mediapipe"):
+            pass
+
+
+def test_face_alignment_gives_the_largest_face_in_our_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in package with face-alignment's interface: integer pixel centres, one array per face."""
+    large = np.random.default_rng(0).uniform(0, 90, (68, 2))
+
+    class Aligner:
+        def __init__(self, kind: str, device: str) -> None:
+            assert (kind, device) == ("2d", "cpu")
+
+        def get_landmarks_from_image(self, image: np.ndarray) -> list | None:
+            return [0.2 * large, large] if image.any() else None
+
+    module = types.SimpleNamespace(LandmarksType=types.SimpleNamespace(TWO_D="2d"), FaceAlignment=Aligner)
+    monkeypatch.setitem(sys.modules, "face_alignment", module)
+    with open_detector("face-alignment") as detector:
+        np.testing.assert_allclose(detector.detect(np.ones((9, 9, 3), np.uint8)), large + 0.5)
+        assert detector.detect(np.zeros((9, 9, 3), np.uint8)) is None
+
+
+def test_the_map_from_face_mesh_is_affine_and_symmetric_enough() -> None:
+    weights = landmark_map()
+    assert weights.shape == (68, 478)
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-3)
+    assert np.abs(weights).max() < 5.0  # no point is far outside the mesh points that it is made of
+    shifted = weights @ (np.random.default_rng(0).random((478, 2)) + 7.0)
+    assert np.isfinite(shifted).all()
+
+
+@pytest.mark.slow
+def test_mediapipe_finds_the_landmarks_of_rendered_heads(shared: Path, ict_path: Path) -> None:
+    """Runs where `mifit landmarks` has made MediaPipe's environment before."""
+    if not environment_python().exists():
+        pytest.skip(f"needs MediaPipe's environment ({', '.join(REQUIREMENTS)}), made by the first `mifit landmarks`")
+    landmarks = np.load(ict_path)["landmarks_ibug68"]
+    capture, errors = Capture.load(shared / "captures/soft"), []
+    with open_detector("mediapipe") as detector:
+        for camera in ("left", "right"):
+            for t in (0, 3, 6):
+                image = load_image(capture.shots[camera, t].image).pixels
+                found = detector.detect((np.clip(image, 0, 1) ** (1 / 2.2) * 255).astype(np.uint8))
+                truth = np.load(shared / f"captures/soft/truth/{t:04d}.npz")["vertices"][landmarks]
+                marks = capture.landmarks(camera, t)
+                assert found is not None
+                assert marks is not None
+                errors.append(np.linalg.norm(found - capture.camera(camera).project(truth), axis=1)[marks.visible])
+        assert detector.detect(np.zeros((120, 160, 3), np.uint8)) is None
+    assert np.median(np.concatenate(errors)) < 6.5
+
+
+def test_the_table_file_is_plain_json() -> None:
+    from importlib import resources
+
+    table = json.loads((resources.files("mifit.capture") / "face_mesh_68.json").read_text())
+    assert {len(row) for row in table["index"]} == {len(row) for row in table["weight"]}
+    assert max(max(row) for row in table["index"]) < 478
