@@ -146,7 +146,12 @@ def srgb_albedo(mean: NDArray, modes: NDArray) -> tuple[NDArray[np.float32], NDA
     return linear.astype(np.float32), (slope[..., None].astype(np.float32) * modes.astype(np.float32, copy=False))
 
 
-def interleaved(values: NDArray) -> NDArray:
+def single(values: NDArray) -> NDArray[np.float32]:
+    """Contiguous float32 array; what overflows becomes infinite, which the model refuses."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.ascontiguousarray(values, dtype=np.float32)
+
+
+def interleaved(values: NDArray) -> NDArray[np.float32]:
     """(3V, K) with x, y, z interleaved -> (V, 3, K) in C order."""
-    with np.errstate(over="ignore"):  # what overflows becomes infinite, which the model refuses
-        return np.ascontiguousarray(values, dtype=np.float32).reshape(len(values) // 3, 3, -1)
+    return single(values).reshape(len(values) // 3, 3, -1)

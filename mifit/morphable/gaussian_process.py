@@ -72,13 +72,15 @@ def compress(columns: NDArray[np.float32], count: int) -> NDArray[np.float32]:
     Returns
     -------
     (N, min(count, M)) float32
-        Orthogonal modes, each as long as its standard deviation, longest first; the sign of each is fixed by
-        its largest entry.
+        Orthogonal modes, each as long as its standard deviation, longest first; the first large entry
+        of each is positive.
     """
     modes = columns
     for sample in (columns[:: max(1, len(columns) // 30_000)], None):  # find the subspace fast, then its exact axes
         rows = modes if sample is None else sample
         vectors = np.linalg.eigh((rows.T @ rows).astype(np.float64))[1][:, ::-1][:, :count]
         modes = modes @ vectors.astype(np.float32)
-    peak = np.abs(modes).argmax(0)
-    return modes * np.where(modes[peak, np.arange(modes.shape[1])] < 0, -1.0, 1.0).astype(np.float32)
+    # the first large entry, not the largest: mirror-odd modes have two of those, with opposite signs
+    size = np.abs(modes)
+    first = (size > 0.5 * size.max(0)).argmax(0)
+    return modes * np.where(modes[first, np.arange(modes.shape[1])] < 0, -1.0, 1.0).astype(np.float32)

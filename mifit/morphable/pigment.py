@@ -39,7 +39,12 @@ _REGIONS = {
 
 
 def skin_model(
-    mean: NDArray, faces_used: NDArray, landmarks: NDArray, unit_mm: float, count: int
+    mean: NDArray,
+    faces_used: NDArray,
+    landmarks: NDArray,
+    unit_mm: float,
+    count: int,
+    skin: NDArray | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean albedo and albedo modes for a face surface.
 
@@ -55,6 +60,8 @@ def skin_model(
         Millimetres per unit of ``mean``.
     count : int
         Albedo modes to make.
+    skin : (V,) bool, optional
+        Vertices whose albedo varies; all by default.
 
     Returns
     -------
@@ -88,6 +95,8 @@ def skin_model(
         ],
         axis=2,
     )
+    if skin is not None:
+        columns[~skin] = 0.0
     modes = compress(columns.reshape(3 * n, -1), count)
     return albedo.astype(np.float32), modes.reshape(n, 3, -1)
 
@@ -105,7 +114,7 @@ def region_masks(points: NDArray, landmarks: NDArray) -> dict[str, NDArray[np.fl
     brows = np.zeros(len(points))
     for first in (17, 22):
         brow = p[first : first + 5] - (0.0, 1.5 * eye, 0.0)  # detectors mark the brow's upper edge
-        brows = np.maximum(brows, np.exp(-0.5 * (_polyline_distance(points, brow) / (2.9 * eye)) ** 4))
+        brows = np.maximum(brows, np.exp(-0.5 * (_polyline_distance(points, brow) / (2.6 * eye)) ** 3))
     masks["brows"] = brows
 
     masks["cheeks"] = np.maximum(

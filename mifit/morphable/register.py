@@ -143,7 +143,7 @@ def distance_to_surface(points: NDArray, vertices: NDArray, faces: NDArray, cand
     _, near = cKDTree(corners.mean(1)).query(points, k=min(candidates, len(faces)))
     best = np.full(len(points), np.inf)
     normals = face_cross(vertices, faces)
-    for k in near.T:
+    for k in near.reshape(len(points), -1).T:
         a, b, c = (corners[k, i] for i in range(3))
         best = np.minimum(best, _point_triangle(points, a, b, c, normals[k]))
     return best

@@ -225,8 +225,8 @@ CENTRAL: dict[str, Motion] = {
         "in_up_out": (0, 0, -2.4),
     },
     "rollLower": {
-        "low_mid": (0, 2.4, -1.5),
-        "low_out": (0, 2.0, -1.3),
+        "low_mid": (0, 1.4, -1.5),
+        "low_out": (0, 0.8, -1.3),
         "in_low_mid": (0, 0, -3.2),
         "in_low_out": (0, 0, -2.6),
         "fold_chin": (0, 1, -0.5),
@@ -245,10 +245,10 @@ CENTRAL: dict[str, Motion] = {
         "up_out": (0, 0.8, 0.6),
     },
     "lipPress": {
-        "low_mid": (0, 1.6, -0.6),
-        "low_out": (0, 1.4, -0.6),
-        "up_mid": (0, -1.4, -0.6),
-        "up_out": (0, -1.2, -0.6),
+        "low_mid": (0, 1.0, -0.6),
+        "low_out": (0, 0.5, -0.6),
+        "up_mid": (0, -1.0, -0.6),
+        "up_out": (0, -0.5, -0.6),
         "corner": (0.8, 0, -1),
         "in_up_mid": (0, 0, -1),
         "in_low_mid": (0, 0, -1),
@@ -263,10 +263,14 @@ CENTRAL: dict[str, Motion] = {
     },
 }
 
-# Localised modes: point, axis, parity (1 both sides alike, -1 opposite); one standard deviation is LOCAL mm.
+# Localised modes: point, axis, parity (1 both sides alike, -1 opposite); one standard deviation is LOCAL mm, less
+# where lips would close upon each other.
 LOCAL = 1.2
+LOCAL_LIPS = 0.6
 LOCALISED = [
-    *((p, a, 1) for p in ("up_out", "low_out", "corner") for a in "xyz"),
+    *((p, a, 1) for p in ("up_out", "corner") for a in "xyz"),
+    *((p, "z", 1) for p in ("low_out", "philtrum_side")),
+    ("cheek", "y", 1),
     *((p, a, 1) for p in ("up_mid", "low_mid", "chin") for a in "yz"),
     *((p, "z", 1) for p in ("nasolabial", "cheek", "cheek_low", "under_eye", "nose_side", "fold_chin", "fore_in")),
     ("brow_mid", "y", 1),
@@ -276,7 +280,7 @@ LOCALISED = [
     ("tip", "y", 1),
     *(("corner", a, -1) for a in "xyz"),
     ("up_out", "y", -1),
-    ("low_out", "y", -1),
+    ("nasolabial", "z", -1),
     ("brow_mid", "y", -1),
     ("chin", "x", 0),
     ("cheek_low", "z", -1),

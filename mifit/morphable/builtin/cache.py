@@ -22,7 +22,7 @@ def builtin_model(coarse: bool = False) -> MorphableModel:
     coarse : bool
         About 8 000 instead of 31 000 vertices.
     """
-    path = cache_folder() / f"builtin-{'coarse' if coarse else 'full'}-{source_digest()}.npz"
+    path = cache_folder() / f"builtin-{'coarse' if coarse else 'full'}-{_DIGEST}.npz"
     if path.is_file():
         try:
             return load_own(path)
@@ -47,14 +47,19 @@ def cache_folder() -> Path:
         return Path(os.devnull) / "mifit"
 
 
-@cache
-def source_digest() -> str:
+def _source_digest() -> str:
     """Digest of the code that makes the model: a cached file is valid for this code only."""
     here = Path(__file__).parent
     files = sorted(
-        [*here.glob("*.py"), *(here.parent / f for f in ("gaussian_process.py", "pigment.py", "topology.py"))]
+        [
+            *here.glob("*.py"),
+            *(here.parent / f for f in ("gaussian_process.py", "pigment.py", "topology.py", "landmarks.py")),
+        ]
     )
     h = hashlib.blake2b(digest_size=8)
     for file in files:
         h.update(file.read_bytes())
     return h.hexdigest()
+
+
+_DIGEST = _source_digest()  # at import, while the files are those that were imported

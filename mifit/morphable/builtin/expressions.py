@@ -14,7 +14,16 @@ from scipy.sparse.linalg import splu
 
 from mifit.core.mesh import face_cross
 from mifit.morphable.builtin import sculpt
-from mifit.morphable.builtin.action_units import CENTRAL, JAW_SHARE, LOCAL, LOCALISED, PAIRED, POINTS, Motion
+from mifit.morphable.builtin.action_units import (
+    CENTRAL,
+    JAW_SHARE,
+    LOCAL,
+    LOCAL_LIPS,
+    LOCALISED,
+    PAIRED,
+    POINTS,
+    Motion,
+)
 from mifit.morphable.builtin.landmarks import PointFinder
 from mifit.morphable.builtin.template import EYEBALL, POUCH, SKIN, Template
 
@@ -65,8 +74,8 @@ def expression_modes(template: Template) -> tuple[NDArray[np.float32], tuple[str
     for name in ("jawForward", "jawSideways", "mouthSideways"):
         bounds[name] = (-ACTION_BOUND, ACTION_BOUND)
 
-    for name, upper, lower in (("blink", 0.86, 0.12), ("squint", 0.2, 0.25), ("eyeWide", -0.22, -0.05)):
-        field = _lid_motion(template, upper, lower)
+    for name, up, low in (("blink", 0.86, 0.12), ("squint", 0.2, 0.25), ("eyeWide", -0.22, -0.05)):
+        field = _lid_motion(template, up, low)
         modes[f"{name}_L"], modes[f"{name}_R"] = field * left, field * (1 - left)
         bounds[f"{name}_L"] = bounds[f"{name}_R"] = (0.0, ACTION_BOUND)
     for name, spin in (("gazeUp", (-1.0, 0.0, 0.0)), ("gazeSideways", (0.0, 1.0, 0.0))):
@@ -76,7 +85,8 @@ def expression_modes(template: Template) -> tuple[NDArray[np.float32], tuple[str
     out = {n: m / ACTION_BOUND for n, m in modes.items()}
     for point, axis, parity in LOCALISED:
         name = f"local_{point}_{axis}{'' if parity == 1 else '_odd'}"
-        vector = LOCAL * np.eye(3)["xyz".index(axis)]
+        lips = axis == "y" and point == "up_out"
+        vector = (LOCAL_LIPS if lips else LOCAL) * np.eye(3)["xyz".index(axis)]
         d = np.zeros((len(names), 3))
         if point in index:
             d[index[point]] = vector

@@ -24,13 +24,12 @@ def make_head(coarse: bool = False) -> MorphableModel:
     mask = face_area(t)
     identity = identity_modes(t, N_IDENTITY)
     expression, names, bounds = expression_modes(t)
-    mean_albedo, albedo_modes = skin_model(t.vertices, t.faces[mask], landmarks, 1.0, N_ALBEDO)
+    mean_albedo, albedo_modes = skin_model(t.vertices, t.faces[mask], landmarks, 1.0, N_ALBEDO, t.part == SKIN)
     ball = t.part == EYEBALL
     mean_albedo[ball] = _SCLERA
     mean_albedo[ball & (t.eye_angle < np.radians(28.5))] = _IRIS
     mean_albedo[ball & (t.eye_angle < np.radians(10.5))] = _PUPIL
     mean_albedo[t.part == POUCH] = _POUCH
-    albedo_modes[t.part != SKIN] = 0.0
     return MorphableModel(
         name="builtin:coarse" if coarse else "builtin",
         mean=0.1 * (t.vertices + _PLACE),

@@ -41,7 +41,7 @@ _SLICES = np.array(
 EYE_SLICE, MOUTH_SLICE = 6, 9
 
 # Columns: angle about the vertical axis in degrees, and grid lines to the next one.
-_COLUMNS = np.array([[0, 15], [13, 11], [22, 20], [42, 10], [60, 9], [82, 16], [112, 7], [180, 0]])
+_COLUMNS = np.array([[0, 15], [13, 11], [22, 20], [42, 9], [60, 8], [82, 19], [112, 6], [180, 0]])
 
 EYE = np.array([31.5, 0.0, 71.8])
 EYE_RADIUS = 12.2
@@ -249,8 +249,8 @@ def ears(p: NDArray) -> NDArray:
     half_width = 15.5 + 3.0 * np.clip(v / 31.0, -1, 1)
     radius = np.sqrt((u / half_width) ** 2 + (v / 31.0) ** 2)
     back = smooth_step(u / half_width, -0.9, 0.5)
-    flap = (1 - smooth_step(radius, 0.85, 1.45)) * (np.abs(p[..., 0]) > 40)
-    height = (1.5 + 9.5 * back) * np.sqrt(np.clip(1.0 - (v / 36.0) ** 2, 0.0, 1.0))
+    flap = (1 - smooth_step(radius, 0.82, 1.6)) * (np.abs(p[..., 0]) > 40)
+    height = (1.5 + 8.5 * back) * np.sqrt(np.clip(1.0 - (v / 36.0) ** 2, 0.0, 1.0))
     helix = 2.2 * np.exp(-0.5 * ((radius - 0.86) / 0.12) ** 2) * smooth_step(v, -24, -8)
     scapha = -2.2 * np.exp(-0.5 * ((radius - 0.68) / 0.10) ** 2) * smooth_step(v, -18, -2) * back
     concha = -8.0 * np.exp(-0.5 * (((u + 1.0) / 6.5) ** 2 + ((v + 3.0) / 8.5) ** 2) ** 1.3)

@@ -284,7 +284,7 @@ def _eyeball(rings: NDArray, segments: int) -> tuple[NDArray, NDArray, NDArray]:
     around = np.concatenate([[0.0], np.tile(turn, len(rings) - 1)])
     r = sculpt.EYE_RADIUS
     p = np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], axis=1) * r
-    stretch = np.where(p[:, 0] < 0, 0.28, 0.10)  # reach the eye's corners; the inner one is farther
+    stretch = np.where(p[:, 0] < 0, 0.42, 0.10)  # reach the eye's corners; the inner one is farther
     p[:, 0] *= 1.0 + stretch * sculpt.smooth_step(angle, np.radians(32.0), np.radians(60.0))
     k = 1 + np.arange((len(rings) - 1) * segments).reshape(-1, segments)
     following = np.roll(k, -1, axis=1)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.errors import InputError
-from mifit.morphable.assemble import complete, interleaved, srgb_albedo
+from mifit.morphable.assemble import complete, interleaved, single, srgb_albedo
 from mifit.morphable.formats.mat5 import read_mat
 from mifit.morphable.model import MorphableModel
 
@@ -36,7 +36,7 @@ def load_bfm2009(path: Path, add_expression_mean: bool = False) -> MorphableMode
         mean = mean + mean_offset
     return complete(
         "bfm2009",
-        (mean / 1000.0).reshape(-1, 3).astype(np.float32),
+        single(mean / 1000.0).reshape(-1, 3),
         faces,
         interleaved(data["shapePC"] * (sigma / 1000.0)),
         expression / np.float32(1000.0),

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.errors import InputError
-from mifit.morphable.assemble import complete, interleaved, srgb_albedo
+from mifit.morphable.assemble import complete, interleaved, single, srgb_albedo
 from mifit.morphable.formats.hdf5 import Reader, open_h5
 from mifit.morphable.model import MorphableModel
 from mifit.morphable.topology import oriented_outwards
@@ -44,7 +44,7 @@ def load_bfm_h5(path: Path) -> MorphableModel:
                     albedo = _pca(h5, "diffuseAlbedo", False, n)
     return complete(
         f"bfm:{path.stem}",
-        mean.astype(np.float32),
+        single(mean),
         oriented_outwards(mean, faces),
         identity,
         expression,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mifit.errors import InputError
-from mifit.morphable.assemble import complete, face_area, interleaved, srgb_albedo
+from mifit.morphable.assemble import complete, face_area, interleaved, single, srgb_albedo
 from mifit.morphable.formats.bfm2009 import check_modes, triangles, vector
 from mifit.morphable.formats.mat5 import read_mat
 from mifit.morphable.model import MorphableModel
@@ -34,7 +34,7 @@ def load_deep3d(path: Path) -> MorphableModel:
     texture = vector(path, data["meantex"], "meantex", n3).reshape(-1, 3) / 255.0
     return complete(
         "deep3dfacerecon",
-        mean.astype(np.float32),
+        single(mean),
         faces,
         interleaved(data["idBase"]),
         interleaved(data["exBase"]),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.errors import InputError
-from mifit.morphable.assemble import complete, interleaved
+from mifit.morphable.assemble import complete, interleaved, single
 from mifit.morphable.model import MorphableModel
 from mifit.morphable.topology import oriented_outwards
 
@@ -99,7 +99,7 @@ def load_eos(path: Path) -> MorphableModel:
     # eos stores v from the top
     return complete(
         f"eos:{path.stem}",
-        mean.reshape(-1, 3).astype(np.float32),
+        single(mean).reshape(-1, 3),
         flipped,
         interleaved(modes * sigma),
         interleaved(expression),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mifit.core.uv import sample_map
 from mifit.errors import InputError
-from mifit.morphable.assemble import complete, srgb_albedo
+from mifit.morphable.assemble import complete, single, srgb_albedo
 from mifit.morphable.formats.archive import read_npz
 from mifit.morphable.formats.pickles import plain_array, read_pickle
 from mifit.morphable.model import MorphableModel
@@ -47,10 +47,10 @@ def _build(path: Path, data: dict[str, Any]) -> MorphableModel:
     uv, albedo = _texture(path.parent, mean.shape[0], faces)
     return complete(
         f"flame:{path.stem}",
-        mean.astype(np.float32),
+        single(mean),
         faces,
-        np.ascontiguousarray(directions[:, :, :split], dtype=np.float32),
-        np.ascontiguousarray(directions[:, :, split:], dtype=np.float32),
+        single(directions[:, :, :split]),
+        single(directions[:, :, split:]),
         1000.0,
         albedo=albedo,
         uv=uv,

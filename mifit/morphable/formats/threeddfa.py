@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mifit.errors import InputError
-from mifit.morphable.assemble import complete, interleaved
+from mifit.morphable.assemble import complete, interleaved, single
 from mifit.morphable.formats.bfm2009 import check_modes, triangles, vector
 from mifit.morphable.formats.mat5 import read_mat
 from mifit.morphable.model import MorphableModel
@@ -32,7 +32,7 @@ def load_3ddfa(path: Path) -> MorphableModel:
         mean = mean + vector(beside, extra["mu_exp"], "mu_exp", n3)
     return complete(
         "3ddfa",
-        (mean / 1000.0).reshape(-1, 3).astype(np.float32),
+        single(mean / 1000.0).reshape(-1, 3),
         oriented_outwards(mean.reshape(-1, 3), faces),
         identity,
         expression,

@@ -1,0 +1,132 @@
+"""Registration, models of any template, landmarks found on strange meshes, previews."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from mifit.errors import InputError
+from mifit.morphable import MorphableModel, describe
+from mifit.morphable.landmarks import IBUG_MIRROR, MEDIAPIPE_TO_IBUG68
+from mifit.morphable.register import distance_to_surface, register, rigid_between, rotation_of
+from mifit.morphable.topology import EYES_AND_MOUTH
+from mifit.morphable.unwrap import unwrap
+
+
+@pytest.fixture(scope="module")
+def coarse() -> MorphableModel:
+    return MorphableModel.load("builtin:coarse")
+
+
+@pytest.fixture(scope="module")
+def ict(ict_path) -> MorphableModel:
+    return MorphableModel.load(ict_path)
+
+
+def test_distance_to_surface_is_exact():
+    vertices = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]])
+    points = np.array([[1.0, 1, 3], [-2, 0, 0], [4, 4, 0], [2, -1, 1]])
+    expected = [3.0, 2.0, 4 / np.sqrt(2), np.sqrt(2)]
+    np.testing.assert_allclose(distance_to_surface(points, vertices, np.array([[0, 1, 2]])), expected)
+
+
+def test_rigid_between():
+    rng = np.random.default_rng(0)
+    p = rng.standard_normal((9, 3))
+    r, t = rotation_of(np.array([0.3, -1.0, 0.4])), np.array([1.0, 2, 3])
+    rotation, translation = rigid_between(p, p @ r.T + t)
+    np.testing.assert_allclose(rotation, r, atol=1e-12)
+    np.testing.assert_allclose(translation, t, atol=1e-12)
+
+
+def test_model_registers_to_a_subject_of_its_own(coarse):
+    subject = 10.0 * coarse.shape(coarse.sample(1, 0.7)[0]).astype(float)
+    r = rotation_of(np.array([0.1, 0.2, 0.0]))
+    fit = register(coarse, subject @ r.T + 5.0, coarse.faces, coarse.landmarks, iterations=12)
+    on_face = np.unique(coarse.faces[coarse.face_mask])
+    assert np.linalg.norm(fit.vertices - subject @ r.T - 5.0, axis=1)[on_face].mean() < 1.0
+
+
+def test_builtin_spans_ict_heads(coarse, ict):
+    """Two heads here; benchmarks/register_builtin.py takes twenty."""
+    on_face = np.unique(coarse.faces[coarse.face_mask])
+    for seed in (100, 101):
+        head = 10.0 * ict.shape(ict.sample(seed)[0]).astype(float)
+        fit = register(coarse, head, ict.faces, ict.landmarks)
+        assert distance_to_surface(fit.vertices[on_face], head, ict.faces).mean() < 2.0
+
+
+def test_landmarks_are_found_on_a_mesh_without_any(ict):
+    from mifit.morphable.assemble import transfer_landmarks
+
+    found = transfer_landmarks(10.0 * ict.mean.astype(float), ict.faces)
+    error = 10.0 * np.linalg.norm(ict.mean[found] - ict.mean[ict.landmarks], axis=1)
+    assert np.median(error) < 6.0
+    for ring in EYES_AND_MOUTH:
+        assert error[list(ring)].mean() < 8.0
+
+
+def test_template_becomes_a_model(coarse):
+    m = MorphableModel.from_template((coarse.mean, coarse.faces), landmarks=coarse.landmarks, modes=20)
+    assert (m.n_identity, m.n_expression, m.n_albedo) == (20, 30, 60)
+    np.testing.assert_array_equal(m.mean, coarse.mean)
+    assert m.symmetry is not None
+    v = 10 * (m.shape(m.sample(0)[0]) - m.mean)
+    assert 1.0 < np.linalg.norm(v, axis=1).mean() < 20.0
+    assert (m.albedo() > 0).all()
+    with pytest.raises(InputError, match=r"mesh is a str, expected \(vertices, faces\)"):
+        MorphableModel.from_template("x")
+    with pytest.raises(InputError, match="68 indices"):
+        MorphableModel.from_template((coarse.mean, coarse.faces), landmarks=np.arange(5))
+    kernels = ((60.0, 20, (3.0, 3.0, 3.0)),)
+    smooth = MorphableModel.from_template((coarse.mean, coarse.faces), coarse.landmarks, kernels, modes=10)
+    assert smooth.n_identity == 10
+
+
+def test_unwrapping_is_one_to_one(coarse):
+    uv, corners = unwrap(coarse.mean.astype(float), coarse.faces, coarse.face_mask)
+    t = uv[corners[coarse.face_mask]].astype(float)
+    a, b = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
+    area = 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    assert (area > -1e-9).all()
+    assert area.sum() == pytest.approx(0.98**2, rel=0.02)  # fills the square but for the holes, once
+
+
+def test_unwrapping_of_what_is_no_disc():
+    two = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [3, 0, 0], [4, 0, 0], [3, 1, 0]])
+    uv, corners = unwrap(two, np.array([[0, 1, 2], [3, 4, 5]]), np.array([True, True]))
+    assert corners.shape == (2, 3) and 0 <= uv.min() and uv.max() <= 1
+    assert len(np.unique(uv[corners].reshape(-1, 2), axis=0)) == 6
+
+
+def test_landmark_maps():
+    assert MEDIAPIPE_TO_IBUG68.shape == (68,) and MEDIAPIPE_TO_IBUG68.max() < 468
+    np.testing.assert_array_equal(IBUG_MIRROR[IBUG_MIRROR], np.arange(68))
+
+
+def test_info_names_what_is_odd(coarse):
+    text = describe.model_info(coarse)
+    assert "identity          100 modes" in text and "79 bounded" in text and coarse.digest in text
+    assert "notice" not in text
+    skewed = coarse.identity[:, :, :2].copy()
+    skewed[:, :, 1] += skewed[:, :, 0]
+    import dataclasses
+
+    odd = dataclasses.replace(coarse, identity=skewed, faces=np.r_[coarse.faces[:-1], [[5, 5, 6]]])
+    assert describe.notices(odd)[0].startswith("1 faces of the mean have no area")
+    assert "identity modes are not orthogonal" in describe.notices(odd)[1]
+
+
+def test_preview_shows_a_head_on_white(coarse, tmp_path):
+    describe.save_preview(coarse, tmp_path / "p.png", modes=1)
+    image = cv2.imread(str(tmp_path / "p.png"))
+    assert image.shape == (660, 880, 3)
+    first = image[:220, :220].astype(int)
+    assert (first[:5, :5] == 255).all()
+    middle = first[100:120, 100:120].reshape(-1, 3).mean(0)
+    assert middle[2] > middle[1] > middle[0] > 20  # skin: red over green over blue
+    minus, plus = image[:220, 660:880].astype(int), image[220:440, 660:880].astype(int)
+    assert np.abs(minus - plus).max() > 40  # the first albedo mode at -2 and +2
+    with pytest.raises(InputError, match=r"expected \.png"):
+        describe.save_preview(coarse, tmp_path / "p.txt", modes=1)
