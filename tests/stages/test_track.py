@@ -196,18 +196,17 @@ def reload(folder):
 
 
 def test_each_frame_is_on_disk_when_it_is_done(scene, fit_truth, saved, monkeypatch):
-    from mifit.output import folder as folder_module
-    from mifit.output.tracking import track_into
+    from mifit.output import tracking
 
     seen = []
-    write = folder_module.add_timestep
+    write = tracking.add_timestep
 
     def watch(result, folder, timestep):
         write(result, folder, timestep)
         seen.append(reload(folder).timesteps)
 
-    monkeypatch.setattr(folder_module, "add_timestep", watch)
-    track_into(saved, reload(saved), scene, (1, 2), CONFIG)
+    monkeypatch.setattr(tracking, "add_timestep", watch)
+    tracking.track_into(saved, reload(saved), scene, (1, 2), CONFIG)
     assert seen == [(0, 1), (0, 1, 2)]
     for t in (1, 2):
         assert (saved / "geometry" / f"{t:04d}.ply").is_file()
@@ -220,17 +219,17 @@ def test_a_killed_run_resumes_to_the_same_result(scene, fit_truth, saved, tmp_pa
     import shutil
 
     from mifit.output import folder as folder_module
-    from mifit.output.tracking import track_into
+    from mifit.output import tracking
 
     whole = tmp_path / "whole"
     shutil.copytree(saved, whole)
-    expected = track_into(whole, reload(whole), scene, (1, 2), CONFIG)
+    expected = tracking.track_into(whole, reload(whole), scene, (1, 2), CONFIG)
 
     class Killed(BaseException):
         pass
 
     count = [0]
-    document, write = folder_module.write_text, folder_module.add_timestep
+    document, write = folder_module.write_text, tracking.add_timestep
 
     def die(*arguments):
         if count[0] == killed_after:
@@ -240,10 +239,13 @@ def test_a_killed_run_resumes_to_the_same_result(scene, fit_truth, saved, tmp_pa
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
         # before: no file of the frame; between: its maps are there, result.json doesn't name it yet
-        patch.setattr(folder_module, "add_timestep" if moment == "before" else "write_text", die)
-        track_into(saved, reload(saved), scene, (1, 2), CONFIG)
+        if moment == "before":
+            patch.setattr(tracking, "add_timestep", die)
+        else:
+            patch.setattr(folder_module, "write_text", die)
+        tracking.track_into(saved, reload(saved), scene, (1, 2), CONFIG)
     assert len(reload(saved).timesteps) == 1 + killed_after
-    track_into(saved, reload(saved), scene, (1, 2), CONFIG, resume=True)
+    tracking.track_into(saved, reload(saved), scene, (1, 2), CONFIG, resume=True)
     found = reload(saved)
     assert found.timesteps == expected.timesteps == (0, 1, 2)
     assert_array_equal(found.geometry.vertices, reload(whole).geometry.vertices)
