@@ -110,6 +110,7 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--calibration", type=Path, help="OpenCV stereo calibration, YAML or XML")
     p.add_argument("--colmap", type=Path, help="folder with cameras.txt and images.txt")
     p.add_argument("--transforms", type=Path, help="nerfstudio transforms.json")
+    p.add_argument("--units", default="cm", help="unit of length of the calibration: mm, cm or m (default: cm)")
     p.add_argument("--every", type=_at_least(1), default=1, help="keep every N-th frame")
     p.add_argument("--start", type=_at_least(0), default=0, help="first frame")
     p.add_argument("--count", type=_at_least(1), help="number of frames to keep")
@@ -117,7 +118,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     p = add("landmarks", "detect 68 landmarks in every image and write them into the capture")
     p.add_argument("capture", type=Path)
-    p.add_argument("--detector", help="mediapipe, face-alignment or lbf; default: the first that is there")
+    p.add_argument("--detector", help="mediapipe, face-alignment or lbf:FOLDER; default: the first that is there")
 
     p = add("fit", "fit geometry, reflectance and normals to a capture")
     p.add_argument("capture", type=Path)

@@ -130,6 +130,7 @@ def import_(arguments: Namespace) -> None:
         every=arguments.every,
         start=arguments.start,
         count=arguments.count,
+        units=arguments.units,
         progress=console_progress(arguments.quiet),
     )
     print(f"Capture: {arguments.out}")

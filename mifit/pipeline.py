@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 Stage = Literal["geometry", "reflectance", "normals"]
 STAGES: tuple[Stage, ...] = ("geometry", "reflectance", "normals")
 T = TypeVar("T")
+ESTIMATED_CAMERAS = "the capture is uncalibrated: focal length, camera poses and so the scale are estimates"
+CALIBRATION_MODES = 30
+"""Identity modes that may move with the cameras when those are estimated from landmarks."""
 
 
 def fit(
@@ -86,9 +89,13 @@ def fit(
     if until not in STAGES:
         raise InputError(f"until: found {until!r}, expected one of {', '.join(STAGES)}")
     folder = None if checkpoints is None else Path(checkpoints)
+    digest = capture.digest(cameras, timesteps)
+    known_cameras = capture.calibrated
+    if not known_cameras:
+        capture = calibrated(capture, model, cameras, timesteps)
     inputs = {
         "version": mifit.__version__,
-        "capture": capture.digest(cameras, timesteps),
+        "capture": digest,
         "model": model.digest,
         "cameras": list(cameras),
         "timesteps": list(timesteps),
@@ -142,12 +149,22 @@ def fit(
         normals=normals,
         config={**settings, "seed": seed},
         cameras=tuple(capture.camera(name) for name in cameras),
-        capture_digest=inputs["capture"],
+        capture_digest=digest,
         units=capture.units,
         unit_mm=capture.unit_mm,
+        warnings=() if known_cameras else (ESTIMATED_CAMERAS,),
         seconds=sum(s.report.seconds for s in (geometry, reflectance, normals) if s is not None),
         peak_memory=peak_memory(),
     )
+
+
+def calibrated(capture: Capture, model: MorphableModel, cameras: Sequence[str], timesteps: Sequence[int]) -> Capture:
+    """An uncalibrated capture with cameras estimated from its landmarks and the model's."""
+    from mifit.capture.calibrate import calibrate
+
+    scale = model.unit_mm / capture.unit_mm
+    mean, modes = model.mean[model.landmarks], model.identity[model.landmarks][..., :CALIBRATION_MODES]
+    return calibrate(capture, scale * mean, scale * modes, cameras, timesteps)
 
 
 def choose(kind: str, known: Sequence[T], wanted: Sequence[T] | None, default: int) -> tuple[T, ...]:
