@@ -26,7 +26,7 @@ import mifit
 from mifit import checkpoint
 from mifit.config import GeometryConfig, NormalsConfig, ReflectanceConfig, from_mapping, read_toml
 from mifit.core.files import replacing, write_text
-from mifit.errors import InputError
+from mifit.errors import InputError, MifitError
 from mifit.progress import Progress, silent
 
 FORMAT_VERSION = 1
@@ -421,7 +421,9 @@ def run_experiment(
     Raises
     ------
     InputError
-        Bad file or input, before anything runs, or runs that failed (after all others have finished).
+        Bad file or input, before anything runs.
+    MifitError
+        Runs that failed, after all others have finished.
     """
     plan = load_plan(path, overrides, seed)
     folder = Path(out) if out is not None else Path("out") / plan.name
@@ -436,7 +438,7 @@ def run_experiment(
     summary = _summary(plan, folder)
     write_text(folder / "summary.md", summary + "\n")
     if failures:
-        raise InputError(f"{len(failures)} of {total} runs failed; the others are in {folder}; " + "; ".join(failures))
+        raise MifitError(f"{len(failures)} of {total} runs failed; the others are in {folder}; " + "; ".join(failures))
     return summary
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mifit.errors import InputError
+from mifit.errors import InputError, MifitError
 from mifit.experiment import finished, load_plan, run_experiment
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
@@ -123,7 +123,7 @@ def test_a_failing_run_is_named_and_the_others_finish(done, tmp_path):
     path = write(tmp_path)
     text = path.read_text().replace('"render.parameters.exponent" = [5, 50]', '"render.spp" = [4, 2]')
     path.write_text(text.replace('integrator = "shdirect"', 'integrator = "shdirect", exponent = "many"'))
-    with pytest.raises(InputError, match="2 of 2 runs failed") as error:
+    with pytest.raises(MifitError, match="2 of 2 runs failed") as error:
         run_experiment(path, out=tmp_path / "out", variant="llvm_ad_rgb")
     assert "many" in str(error.value)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 
@@ -11,10 +12,11 @@ from scipy.spatial.transform import Rotation
 
 import mifit
 from mifit.core.estimate import NormalsEstimate
-from mifit.core.image import to_8_bit
+from mifit.core.image import to_8_bit, write_image
 from mifit.core.metrics import psnr
 from mifit.errors import InputError
 from mifit.output.export import export
+from mifit.output.relight import write_relit
 from mifit.output.scene import write_scene
 from mifit.output.surface import surface_maps
 from mifit.render.scene_image import render_scene
@@ -109,6 +111,15 @@ def test_relit_scene_is_lit_by_the_environment(flat, variant, tmp_path):
     assert correlation > 0.95
     write_scene(lit, tmp_path / "lit.xml", 0)
     assert 'type="envmap"' in (tmp_path / "lit.xml").read_text()
+
+
+def test_relit_views_are_written_fast_and_path_traced(flat, variant, tmp_path):
+    write_image(tmp_path / "studio.hdr", smooth_environment())
+    figures = write_relit(flat, tmp_path / "studio.hdr", tmp_path / "out", rotate=20, samples=64)
+    names = {f"{c}_{kind}.png" for c in ("left", "right") for kind in ("fast", "path", "difference")}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == names | {"relight.png", "relight.json"}
+    assert json.loads((tmp_path / "out" / "relight.json").read_text()) == {"rotate": 20, **figures}
+    assert 25 < figures["psnr"] < 60
 
 
 def test_saved_result_has_a_scene_that_load_scene_renders(ball, variant, tmp_path):
