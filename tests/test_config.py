@@ -10,10 +10,10 @@ def test_defaults_are_the_papers():
     config = FitConfig()
     assert config.geometry.landmark_weight == 10
     assert config.geometry.prior_weight == 5e-5
-    assert config.reflectance.exponent == 5
+    assert config.reflectance.exponent is None  # 5 for the paper's shading, estimated otherwise
     assert config.reflectance.specular_difference_weight == 0.1
     assert config.reflectance.smoothness_weight == 0.001
-    assert (config.normals.laplacian_weight, config.normals.magnitude_weight) == (1e-3, 0.3)
+    assert config.normals.laplacian_weight == 1e-3
 
 
 def test_nested_values_and_integers_for_floats():
