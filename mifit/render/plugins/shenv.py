@@ -237,6 +237,9 @@ def make() -> type:
             )
 
     def _entry(flat: Any, index: int) -> Any:
-        return dr.gather(mi.Float, flat, index) if dr.is_jit_v(mi.Float) else flat[index]
+        if not dr.is_jit_v(mi.Float):
+            return flat[index]
+        # All points add to these few gradients: in copies per thread, or they would wait for one another.
+        return dr.gather(mi.Float, flat, mi.UInt32(index), mode=dr.ReduceMode.Expand)
 
     return SHEnvironment
