@@ -120,9 +120,10 @@ def main() -> int:
         for label, config in runs.items():
             rows[f"{name}/{label}"] = run(name, config, model)
             print(name, label, rows[f"{name}/{label}"], file=sys.stderr, flush=True)
-    record("reflectance", {"size": a.size, "adam_size": a.adam_size, "rows": rows})
-    write_text(RESULTS / "reflectance.md", markdown(rows))
-    plot(rows, RESULTS / "reflectance.png")
+        # After each capture, so that a run that is broken off leaves what it measured.
+        record("reflectance", {"size": a.size, "adam_size": a.adam_size, "rows": rows})
+        write_text(RESULTS / "reflectance.md", markdown(rows))
+        plot(rows, RESULTS / "reflectance.png")
     print(markdown(rows))
     return 0
 
