@@ -103,8 +103,10 @@ def test_the_prefiltered_lobe_is_the_path_traced_one(exponent: float) -> None:
 
 def test_the_image_does_not_depend_on_the_seed() -> None:
     scene = make_scene(ball(), {"type": "blinnphong"}, LIGHTS["positive"], rfilter="gaussian")
-    assert np.array_equal(render(scene, 4, seed=0), render(scene, 4, seed=9))
-    assert np.array_equal(render(scene, 1, seed=0), render(scene, 1, seed=9))
+    for samples in (1, 4):
+        one, other = render(scene, samples, seed=0), render(scene, samples, seed=9)
+        # Threads add samples to the film in any order, so that even one seed's images differ by rounding.
+        assert np.abs(one - other).max() < 1e-5 * one.max()
 
 
 def test_the_background_is_the_emitter() -> None:

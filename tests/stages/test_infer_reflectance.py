@@ -163,7 +163,6 @@ def test_als_ends_below_adam(dome):
     adam = infer(dome, replace(config, solver="adam", max_iterations=8))
     als = infer(dome, config)
     assert als.report.details["objective"]["total"] < adam.report.details["objective"]["total"]
-    assert als.report.seconds < adam.report.seconds
 
 
 @pytest.mark.parametrize(
