@@ -37,7 +37,7 @@ notebooks:
 
 docs:
 	@.ci/setup docs
-	$(BIN)/mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 lint:
 	@.ci/setup test

@@ -1,36 +1,37 @@
-"""A fit that is killed goes on, and ends with what an uninterrupted one gives."""
+"""A fit or a tracking run that is killed goes on, and ends with what an uninterrupted one gives."""
 
 import json
 import random
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mifit.core.image import read_image
 
-
-def command(capture, out, config, *more):
-    return [
-        sys.executable, "-m", "mifit", "fit", str(capture), "--out", str(out), "--model", "builtin:coarse",
-        "--timesteps", "0", "--config", str(config), "--quiet", *more,
-    ]  # fmt: skip
+CONFIG = '[reflectance]\ntexture_size = 64\nshading = "prefiltered"\nexponent = 100\n'
 
 
-@pytest.mark.slow
-def test_killed_at_random_moments_and_resumed(tiny_capture, tmp_path):
-    config = tmp_path / "c.toml"
-    config.write_text('[reflectance]\ntexture_size = 64\nshading = "prefiltered"\nexponent = 100\n')
+def mifit(*arguments):
+    return [sys.executable, "-m", "mifit", *map(str, arguments), "--quiet"]
+
+
+def timed(command):
     started = time.perf_counter()
-    subprocess.run(command(tiny_capture, tmp_path / "whole", config), check=True, capture_output=True)
-    seconds = time.perf_counter() - started
+    subprocess.run(command, check=True, capture_output=True)
+    return time.perf_counter() - started
 
-    kills, chance = 0, random.Random(4)
+
+def kill_and_resume(command, seconds, seed):
+    """Kill -9 up to three runs at random moments of their expected time, then let one end."""
+    kills, chance = 0, random.Random(seed)
     while kills < 3:
-        process = subprocess.Popen(command(tiny_capture, tmp_path / "killed", config, "--resume"))
+        process = subprocess.Popen(command)
         try:
             process.wait(chance.uniform(0.3, 0.95) * seconds)
             break  # it was faster this time
@@ -39,12 +40,39 @@ def test_killed_at_random_moments_and_resumed(tiny_capture, tmp_path):
             process.wait()
             kills += 1
     assert kills
-    subprocess.run(command(tiny_capture, tmp_path / "killed", config, "--resume"), check=True, capture_output=True)
+    subprocess.run(command, check=True, capture_output=True)
 
-    whole, again = (json.loads((tmp_path / name / "result.json").read_text()) for name in ("whole", "killed"))
-    np.testing.assert_allclose(again["lighting"]["radiance"], whole["lighting"]["radiance"], atol=1e-3)
-    np.testing.assert_allclose(again["timesteps"][0]["translation"], whole["timesteps"][0]["translation"], atol=1e-4)
-    for name in ("diffuse", "specular", "normal_object_0000"):
-        a, b = (read_image(tmp_path / folder / "maps" / f"{name}.exr") for folder in ("whole", "killed"))
-        assert np.abs(np.asarray(a) - np.asarray(b)).max() < 5e-3, name
-    assert not list((tmp_path / "killed").glob("**/.*.part*"))
+
+def assert_equal_results(one: Path, other: Path, timesteps):
+    a, b = (json.loads((folder / "result.json").read_text()) for folder in (one, other))
+    assert [t["timestep"] for t in a["timesteps"]] == [t["timestep"] for t in b["timesteps"]] == timesteps
+    np.testing.assert_allclose(a["lighting"]["radiance"], b["lighting"]["radiance"], atol=1e-3)
+    for s, t in zip(a["timesteps"], b["timesteps"], strict=True):
+        np.testing.assert_allclose(s["translation"], t["translation"], atol=1e-3)
+    for name in ("diffuse", "specular", *(f"normal_object_{t:04d}" for t in timesteps)):
+        x, y = (np.asarray(read_image(folder / "maps" / f"{name}.exr")) for folder in (one, other))
+        assert np.abs(x - y).max() < 5e-3, name
+    assert not list(other.glob("**/.*.part*"))
+
+
+@pytest.mark.slow
+def test_killed_at_random_moments_and_resumed(tiny_capture, tmp_path):
+    config, whole, killed = tmp_path / "c.toml", tmp_path / "whole", tmp_path / "killed"
+    config.write_text(CONFIG)
+
+    def fit(out, *more):
+        options = ("--model", "builtin:coarse", "--timesteps", "0", "--config", config)
+        return mifit("fit", tiny_capture, "--out", out, *options, *more)
+
+    def track(result, *more):
+        return mifit("track", tiny_capture, "--result", result, "--timesteps", "1,2", *more)
+
+    seconds = timed(fit(whole))
+    kill_and_resume(fit(killed, "--resume"), seconds, seed=4)
+    assert_equal_results(whole, killed, [0])
+
+    shutil.rmtree(killed)
+    shutil.copytree(whole, killed)
+    seconds = timed(track(whole))
+    kill_and_resume(track(killed, "--resume"), seconds, seed=5)
+    assert_equal_results(whole, killed, [0, 1, 2])
