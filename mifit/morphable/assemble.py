@@ -6,6 +6,7 @@ unwrapping of the face area, the albedo from the pigment model.
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,8 @@ from mifit.morphable.pigment import skin_model
 from mifit.morphable.topology import adjacency, mirror_map, opening_faces
 from mifit.morphable.unwrap import unwrap
 
+_HERE = Path(__file__).parent
+_CODE = b"".join((_HERE / f).read_bytes() for f in ("assemble.py", "gaussian_process.py", "pigment.py", "unwrap.py"))
 N_ALBEDO = 60
 """Albedo modes of the pigment model where a file has no albedo."""
 
@@ -57,6 +60,7 @@ def complete(
         The model's file: a file ``<name>.landmarks.json`` beside it (68 vertex indices) takes precedence over
         landmarks found or given.
     """
+    computed = albedo is None or uv is None or landmarks is None
     if source is not None:
         beside = source.parent / f"{source.name}.landmarks.json"
         if beside.is_file():
@@ -91,7 +95,17 @@ def complete(
         unit_mm=unit_mm,
         expression_names=expression_names,
         expression_bounds=expression_bounds,  # type: ignore[arg-type]
+        fingerprint=fingerprint(mean, faces, identity, expression, landmarks) if computed else "",
     )
+
+
+def fingerprint(*arrays: NDArray) -> str:
+    """Identify a model by the arrays that were read and the code that computes the others from them."""
+    h = hashlib.blake2b(_CODE, digest_size=16)
+    for array in arrays:
+        h.update(f"{array.shape}{array.dtype}".encode())
+        h.update(np.ascontiguousarray(array).data)
+    return h.hexdigest()
 
 
 def check_mesh(name: str, mean: NDArray, faces: NDArray, landmarks: NDArray | None) -> None:

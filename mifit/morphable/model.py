@@ -54,6 +54,9 @@ class MorphableModel:
         One name per expression mode.
     expression_bounds : (Ke, 2) float32
         Lower and upper bounds of each expression coefficient; infinite when free.
+    fingerprint : str
+        What identifies a model whose arrays are partly computed: sums repeat only to rounding (their order depends
+        on threads and memory), so its bytes can't. Empty for a model that is known by its content.
 
     Raises
     ------
@@ -76,6 +79,7 @@ class MorphableModel:
     unit_mm: float = 10.0
     expression_names: tuple[str, ...] = ()
     expression_bounds: NDArray[np.float32] = None  # type: ignore[assignment]
+    fingerprint: str = ""
 
     def __post_init__(self) -> None:
         v, f = len(np.atleast_1d(self.mean)), len(np.atleast_1d(self.faces))
@@ -242,6 +246,7 @@ class MorphableModel:
             albedo_modes=np.ascontiguousarray(self.albedo_modes[:, :, a]),
             expression_names=self.expression_names[e],
             expression_bounds=self.expression_bounds[e],
+            fingerprint="",
             face_mask=self.face_mask if region is None else self.face_mask & region,
         )
 
@@ -253,7 +258,9 @@ class MorphableModel:
 
     @cached_property
     def digest(self) -> str:
-        """Hexadecimal digest of all content but the name."""
+        """Hexadecimal digest of all content but the name, or the fingerprint of a model that has one."""
+        if self.fingerprint:
+            return self.fingerprint
         h = hashlib.blake2b(digest_size=16)
         for f in fields(self):
             value = getattr(self, f.name)

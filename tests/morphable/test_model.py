@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -128,3 +131,19 @@ def test_degenerate_faces_are_reported():
     faces[7] = (3, 3, 4)
     assert small_model(faces=faces).degenerate_faces.tolist() == [7]
     assert small_model().degenerate_faces.size == 0
+
+
+def test_digest_of_a_computed_model_does_not_depend_on_threads(ict_path):
+    """Results are refused for another model, so the digest must be the same in every process."""
+    code = f"import mifit; print(mifit.MorphableModel.load({str(ict_path)!r}).digest)"
+    digests = {
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "OPENBLAS_NUM_THREADS": threads},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for threads in ("1", "2")
+    }
+    assert len(digests) == 1

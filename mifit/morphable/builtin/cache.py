@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -28,7 +29,7 @@ def builtin_model(coarse: bool = False) -> MorphableModel:
             return load_own(path)
         except InputError:
             pass  # damaged: make it anew and replace it
-    model = make_head(coarse)
+    model = replace(make_head(coarse), fingerprint=path.stem)
     try:
         for stale in path.parent.glob(f"{path.name.rsplit('-', 1)[0]}-*.npz"):
             stale.unlink(missing_ok=True)

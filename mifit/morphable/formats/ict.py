@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.errors import InputError
-from mifit.morphable.assemble import N_ALBEDO, check_mesh
+from mifit.morphable.assemble import N_ALBEDO, check_mesh, fingerprint
 from mifit.morphable.formats.archive import read_npz
 from mifit.morphable.model import MorphableModel
 from mifit.morphable.pigment import skin_model
@@ -184,4 +184,5 @@ def assemble_ict(
         unit_mm=10.0,
         expression_names=expression_names,
         expression_bounds=np.tile(np.array([0.0, bound], dtype=np.float32), (len(expression_names), 1)),
+        fingerprint=fingerprint(mean, faces, identity, expression, landmarks, uv),
     )

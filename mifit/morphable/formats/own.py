@@ -44,7 +44,7 @@ def load_own(path: Path) -> MorphableModel:
     if version.shape != () or version != _VERSION:
         raise InputError(f"{path}: {FORMAT_KEY} version {version}, expected {_VERSION}")
     known = {f.name for f in fields(MorphableModel)}
-    missing = sorted(known - {"symmetry"} - set(data))
+    missing = sorted(known - {"symmetry", "fingerprint"} - set(data))
     if missing:
         raise InputError(f"{path}: lacks {', '.join(missing)}; expected every field of a mifit model")
     unit = data["unit_mm"]
@@ -52,6 +52,7 @@ def load_own(path: Path) -> MorphableModel:
         raise InputError(f"{path}: unit_mm is {unit}, expected a number")
     values: dict = {k: v for k, v in data.items() if k in known}
     values["name"] = str(data["name"])
+    values["fingerprint"] = str(data.get("fingerprint", ""))
     values["unit_mm"] = float(unit)
     values["expression_names"] = tuple(str(n) for n in data["expression_names"].ravel())
     return MorphableModel(**values)
