@@ -153,6 +153,7 @@ def fit(arguments: Namespace) -> None:
     config = FitConfig.load(arguments.config) if arguments.config else FitConfig()
     capture = mifit.Capture.load(arguments.capture)
     model = mifit.MorphableModel.load(arguments.model)
+    out.mkdir(parents=True, exist_ok=True)  # a place that can't be written is refused now, not after the fit
     _use_variant(arguments)
     from mifit.output.report import write_report
 
