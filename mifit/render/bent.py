@@ -1,12 +1,108 @@
-"""Shading of a surface with refined normals, by the same function that refined them."""
+"""Shading of a surface whose normals are bent away from the mesh's: for renders and for the solver that bends them."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.estimate import ReflectanceEstimate
-from mifit.render.refine import NormalView, material_shade
+from mifit.errors import InputError
+from mifit.render import shading
+
+Shade = Callable[[Any, Any, int], Any]
+"""Normals, view directions (Dr.Jit vectors), number of the view -> radiance (Color3f) of the texels."""
+
+
+@dataclass(frozen=True)
+class NormalView:
+    """What one image says about N texels.
+
+    Attributes
+    ----------
+    colour : (N, 3)
+        Linear image colour.
+    weight : (N,)
+        Weight of the squared residual; 0 where the image doesn't measure the texel.
+    direction : (N, 3)
+        Unit vectors towards the camera.
+    normal : (N, 3), tangents : (N, 2, 3)
+        Base normals and tangents when the image was taken, world space.
+    """
+
+    colour: NDArray
+    weight: NDArray
+    direction: NDArray
+    normal: NDArray
+    tangents: NDArray
+
+
+def material_shade(
+    reflectance: ReflectanceEstimate,
+    diffuse: NDArray,
+    specular: NDArray,
+    views: Sequence[NormalView],
+    traced: Sequence[NDArray] | None = None,
+) -> Shade:
+    """Shading of texels by the model that stage 2 estimated them with.
+
+    Parameters
+    ----------
+    reflectance : ReflectanceEstimate
+        Lighting, exponent and shading model; its maps aren't used.
+    diffuse : (N, 3), specular : (N,)
+        Albedos of the texels.
+    views : sequence of NormalView
+    traced : sequence of (N, B*B), optional
+        Per view the shadowed diffuse transfer at the base normal, for the ``shadowed`` model.
+
+    Notes
+    -----
+    Shadows are traced for the base normal. For a bent one the unshadowed change is added, dimmed by the part of the
+    light that reaches the point, and the lobe keeps its dimming.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    albedo = vector(mi.Color3f, diffuse)
+    gloss = mi.Float(np.ascontiguousarray(specular, dtype=np.float32))
+    coefficients = [mi.Color3f(*map(float, row)) for row in reflectance.radiance]
+    ambient = mi.Float(float(reflectance.ambient))
+    dr.make_opaque(coefficients, ambient)
+    order = round(len(coefficients) ** 0.5)
+    model = reflectance.shading_model
+    exponent: Any = float(reflectance.exponent)
+    if model != "paper":
+        exponent = shading.lobe(exponent, order, fresnel=reflectance.fresnel)
+    shadows: list[tuple[Any, Any, Any]] = []
+    if model == "shadowed":
+        if traced is None:
+            raise InputError("shading model 'shadowed': found no transfer vectors, expected those of trace_transfer")
+        for view, rows in zip(views, traced, strict=True):
+            columns = [mi.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in np.asarray(rows).T]
+            lit = shading.radiance(columns, coefficients)
+            n, v = vector(mi.Vector3f, view.normal), vector(mi.Vector3f, view.direction)
+            open_sky = shading.radiance(shading.diffuse_transfer(n, order), coefficients)
+            open_light = dr.maximum(mi.luminance(open_sky), 1e-6)
+            passed = dr.clip(mi.luminance(lit) / open_light, 0.0, 1.0)
+            axis, _ = shading.lobe_axis(n, v, exponent)
+            glint = shading.unoccluded(n, axis, columns, order)
+            base = lit - passed * open_sky
+            dr.eval(base, passed, glint)
+            shadows.append((base, passed, glint))
+
+    def shade(n: Any, v: Any, view: int) -> Any:
+        if model != "shadowed":
+            body, glint = shading.shade(n, v, coefficients, exponent, model)
+            return ambient + albedo * body + gloss * glint
+        base, passed, dimmed = shadows[view]
+        body, glint = shading.shade(n, v, coefficients, exponent, "prefiltered")
+        return ambient + albedo * (base + passed * body) + gloss * dimmed * glint
+
+    return shade
 
 
 def shade_bent(
@@ -41,8 +137,13 @@ def shade_bent(
         return np.zeros((0, 3), np.float32)
     nothing = np.zeros(count, np.float32)
     points = NormalView(nothing, nothing, view, base, nothing)
-    n, v = (mi.Vector3f(np.ascontiguousarray(x.T, dtype=np.float32)) for x in (normals, view))
+    n, v = vector(mi.Vector3f, normals), vector(mi.Vector3f, view)
     shade = material_shade(reflectance, diffuse, specular, [points], None if traced is None else [traced])
     colour = mi.Color3f(shade(n, v, 0))
     dr.eval(colour)
     return np.stack([np.array(c, dtype=np.float32) for c in (colour.x, colour.y, colour.z)], axis=1)
+
+
+def vector(kind: Any, values: NDArray) -> Any:
+    """(N, 3) array -> Dr.Jit vector."""
+    return kind(np.ascontiguousarray(np.asarray(values, dtype=np.float32).T))

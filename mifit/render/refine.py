@@ -9,48 +9,21 @@ Dr.Jit between iterations; the host reads one number per iteration, the energy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.estimate import ReflectanceEstimate
-from mifit.errors import InputError
 from mifit.progress import Progress, silent
-from mifit.render import shading
-
-Shade = Callable[[Any, Any, int], Any]
-"""Normals, view directions (Dr.Jit vectors), number of the view -> radiance (Color3f) of the texels."""
+from mifit.render.bent import NormalView, Shade, vector
+from mifit.render.pairs import bend, bend_jacobian, conjugate_gradients, solve_blocks
 
 L1_FLOOR = 1e-4
 """Radians below which the L1 norm is rounded off: sqrt(c^2 + floor^2); its reweighting stays finite."""
 FACING = 0.05
 """Smallest cosine between a refined normal and the direction to a camera that measures it."""
-
-
-@dataclass(frozen=True)
-class NormalView:
-    """What one image says about N texels.
-
-    Attributes
-    ----------
-    colour : (N, 3)
-        Linear image colour.
-    weight : (N,)
-        Weight of the squared residual; 0 where the image doesn't measure the texel.
-    direction : (N, 3)
-        Unit vectors towards the camera.
-    normal : (N, 3), tangents : (N, 2, 3)
-        Base normals and tangents when the image was taken, world space.
-    """
-
-    colour: NDArray
-    weight: NDArray
-    direction: NDArray
-    normal: NDArray
-    tangents: NDArray
 
 
 @dataclass(frozen=True)
@@ -108,9 +81,9 @@ class NormalProblem:
         self._degree = sum(dr.select(n != dr.arange(mi.UInt32, self._count), mi.Float(1), 0) for n in self._near)
         self._views = [
             (
-                _vector(mi.Color3f, v.colour),
+                vector(mi.Color3f, v.colour),
                 mi.Float(np.ascontiguousarray(v.weight, dtype=np.float32)),
-                _vector(mi.Vector3f, v.direction),
+                vector(mi.Vector3f, v.direction),
                 _frame(v.normal, v.tangents),
             )
             for v in views
@@ -121,7 +94,7 @@ class NormalProblem:
         self._w1 = dr.opaque(mi.Float, float(laplacian_weight))
         self._w2 = dr.opaque(mi.Float, float(magnitude_weight))
         self._huber = dr.opaque(mi.Float, float(huber))
-        self._aim = _vector(mi.Vector3f, np.zeros((self._count, 3)) if aim is None else aim)
+        self._aim = vector(mi.Vector3f, np.zeros((self._count, 3)) if aim is None else aim)
         dr.eval(self._degree, self._aim)
 
     def energies(self, offsets: NDArray) -> dict[str, float]:
@@ -130,7 +103,7 @@ class NormalProblem:
 
     def normals(self, offsets: NDArray, view: int) -> NDArray[np.float32]:
         """(N, 3) refined normals in the frame of one view, world space."""
-        return np.array(_bend(self._views[view][3], *self._load(offsets))).T
+        return np.array(bend(self._views[view][3], *self._load(offsets))).T
 
     def gauss_newton(
         self,
@@ -225,7 +198,7 @@ class NormalProblem:
         import drjit as dr
 
         colour, weight, direction, frame = self._views[view]
-        residual = colour - self._shade(_bend(frame, a, b), direction, view)
+        residual = colour - self._shade(bend(frame, a, b), direction, view)
         return self._penalty(weight, dr.squared_norm(residual))
 
     def _penalty(self, weight: Any, square: Any) -> Any:
@@ -240,7 +213,7 @@ class NormalProblem:
     def _magnitude(self, a: Any, b: Any) -> Any:
         import drjit as dr
 
-        return self._w2 * dr.squared_norm(_bend(self._base, a, b) - self._base[0] - self._aim)
+        return self._w2 * dr.squared_norm(bend(self._base, a, b) - self._base[0] - self._aim)
 
     def _rough(self, a: Any, b: Any) -> Any:
         import drjit as dr
@@ -248,7 +221,7 @@ class NormalProblem:
 
         if not self._smooth:
             return dr.zeros(mi.Float, self._count)
-        delta = _bend(self._base, a, b) - self._base[0]
+        delta = bend(self._base, a, b) - self._base[0]
         dr.eval(delta)
         return self._w1 * dr.sum(dr.sqrt(dr.square(self._laplacian(delta)) + L1_FLOOR**2))
 
@@ -274,7 +247,7 @@ class NormalProblem:
             for i in range(2):
                 x = [mi.Float(a), mi.Float(b)]
                 dr.enable_grad(x[i])
-                shading = self._shade(_bend(frame, *x), direction, k)
+                shading = self._shade(bend(frame, *x), direction, k)
                 dr.set_grad(x[i], 1.0)
                 dr.enqueue(dr.ADMode.Forward, x[i])
                 dr.traverse(dr.ADMode.Forward)
@@ -304,8 +277,8 @@ class NormalProblem:
         import drjit as dr
 
         ga, gb, haa, hab, hbb = system
-        delta = _bend(self._base, a, b) - self._base[0]
-        ja, jb = _bend_jacobian(self._base, a, b)
+        delta = bend(self._base, a, b) - self._base[0]
+        ja, jb = bend_jacobian(self._base, a, b)
         # d/dx of w2 |delta - aim|^2
         pull = 2.0 * self._w2 * (delta - self._aim)
         irls = None
@@ -326,7 +299,7 @@ class NormalProblem:
         block[0] += lift
         block[2] += lift
         if irls is None:
-            step = _solve(block, ra, rb)
+            step = solve_blocks(block, ra, rb)
             dr.eval(step)
             return step
         diagonal = dr.square(self._degree) * irls
@@ -352,7 +325,7 @@ class NormalProblem:
                 block[1] * sa + block[2] * sb + dr.dot(jb, smooth),
             )
 
-        return _conjugate_gradients(apply, (ra, rb), lambda r: _solve(preconditioner, *r))
+        return conjugate_gradients(apply, (ra, rb), lambda r: solve_blocks(preconditioner, *r))
 
     def _facing(self, a: Any, b: Any, da: Any, db: Any) -> tuple[Any, Any]:
         """Take steps from offsets that face every camera that measures the texel, halved until the ends do too."""
@@ -364,7 +337,7 @@ class NormalProblem:
             x, y = a + da, b + db
             good = x * x + y * y < 4.0  # a right angle
             for _, weight, direction, frame in self._views:
-                good &= (weight <= 0) | (dr.dot(_bend(frame, x, y), direction) >= FACING)
+                good &= (weight <= 0) | (dr.dot(bend(frame, x, y), direction) >= FACING)
             factor = dr.select(good, 1.0, 0.5 if attempt < 3 else 0.0)
             da, db = da * factor, db * factor
         return a + da, b + db
@@ -386,115 +359,17 @@ class NormalProblem:
         return tuple(mi.Float(np.ascontiguousarray(offsets[:, i], dtype=np.float32)) for i in range(2))  # type: ignore[return-value]
 
 
-def material_shade(
-    reflectance: ReflectanceEstimate,
-    diffuse: NDArray,
-    specular: NDArray,
-    views: Sequence[NormalView],
-    traced: Sequence[NDArray] | None = None,
-) -> Shade:
-    """Shading of texels by the model that stage 2 estimated them with.
-
-    Parameters
-    ----------
-    reflectance : ReflectanceEstimate
-        Lighting, exponent and shading model; its maps aren't used.
-    diffuse : (N, 3), specular : (N,)
-        Albedos of the texels.
-    views : sequence of NormalView
-    traced : sequence of (N, B*B), optional
-        Per view the shadowed diffuse transfer at the base normal, for the ``shadowed`` model.
-
-    Notes
-    -----
-    Shadows are traced for the base normal. For a bent one the unshadowed change is added, dimmed by the part of the
-    light that reaches the point, and the lobe keeps its dimming.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    albedo = _vector(mi.Color3f, diffuse)
-    gloss = mi.Float(np.ascontiguousarray(specular, dtype=np.float32))
-    coefficients = [mi.Color3f(*map(float, row)) for row in reflectance.radiance]
-    ambient = mi.Float(float(reflectance.ambient))
-    dr.make_opaque(coefficients, ambient)
-    order = round(len(coefficients) ** 0.5)
-    model = reflectance.shading_model
-    exponent: Any = float(reflectance.exponent)
-    if model != "paper":
-        exponent = shading.lobe(exponent, order, fresnel=reflectance.fresnel)
-    shadows: list[tuple[Any, Any, Any]] = []
-    if model == "shadowed":
-        if traced is None:
-            raise InputError("shading model 'shadowed': found no transfer vectors, expected those of trace_transfer")
-        for view, rows in zip(views, traced, strict=True):
-            columns = [mi.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in np.asarray(rows).T]
-            lit = shading.radiance(columns, coefficients)
-            n, v = _vector(mi.Vector3f, view.normal), _vector(mi.Vector3f, view.direction)
-            open_sky = shading.radiance(shading.diffuse_transfer(n, order), coefficients)
-            open_light = dr.maximum(mi.luminance(open_sky), 1e-6)
-            passed = dr.clip(mi.luminance(lit) / open_light, 0.0, 1.0)
-            axis, _ = shading.lobe_axis(n, v, exponent)
-            glint = shading.unoccluded(n, axis, columns, order)
-            base = lit - passed * open_sky
-            dr.eval(base, passed, glint)
-            shadows.append((base, passed, glint))
-
-    def shade(n: Any, v: Any, view: int) -> Any:
-        if model != "shadowed":
-            body, glint = shading.shade(n, v, coefficients, exponent, model)
-            return ambient + albedo * body + gloss * glint
-        base, passed, dimmed = shadows[view]
-        body, glint = shading.shade(n, v, coefficients, exponent, "prefiltered")
-        return ambient + albedo * (base + passed * body) + gloss * dimmed * glint
-
-    return shade
-
-
 def residual_scale(views: Sequence[NormalView], shade: Shade) -> float:
     """Robust standard deviation of the residual's length at the base normals: 1.48 times the median."""
     import mitsuba as mi
 
     lengths = []
     for k, view in enumerate(views):
-        shown = shade(_vector(mi.Vector3f, view.normal), _vector(mi.Vector3f, view.direction), k)
+        shown = shade(vector(mi.Vector3f, view.normal), vector(mi.Vector3f, view.direction), k)
         residual = view.colour - np.array(mi.Color3f(shown)).T
         lengths.append(np.linalg.norm(residual, axis=1)[np.asarray(view.weight) > 0])
     every = np.concatenate(lengths) if lengths else np.zeros(0)
     return 1.48 * float(np.median(every)) if len(every) else 0.0
-
-
-def _conjugate_gradients(
-    apply: Callable[..., tuple[Any, Any]],
-    right: tuple[Any, Any],
-    precondition: Callable[[tuple[Any, Any]], tuple[Any, Any]],
-    tolerance: float = 0.03,
-    max_iterations: int = 60,
-) -> tuple[Any, Any]:
-    """Preconditioned conjugate gradients to a relative residual."""
-    import drjit as dr
-
-    def inner(p: tuple[Any, Any], q: tuple[Any, Any]) -> Any:
-        return dr.sum(p[0] * q[0] + p[1] * q[1])
-
-    x = (dr.zeros(type(right[0]), len(right[0])), dr.zeros(type(right[0]), len(right[0])))
-    r, z = right, precondition(right)
-    p, rz = z, inner(right, z)
-    dr.eval(p, rz)
-    goal = tolerance**2 * float(rz[0])
-    for _ in range(max_iterations):
-        q = apply(*p)
-        alpha = rz / dr.maximum(inner(p, q), 1e-30)
-        x = (x[0] + alpha * p[0], x[1] + alpha * p[1])
-        r = (r[0] - alpha * q[0], r[1] - alpha * q[1])
-        z = precondition(r)
-        before, rz = rz, inner(r, z)
-        beta = rz / dr.maximum(before, 1e-30)
-        p = (z[0] + beta * p[0], z[1] + beta * p[1])
-        dr.eval(x, r, p, rz)
-        if float(rz[0]) <= goal:
-            break
-    return x
 
 
 def _descend(energy: Any) -> Any:
@@ -515,41 +390,11 @@ def _totals(local: dict[str, Any], rough: Any) -> dict[str, float]:
     return {name: float(np.array(value, dtype=np.float64).sum()) for name, value in terms.items()}
 
 
-def _solve(block: Sequence[Any], ra: Any, rb: Any) -> tuple[Any, Any]:
-    """Solve symmetric 2 x 2 systems (aa, ab, bb)."""
-    import drjit as dr
-
-    scale = 1.0 / dr.maximum(block[0] * block[2] - block[1] * block[1], 1e-30)
-    return (block[2] * ra - block[1] * rb) * scale, (block[0] * rb - block[1] * ra) * scale
-
-
-def _bend(frame: tuple[Any, Any, Any], a: Any, b: Any) -> Any:
-    """The chart of `core.bend.bend`."""
-    n, t1, t2 = frame
-    p, q = 0.5 * a, 0.5 * b
-    square = p * p + q * q
-    return (t1 * (2.0 * p) + t2 * (2.0 * q) + n * (1.0 - square)) / (1.0 + square)
-
-
-def _bend_jacobian(frame: tuple[Any, Any, Any], a: Any, b: Any) -> tuple[Any, Any]:
-    """Derivatives of `_bend` by a and b."""
-    n, t1, t2 = frame
-    p, q = 0.5 * a, 0.5 * b
-    scale = 1.0 / (1.0 + p * p + q * q)
-    total = n + _bend(frame, a, b)
-    return (t1 - total * p) * scale, (t2 - total * q) * scale
-
-
 def _frame(normals: NDArray, tangents: NDArray) -> tuple[Any, Any, Any]:
     import mitsuba as mi
 
-    return tuple(_vector(mi.Vector3f, v) for v in (normals, tangents[:, 0], tangents[:, 1]))  # type: ignore[return-value]
+    return tuple(vector(mi.Vector3f, v) for v in (normals, tangents[:, 0], tangents[:, 1]))  # type: ignore[return-value]
 
 
 def _store(a: Any, b: Any) -> NDArray[np.float64]:
     return np.stack([np.array(a, dtype=np.float64), np.array(b, dtype=np.float64)], axis=1)
-
-
-def _vector(kind: Any, values: NDArray) -> Any:
-    """(N, 3) array -> Dr.Jit vector."""
-    return kind(np.ascontiguousarray(np.asarray(values, dtype=np.float32).T))

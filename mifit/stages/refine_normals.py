@@ -190,7 +190,8 @@ def frame_problem(
 
     Without a measured texel there is no optimisation: None.
     """
-    from mifit.render.refine import NormalProblem, NormalView, material_shade, residual_scale
+    from mifit.render.bent import NormalView, material_shade
+    from mifit.render.refine import NormalProblem, residual_scale
     from mifit.render.transfer import trace_transfer
 
     rotation = geometry.rotation[0]

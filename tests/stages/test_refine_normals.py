@@ -67,7 +67,8 @@ def sphere_problem(w1=1e-3 * 127.5 / 255**2, w2=1e-3, huber=float("inf"), size=9
     import mitsuba as mi
 
     from mifit.render import shading
-    from mifit.render.refine import NormalProblem, NormalView
+    from mifit.render.bent import NormalView
+    from mifit.render.refine import NormalProblem
 
     texels, base, true = bumpy_sphere(size)
     radiance = 0.4 * np.random.default_rng(seed).normal(size=(9, 3))
