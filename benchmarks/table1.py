@@ -22,6 +22,7 @@ from benchmarks.record import RESULTS, SHARED, record
 from mifit.core.files import write_text
 
 ENVIRONMENTS = ("apartment", "studio", "softbox")
+TONES = (0.0, 0.25, 0.5, 0.75, 1.0)  # fair to deep; three lights and five tones meet once in fifteen subjects
 METHODS = ("pca", "diffuse", "full")
 PAPER = {"pca": (24.6, 15.0), "diffuse": (26.8, 11.6), "full": (28.3, 9.8)}
 FULL_SIZE = {"timesteps": 4, "width": 680, "height": 480, "spp": 64}
@@ -46,7 +47,8 @@ def run_subject(subject: int, work: Path, size: dict[str, int], model: str) -> d
     if not figures.exists():
         if not (folder / "capture" / "transforms.json").exists():
             options = [part for key, value in size.items() for part in (f"--{key}", value)]
-            mifit("synth", "--out", folder / "capture", "--seed", 100 + subject, "--model", model, *options, *light)
+            mifit("synth", "--out", folder / "capture", "--seed", 100 + subject, "--model", model,
+                  "--tone", TONES[subject % len(TONES)], *options, *light)  # fmt: skip
         mifit("fit", folder / "capture", "--out", folder / "result", "--model", model, "--cameras", "left,right",
               "--timesteps", f"0-{size['timesteps'] - 1}", "--resume")  # fmt: skip
         mifit("evaluate", folder / "result", "--capture", folder / "capture", "--camera", "third", "--json", figures)

@@ -103,6 +103,7 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--width", type=_at_least(16), default=680)
     p.add_argument("--height", type=_at_least(16), default=480)
     p.add_argument("--spp", type=_at_least(1), default=64, help="samples per pixel (default: 64)")
+    p.add_argument("--tone", type=float, help="skin from 0, fair, to 1, deep; default: drawn for each subject")
 
     p = add("import", "a capture from videos, image folders, COLMAP text models or nerfstudio transforms.json")
     p.add_argument("--video", type=Path, action="append", default=[], help="one camera's video; repeat per camera")

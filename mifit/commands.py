@@ -111,6 +111,7 @@ def synth(arguments: Namespace) -> None:
         width=arguments.width,
         height=arguments.height,
         spp=arguments.spp,
+        tone=arguments.tone,
         progress=console_progress(arguments.quiet),
     )
     print(f"Capture: {arguments.out}")

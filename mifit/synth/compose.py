@@ -48,6 +48,7 @@ def synthesize(
     width: int = 680,
     height: int = 480,
     spp: int = 64,
+    tone: float | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Render a capture of an unseen subject, with ground truth beside it.
@@ -72,6 +73,8 @@ def synthesize(
         Image size in pixels.
     spp : int
         Samples per pixel.
+    tone : float, optional
+        Skin from 0, fair, to 1, deep; drawn for each subject by default.
     progress : Progress
 
     Returns
@@ -95,6 +98,8 @@ def synthesize(
     ):
         if value < low:
             raise InputError(f"{name}: found {value}, expected at least {low}")
+    if tone is not None and not 0 <= tone <= 1:
+        raise InputError(f"tone: found {tone}, expected 0 (fair) to 1 (deep)")
     shape = MorphableModel.load(model)
     radiance = None if env is None else _environment(env)
     total = subjects * (timesteps + 1)
@@ -102,7 +107,7 @@ def synthesize(
     map_size = 1024 if min(width / 680, height / 480) > 0.6 else 512
     for i in range(subjects):
         folder = out if subjects == 1 else out / f"subject_{i:02d}"
-        subject = _draw_subject(shape, seed + i, timesteps, map_size)
+        subject = _draw_subject(shape, SkinStyle.draw(seed + i, tone), timesteps, map_size)
         light = studio_environment(seed + i) if radiance is None else radiance
         start = i * (timesteps + 1)
         _write_capture(
@@ -158,11 +163,11 @@ class _Subject:
     eyes: list[NDArray[np.float64]]
 
 
-def _draw_subject(model: MorphableModel, seed: int, timesteps: int, map_size: int) -> _Subject:
+def _draw_subject(model: MorphableModel, style: SkinStyle, timesteps: int, map_size: int) -> _Subject:
+    seed = style.seed
     scale = model.unit_mm / 10.0  # the world is in centimetres
     mean_mm = model.mean.astype(np.float64) * model.unit_mm
     normals = vertex_normals(mean_mm, model.faces)
-    style = SkinStyle.draw(seed)
     skin: dict[str, SkinMaps] = {}
     parts: dict[str, head.SplitMesh] = {}
     rest = ~model.face_mask

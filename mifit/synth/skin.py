@@ -62,10 +62,11 @@ class SkinStyle:
     moles: int
 
     @classmethod
-    def draw(cls, seed: int) -> SkinStyle:
-        """Draw a subject's style; the same seed gives the same one."""
+    def draw(cls, seed: int, tone: float | None = None) -> SkinStyle:
+        """Draw a subject's style; the same seed gives the same one. `tone` from 0 (fair) to 1 (deep)."""
         rng = np.random.default_rng([seed, 1])
-        t = rng.uniform(0.0, 0.75)
+        drawn = rng.uniform(0.0, 0.75)
+        t = drawn if tone is None else tone
         return cls(
             seed=seed,
             tone=np.exp((1 - t) * np.log(FAIR) + t * np.log(DEEP)) * rng.uniform(0.97, 1.03, 3),

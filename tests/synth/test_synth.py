@@ -13,6 +13,7 @@ from mifit.morphable import MorphableModel
 from mifit.synth.compose import FULL_WELL, READ_NOISE, expose, place_cameras
 from mifit.synth.head import split_at_seams, wrap_uv
 from mifit.synth.noise import smooth_noise
+from mifit.synth.skin import SkinStyle
 from mifit.synth.studio import studio_environment
 
 
@@ -96,6 +97,13 @@ def test_smooth_noise_is_smooth_and_of_unit_size() -> None:
     assert np.abs(here - near).max() < 0.2
 
 
+def test_a_given_tone_changes_nothing_else_of_a_subject() -> None:
+    own, fair, deep = SkinStyle.draw(5), SkinStyle.draw(5, 0.0), SkinStyle.draw(5, 1.0)
+    assert (deep.tone < 0.45 * fair.tone).all()
+    for name in ("stubble", "wrinkles", "oil", "freckles", "moles"):
+        assert getattr(own, name) == getattr(fair, name) == getattr(deep, name)
+
+
 def test_seams_are_split_and_tiles_wrapped() -> None:
     faces, faces_uv = np.array([[0, 1, 2], [2, 1, 3]]), np.array([[0, 1, 2], [4, 3, 5]])
     uv = np.array([[0, 0], [1, 0], [0, 1], [1.2, 0.1], [1.1, 0.9], [1.9, 0.9]], dtype=np.float32)
@@ -114,6 +122,7 @@ def test_seams_are_split_and_tiles_wrapped() -> None:
         ({"timesteps": 0}, "timesteps: found 0, expected at least 1"),
         ({"width": 8}, "width: found 8, expected at least 16"),
         ({"spp": 0}, "spp: found 0"),
+        ({"tone": 1.5}, "tone: found 1.5, expected 0"),
         ({"env": "none.hdr", "model": "builtin:coarse"}, "none.hdr: no such image file"),
     ],
 )
