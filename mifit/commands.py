@@ -226,9 +226,9 @@ def evaluate(arguments: Namespace) -> None:
     if arguments.json:
         write_text(arguments.json, json.dumps(found, indent=2) + "\n")
     print(f"camera {found['camera']}, timesteps {found['timesteps']}, {found['region_pixels']} pixels")
-    print(f"{'method':<10}{'PSNR dB':>9}{'RMSE':>8}")
-    for method, figures in found["methods"].items():
-        print(f"{method:<10}{figures['psnr']:>9.2f}{figures['rmse']:>8.2f}")
+    print(f"{'method':<10}{'PSNR dB':>9}{'RMSE':>8}{'SSIM':>8}{'FLIP':>8}")
+    for method, f in found["methods"].items():
+        print(f"{method:<10}{f['psnr']:>9.2f}{f['rmse']:>8.2f}{f['ssim']:>8.4f}{f['flip']:>8.4f}")
     write_report(arguments.result, result, capture, evaluation=found)
 
 

@@ -41,7 +41,7 @@ def psnr_from_rmse(error: float, peak: float = 255.0) -> float:
 
 def mean_squared_error(image: NDArray, reference: NDArray, mask: NDArray | None = None) -> float:
     """Mean squared difference over a region; parameters and errors as for `rmse`."""
-    a, b, mask = _checked(image, reference, mask)
+    a, b, mask = checked_pair(image, reference, mask)
     difference = a[mask] - b[mask]
     return float(np.mean(difference * difference))
 
@@ -59,7 +59,7 @@ def ssim(image: NDArray, reference: NDArray, mask: NDArray | None = None, peak: 
     peak : float
         Largest value that a pixel can take.
     """
-    a, b, mask = _checked(image, reference, mask)
+    a, b, mask = checked_pair(image, reference, mask)
     if a.ndim == 2:
         a, b = a[..., None], b[..., None]
 
@@ -74,7 +74,7 @@ def ssim(image: NDArray, reference: NDArray, mask: NDArray | None = None, peak: 
     return float(score[mask].mean())
 
 
-def _checked(image: NDArray, reference: NDArray, mask: NDArray | None) -> tuple[NDArray, NDArray, NDArray]:
+def checked_pair(image: NDArray, reference: NDArray, mask: NDArray | None) -> tuple[NDArray, NDArray, NDArray]:
     """Both images as float64 and the region as a boolean array, after checks of shape."""
     a, b = np.asarray(image, dtype=np.float64), np.asarray(reference, dtype=np.float64)
     if a.shape != b.shape or a.ndim not in (2, 3):

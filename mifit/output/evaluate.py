@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from mifit.core.camera import Camera
+from mifit.core.flip import flip
 from mifit.core.image import to_8_bit
 from mifit.core.metrics import mean_squared_error, psnr_from_rmse, ssim
 from mifit.errors import InputError
@@ -76,8 +78,8 @@ def evaluate(
     Returns
     -------
     dict
-        ``{"camera", "timesteps", "region", "region_pixels", "methods": {method: {"psnr", "rmse", "ssim"}},
-        "per_timestep": [{"timestep", "region_pixels", "methods"}]}``; PSNR in dB, RMSE 0..255.
+        ``{"camera", "timesteps", "region", "region_pixels", "methods": {method: {"psnr", "rmse", "ssim",
+        "flip"}}, "per_timestep": [{"timestep", "region_pixels", "methods"}]}``; PSNR in dB, RMSE 0..255, FLIP 0..1.
 
     Raises
     ------
@@ -86,8 +88,8 @@ def evaluate(
     """
     steps = reconstruction.timesteps if timesteps is None else tuple(timesteps)
     per_timestep = []
-    squared: dict[str, float] = dict.fromkeys(reconstruction.methods, 0.0)
-    similarity: dict[str, float] = dict.fromkeys(reconstruction.methods, 0.0)
+    # Sums over pixels of squared error, similarity and FLIP error.
+    sums = {method: np.zeros(3) for method in reconstruction.methods}
     pixels = 0
     progress("Evaluating", 0, len(steps))
     for done, timestep in enumerate(steps):
@@ -96,11 +98,10 @@ def evaluate(
         pixels += count
         figures = {}
         for method, render in found.renders.items():
-            error = mean_squared_error(render[..., :3], found.photograph, found.region)
-            likeness = ssim(render[..., :3], found.photograph, found.region)
-            squared[method] += count * error
-            similarity[method] += count * likeness
-            figures[method] = _figures(error, likeness)
+            pair = (render[..., :3], found.photograph, found.region)
+            means = np.array([mean_squared_error(*pair), ssim(*pair), flip(*pair)])
+            sums[method] += count * means
+            figures[method] = _figures(means)
         per_timestep.append({"timestep": timestep, "region_pixels": count, "methods": figures})
         progress("Evaluating", done + 1, len(steps))
     return {
@@ -108,14 +109,15 @@ def evaluate(
         "timesteps": list(steps),
         "region": region,
         "region_pixels": pixels,
-        "methods": {m: _figures(squared[m] / pixels, similarity[m] / pixels) for m in squared},
+        "methods": {m: _figures(total / pixels) for m, total in sums.items()},
         "per_timestep": per_timestep,
     }
 
 
-def _figures(mean_squared: float, likeness: float) -> dict[str, float]:
-    error = float(np.sqrt(mean_squared))
-    return {"psnr": psnr_from_rmse(error), "rmse": error, "ssim": likeness}
+def _figures(means: NDArray) -> dict[str, float]:
+    squared, likeness, flipped = map(float, means)
+    error = math.sqrt(squared)
+    return {"psnr": psnr_from_rmse(error), "rmse": error, "ssim": likeness, "flip": flipped}
 
 
 def compare(

@@ -120,14 +120,16 @@ def _summary(result: Reconstruction, evaluation: dict[str, Any] | None) -> str:
         held_out = evaluation["camera"] not in [c.name for c in result.cameras]
         kind = "held out, never fitted" if held_out else "this camera was fitted, so it is no test"
         rows = "".join(
-            f"<tr><td>{NAMES[m]}</td><td>{f['psnr']:.2f}</td><td>{f['rmse']:.2f}</td><td>{f['ssim']:.4f}</td></tr>"
+            f"<tr><td>{NAMES[m]}</td><td>{f['psnr']:.2f}</td><td>{f['rmse']:.2f}</td><td>{f['ssim']:.4f}</td>"
+            f"<td>{f['flip']:.4f}</td></tr>"
             for m, f in evaluation["methods"].items()
         )
         area = "fitted model" if evaluation["region"] == "model" else "ground-truth mesh"
         parts.append(
             f"<p>Error on camera <b>{html.escape(evaluation['camera'])}</b> ({kind}), over "
             f"{evaluation['region_pixels']:,} pixels of the {area}'s face area.</p>"
-            '<div class="wide"><table><tr><th>Method</th><th>PSNR, dB</th><th>RMSE of 255</th><th>SSIM</th></tr>'
+            '<div class="wide"><table><tr><th>Method</th><th>PSNR, dB</th><th>RMSE of 255</th><th>SSIM</th>'
+            "<th>FLIP</th></tr>"
             f"{rows}</table></div>"
         )
     else:

@@ -107,7 +107,8 @@ def test_evaluation_of_a_perfect_photograph_and_of_a_known_error(ball, variant):
     capture = FakeCapture((camera,), lambda c, t: ball.render(c, t)[..., :3])
     found = evaluate(ball, capture, "third")
     assert list(found["methods"]) == ["pca", "diffuse", "full"]
-    assert found["methods"]["full"]["rmse"] == 0 and found["methods"]["full"]["ssim"] == pytest.approx(1)
+    full = found["methods"]["full"]
+    assert full["rmse"] == 0 and full["ssim"] == pytest.approx(1) and full["flip"] == 0
     assert found["methods"]["diffuse"]["rmse"] > 0 and found["timesteps"] == [0, 3]
     assert found["region_pixels"] == sum(x["region_pixels"] for x in found["per_timestep"])
     # A photograph that is 10 steps brighter in one timestep and 20 in the other: the pooled error is known.
