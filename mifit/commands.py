@@ -239,7 +239,7 @@ def render(arguments: Namespace) -> None:
 
     result = mifit.Reconstruction.load(arguments.result)
     capture = mifit.Capture.load(arguments.capture)
-    camera = capture.camera(arguments.camera)
+    camera = capture.with_fitted(result.cameras).camera(arguments.camera)
     _use_variant(arguments)
     image = result.render(camera, arguments.timestep, method=arguments.method, integrator=arguments.integrator)
     write_image(arguments.out, image)

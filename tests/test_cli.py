@@ -152,3 +152,35 @@ def test_from_capture_to_figures(capsys, tiny_capture, tmp_path):
     )  # fmt: skip
     assert code == 0, err
     assert cv2.imread(str(tmp_path / "x.png"), cv2.IMREAD_UNCHANGED).shape == (150, 200, 4)
+
+
+@pytest.mark.slow
+def test_an_uncalibrated_capture_is_fitted_and_reported(capsys, capture, tmp_path):
+    known = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "transform_matrix")
+    edit(capture, lambda c: [part.pop(key, None) for part in (c, *c["frames"]) for key in known])
+    out, shot = tmp_path / "result", tmp_path / "left.png"
+    code, _, err = run(
+        capsys, "fit", capture, "--out", out, "--model", "builtin:coarse", "--cameras", "left,right",
+        "--timesteps", 0, "--until", "geometry", "--quiet",
+    )  # fmt: skip
+    assert code == 0, err
+    assert "uncalibrated" in json.loads((out / "result.json").read_text())["warnings"][0]
+    assert "uncalibrated" in (out / "report.html").read_text()
+    code, _, err = run(
+        capsys,
+        "render",
+        out,
+        "--capture",
+        capture,
+        "--camera",
+        "left",
+        "--timestep",
+        0,
+        "--method",
+        "pca",
+        "--out",
+        shot,
+    )
+    assert code == 0, err
+    assert (cv2.imread(str(shot), cv2.IMREAD_UNCHANGED)[..., 3] > 0).mean() > 0.05
+    assert "third" in refused(capsys, "evaluate", out, "--capture", capture, "--camera", "third")

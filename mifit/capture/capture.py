@@ -237,6 +237,10 @@ class Capture:
         """The same capture with estimated cameras for views that aren't calibrated; `calibrated` stays False."""
         return dataclasses.replace(self, estimated={camera.name: camera for camera in cameras}, _cache=self._cache)
 
+    def with_fitted(self, cameras: Sequence[Camera]) -> Capture:
+        """The capture as a fit with these cameras saw it: its own calibration, or else the estimated cameras."""
+        return self if self.calibrated or not cameras else self.with_estimate(cameras)
+
     def save(self) -> None:
         """Write ``transforms.json`` anew (whole or not at all); images and landmarks stay as they are."""
         write_transforms(self.path / "transforms.json", self.views.values(), self.shots.values(), self.units)

@@ -130,6 +130,7 @@ def compare(
     oversampling: int = 2,
 ) -> Comparison:
     """Render one view by some methods (default: all) and find the region in which to compare it; see `evaluate`."""
+    capture = capture.with_fitted(reconstruction.cameras)
     view = capture.camera(camera)
     reconstruction.index(timestep)
     if timestep not in capture.timesteps:

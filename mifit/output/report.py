@@ -65,6 +65,7 @@ def write_report(
     Path
         The file.
     """
+    capture = capture.with_fitted(reconstruction.cameras)
     shown = reconstruction.timesteps[:SHOWN_TIMESTEPS]
     sections = [
         ("Result", _summary(reconstruction, evaluation)),

@@ -70,7 +70,7 @@ def track_into(
     else:
         result = _without(result, [t for t in tracked if t in timesteps])
     frames = track(
-        capture,
+        capture.with_fitted(result.cameras),
         result.model,
         result.geometry,
         result.reflectance,
