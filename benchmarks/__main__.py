@@ -5,13 +5,15 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from pathlib import Path
 
-from benchmarks.record import SHARED
+from benchmarks.record import RESULTS, SHARED, renew_tables
 
 RUNS = (
     ("table1", ["--reduced", "--subjects", "3", "--work", "out/table1_reduced"]),
     ("captures", []),
 )
+README = Path(__file__).resolve().parents[1] / "README.md"
 
 
 def main() -> int:
@@ -24,6 +26,7 @@ def main() -> int:
         done = subprocess.run([sys.executable, "-m", f"benchmarks.{name}", *options], check=False)
         print(f"{name}: {time.perf_counter() - started:.0f} s, exit code {done.returncode}", file=sys.stderr)
         failed += [name] * bool(done.returncode)
+    renew_tables(README, RESULTS)
     return 1 if failed else 0
 
 

@@ -6,6 +6,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
 import subprocess
 import time
 from pathlib import Path
@@ -45,3 +46,19 @@ def record(name: str, figures: dict[str, Any], seeds: Any = 0) -> Path:
     content = {"benchmark": name, "machine": machine(), "seeds": seeds, "figures": figures}
     write_text(path, json.dumps(content, indent=2) + "\n")
     return path
+
+
+def renew_tables(page: Path, results: Path) -> list[str]:
+    """Put ``NAME.md`` between the marks ``<!-- NAME -->`` and ``<!-- /NAME -->`` of a page; return the names found."""
+    renewed = []
+
+    def table(found: re.Match[str]) -> str:
+        source = results / f"{found[1]}.md"
+        if not source.exists():
+            return found[0]
+        renewed.append(found[1])
+        return f"<!-- {found[1]} -->\n{source.read_text(encoding='utf-8').strip()}\n<!-- /{found[1]} -->"
+
+    text = page.read_text(encoding="utf-8")
+    write_text(page, re.sub(r"<!-- (\w+) -->\n.*?<!-- /\1 -->", table, text, flags=re.DOTALL))
+    return renewed
