@@ -14,10 +14,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from benchmarks.record import RESULTS, SHARED, record
 from benchmarks.table1 import METHODS, mifit
+from benchmarks.truth import mesh_error
 from mifit import Reconstruction
 from mifit.core.files import write_text
 
@@ -40,21 +39,6 @@ def run_capture(name: str, work: Path) -> dict[str, Any]:
         "seconds": {stage: round(report.seconds, 1) for stage, report in result.reports.items()},
         "outcomes": {stage: report.outcome for stage, report in result.reports.items()},
         "peak_memory_mb": round(result.peak_memory / 2**20),
-    }
-
-
-def mesh_error(result: Reconstruction, capture: Path) -> dict[str, float]:
-    """Mean distance of face-area vertices (mm) and head rotation (degrees) to the truth, without any alignment."""
-    area = np.unique(result.model.faces[result.model.face_mask])
-    distances, angles = [], []
-    for i, timestep in enumerate(result.timesteps):
-        with np.load(capture / "truth" / f"{timestep:04d}.npz") as truth:
-            distances.append(np.linalg.norm(result.geometry.vertices[i][area] - truth["vertices"][area], axis=1))
-            turn = result.geometry.rotation[i] @ truth["R"].T
-        angles.append(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
-    return {
-        "mesh_mm": round(float(np.mean(distances)) * result.unit_mm, 3),
-        "rotation_degrees": round(float(np.max(angles)), 3),
     }
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.record import RESULTS, SHARED, record
+from benchmarks.truth import angle, bumped_normals
 from mifit import Capture, Reconstruction, set_variant
 from mifit.config import NormalsConfig
 from mifit.core.mesh import interpolate, normalize, vertex_normals
@@ -32,30 +33,6 @@ from mifit.stages.track import track
 WEIGHTS = (0.3, 3.0)
 EQUAL = 1e-3
 """Relative difference up to which energies count as equal."""
-
-
-def bumped_normals(result: Reconstruction, capture: Path, timestep: int, texels: TexelMap) -> NDArray:
-    """(N, 3) true world normals with the painted bump: its map is a height along the normal in centimetres.
-
-    The gradient of the bump is taken at the map's full size and averaged down to the texels.
-    """
-    with np.load(capture / "truth" / f"{timestep:04d}.npz") as truth, np.load(capture / "truth" / "maps.npz") as maps:
-        vertices, bump = truth["vertices"].astype(np.float64), maps["bump"].astype(np.float64)
-    model, size = result.model, texels.size
-    k = len(bump) // size
-    slope = np.stack([np.gradient(bump, axis=1), -np.gradient(bump, axis=0)], axis=-1) * len(bump)
-    slope = texels.from_map(slope.reshape(size, k, size, k, 2).mean((1, 3)))
-    p, t = vertices[model.faces], model.uv[model.faces_uv].astype(np.float64)
-    e, d = p[:, 1:] - p[:, :1], t[:, 1:] - t[:, :1]
-    by_uv = np.einsum("fij,fjc->fic", np.linalg.pinv(d), e)[texels.face]  # dp/du, dp/dv
-    n = normalize(interpolate(vertex_normals(vertices, model.faces), model.faces, texels.face, texels.weights))
-    by_uv -= np.einsum("nic,nc->ni", by_uv, n)[..., None] * n[:, None]
-    bent = np.cross(by_uv[:, 0] + slope[:, :1] * n, by_uv[:, 1] + slope[:, 1:] * n)
-    return normalize(bent * np.sign(np.sum(bent * n, axis=1, keepdims=True)))
-
-
-def angle(a: NDArray, b: NDArray) -> float:
-    return float(np.degrees(np.arccos(np.clip(np.sum(a * b, axis=-1), -1, 1))).mean())
 
 
 def solver_speed(result: Reconstruction, capture: Capture, texels: TexelMap) -> dict[str, Any]:
@@ -105,7 +82,7 @@ def accuracy(result: Reconstruction, capture: Capture, folder: Path, texels: Tex
     """Normal, position and third-view error, unrefined and for several weights."""
     plain = replace(result, normals=None)
     steps = result.timesteps
-    truth = [bumped_normals(result, folder, t, texels) for t in steps]
+    truth = [bumped_normals(result.model, folder, t, texels) for t in steps]
     area = np.unique(result.model.faces[result.model.face_mask])
 
     def positions(vertices: NDArray) -> float:

@@ -14,15 +14,12 @@ import sys
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 import mifit
 from benchmarks.record import RESULTS, SHARED, record
-from benchmarks.truth import true_geometry, true_maps
+from benchmarks.truth import map_errors, true_geometry
 from mifit import Capture, MorphableModel, Reconstruction
 from mifit.config import ReflectanceConfig
 from mifit.core.files import write_text
-from mifit.core.uv import rasterize_uv
 from mifit.output.evaluate import evaluate
 
 MODEL = SHARED / "models" / "ict_facekit" / "ict_facekit_head.npz"
@@ -47,21 +44,6 @@ def run(name: str, config: ReflectanceConfig, model: MorphableModel) -> dict[str
         "outcome": found.report.outcome,
         "objective": found.report.details.get("objective", {}).get("total"),
         "seconds": round(found.report.seconds, 1),
-    }
-
-
-def map_errors(capture: Capture, model: MorphableModel, found: Any) -> dict[str, float]:
-    """Diffuse RMSE after one scale per channel, and the specular map's correlation with the true lobe weight."""
-    size = len(found.diffuse)
-    truth = true_maps(capture, size)
-    seen = (found.confidence > 0.5) & rasterize_uv(model.uv, model.faces_uv, size, model.face_mask).mask
-    estimate, true = found.diffuse[seen], truth["albedo"][seen]
-    scale = (estimate * true).sum(0) / np.maximum((estimate**2).sum(0), 1e-12)
-    return {
-        "diffuse_rmse": round(float(np.sqrt(np.mean((scale * estimate - true) ** 2))), 4),
-        "specular_correlation": round(float(np.corrcoef(found.specular[seen], truth["specular"][seen])[0, 1]), 3)
-        if found.specular[seen].std() > 0
-        else 0.0,
     }
 
 

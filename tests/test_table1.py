@@ -1,0 +1,81 @@
+"""Table 1: errors against a truth that is known exactly, and what the table says of subjects that failed."""
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks import table1
+from benchmarks.truth import truth_errors
+from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.uv import rasterize_uv
+from tests.output.conftest import ball_result
+
+
+@pytest.fixture
+def perfect(tmp_path, monkeypatch):
+    """A result and a capture folder whose truth is the result itself, with a flat bump."""
+    result = ball_result()
+    folder = tmp_path / "truth"
+    folder.mkdir()
+    for i, t in enumerate(result.timesteps):
+        vertices, rotation = result.geometry.vertices[i], result.geometry.rotation[i]
+        np.savez(folder / f"{t:04d}.npz", vertices=vertices, R=rotation, t=result.geometry.translation[i])
+    size = 2 * len(result.reflectance.diffuse)
+    maps = {
+        "albedo": result.reflectance.diffuse.repeat(2, 0).repeat(2, 1) * (0.5, 0.6, 0.7),
+        "specular": np.random.default_rng(0).uniform(0, 1, (size // 2, size // 2)).repeat(2, 0).repeat(2, 1),
+        "roughness": np.full((size, size), 0.4),
+        "bump": np.zeros((size, size)),
+    }
+    np.savez(folder / "maps.npz", **maps)
+    frame = {"file_path": "x.png", "timestep_index": 0, "w": 64, "h": 64}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    return result, tmp_path, maps
+
+
+def test_a_result_that_is_the_truth_has_no_error_but_where_it_was_bent(perfect):
+    result, folder, _ = perfect
+    found = truth_errors(result, folder, 0.1)
+    assert found["mesh_mm"] == 0 and found["rotation_degrees"] == pytest.approx(0, abs=0.01)
+    assert found["diffuse_rmse"] == pytest.approx(0, abs=1e-4)  # the truth's own scale per channel doesn't count
+    assert found["normal_degrees_stage1"] == pytest.approx(0, abs=0.05)
+    model = result.model
+    texels = rasterize_uv(model.uv, model.faces_uv, len(result.reflectance.diffuse), model.face_mask)
+    bent = []
+    for i, t in enumerate(result.timesteps):
+        base = vertex_normals(result.geometry.vertices[i], model.faces) @ result.geometry.rotation[i]
+        base = normalize(interpolate(base, model.faces, texels.face, texels.weights))
+        cosine = np.sum(base * texels.from_map(result.refined_normal(t)), axis=1)
+        bent.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
+    assert found["normal_degrees"] == pytest.approx(np.mean(bent), abs=0.05) and np.mean(bent) > 3
+
+
+def test_errors_grow_with_the_distance_from_the_truth(perfect):
+    result, folder, maps = perfect
+    path = folder / "truth" / "0000.npz"
+    moved = dict(np.load(path))
+    moved["vertices"] = moved["vertices"] + np.float32((0.3, 0, 0))
+    np.savez(path, **moved)
+    ramp = np.linspace(0, 1, len(maps["bump"]))[None].repeat(len(maps["bump"]), 0)
+    np.savez(folder / "truth" / "maps.npz", **{**maps, "bump": 100 * ramp, "albedo": maps["albedo"][::-1]})
+    found = truth_errors(result, folder, 0.1)
+    assert found["mesh_mm"] == pytest.approx(0.5 * 0.3 * result.unit_mm, abs=0.002)  # one of two timesteps moved
+    assert found["normal_degrees_stage1"] > 5 and found["diffuse_rmse"] > 0.01
+
+
+def test_failed_subjects_stay_in_the_table():
+    figures = dict.fromkeys(table1.MEASURES, 1.0)
+    row = {
+        "subject": 0,
+        "light": "studio",
+        "tone": 0.25,
+        "seconds": 3.0,
+        "methods": {"pca": figures, "diffuse": {**figures, "psnr": 2.0}, "full": {**figures, "psnr": 4.5}},
+        "truth": dict.fromkeys(table1.TRUTHS, 0.5),
+    }
+    other = {**row, "subject": 2, "methods": {**row["methods"], "full": {**figures, "psnr": 5.5}}}
+    text = table1.markdown([row, other], {1: "InputError: no landmarks"})
+    assert "2 of 3 subjects" in text and "| 1 | failed: InputError: no landmarks |" in text
+    assert "4.00 dB above `pca` and 3.00 dB above `diffuse`" in text and "5.00 ± 0.50" in text
+    assert "0 of 1 subjects" in table1.markdown([], {0: "RuntimeError: x"})
