@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 from benchmarks.record import RESULTS, SHARED, record
 from benchmarks.truth import angle, bumped_normals
 from mifit import Capture, Reconstruction, set_variant
-from mifit.config import NormalsConfig
-from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.config import MeshConfig, NormalsConfig
+from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
+from mifit.core.mesh_update import interior_vertices
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.output.evaluate import evaluate
 from mifit.output.tracking import extend
-from mifit.stages.refine_mesh import refine_mesh
+from mifit.stages.refine_mesh import refine_mesh, split_faces
 from mifit.stages.refine_normals import frame_problem, one_timestep, refine_normals
 from mifit.stages.track import track
 
@@ -83,15 +84,6 @@ def accuracy(result: Reconstruction, capture: Capture, folder: Path, texels: Tex
     plain = replace(result, normals=None)
     steps = result.timesteps
     truth = [bumped_normals(result.model, folder, t, texels) for t in steps]
-    area = np.unique(result.model.faces[result.model.face_mask])
-
-    def positions(vertices: NDArray) -> float:
-        errors = []
-        for k, t in enumerate(steps):
-            with np.load(folder / "truth" / f"{t:04d}.npz") as true:
-                errors.append(np.linalg.norm(vertices[k][area] - true["vertices"][area], axis=1).mean())
-        return float(np.mean(errors)) * result.unit_mm
-
     base = [
         normalize(interpolate(vertex_normals(v, result.model.faces), result.model.faces, texels.face, texels.weights))
         for v in result.geometry.vertices
@@ -99,7 +91,7 @@ def accuracy(result: Reconstruction, capture: Capture, folder: Path, texels: Tex
     figures: dict[str, Any] = {
         "stage 1": {
             "normal_degrees": float(np.mean([angle(b, t) for b, t in zip(base, truth, strict=True)])),
-            "mesh_mm": positions(result.geometry.vertices),
+            "mesh_mm": position_error(result, folder, result.geometry.vertices),
             "third_full_db": evaluate(plain, capture, "third")["methods"]["full"]["psnr"],
         }
     }
@@ -116,12 +108,46 @@ def accuracy(result: Reconstruction, capture: Capture, folder: Path, texels: Tex
         refined = replace(result, normals=found)
         figures[f"w2={weight}"] = {
             "normal_degrees": float(np.mean([angle(n, t) for n, t in zip(world, truth, strict=True)])),
-            "mesh_mm": positions(refine_mesh(result.model, result.geometry, found).vertices),
+            "mesh_mm": position_error(result, folder, refine_mesh(result.model, result.geometry, found).vertices),
             "third_full_db": evaluate(refined, capture, "third")["methods"]["full"]["psnr"],
             "seconds_per_timestep": round(found.report.seconds / len(steps), 2),
         }
         print("accuracy", weight, figures[f"w2={weight}"], flush=True)
     print("stage 1", figures["stage 1"], flush=True)
+    return figures
+
+
+def position_error(result: Reconstruction, folder: Path, vertices: NDArray) -> float:
+    """Mean distance in millimetres of the face area's vertices (T, V', 3) from the truth; the model's come first."""
+    area = np.unique(result.model.faces[result.model.face_mask])
+    errors = []
+    for k, t in enumerate(result.timesteps):
+        with np.load(folder / "truth" / f"{t:04d}.npz") as true:
+            errors.append(np.linalg.norm(vertices[k][area] - true["vertices"][area], axis=1).mean())
+    return float(np.mean(errors)) * result.unit_mm
+
+
+def meshes(result: Reconstruction, folder: Path) -> dict[str, Any]:
+    """Position error before and after the mesh update, flipped faces, vertices that must stay, seconds."""
+    figures: dict[str, Any] = {"fitted_mm": position_error(result, folder, result.geometry.vertices)}
+    for subdivisions in (0, 1):
+        found = refine_mesh(result.model, result.geometry, result.normals, MeshConfig(subdivisions))
+        top = split_faces(result.model, subdivisions)
+        fixed = ~interior_vertices(top.faces, top.face_mask, top.n_vertices)
+        before = np.stack([top.matrix @ v for v in result.geometry.vertices])
+        flipped = [
+            np.sum(np.sum(face_cross(a, top.faces) * face_cross(b, top.faces), axis=1) < 0)
+            for a, b in zip(before, found.vertices, strict=True)
+        ]
+        figures[f"subdivisions={subdivisions}"] = {
+            "vertices": top.n_vertices,
+            "mesh_mm": position_error(result, folder, found.vertices),
+            "largest_displacement_mm": float(np.abs(found.displacement).max()) * result.unit_mm,
+            "flipped_faces": int(np.sum(flipped)),
+            "border_moved_mm": float(np.abs(found.vertices - before)[:, fixed].max()) * result.unit_mm,
+            **{k: round(v, 3) for k, v in found.report.details.items() if k.startswith("seconds")},
+        }
+        print("mesh", figures[f"subdivisions={subdivisions}"], flush=True)
     return figures
 
 
@@ -157,7 +183,7 @@ def main() -> int:
     parser.add_argument("--result", type=Path, required=True)
     parser.add_argument("--capture", default="soft")
     parser.add_argument("--track", default="4,5,6,7")
-    parser.add_argument("--parts", default="speed,accuracy,tracking")
+    parser.add_argument("--parts", default="speed,accuracy,meshes,tracking")
     a = parser.parse_args()
     variant = set_variant("auto")
     folder = SHARED / "captures" / a.capture
@@ -173,6 +199,7 @@ def main() -> int:
     parts = {
         "speed": lambda: solver_speed(result, capture, texels),
         "accuracy": lambda: accuracy(result, capture, folder, texels),
+        "meshes": lambda: meshes(result, folder),
         "tracking": lambda: tracking(result, capture, [int(t) for t in a.track.split(",")]),
     }
     for name, run in [(n, parts[n]) for n in a.parts.split(",")]:  # written after each part: the run takes minutes

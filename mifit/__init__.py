@@ -19,6 +19,7 @@ _EXPORTS = {
     "GeometryConfig": "mifit.config",
     "ReflectanceConfig": "mifit.config",
     "NormalsConfig": "mifit.config",
+    "MeshConfig": "mifit.config",
     "InputError": "mifit.errors",
     "MifitError": "mifit.errors",
     "VariantError": "mifit.errors",
@@ -31,6 +32,7 @@ _EXPORTS = {
     "fit_geometry": "mifit.stages.fit_geometry",
     "infer_reflectance": "mifit.stages.infer_reflectance",
     "refine_normals": "mifit.stages.refine_normals",
+    "refine_mesh": "mifit.stages.refine_mesh",
     "Reconstruction": "mifit.output.reconstruction",
 }
 

@@ -124,7 +124,7 @@ def build_parser() -> argparse.ArgumentParser:
     p = add("fit", "fit geometry, reflectance and normals to a capture")
     p.add_argument("capture", type=Path)
     p.add_argument("--out", type=Path, required=True, help="result folder to write")
-    p.add_argument("--config", type=Path, help="TOML file with tables geometry, reflectance, normals")
+    p.add_argument("--config", type=Path, help="TOML file with tables geometry, reflectance, normals, mesh")
     p.add_argument("--model", default="builtin", help="morphable model: a path or builtin (default)")
     p.add_argument("--cameras", type=_names, help="cameras to use, e.g. left,right; default: the first two")
     p.add_argument("--timesteps", type=_timesteps, help="e.g. 0,1,2,3 or 0-3; default: the first four")
@@ -172,6 +172,13 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("result", type=Path)
     p.add_argument("--format", choices=["glb", "obj", "ply", "mitsuba"], required=True)
     p.add_argument("--out", type=Path, required=True)
+    p.add_argument("--timestep", type=_at_least(0), help="default: the first of the result")
+    p.add_argument(
+        "--mesh",
+        choices=["fitted", "refined"],
+        default="fitted",
+        help="refined: with the refined normals as shape, and its displacement map (default: fitted)",
+    )
 
     p = add("run", "a scene-file driven experiment or a sweep of them")
     p.add_argument("experiment", type=Path)

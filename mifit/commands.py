@@ -279,7 +279,7 @@ def export(arguments: Namespace) -> None:
     result = _result_and_variant(arguments)
     from mifit.output.export import export
 
-    export(result, arguments.format, arguments.out)
+    export(result, arguments.format, arguments.out, arguments.timestep, arguments.mesh)
     print(f"Export: {arguments.out}")
 
 

@@ -122,12 +122,35 @@ class NormalsConfig:
 
 
 @dataclass(frozen=True)
+class MeshConfig:
+    """Vertices from refined normals (``stages.refine_mesh``).
+
+    Attributes
+    ----------
+    subdivisions : int
+        Times that every face is split into four first: a mesh holds no detail finer than its edges.
+    detail : float
+        Length in centimetres below which shape comes from the normals and above which it comes from the positions.
+    """
+
+    subdivisions: int = 0
+    detail: float = 0.3
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.subdivisions <= 3:
+            raise ValueError(f"mesh.subdivisions: found {self.subdivisions}, expected 0 to 3")
+        if not self.detail > 0:
+            raise ValueError(f"mesh.detail: found {self.detail}, expected a number above 0")
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """All settings of ``mifit.fit``."""
 
     geometry: GeometryConfig = field(default_factory=GeometryConfig)
     reflectance: ReflectanceConfig = field(default_factory=ReflectanceConfig)
     normals: NormalsConfig = field(default_factory=NormalsConfig)
+    mesh: MeshConfig = field(default_factory=MeshConfig)
 
     @classmethod
     def load(cls, path: str | Path) -> FitConfig:

@@ -1,4 +1,4 @@
-"""``mifit.fit``: capture and model -> geometry -> reflectance -> normals -> reconstruction."""
+"""``mifit.fit``: capture and model -> geometry -> reflectance -> normals, mesh -> reconstruction."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import mifit
 from mifit import checkpoint
 from mifit.config import FitConfig
-from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
+from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
 
@@ -54,7 +54,7 @@ def fit(
     config : FitConfig, optional
         Settings of the stages.
     until : {"geometry", "reflectance", "normals"}
-        Last stage to run.
+        Last stage to run; the mesh update goes with the normals.
     seed : int
         Seed of everything random.
     progress : Progress
@@ -81,6 +81,7 @@ def fit(
     from mifit.output.reconstruction import Reconstruction
     from mifit.stages.fit_geometry import fit_geometry
     from mifit.stages.infer_reflectance import infer_reflectance
+    from mifit.stages.refine_mesh import refine_mesh
     from mifit.stages.refine_normals import refine_normals
 
     config = config or FitConfig()
@@ -102,7 +103,7 @@ def fit(
         "seed": seed,
     }
 
-    def stage(name: Stage, cls: type[T], used: dict[str, Any], run: Callable[[], T]) -> T:
+    def stage(name: str, cls: type[T], used: dict[str, Any], run: Callable[[], T]) -> T:
         key = checkpoint.digest({**inputs, **used})
         done = checkpoint.load(folder, name, cls, key) if folder else None
         if done is None:
@@ -119,7 +120,7 @@ def fit(
         used,
         lambda: fit_geometry(capture, model, cameras, timesteps, config.geometry, seed=seed, progress=progress),
     )
-    reflectance, normals = None, None
+    reflectance, normals, mesh = None, None, None
     if until != "geometry":
         used = {**used, "reflectance": settings["reflectance"]}
         reflectance = stage(
@@ -142,18 +143,26 @@ def fit(
                 capture, model, geometry, found, cameras, config.normals, seed=seed, progress=progress
             ),
         )
+        refined = normals
+        mesh = stage(
+            "mesh",
+            MeshEstimate,
+            {**used, "mesh": settings["mesh"]},
+            lambda: refine_mesh(model, geometry, refined, config.mesh, progress),
+        )
     return Reconstruction(
         model=model,
         geometry=geometry,
         reflectance=reflectance,
         normals=normals,
+        mesh=mesh,
         config={**settings, "seed": seed},
         cameras=tuple(capture.camera(name) for name in cameras),
         capture_digest=digest,
         units=capture.units,
         unit_mm=capture.unit_mm,
         warnings=() if known_cameras else (ESTIMATED_CAMERAS,),
-        seconds=sum(s.report.seconds for s in (geometry, reflectance, normals) if s is not None),
+        seconds=sum(s.report.seconds for s in (geometry, reflectance, normals, mesh) if s is not None),
         peak_memory=peak_memory(),
     )
 

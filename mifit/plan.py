@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import mifit
 from mifit import checkpoint
-from mifit.config import GeometryConfig, NormalsConfig, ReflectanceConfig, from_mapping, read_toml
+from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, ReflectanceConfig, from_mapping, read_toml
 from mifit.errors import InputError
 
 BUILTIN = ("builtin", "builtin:coarse")
@@ -46,6 +46,7 @@ class FitRun:
     geometry: GeometryConfig = field(default_factory=GeometryConfig)
     reflectance: ReflectanceConfig = field(default_factory=ReflectanceConfig)
     normals: NormalsConfig = field(default_factory=NormalsConfig)
+    mesh: MeshConfig = field(default_factory=MeshConfig)
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,8 @@ def test_nested_values_and_integers_for_floats():
         ({"reflectance": {"texture_size": True}}, "expected a value of type int"),
         ({"reflectance": {"solver": "sgd"}}, "expected one of"),
         ({"reflectance": 3}, "expected a table"),
+        ({"mesh": {"subdivisions": 9}}, "mesh.subdivisions: found 9, expected 0 to 3"),
+        ({"mesh": {"detail": 0}}, "mesh.detail: found 0.0, expected a number above 0"),
     ],
 )
 def test_refusals_name_key_value_and_expectation(values, message):

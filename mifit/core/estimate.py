@@ -126,3 +126,32 @@ class NormalsEstimate:
     timesteps: tuple[int, ...]
     normal_object: NDArray
     report: Report
+
+
+@dataclass(frozen=True)
+class MeshEstimate:
+    """Meshes with the refined normals as shape, on one topology.
+
+    Attributes
+    ----------
+    timesteps : tuple of int
+    vertices : (T, V', 3) float32
+        World space. With subdivision the model's vertices come first.
+    faces, faces_uv : (F', 3) int32
+    uv : (T', 2) float32
+    displacement : (T, S, S) float32
+        Distance from the fitted mesh along its normals, capture units; 0 outside the covered texels.
+    """
+
+    timesteps: tuple[int, ...]
+    vertices: NDArray
+    faces: NDArray
+    faces_uv: NDArray
+    uv: NDArray
+    displacement: NDArray
+    report: Report
+
+    @property
+    def subdivisions(self) -> int:
+        """Times that every face of the model was split into four."""
+        return int(self.report.details["subdivisions"])

@@ -22,7 +22,16 @@ Format = Literal["glb", "obj", "ply", "mitsuba"]
 SUFFIXES = {"glb": ".glb", "obj": ".obj", "ply": ".ply", "mitsuba": ".xml"}
 
 
-def export(reconstruction: Reconstruction, format: Format, path: str | Path, timestep: int | None = None) -> None:
+Mesh = Literal["fitted", "refined"]
+
+
+def export(
+    reconstruction: Reconstruction,
+    format: Format,
+    path: str | Path,
+    timestep: int | None = None,
+    mesh: Mesh = "fitted",
+) -> None:
     """Write one timestep for another program.
 
     Parameters
@@ -36,30 +45,38 @@ def export(reconstruction: Reconstruction, format: Format, path: str | Path, tim
         File to write; its suffix must be the format's.
     timestep : int, optional
         Default: the first that was fitted.
+    mesh : {"fitted", "refined"}
+        ``refined`` has the refined normals as shape; its displacement from the fitted mesh, in the result's units
+        along that mesh's normals, is written as ``NAME_displacement.exr``.
 
     Raises
     ------
     InputError
-        Unknown format, another suffix, or a timestep that was not fitted.
+        Unknown format or mesh, another suffix, a timestep that was not fitted, or no refined mesh.
     """
     path = Path(path)
     if format not in SUFFIXES:
         raise InputError(f"format: found {format!r}, expected one of {', '.join(SUFFIXES)}")
     if path.suffix.lower() != SUFFIXES[format]:
         raise InputError(f"{path}: found suffix {path.suffix!r}, expected {SUFFIXES[format]!r} for format {format}")
+    if mesh not in ("fitted", "refined"):
+        raise InputError(f"mesh: found {mesh!r}, expected 'fitted' or 'refined'")
     timestep = reconstruction.timesteps[0] if timestep is None else timestep
-    i = reconstruction.index(timestep)
+    reconstruction.index(timestep)
+    if mesh == "refined":
+        displacement = reconstruction.displacement(timestep)
+        reconstruction = reconstruction.with_refined_mesh()
+        write_image(path.with_name(f"{path.stem}_displacement.exr"), displacement)
     if format == "glb":
         write_glb(reconstruction, path, timestep)
     elif format == "obj":
         _write_obj(reconstruction, path, timestep)
     elif format == "ply":
-        mesh = split_at_seams(reconstruction.model)
-        vertices = reconstruction.geometry.vertices[i]
-        normals = vertex_normals(vertices, reconstruction.model.faces)[mesh.origin]
-        albedo = reconstruction.geometry.vertex_albedo[mesh.origin]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_ply(path, vertices[mesh.origin], mesh.faces, normals, mesh.uv, albedo)
+        split = split_at_seams(reconstruction.model)
+        vertices = reconstruction.geometry.vertices[reconstruction.index(timestep)]
+        normals = vertex_normals(vertices, reconstruction.model.faces)[split.origin]
+        albedo = reconstruction.geometry.vertex_albedo[split.origin]
+        write_ply(path, vertices[split.origin], split.faces, normals, split.uv, albedo)
     else:
         from mifit.output.scene import write_scene
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 
 import mifit
 from mifit.core.camera import Camera
-from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
+from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.files import replacing, write_text
 from mifit.core.image import encode_png, read_image, write_image
 from mifit.core.mesh import vertex_normals
@@ -20,6 +22,7 @@ from mifit.errors import InputError
 from mifit.output.ply import read_ply, write_ply
 from mifit.output.scene import write_scene
 from mifit.output.surface import SplitMesh, split_at_seams, tangent_space_map
+from mifit.stages.refine_mesh import split_faces
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
@@ -35,13 +38,12 @@ def save(result: Reconstruction, folder: Path) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "result.json").unlink(missing_ok=True)
-    for pattern in ("geometry/*.ply", "maps/*", "lighting.exr", "scene*.xml", "scene_files/*"):
+    for pattern in ("geometry/*.ply", "refined/*.ply", "maps/*", "lighting.exr", "scene*.xml", "scene_files/*"):
         for old in folder.glob(pattern):
             old.unlink()
-    (folder / "geometry").mkdir(exist_ok=True)
-    mesh = split_at_seams(result.model)
+    surfaces = _surfaces(result)
     for timestep in result.timesteps:
-        _write_timestep(result, folder, timestep, mesh)
+        _write_timestep(result, folder, timestep, surfaces)
     if result.reflectance is not None:
         for name in ("diffuse", "specular", "confidence"):
             write_image(folder / "maps" / f"{name}.exr", getattr(result.reflectance, name))
@@ -52,36 +54,55 @@ def save(result: Reconstruction, folder: Path) -> None:
 
 def add_timestep(result: Reconstruction, folder: Path, timestep: int) -> None:
     """Write the files of one timestep of a result into its folder, then ``result.json`` anew."""
-    (folder / "geometry").mkdir(exist_ok=True)
-    _write_timestep(result, folder, timestep, split_at_seams(result.model))
+    _write_timestep(result, folder, timestep, _surfaces(result))
     write_text(folder / "result.json", json.dumps(_document(result), indent=1, allow_nan=False) + "\n")
 
 
-def _write_timestep(result: Reconstruction, folder: Path, timestep: int, mesh: SplitMesh) -> None:
-    """Mesh and normal maps of one timestep."""
-    i = result.index(timestep)
+def _surfaces(result: Reconstruction) -> list[_Surface]:
+    """The fitted mesh and, where there is one, the refined mesh, as files hold them."""
+    albedo = result.geometry.vertex_albedo
+    found = [_Surface("geometry", split_at_seams(result.model), result.model.faces, albedo)]
+    if result.mesh is not None:
+        albedo = split_faces(result.model, result.mesh.subdivisions).matrix @ albedo
+        found.append(_Surface("refined", split_at_seams(result.mesh), result.mesh.faces, albedo))
+    return found
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """What the mesh files of one folder share over the timesteps; ``albedo`` (V, 3) is linear."""
+
+    folder: str
+    mesh: SplitMesh
+    faces: NDArray
+    albedo: NDArray
+
+    def write(self, result_folder: Path, timestep: int, vertices: NDArray, normals: NDArray) -> None:
+        """Write one timestep from its vertices and their normals (V, 3), world space."""
+        at = self.mesh.origin
+        path = result_folder / self.folder / f"{timestep:04d}.ply"
+        write_ply(path, vertices[at], self.mesh.faces, normals[at], self.mesh.uv, self.albedo[at])
+
+
+def _write_timestep(result: Reconstruction, folder: Path, timestep: int, surfaces: Sequence[_Surface]) -> None:
+    """Meshes, normal maps and displacement map of one timestep."""
+    i, fitted = result.index(timestep), surfaces[0]
     vertices = result.geometry.vertices[i]
     normals = vertex_normals(vertices, result.model.faces)
-    write_ply(
-        folder / "geometry" / f"{timestep:04d}.ply",
-        vertices[mesh.origin],
-        mesh.faces,
-        normals[mesh.origin],
-        mesh.uv,
-        result.geometry.vertex_albedo[mesh.origin],
-    )
+    fitted.write(folder, timestep, vertices, normals)
     refined = result.refined_normal(timestep)
     if refined is not None:
-        rotation = result.geometry.rotation[i]
+        rotation, at = result.geometry.rotation[i], fitted.mesh.origin
         tangent = tangent_space_map(
-            refined,
-            (vertices @ rotation)[mesh.origin],
-            (normals @ rotation)[mesh.origin],
-            mesh,
-            result.model.face_mask,
+            refined, (vertices @ rotation)[at], (normals @ rotation)[at], fitted.mesh, result.model.face_mask
         )
         write_image(folder / "maps" / f"normal_object_{timestep:04d}.exr", refined)
         write_data_png(folder / "maps" / f"normal_tangent_{timestep:04d}.png", 0.5 + 0.5 * tangent)
+    if result.mesh is not None and timestep in result.mesh.timesteps:
+        k = result.mesh.timesteps.index(timestep)
+        vertices = result.mesh.vertices[k]
+        surfaces[1].write(folder, timestep, vertices, vertex_normals(vertices, result.mesh.faces))
+        write_image(folder / "maps" / f"displacement_{timestep:04d}.exr", result.mesh.displacement[k])
 
 
 def write_data_png(path: Path, values: NDArray) -> None:
@@ -134,6 +155,7 @@ def _document(result: Reconstruction) -> dict[str, Any]:
                     "translation": geometry.translation[i].tolist(),
                     "expression": geometry.expression[i].tolist(),
                     "refined_normals": result.refined_normal(t) is not None,
+                    "refined_mesh": result.mesh is not None and t in result.mesh.timesteps,
                 }
                 for i, t in enumerate(result.timesteps)
             ],
@@ -203,6 +225,7 @@ def load(folder: Path, model: MorphableModel | None) -> Reconstruction:
             geometry=geometry,
             reflectance=_reflectance(folder, document),
             normals=_normals(folder, document),
+            mesh=_mesh(folder, document, model, geometry),
             config=document["config"],
             cameras=tuple(
                 Camera(**{**c, "world_to_camera": np.array(c["world_to_camera"], dtype=np.float64)})
@@ -287,13 +310,7 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
         rotation, translation = np.array(step["rotation"]), np.array(step["translation"])
         shape = model.shape(identity, expression[i])
         vertices[i] = entry["scale"] * shape @ rotation.T + translation
-        path = folder / "geometry" / f"{step['timestep']:04d}.ply"
-        stored = read_ply(path)
-        if len(stored["vertices"]) != len(mesh.origin) or not np.isfinite(stored["vertices"]).all():
-            raise InputError(
-                f"{path}: found {len(stored['vertices'])} vertices, expected {len(mesh.origin)} finite ones "
-                "as the model has; fit again"
-            )
+        stored = _read_mesh(folder / "geometry" / f"{step['timestep']:04d}.ply", mesh)
         vertices[i, mesh.origin] = stored["vertices"]
         vertex_albedo[mesh.origin] = stored["albedo"]
     return GeometryEstimate(
@@ -310,6 +327,17 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
         ambient=float(lighting["shading_ambient"]),
         report=_report(document, "geometry"),
     )
+
+
+def _read_mesh(path: Path, mesh: SplitMesh) -> dict[str, NDArray]:
+    """Read a mesh file and check that it has the vertices that the model gives it."""
+    stored = read_ply(path)
+    if len(stored["vertices"]) != len(mesh.origin) or not np.isfinite(stored["vertices"]).all():
+        raise InputError(
+            f"{path}: found {len(stored['vertices'])} vertices, expected {len(mesh.origin)} finite ones "
+            "as the model has; fit again"
+        )
+    return stored
 
 
 def _read_map(path: Path, channels: int, size: int | None = None) -> NDArray[np.float32]:
@@ -352,3 +380,28 @@ def _normals(folder: Path, document: dict[str, Any]) -> NormalsEstimate | None:
     timesteps = [int(s["timestep"]) for s in document["timesteps"] if s["refined_normals"]]
     maps = [_read_map(folder / "maps" / f"normal_object_{t:04d}.exr", 3) for t in timesteps]
     return NormalsEstimate(tuple(timesteps), np.stack(maps), _report(document, "normals"))
+
+
+def _mesh(
+    folder: Path, document: dict[str, Any], model: MorphableModel, geometry: GeometryEstimate
+) -> MeshEstimate | None:
+    if "mesh" not in document["stages"]:
+        return None
+    report = _report(document, "mesh")
+    topology = split_faces(model, int(report.details["subdivisions"]))
+    timesteps = tuple(int(s["timestep"]) for s in document["timesteps"] if s["refined_mesh"])
+    mesh = split_at_seams(topology)
+    # Vertices that no face uses are in no mesh file: they stay where the fit left them.
+    vertices = np.stack([topology.matrix @ geometry.vertices[geometry.index(t)] for t in timesteps])
+    for k, timestep in enumerate(timesteps):
+        vertices[k, mesh.origin] = _read_mesh(folder / "refined" / f"{timestep:04d}.ply", mesh)["vertices"]
+    heights = [_read_map(folder / "maps" / f"displacement_{t:04d}.exr", 1) for t in timesteps]
+    return MeshEstimate(
+        timesteps,
+        vertices.astype(np.float32),
+        topology.faces,
+        topology.faces_uv,
+        topology.uv,
+        np.stack(heights),
+        report,
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
-from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
+from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.sh import SHLighting, bands, cosine_coefficients
 from mifit.errors import InputError
 
@@ -34,6 +34,9 @@ class Reconstruction:
         None when the fit ended after stage 1.
     normals : NormalsEstimate or None
         None when stage 3 did not run.
+    mesh : MeshEstimate or None
+        Meshes with the refined normals as shape; None when stage 3 did not run. Renders and relighting use the
+        fitted mesh with the refined normals instead, as the fit did.
     config : dict
         Settings as used (``dataclasses.asdict`` of the FitConfig, and the seed).
     cameras : tuple of Camera
@@ -71,6 +74,7 @@ class Reconstruction:
     model_source: str = ""
     warnings: tuple[str, ...] = ()
     environment: NDArray[np.float32] | None = field(default=None, repr=False)
+    mesh: MeshEstimate | None = field(default=None, repr=False)
 
     @property
     def timesteps(self) -> tuple[int, ...]:
@@ -85,7 +89,12 @@ class Reconstruction:
     @property
     def reports(self) -> dict[str, Report]:
         """How each stage that ran ended, by its name, in order."""
-        stages = {"geometry": self.geometry, "reflectance": self.reflectance, "normals": self.normals}
+        stages = {
+            "geometry": self.geometry,
+            "reflectance": self.reflectance,
+            "normals": self.normals,
+            "mesh": self.mesh,
+        }
         return {name: stage.report for name, stage in stages.items() if stage is not None}
 
     @property
@@ -115,6 +124,35 @@ class Reconstruction:
         if self.normals is None or timestep not in self.normals.timesteps:
             return None
         return self.normals.normal_object[self.normals.timesteps.index(timestep)]
+
+    def displacement(self, timestep: int) -> NDArray:
+        """(S, S) distance of the refined mesh from the fitted one, along its normals; InputError without one."""
+        if self.mesh is None or timestep not in self.mesh.timesteps:
+            raise InputError(
+                f"timestep {timestep} has no refined mesh in this result; fit with --until normals, which makes it"
+            )
+        return self.mesh.displacement[self.mesh.timesteps.index(timestep)]
+
+    def with_refined_mesh(self) -> Reconstruction:
+        """This face on its refined mesh: `mesh` becomes model and geometry, for export or for rendering.
+
+        Raises
+        ------
+        InputError
+            The result has no refined mesh.
+        """
+        from mifit.stages.refine_mesh import finer_model, split_faces
+        from mifit.stages.track import subset
+
+        if self.mesh is None:
+            raise InputError("this result has no refined mesh; fit with --until normals, which makes it")
+        matrix = split_faces(self.model, self.mesh.subdivisions).matrix
+        geometry = replace(
+            subset(self.geometry, self.mesh.timesteps),
+            vertices=self.mesh.vertices,
+            vertex_albedo=(matrix @ self.geometry.vertex_albedo).astype(np.float32),
+        )
+        return replace(self, model=finer_model(self.model, self.mesh.subdivisions), geometry=geometry, mesh=None)
 
     def save(self, folder: str | Path) -> None:
         """Write the result folder (docs/formats.md); ``result.json`` comes last and marks it whole."""

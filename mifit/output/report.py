@@ -38,7 +38,7 @@ NAMES = {
     "diffuse": "Diffuse only",
     "full": "Full",
 }
-STAGES = {"geometry": "1 Geometry", "reflectance": "2 Reflectance", "normals": "3 Normals"}
+STAGES = {"geometry": "1 Geometry", "reflectance": "2 Reflectance", "normals": "3 Normals", "mesh": "3 Mesh"}
 SHOWN_TIMESTEPS = 4
 """Timesteps whose pictures a report holds, so that it stays small enough for a phone."""
 
@@ -257,6 +257,12 @@ def _maps(result: Reconstruction, timestep: int) -> str:
                 "normal map",
             )
         )
+    if result.mesh is not None and timestep in result.mesh.timesteps:
+        shift = result.displacement(timestep) * result.unit_mm
+        white = max(float(np.quantile(np.abs(shift), 0.999)), 1e-6)
+        codes = np.round(127.5 * (1 + np.clip(shift / white, -1, 1))).astype(np.uint8)
+        caption = f"Displacement of the refined mesh, timestep {timestep} (white = {white:.2g} mm outwards)"
+        figures.append(_figure(jpeg_uri(codes), caption, "displacement map"))
     return f'<div class="grid">{"".join(figures)}</div>'
 
 

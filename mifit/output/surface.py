@@ -18,18 +18,20 @@ from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, rasterize_uv
 
 if TYPE_CHECKING:
+    from mifit.core.estimate import MeshEstimate
     from mifit.morphable import MorphableModel
     from mifit.output.reconstruction import Reconstruction
+    from mifit.stages.refine_mesh import Topology
 
 
 @dataclass(frozen=True)
 class SplitMesh:
-    """A model's mesh with one vertex per pair of position and texture coordinate.
+    """A mesh with one vertex per pair of position and texture coordinate.
 
     Attributes
     ----------
     origin : (N,) int64
-        Model vertex of each split vertex.
+        Vertex of the model that each split vertex is at.
     uv : (N, 2) float32
     faces : (F, 3) int32
         In the order of the model's faces.
@@ -40,12 +42,12 @@ class SplitMesh:
     faces: NDArray[np.int32]
 
 
-def split_at_seams(model: MorphableModel) -> SplitMesh:
-    """Split a model's vertices where texture coordinates differ; the order is by model vertex."""
-    n = len(model.uv)
-    key = model.faces.astype(np.int64) * n + model.faces_uv
+def split_at_seams(mesh: MorphableModel | MeshEstimate | Topology) -> SplitMesh:
+    """Split the vertices of a mesh where texture coordinates differ; the order is by model vertex."""
+    n = len(mesh.uv)
+    key = mesh.faces.astype(np.int64) * n + mesh.faces_uv
     pairs, inverse = np.unique(key.ravel(), return_inverse=True)
-    return SplitMesh(pairs // n, model.uv[pairs % n].astype(np.float32), inverse.reshape(-1, 3).astype(np.int32))
+    return SplitMesh(pairs // n, mesh.uv[pairs % n].astype(np.float32), inverse.reshape(-1, 3).astype(np.int32))
 
 
 def part_of(mesh: SplitMesh, selected: NDArray[np.bool_]) -> SplitMesh:

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mifit.config import GeometryConfig, NormalsConfig
+from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, from_mapping
 from mifit.core.estimate import NormalsEstimate, Report
 from mifit.errors import InputError
 from mifit.output.folder import add_timestep
 from mifit.progress import Progress, silent
+from mifit.stages.refine_mesh import MeshRefiner
 from mifit.stages.track import TrackedFrame, subset, track
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ def track_into(
         timesteps = [t for t in timesteps if t not in tracked]
     else:
         result = _without(result, [t for t in tracked if t in timesteps])
+    refiner = None if result.mesh is None else mesh_refiner(result)
     frames = track(
         capture.with_fitted(result.cameras),
         result.model,
@@ -84,13 +86,24 @@ def track_into(
         progress,
     )
     for frame in frames:
-        result = extend(result, frame)
+        result = extend(result, frame, refiner)
         add_timestep(result, Path(folder), frame.timestep)
     return result
 
 
-def extend(result: Reconstruction, frame: TrackedFrame) -> Reconstruction:
-    """A result with one more timestep; its normals' report lists it under ``tracked``."""
+def mesh_refiner(result: Reconstruction) -> MeshRefiner:
+    """What refines the meshes of further timesteps as those of a result are."""
+    assert result.mesh is not None and result.reflectance is not None
+    settings = from_mapping(MeshConfig, result.config.get("mesh", {}), "result.json: config: mesh")
+    settings = replace(settings, subdivisions=result.mesh.subdivisions)
+    return MeshRefiner(result.model, len(result.reflectance.diffuse), settings)
+
+
+def extend(result: Reconstruction, frame: TrackedFrame, refiner: MeshRefiner | None = None) -> Reconstruction:
+    """A result with one more timestep; its normals' report lists it under ``tracked``.
+
+    With a refiner its refined mesh is made too.
+    """
     a, b = result.geometry, frame.geometry
     geometry = replace(
         a,
@@ -113,7 +126,16 @@ def extend(result: Reconstruction, frame: TrackedFrame) -> Reconstruction:
         np.concatenate([before.normal_object, frame.normal_object[None]]),
         report,
     )
-    return replace(result, geometry=geometry, normals=normals)
+    mesh = result.mesh
+    if mesh is not None and refiner is not None:
+        vertices, height = refiner.refine(frame.geometry, frame.timestep, frame.normal_object)
+        mesh = replace(
+            mesh,
+            timesteps=(*mesh.timesteps, frame.timestep),
+            vertices=np.concatenate([mesh.vertices, vertices[None]]),
+            displacement=np.concatenate([mesh.displacement, height[None]]),
+        )
+    return replace(result, geometry=geometry, normals=normals, mesh=mesh)
 
 
 def _without(result: Reconstruction, dropped: Sequence[int]) -> Reconstruction:
@@ -122,6 +144,15 @@ def _without(result: Reconstruction, dropped: Sequence[int]) -> Reconstruction:
         return result
     normals, report = result.normals, result.normals.report
     rows = [i for i, t in enumerate(normals.timesteps) if t not in dropped]
+    mesh = result.mesh
+    if mesh is not None:
+        kept = [i for i, t in enumerate(mesh.timesteps) if t not in dropped]
+        mesh = replace(
+            mesh,
+            timesteps=tuple(mesh.timesteps[i] for i in kept),
+            vertices=mesh.vertices[kept],
+            displacement=mesh.displacement[kept],
+        )
     details = {**report.details, "tracked": [t for t in report.details["tracked"] if t not in dropped]}
     return replace(
         result,
@@ -129,4 +160,5 @@ def _without(result: Reconstruction, dropped: Sequence[int]) -> Reconstruction:
         normals=NormalsEstimate(
             tuple(normals.timesteps[i] for i in rows), normals.normal_object[rows], replace(report, details=details)
         ),
+        mesh=mesh,
     )

@@ -2,113 +2,179 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from mifit.core.estimate import GeometryEstimate, NormalsEstimate
+from mifit.config import MeshConfig
+from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, Report
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.mesh_update import MeshUpdater, displacement, interior_vertices, subdivide, wanted_face_normals
-from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.core.uv import rasterize_uv
+from mifit.progress import Progress, silent
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
-
-DETAIL = 0.3
-"""Length in centimetres below which shape comes from the normals and above which it comes from the positions."""
-
-
-@dataclass(frozen=True)
-class RefinedMesh:
-    """Meshes of all refined timesteps on one topology.
-
-    Attributes
-    ----------
-    timesteps : tuple of int
-    vertices : (T, V', 3) float32
-        World space. With subdivision the model's vertices come first.
-    faces, faces_uv : (F', 3) int
-    uv : (T', 2) float32
-    displacement : (T, S, S) float32
-        Distance from the fitted mesh along its normals, capture units; 0 outside the covered texels.
-    """
-
-    timesteps: tuple[int, ...]
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int64]
-    faces_uv: NDArray[np.int64]
-    uv: NDArray[np.float32]
-    displacement: NDArray[np.float32]
 
 
 def refine_mesh(
     model: MorphableModel,
     geometry: GeometryEstimate,
     normals: NormalsEstimate,
-    subdivisions: int = 0,
-    detail: float = DETAIL,
-) -> RefinedMesh:
+    config: MeshConfig | None = None,
+    progress: Progress = silent,
+) -> MeshEstimate:
     """Move the vertices of the face area so that the mesh takes the refined normals.
 
     Parameters
     ----------
     model, geometry, normals
         Stage 1's mesh and stage 3's normals; timesteps without normals are left out.
-    subdivisions : int
-        Times that every face is split into four first: a mesh holds no detail finer than its edges.
-    detail : float
-        Length in centimetres, see ``DETAIL``.
+    config : MeshConfig, optional
+    progress : Progress
 
     Returns
     -------
-    RefinedMesh
+    MeshEstimate
         The boundary of the face area and everything outside it stay; no face flips.
 
     Notes
     -----
     Nehab et al. 2005, see `core.mesh_update`. The system is factorised once for all timesteps.
     """
-    size = normals.normal_object.shape[1]
-    faces, faces_uv, uv = model.faces.astype(np.int64), model.faces_uv.astype(np.int64), model.uv.astype(np.float64)
-    mask, lift = model.face_mask, None
-    rest = model.mean.astype(np.float64)
-    for _ in range(subdivisions):
-        split, split_uv = subdivide(faces, len(rest)), subdivide(faces_uv, len(uv))
-        lift = split.matrix if lift is None else split.matrix @ lift
-        rest, uv = split.matrix @ rest, split_uv.matrix @ uv
-        faces, faces_uv, mask = split.faces, split_uv.faces, np.repeat(mask, 4)
-    texels = rasterize_uv(uv, faces_uv, size, mask)
-    # Object space is in model units; a wave of length L keeps the share 1 / (1 + weight (L / 2 pi)^2) of its normals.
-    length = detail * 10.0 / model.unit_mm / (2.0 * np.pi)
-    updater = MeshUpdater(rest, faces, interior_vertices(faces, mask, len(rest)), 1.0 / length**2)
-    vertices, heights = [], []
-    for timestep, wanted in zip(normals.timesteps, normals.normal_object, strict=True):
-        k = geometry.index(timestep)
-        rotation, translation, scale = geometry.rotation[k], geometry.translation[k], geometry.scale
-        shape = (geometry.vertices[k].astype(np.float64) - translation) @ rotation / scale
-        shape = shape if lift is None else lift @ shape
-        moved, height = _update(updater, shape, faces, texels, wanted)
-        vertices.append(scale * moved @ rotation.T + translation)
-        heights.append(texels.to_map(scale * height))
-    return RefinedMesh(
-        normals.timesteps,
-        np.stack(vertices).astype(np.float32),
-        faces,
-        faces_uv,
-        uv.astype(np.float32),
-        np.stack(heights).astype(np.float32),
+    began = time.perf_counter()
+    refiner = MeshRefiner(model, normals.normal_object.shape[1], config or MeshConfig())
+    factorised = time.perf_counter()
+    steps = normals.timesteps
+    vertices = np.empty((len(steps), refiner.topology.n_vertices, 3), dtype=np.float32)
+    heights = np.empty(normals.normal_object.shape[:3], dtype=np.float32)
+    for i, timestep in enumerate(steps):
+        progress("refine mesh", i, len(steps))
+        vertices[i], heights[i] = refiner.refine(geometry, timestep, normals.normal_object[i])
+    progress("refine mesh", len(steps), len(steps))
+    seconds = time.perf_counter() - factorised
+    details = {
+        "subdivisions": refiner.config.subdivisions,
+        "seconds_to_factorise": factorised - began,
+        "seconds_per_timestep": seconds / max(len(steps), 1),
+    }
+    topology = refiner.topology
+    return MeshEstimate(
+        steps,
+        vertices,
+        topology.faces,
+        topology.faces_uv,
+        topology.uv,
+        heights,
+        Report("converged", seconds=time.perf_counter() - began, details=details),
     )
 
 
-def _update(
-    updater: MeshUpdater, shape: NDArray, faces: NDArray, texels: TexelMap, wanted: NDArray
-) -> tuple[NDArray, NDArray]:
-    """One timestep in object space: positions, and displacement per covered texel."""
-    base = normalize(interpolate(vertex_normals(shape, faces), faces, texels.face, texels.weights))
-    refined = texels.from_map(wanted).astype(np.float64)
-    missing = np.linalg.norm(refined, axis=1) < 0.5
-    refined[missing] = base[missing]
-    moved = updater.update(shape, wanted_face_normals(shape, faces, texels, base, refined))
-    return moved, displacement(texels, faces, shape, moved, base)
+@dataclass(frozen=True)
+class Topology:
+    """A model's mesh with its faces split.
+
+    Attributes
+    ----------
+    faces, faces_uv : (F', 3) int32
+    uv : (T', 2) float32
+    face_mask : (F',) bool
+    matrix : (V', V) sparse
+        Values at the model's vertices -> values at these; the model's come first, unchanged.
+    """
+
+    faces: NDArray[np.int32]
+    faces_uv: NDArray[np.int32]
+    uv: NDArray[np.float32]
+    face_mask: NDArray[np.bool_]
+    matrix: sp.csr_matrix
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices V'."""
+        return self.matrix.shape[0]
+
+
+def split_faces(model: MorphableModel, subdivisions: int) -> Topology:
+    """A model's mesh with every face split into four, ``subdivisions`` times."""
+    faces: NDArray = model.faces
+    faces_uv: NDArray = model.faces_uv
+    uv = model.uv.astype(np.float64)
+    matrix = sp.identity(len(model.mean), format="csr")
+    for _ in range(subdivisions):
+        split, split_uv = subdivide(faces, matrix.shape[0]), subdivide(faces_uv, len(uv))
+        matrix, uv = split.matrix @ matrix, split_uv.matrix @ uv
+        faces, faces_uv = split.faces, split_uv.faces
+    mask = np.repeat(model.face_mask, 4**subdivisions)
+    return Topology(faces.astype(np.int32), faces_uv.astype(np.int32), uv.astype(np.float32), mask, matrix)
+
+
+def finer_model(model: MorphableModel, subdivisions: int) -> MorphableModel:
+    """A model on the split mesh of `split_faces`: shapes and albedos are those of the model, landmarks its vertices."""
+    if not subdivisions:
+        return model
+    topology = split_faces(model, subdivisions)
+
+    def lift(values: NDArray) -> NDArray[np.float32]:
+        flat = topology.matrix @ values.reshape(len(values), -1)
+        return flat.reshape(topology.n_vertices, *values.shape[1:]).astype(np.float32)
+
+    return replace(
+        model,
+        mean=lift(model.mean),
+        identity=lift(model.identity),
+        expression=lift(model.expression),
+        mean_albedo=lift(model.mean_albedo),
+        albedo_modes=lift(model.albedo_modes),
+        faces=topology.faces,
+        faces_uv=topology.faces_uv,
+        uv=topology.uv,
+        face_mask=topology.face_mask,
+        symmetry=None,
+        fingerprint=f"{model.fingerprint}/{subdivisions}" if model.fingerprint else "",
+    )
+
+
+class MeshRefiner:
+    """Refines the meshes of one model; the system is factorised here, once.
+
+    Parameters
+    ----------
+    model : MorphableModel
+    size : int
+        Side of the normal maps.
+    config : MeshConfig
+    """
+
+    def __init__(self, model: MorphableModel, size: int, config: MeshConfig) -> None:
+        self.config = config
+        self.topology = top = split_faces(model, config.subdivisions)
+        self._texels = rasterize_uv(top.uv, top.faces_uv, size, top.face_mask)
+        # Object space is in model units; a wave of length L keeps the share 1 / (1 + weight (L / 2 pi)^2) of its
+        # normals.
+        length = config.detail * 10.0 / model.unit_mm / (2.0 * np.pi)
+        free = interior_vertices(top.faces, top.face_mask, top.n_vertices)
+        rest = top.matrix @ model.mean.astype(np.float64)
+        self._updater = MeshUpdater(rest, top.faces, free, 1.0 / length**2)
+
+    def refine(
+        self, geometry: GeometryEstimate, timestep: int, normal_object: NDArray
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """World-space vertices (V', 3) of a timestep and its displacement map (S, S), from its normals (S, S, 3)."""
+        k, faces, texels = geometry.index(timestep), self.topology.faces, self._texels
+        rotation, translation, scale = geometry.rotation[k], geometry.translation[k], geometry.scale
+        world = geometry.vertices[k].astype(np.float64)
+        shape = self.topology.matrix @ ((world - translation) @ rotation / scale)
+        base = normalize(interpolate(vertex_normals(shape, faces), faces, texels.face, texels.weights))
+        refined = texels.from_map(normal_object).astype(np.float64)
+        missing = np.linalg.norm(refined, axis=1) < 0.5
+        refined[missing] = base[missing]
+        moved = self._updater.update(shape, wanted_face_normals(shape, faces, texels, base, refined))
+        height = displacement(texels, faces, shape, moved, base)
+        # As a shift of the world's vertices, so that those that stay are the same to the last bit.
+        vertices = self.topology.matrix @ world + scale * (moved - shape) @ rotation.T
+        return vertices.astype(np.float32), texels.to_map((scale * height).astype(np.float32))

@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mifit.config import MeshConfig
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
 from mifit.output.reconstruction import Reconstruction
+from mifit.stages.refine_mesh import refine_mesh
 
 RADIUS = 9.0
 
@@ -103,11 +105,13 @@ def ball_result(size: int = 32, shading_model: str = "prefiltered") -> Reconstru
         base = interpolate(vertex_normals(v, model.faces) @ r, model.faces, texels.face, texels.weights)
         bent = normalize(base + 0.1 * rng.standard_normal(base.shape))
         normals.append(texels.to_map(bent.astype(np.float32)))
+    refined = NormalsEstimate((0, 3), np.stack(normals), Report("converged", curve, 0.7))
     return Reconstruction(
         model=model,
         geometry=geometry,
         reflectance=reflectance,
-        normals=NormalsEstimate((0, 3), np.stack(normals), Report("converged", curve, 0.7)),
+        normals=refined,
+        mesh=refine_mesh(model, geometry, refined, MeshConfig(subdivisions=1, detail=3.0)),
         config={"seed": 0, "reflectance": {"exponent": 12.0}},
         cameras=(ball_camera("left", -20), ball_camera("right", 20)),
         capture_digest="0123",
@@ -123,4 +127,4 @@ def ball() -> Reconstruction:
 
 @pytest.fixture(scope="session")
 def stage_1_ball(ball) -> Reconstruction:
-    return replace(ball, reflectance=None, normals=None)
+    return replace(ball, reflectance=None, normals=None, mesh=None)

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from mifit.core.image import read_image
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
-from mifit.output.export import export
+from mifit.output.export import SUFFIXES, export
 from mifit.output.surface import part_of, split_at_seams
 
 
@@ -137,6 +138,43 @@ def test_obj_opens_in_trimesh_with_its_maps(ball, tmp_path):
 def test_ply_export(ball, tmp_path):
     export(ball, "ply", tmp_path / "new" / "ball.ply")
     assert len(trimesh.load(tmp_path / "new" / "ball.ply", process=False).faces) == len(ball.model.faces)
+
+
+@pytest.mark.parametrize("format", ["glb", "obj", "ply", "mitsuba"])
+def test_the_refined_mesh_exports_with_its_displacement(ball, tmp_path, format):
+    path = tmp_path / f"fine{SUFFIXES[format]}"
+    export(ball, format, path, timestep=3, mesh="refined")
+    shown = read_image(tmp_path / "fine_displacement.exr")[..., 0]
+    np.testing.assert_array_equal(shown, ball.mesh.displacement[1])
+    if format == "mitsuba":
+        parts = [trimesh.load(tmp_path / "fine_files" / f"{name}.ply", process=False) for name in ("face", "rest")]
+    else:
+        loaded = trimesh.load(path, process=False)
+        parts = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
+    assert sum(len(part.faces) for part in parts) == 4 * len(ball.model.faces)
+    area = np.sort(np.concatenate([part.area_faces for part in parts]))
+    expected = trimesh.Trimesh(ball.mesh.vertices[1], ball.mesh.faces, process=False).area_faces
+    if format == "glb":  # metres, and the fitted expression is a weight: trimesh shows the base shape
+        assert len(area) == len(expected)
+    else:
+        np.testing.assert_allclose(area, np.sort(expected), rtol=1e-3, atol=1e-5)
+
+
+def test_the_refined_glb_has_the_refined_shape(ball, tmp_path):
+    export(ball, "glb", tmp_path / "a.glb", timestep=3, mesh="refined")
+    document, read, _ = read_glb(tmp_path / "a.glb")
+    pose = np.array(document["nodes"][0]["matrix"]).reshape(4, 4).T
+    primitive = document["meshes"][0]["primitives"][0]
+    base, target = read(primitive["attributes"]["POSITION"]), read(primitive["targets"][0]["POSITION"])
+    world = (base + 0.7 * target) @ pose[:3, :3].T + pose[:3, 3]
+    part = part_of(split_at_seams(ball.mesh), np.repeat(ball.model.face_mask, 4))
+    np.testing.assert_allclose(world, ball.mesh.vertices[1][part.origin] / 100, atol=1e-6)
+
+
+def test_a_result_without_a_refined_mesh_says_so(stage_1_ball, tmp_path):
+    with pytest.raises(InputError, match="timestep 0 has no refined mesh in this result; fit with --until normals"):
+        export(stage_1_ball, "ply", tmp_path / "x.ply", mesh="refined")
+    assert not list(tmp_path.iterdir())
 
 
 def test_stage_1_exports_too(stage_1_ball, tmp_path):

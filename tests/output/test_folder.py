@@ -38,7 +38,7 @@ def same(a, b):
 
 def test_round_trip_is_exact(ball, saved):
     again = Reconstruction.load(saved)
-    for name in ("geometry", "reflectance", "normals"):
+    for name in ("geometry", "reflectance", "normals", "mesh"):
         same(getattr(ball, name), getattr(again, name))
     assert again.model.digest == ball.model.digest
     for key in ("config", "capture_digest", "units", "unit_mm", "seconds", "peak_memory", "warnings"):
@@ -59,6 +59,8 @@ def test_folder_holds_the_files_of_the_contract(saved):
         "maps/normal_object_0000.exr",
         "maps/normal_object_0003.exr",
         "maps/normal_tangent_0003.png",
+        "refined/0003.ply",
+        "maps/displacement_0003.exr",
         "lighting.exr",
     }
     assert not [n for n in names if ".part" in n]
@@ -108,17 +110,40 @@ def test_tangent_normals_decode_to_the_object_normals(ball, saved):
         assert (moving[up] > 0).all() and (along_u | up).any()
 
 
+def test_results_from_before_meshes_were_refined_load(saved, tmp_path):
+    folder = copy_of(saved, tmp_path)
+
+    def older(document):
+        document["stages"].pop("mesh")
+        for step in document["timesteps"]:
+            step.pop("refined_mesh")
+
+    edit(folder, older)
+    assert Reconstruction.load(folder).mesh is None
+
+
+def test_a_refined_mesh_of_another_model_is_refused(saved, tmp_path):
+    folder = copy_of(saved, tmp_path)
+    shutil.copy(folder / "geometry" / "0000.ply", folder / "refined" / "0000.ply")
+    with pytest.raises(InputError, match=r"refined/0000\.ply: found \d+ vertices, expected \d+"):
+        Reconstruction.load(folder)
+
+
 def test_stage_1_alone_round_trips(stage_1_ball, tmp_path):
     stage_1_ball.save(tmp_path)
     again = Reconstruction.load(tmp_path, stage_1_ball.model)
-    assert again.reflectance is None and again.normals is None and again.methods == ("pca",)
+    assert again.reflectance is None and again.normals is None and again.mesh is None and again.methods == ("pca",)
     same(again.geometry, stage_1_ball.geometry)
 
 
 def test_saving_again_leaves_nothing_stale(ball, stage_1_ball, tmp_path):
     ball.save(tmp_path)
     stage_1_ball.save(tmp_path)
-    assert not list(tmp_path.glob("maps/*")) and not (tmp_path / "lighting.exr").exists()
+    assert (
+        not list(tmp_path.glob("maps/*"))
+        and not list(tmp_path.glob("refined/*"))
+        and not (tmp_path / "lighting.exr").exists()
+    )
 
 
 def copy_of(saved, tmp_path):

@@ -35,6 +35,9 @@ class FakeCapture:
     def camera(self, name):
         return next(c for c in self.cameras if c.name == name)
 
+    def with_fitted(self, cameras):
+        return self
+
     def frame(self, name, t):
         image = self.images(self.camera(name), t)
         valid = np.ones(image.shape[:2], bool)

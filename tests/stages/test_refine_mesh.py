@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from mifit.config import MeshConfig
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, Report
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.mesh_update import interior_vertices
@@ -49,7 +50,7 @@ def problem():
 
 def test_bumps_appear_in_positions_and_displacement(problem):
     model, geometry, normals, true = problem
-    refined = refine_mesh(model, geometry, normals, detail=20.0)
+    refined = refine_mesh(model, geometry, normals, MeshConfig(detail=20.0))
     before = np.linalg.norm(geometry.vertices[0] - true, axis=1)
     after = np.linalg.norm(refined.vertices[0] - true, axis=1)
     assert after.mean() < 0.35 * before.mean()
@@ -62,8 +63,8 @@ def test_bumps_appear_in_positions_and_displacement(problem):
 
 def test_positions_hold_against_the_normals_of_large_shapes(problem):
     model, geometry, normals, _ = problem
-    free = refine_mesh(model, geometry, normals, detail=20.0)
-    held = refine_mesh(model, geometry, normals, detail=0.01)
+    free = refine_mesh(model, geometry, normals, MeshConfig(detail=20.0))
+    held = refine_mesh(model, geometry, normals, MeshConfig(detail=0.01))
     move = [np.abs(r.vertices[0] - geometry.vertices[0]).max() for r in (free, held)]
     assert move[1] < 0.05 * move[0]
 
@@ -79,7 +80,7 @@ def test_border_stays_and_nothing_flips(problem):
 
 def test_subdivision_holds_the_model_vertices_first(problem):
     model, geometry, normals, true = problem
-    refined = refine_mesh(model, geometry, normals, subdivisions=1, detail=20.0)
+    refined = refine_mesh(model, geometry, normals, MeshConfig(1, 20.0))
     n = len(model.mean)
     assert len(refined.faces) == len(refined.faces_uv) == 4 * len(model.faces)
     assert refined.uv.min() >= 0 and refined.uv.max() <= 1

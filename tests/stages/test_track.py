@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from mifit.config import NormalsConfig
+from mifit.config import MeshConfig, NormalsConfig
 from mifit.core.estimate import NormalsEstimate, Report
 from mifit.errors import ConvergenceError, InputError
 
@@ -172,16 +172,20 @@ def test_landmark_error_is_in_pixels(scene):
 def saved(scene, tmp_path):
     """A result with timestep 0 in a folder, and its reload."""
     from mifit.output.reconstruction import Reconstruction
+    from mifit.stages.refine_mesh import refine_mesh
 
     scene.model.save(tmp_path / "dome.npz")
     mask = np.linalg.norm(scene.normal_map, axis=-1) > 0
     base = np.where(mask[..., None], [0.0, 0.0, 1.0], 0.0).astype(np.float32)
+    normals = NormalsEstimate((0,), base[None], Report("converged"))
+    config = MeshConfig(subdivisions=1, detail=20.0)
     result = Reconstruction(
         model=scene.model,
         geometry=first(scene),
         reflectance=scene.reflectance,
-        normals=NormalsEstimate((0,), base[None], Report("converged")),
-        config={"seed": 0},
+        normals=normals,
+        mesh=refine_mesh(scene.model, first(scene), normals, config),
+        config={"seed": 0, "mesh": {"detail": config.detail}},
         cameras=tuple(scene.cameras[c] for c in CAMERAS),
         model_source=str(tmp_path / "dome.npz"),
     )
@@ -211,6 +215,20 @@ def test_each_frame_is_on_disk_when_it_is_done(scene, fit_truth, saved, monkeypa
     for t in (1, 2):
         assert (saved / "geometry" / f"{t:04d}.ply").is_file()
         assert (saved / "maps" / f"normal_tangent_{t:04d}.png").is_file()
+        assert (saved / "refined" / f"{t:04d}.ply").is_file()
+
+
+def test_meshes_of_tracked_frames_are_refined_as_those_of_the_fit(scene, fit_truth, saved):
+    from mifit.output.tracking import track_into
+    from mifit.stages.refine_mesh import refine_mesh
+
+    found = track_into(saved, reload(saved), scene, (1,), CONFIG)
+    expected = refine_mesh(scene.model, found.geometry, found.normals, MeshConfig(subdivisions=1, detail=20.0))
+    assert found.mesh.timesteps == (0, 1)
+    assert np.abs(found.displacement(1)).max() > 0
+    for mesh in (found.mesh, reload(saved).mesh):
+        assert_array_equal(mesh.vertices, expected.vertices)
+        assert_array_equal(mesh.displacement, expected.displacement)
 
 
 @pytest.mark.slow
@@ -250,6 +268,7 @@ def test_a_killed_run_resumes_to_the_same_result(scene, fit_truth, saved, tmp_pa
     assert found.timesteps == expected.timesteps == (0, 1, 2)
     assert_array_equal(found.geometry.vertices, reload(whole).geometry.vertices)
     assert_array_equal(found.normals.normal_object, reload(whole).normals.normal_object)
+    assert_array_equal(found.mesh.vertices, reload(whole).mesh.vertices)
     assert found.normals.report.details["tracked"] == [1, 2]
 
 
@@ -262,7 +281,7 @@ def test_without_resume_frames_are_tracked_anew(scene, fit_truth, saved):
     assert len(fit_truth) == 1
     again = track_into(saved, reload(saved), scene, (1,), CONFIG)
     assert len(fit_truth) == 2
-    assert again.timesteps == (0, 1)
+    assert again.timesteps == again.mesh.timesteps == (0, 1)
 
 
 def test_a_result_without_reflectance_is_refused(scene, saved):
