@@ -67,6 +67,13 @@ def _real(text: str) -> float:
     return value
 
 
+def _rate(text: str) -> float:
+    value = _real(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number above 0")
+    return value
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     common = argparse.ArgumentParser(add_help=False)
@@ -87,6 +94,9 @@ def build_parser() -> argparse.ArgumentParser:
 
     def add(name: str, text: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".", parents=[common])
+
+    def add_rate(p: argparse.ArgumentParser) -> None:
+        p.add_argument("--fps", type=_rate, default=12.0, help="timesteps per second of what moves (default: 12)")
 
     p = add("doctor", "what of the set-up works, what doesn't, and the command that mends it")
     p.add_argument("--json", action="store_true", help="print JSON")
@@ -137,6 +147,8 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--result", type=Path, required=True, help="result folder of mifit fit; extended in place")
     p.add_argument("--timesteps", type=_timesteps, help="default: all that aren't in the result yet")
     p.add_argument("--resume", action="store_true", help="keep the frames that an earlier run has written")
+    p.add_argument("--overlay", type=_names, help="cameras to write overlay videos of; default: the fitted ones")
+    add_rate(p)
 
     p = add("evaluate", "error on a held-out view")
     p.add_argument("result", type=Path)
@@ -161,18 +173,28 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--from", dest="start", type=_real, default=-35.0, help="first angle in degrees")
     p.add_argument("--to", dest="stop", type=_real, default=35.0, help="last angle in degrees")
     p.add_argument("--steps", type=_at_least(1), default=7)
+    p.add_argument(
+        "--sequence",
+        action="store_true",
+        help="play the timesteps while the camera turns: sequence.mp4, one frame per timestep in place of --steps",
+    )
+    add_rate(p)
 
     p = add("relight", "relit views under a measured environment")
     p.add_argument("result", type=Path)
     p.add_argument("--env", type=Path, required=True, help="lat-long environment, .hdr or .exr")
     p.add_argument("--out", type=Path, required=True)
     p.add_argument("--rotate", type=_real, default=0.0, help="turn the environment about the vertical, degrees")
+    p.add_argument("--sequence", action="store_true", help="also play the timesteps from the front: sequence.mp4")
+    add_rate(p)
 
     p = add("export", "geometry with its maps for other programs")
     p.add_argument("result", type=Path)
     p.add_argument("--format", choices=["glb", "obj", "ply", "mitsuba"], required=True)
     p.add_argument("--out", type=Path, required=True)
     p.add_argument("--timestep", type=_at_least(0), help="default: the first of the result")
+    p.add_argument("--animate", action="store_true", help="glb: play all timesteps, from --timestep's maps")
+    add_rate(p)
     p.add_argument(
         "--mesh",
         choices=["fitted", "refined"],

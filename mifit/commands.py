@@ -185,12 +185,16 @@ def track(arguments: Namespace) -> None:
     result = mifit.Reconstruction.load(arguments.result)
     capture = mifit.Capture.load(arguments.capture)
     _use_variant(arguments)
+    from mifit.output.sequence import write_moving_pictures
     from mifit.output.tracking import track_into
 
+    for name in arguments.overlay or ():
+        capture.with_fitted(result.cameras).camera(name)  # an unknown one is refused now, not after the work
     rest = [t for t in capture.timesteps if t not in result.geometry.timesteps]
     timesteps = choose("timestep", capture.timesteps, arguments.timesteps, len(capture.timesteps))
     timesteps = tuple(t for t in timesteps if arguments.timesteps or t in rest)
-    track_into(
+    progress = console_progress(arguments.quiet)
+    result = track_into(
         arguments.result,
         result,
         capture,
@@ -198,8 +202,9 @@ def track(arguments: Namespace) -> None:
         config=from_mapping(NormalsConfig, result.config.get("normals", {}), "result.json: config: normals"),
         seed=arguments.seed,
         resume=arguments.resume,
-        progress=console_progress(arguments.quiet),
+        progress=progress,
     )
+    write_moving_pictures(arguments.result, result, capture, arguments.overlay, arguments.fps, progress)
     print(f"Result: {arguments.result}")
 
 
@@ -257,10 +262,17 @@ def _result_and_variant(arguments: Namespace) -> Reconstruction:
 def turntable(arguments: Namespace) -> None:
     """Write novel views about the vertical axis."""
     result = _result_and_variant(arguments)
+    from mifit.output.sequence import write_sequence
     from mifit.output.turntable import write_turntable
 
     progress = console_progress(arguments.quiet)
-    write_turntable(result, arguments.out, arguments.start, arguments.stop, arguments.steps, progress=progress)
+    if arguments.sequence:
+        path, methods = arguments.out / "sequence.mp4", result.methods[:0:-1] or result.methods
+        write_sequence(
+            result, path, arguments.start, arguments.stop, methods=methods, fps=arguments.fps, progress=progress
+        )
+    else:
+        write_turntable(result, arguments.out, arguments.start, arguments.stop, arguments.steps, progress=progress)
     print(f"Views: {arguments.out}")
 
 
@@ -268,9 +280,13 @@ def relight(arguments: Namespace) -> None:
     """Write views under another environment."""
     result = _result_and_variant(arguments)
     from mifit.output.relight import write_relit
+    from mifit.output.sequence import write_sequence
 
     progress = console_progress(arguments.quiet)
     write_relit(result, arguments.env, arguments.out, rotate=arguments.rotate, seed=arguments.seed, progress=progress)
+    if arguments.sequence:
+        lit = result.relight(arguments.env, rotate=arguments.rotate)
+        write_sequence(lit, arguments.out / "sequence.mp4", fps=arguments.fps, progress=progress)
     print(f"Views: {arguments.out}")
 
 
@@ -279,7 +295,15 @@ def export(arguments: Namespace) -> None:
     result = _result_and_variant(arguments)
     from mifit.output.export import export
 
-    export(result, arguments.format, arguments.out, arguments.timestep, arguments.mesh)
+    export(
+        result,
+        arguments.format,
+        arguments.out,
+        arguments.timestep,
+        mesh=arguments.mesh,
+        animate=arguments.animate,
+        fps=arguments.fps,
+    )
     print(f"Export: {arguments.out}")
 
 

@@ -31,6 +31,8 @@ def export(
     path: str | Path,
     timestep: int | None = None,
     mesh: Mesh = "fitted",
+    animate: bool = False,
+    fps: float = 12.0,
 ) -> None:
     """Write one timestep for another program.
 
@@ -48,11 +50,16 @@ def export(
     mesh : {"fitted", "refined"}
         ``refined`` has the refined normals as shape; its displacement from the fitted mesh, in the result's units
         along that mesh's normals, is written as ``NAME_displacement.exr``.
+    animate : bool
+        ``glb`` plays all timesteps; maps, and a refined mesh's shape, stay those of ``timestep``.
+    fps : float
+        Timesteps per second of that animation.
 
     Raises
     ------
     InputError
-        Unknown format or mesh, another suffix, a timestep that was not fitted, or no refined mesh.
+        Unknown format or mesh, an animation in another format than ``glb``, another suffix, a timestep that was not
+        fitted, or no refined mesh.
     """
     path = Path(path)
     if format not in SUFFIXES:
@@ -63,12 +70,14 @@ def export(
         raise InputError(f"mesh: found {mesh!r}, expected 'fitted' or 'refined'")
     timestep = reconstruction.timesteps[0] if timestep is None else timestep
     reconstruction.index(timestep)
+    if animate and format != "glb":
+        raise InputError(f"animate: found format {format!r}, expected 'glb', the only one that holds an animation")
     if mesh == "refined":
         displacement = reconstruction.displacement(timestep)
         reconstruction = reconstruction.with_refined_mesh()
         write_image(path.with_name(f"{path.stem}_displacement.exr"), displacement)
     if format == "glb":
-        write_glb(reconstruction, path, timestep)
+        write_glb(reconstruction, path, timestep, sorted(reconstruction.timesteps) if animate else None, fps)
     elif format == "obj":
         _write_obj(reconstruction, path, timestep)
     elif format == "ply":

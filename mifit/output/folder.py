@@ -38,7 +38,16 @@ def save(result: Reconstruction, folder: Path) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "result.json").unlink(missing_ok=True)
-    for pattern in ("geometry/*.ply", "refined/*.ply", "maps/*", "lighting.exr", "scene*.xml", "scene_files/*"):
+    for pattern in (
+        "geometry/*.ply",
+        "refined/*.ply",
+        "maps/*",
+        "lighting.exr",
+        "scene*.xml",
+        "scene_files/*",
+        "overlay_*.mp4",
+        "sequence.glb",
+    ):
         for old in folder.glob(pattern):
             old.unlink()
     surfaces = _surfaces(result)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import math
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 import mifit
 from mifit.core.blinn_phong import normalization
@@ -27,6 +29,7 @@ from mifit.output.surface import (
 
 if TYPE_CHECKING:
     from mifit.core.camera import Camera
+    from mifit.core.estimate import GeometryEstimate
     from mifit.output.reconstruction import Reconstruction
 
 _KINDS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
@@ -62,12 +65,18 @@ class _Buffer:
             "type": _SHAPES[1 if array.ndim == 1 else array.shape[1]],
         }
         if bounds:
-            entry |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
+            entry |= {name: np.atleast_1d(f(array, axis=0)).tolist() for name, f in (("min", np.min), ("max", np.max))}
         self.accessors.append(entry)
         return len(self.accessors) - 1
 
 
-def write_glb(reconstruction: Reconstruction, path: str | Path, timestep: int | None = None) -> None:
+def write_glb(
+    reconstruction: Reconstruction,
+    path: str | Path,
+    timestep: int | None = None,
+    animate: Sequence[int] | None = None,
+    fps: float = 12.0,
+) -> None:
     """Write one timestep as a ``.glb`` file, whole or not at all.
 
     The head is in metres, in object space, under a node that holds its pose; the fitted cameras stand beside it.
@@ -82,10 +91,14 @@ def write_glb(reconstruction: Reconstruction, path: str | Path, timestep: int | 
     reconstruction : Reconstruction
     path : path
     timestep : int, optional
-        Default: the first that was fitted.
+        Whose mesh and normal map it has; default: the first that is animated, or else that was fitted.
+    animate : sequence of int, optional
+        Timesteps to play as an animation of the pose and of the expressions' weights.
+    fps : float
+        Animated timesteps per second.
     """
     model, geometry = reconstruction.model, reconstruction.geometry
-    timestep = reconstruction.timesteps[0] if timestep is None else timestep
+    timestep = (animate or reconstruction.timesteps)[0] if timestep is None else timestep
     i = reconstruction.index(timestep)
     metre = reconstruction.unit_mm / 1000.0
     rotation, scale = geometry.rotation[i], float(geometry.scale)
@@ -104,9 +117,21 @@ def write_glb(reconstruction: Reconstruction, path: str | Path, timestep: int | 
             part = part_of(mesh, selected)
             primitives.append(_primitive(out, part, base, normals, targets, material, geometry.vertex_albedo))
     images, textures, skin = _skin(out, reconstruction, timestep, mesh, posed, normals)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, geometry.translation[i] * metre
-    nodes: list[dict[str, Any]] = [{"name": "head", "mesh": 0, "matrix": pose.T.ravel().tolist()}]
+    head: dict[str, Any] = {"name": "head", "mesh": 0}
+    animations = []
+    if animate:
+        # A node that is animated may have no matrix.
+        head |= {
+            "rotation": _quaternions(rotation[None])[0].tolist(),
+            "translation": (geometry.translation[i] * metre).tolist(),
+        }
+        rows = [reconstruction.index(t) for t in animate]
+        animations.append(_animation(out, geometry, rows, np.subtract(animate, animate[0]) / fps, metre))
+    else:
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, geometry.translation[i] * metre
+        head["matrix"] = pose.T.ravel().tolist()
+    nodes: list[dict[str, Any]] = [head]
     cameras = []
     for camera in reconstruction.cameras:
         nodes.append(_camera_node(camera, len(cameras), metre))
@@ -141,6 +166,8 @@ def write_glb(reconstruction: Reconstruction, path: str | Path, timestep: int | 
         document["meshes"][0] |= {"weights": weights.tolist(), "extras": {"targetNames": list(model.expression_names)}}
     if cameras:
         document["cameras"] = cameras
+    if animations:
+        document["animations"] = animations
     document["buffers"] = [{"byteLength": len(out.data)}]
     _write(Path(path), document, bytes(out.data))
 
@@ -227,6 +254,34 @@ def _skin(
         },
     }
     return images, textures, skin
+
+
+def _animation(
+    out: _Buffer, geometry: GeometryEstimate, rows: Sequence[int], seconds: NDArray, metre: float
+) -> dict[str, Any]:
+    """Pose and expression of node 0 over time, linear between timesteps."""
+    times = out.accessor(seconds, "<f4", target=None, bounds=True)
+    values = {
+        "translation": geometry.translation[rows] * metre,
+        "rotation": _quaternions(geometry.rotation[rows]),
+    }
+    if geometry.expression.shape[1]:
+        values["weights"] = geometry.expression[rows].ravel()
+    return {
+        "name": "sequence",
+        "samplers": [
+            {"input": times, "interpolation": "LINEAR", "output": out.accessor(v, "<f4", target=None)}
+            for v in values.values()
+        ],
+        "channels": [{"sampler": k, "target": {"node": 0, "path": path}} for k, path in enumerate(values)],
+    }
+
+
+def _quaternions(rotations: NDArray) -> NDArray[np.float64]:
+    """Rotation matrices (N, 3, 3) -> unit quaternions x y z w, each in the half-space of the one before."""
+    q = Rotation.from_matrix(rotations).as_quat()
+    turn = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0)
+    return q * np.concatenate([[1.0], np.cumprod(turn)])[:, None]
 
 
 def _camera(camera: Camera) -> dict[str, Any]:

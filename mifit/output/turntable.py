@@ -1,4 +1,4 @@
-"""Novel views: a camera that circles the head, and sequences over the timesteps."""
+"""Novel views: a camera that circles the head."""
 
 from __future__ import annotations
 
@@ -97,41 +97,6 @@ def write_turntable(
         progress("Turntable", k + 1, steps)
     write_image(folder / "turntable.png", sheet([rows[m] for m in methods]))
     write_animation(folder / "turntable.webp", rows[methods[0]] + rows[methods[0]][-2:0:-1], 12)
-
-
-def write_sequence(
-    reconstruction: Reconstruction,
-    path: str | Path,
-    camera: Camera | None = None,
-    timesteps: Sequence[int] | None = None,
-    method: Method | None = None,
-    fps: float = 12.0,
-    progress: Progress = silent,
-) -> None:
-    """Animate the timesteps of a tracked sequence as ``.webp``.
-
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-    path : path
-        File to write.
-    camera : Camera, optional
-        Default: from straight in front of the first timestep.
-    timesteps : sequence of int, optional
-        Default: all.
-    method : str, optional
-        Default: the best that the result has.
-    fps : float
-        Frames per second.
-    progress : Progress
-    """
-    steps = reconstruction.timesteps if timesteps is None else timesteps
-    camera = camera or orbit_camera(reconstruction, reconstruction.timesteps[0], 0.0)
-    frames = []
-    for k, timestep in enumerate(steps):
-        frames.append(reconstruction.render(camera, timestep, method or reconstruction.methods[-1]))
-        progress("Sequence", k + 1, len(steps))
-    write_animation(path, frames, fps)
 
 
 def on_backdrop(image: NDArray) -> NDArray:

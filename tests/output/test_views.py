@@ -12,7 +12,7 @@ from mifit.core.image import write_image
 from mifit.core.sh import SHLighting, latlong_directions
 from mifit.errors import InputError
 from mifit.output.relight import evaluate_relit
-from mifit.output.turntable import orbit_camera, write_sequence, write_turntable
+from mifit.output.turntable import orbit_camera, write_turntable
 from tests.output.conftest import ball_camera
 from tests.output.test_render_evaluate import FakeCapture
 
@@ -44,15 +44,6 @@ def test_turntable_writes_views_sheet_and_animation(ball, variant, tmp_path):
     assert (full[..., :3] - diffuse[..., :3]).max() > 2 and (full[..., 3] == diffuse[..., 3]).all()
     with Image.open(tmp_path / "turntable.webp") as animation:
         assert animation.n_frames == 4
-
-
-def test_sequence_animates_the_timesteps(stage_1_ball, variant, tmp_path):
-    write_sequence(stage_1_ball, tmp_path / "all.webp")
-    with Image.open(tmp_path / "all.webp") as animation:
-        assert animation.n_frames == 2
-        first = np.asarray(animation.convert("RGB"), float)
-        animation.seek(1)
-        assert np.abs(np.asarray(animation.convert("RGB"), float) - first).max() > 20
 
 
 def smooth_environment(height=64):
