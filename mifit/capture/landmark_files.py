@@ -64,8 +64,8 @@ def read_landmarks(path: str | Path, first_pixel: float | None = None) -> Landma
         raise InputError(f"{path}: no such landmark file") from None
     except InputError:
         raise
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not a readable landmark file: {error}") from None
+    except (OSError, ValueError, KeyError, TypeError, EOFError, OverflowError, RecursionError) as error:
+        raise InputError(f"{path}: not a readable landmark file: {_brief(error)}") from None
     if points.shape != (COUNT, 2):
         raise InputError(
             f"{path}: found {len(points)} landmarks of shape {points.shape}, expected 68 points (iBUG-68) of x and y"
@@ -118,8 +118,15 @@ def _read_pts(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
 
 
 def _read_npy(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    values = np.load(path, allow_pickle=False)
+    values = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped: a header that claims too much is refused
+    if not isinstance(values, np.ndarray):
+        raise InputError(f"{path}: found an archive of arrays, expected one array of shape (68, 2) or (68, 3)")
     if values.ndim != 2 or values.shape[1] not in (2, 3):
         raise InputError(f"{path}: found an array of shape {values.shape}, expected (68, 2) or (68, 3)")
     visible = values[:, 2] > 0.5 if values.shape[1] == 3 else np.ones(len(values), dtype=bool)
     return values[:, :2].astype(np.float64), visible
+
+
+def _brief(error: Exception) -> str:
+    """One line of an exception's text."""
+    return (str(error) or type(error).__name__).splitlines()[0][:200]

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.capture.lens import opencv_matrix
+from mifit.capture.opencv_nodes import read_nodes
 from mifit.capture.transforms import View, nearest_rotation
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.core.files import replacing
-from mifit.core.quiet import silenced_stderr
 from mifit.errors import InputError
 
 _MATRICES = (("M1", "K1", "cameraMatrix1"), ("M2", "K2", "cameraMatrix2"))
@@ -44,10 +44,10 @@ def read_stereo(path: str | Path, names: Sequence[str], sizes: Sequence[tuple[in
         A missing key, a matrix of another shape, a rotation that isn't one, or another image size in the file.
     """
     path = Path(path)
-    found = _read_nodes(path)
+    found = read_nodes(path)
     beside = path.with_name("extrinsics" + path.suffix)
     if "R" not in found and beside != path and beside.exists():
-        found = {**_read_nodes(beside), **found}
+        found = {**read_nodes(beside), **found}
     _check_size(found, sizes, path)
     rotation = nearest_rotation(_matrix(found, ("R",), path, (3, 3)), f"{path}: R")
     translation = _matrix(found, ("T",), path, (3, 1)).ravel()
@@ -86,25 +86,6 @@ def write_stereo(path: str | Path, first: Camera, second: Camera) -> None:
         file.release()
 
 
-def _read_nodes(path: Path) -> dict[str, Any]:
-    """All matrices and numbers at the file's top level."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such calibration file")
-    try:
-        with silenced_stderr():
-            file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-            root = file.root()
-            found: dict[str, Any] = {}
-            for key in root.keys():
-                node = root.getNode(key)
-                found[key] = node.mat() if node.isMap() else node.real() if node.isInt() or node.isReal() else None
-            file.release()
-    except (cv2.error, SystemError, UnicodeDecodeError) as error:
-        text = " ".join(str(error).split())[-80:]
-        raise InputError(f"{path}: not a readable OpenCV YAML or XML file ({text})") from None
-    return found
-
-
 def _matrix(found: dict[str, Any], keys: tuple[str, ...], path: Path, shape: tuple[int, int]) -> NDArray[np.float64]:
     for key in keys:
         if found.get(key) is not None:
@@ -128,10 +109,11 @@ def _distortion(found: dict[str, Any], keys: tuple[str, ...], path: Path) -> tup
 
 
 def _check_size(found: dict[str, Any], sizes: Sequence[tuple[int, int]], path: Path) -> None:
-    width, height = found.get("image_width"), found.get("image_height")
+    expected = found.get("image_width"), found.get("image_height")
     for size in sizes:
-        if width is not None and height is not None and size != (int(width), int(height)):
+        if None not in expected and size != expected:
+            width, height = (f"{x:g}" if isinstance(x, float) else "a matrix" for x in expected)
             raise InputError(
-                f"{path}: calibrated for {int(width)} x {int(height)} pixels, but the images have "
+                f"{path}: calibrated for {width} x {height} pixels, but the images have "
                 f"{size[0]} x {size[1]}; calibrate at their size"
             )

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -106,11 +107,11 @@ def read_transforms(path: str | Path) -> Transforms:
     path = Path(path)
     document = _load(path)
     units = document.get("units", "cm")
-    if units not in UNITS_MM:
-        raise InputError(f"{path}: units: found {units!r}, expected one of {', '.join(UNITS_MM)}")
+    if not isinstance(units, str) or units not in UNITS_MM:
+        raise InputError(f"{path}: units: found {_short(units)}, expected one of {', '.join(UNITS_MM)}")
     model = document.get("camera_model", "OPENCV")
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV"):
-        raise InputError(f"{path}: camera_model: found {model!r}, expected OPENCV or PINHOLE")
+        raise InputError(f"{path}: camera_model: found {_short(model)}, expected OPENCV or PINHOLE")
     frames = document.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: frames: found {_short(frames)}, expected a list of at least one image")
@@ -200,9 +201,15 @@ class _Entry:
 
     def number(self, key: str, expected: str = "a finite number") -> float:
         value = self.values.get(key)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise self.fail(key, expected)
-        return float(value)
+        try:
+            number = float(value)
+        except OverflowError:  # an integer of hundreds of digits
+            number = math.inf
+        if not math.isfinite(number):
+            raise self.fail(key, expected)
+        return number
 
     def positive(self, key: str) -> float:
         expected = "a positive number of pixels"
@@ -229,7 +236,9 @@ class _Entry:
 
 def _shot(entry: _Entry, folder: Path) -> Shot:
     image = folder / entry.text("file_path")
-    if not image.suffix and not image.exists():  # nerfstudio's Blender scenes leave the suffix out
+    if not image.name:
+        raise entry.fail("file_path", "the name of an image file")
+    if not image.suffix and not os.path.exists(image):  # nerfstudio's Blender scenes leave the suffix out
         image = image.with_name(image.name + ".png")
     timestep = entry.whole("timestep_index", 0) if "timestep_index" in entry else 0
     if "camera_id" in entry:
@@ -255,7 +264,10 @@ def _view(entry: _Entry, name: str) -> View:
     intrinsics: tuple[float, float, float, float] | None = None
     distortion: tuple[float, ...] = ()
     if "camera_angle_x" in entry and "fl_x" not in entry:
-        fx = 0.5 * width / math.tan(0.5 * entry.number("camera_angle_x"))
+        angle = entry.number("camera_angle_x")
+        if not 0.0 < angle < math.pi:
+            raise entry.fail("camera_angle_x", "an angle of view between 0 and pi")
+        fx = 0.5 * width / math.tan(0.5 * angle)
         entry = _Entry({**entry.values, "fl_x": fx}, entry.where)
     if "fl_x" in entry:
         fx = entry.positive("fl_x")
@@ -287,7 +299,7 @@ def _gain(entry: _Entry) -> tuple[float, float, float]:
     value = entry.values["gain"]
     try:
         r, g, b = (float(v) for v in (value if isinstance(value, list) else [value] * 3))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise entry.fail("gain", "a positive number or three of them") from None
     if not (0 < min(r, g, b) and max(r, g, b) < math.inf):
         raise entry.fail("gain", "a positive number or three of them")
@@ -298,7 +310,7 @@ def _world_to_camera(entry: _Entry) -> NDArray[np.float64]:
     """Check ``transform_matrix`` and invert it to OpenCV axes."""
     try:
         matrix = np.array(entry.values["transform_matrix"], dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise entry.fail("transform_matrix", "4 x 4 numbers") from None
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)])

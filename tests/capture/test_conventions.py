@@ -84,7 +84,7 @@ def test_stereo_files_hold_opencv_pixels(tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         ("M2:", "X2:", r"expected M2 3 x 3"),
-        ("rows: 3", "rows: 9", r"not a readable|M1: found a matrix of shape|found keys"),
+        ("rows: 3", "rows: 9", r"M1: found 9 values for 9 x 3 of type d"),
         ("701.25", "-701.25", r"M1: found focal lengths -701.25"),
         ("701.25", ".NaN", r"M1: found a NaN"),
         ("image_width: 340", "image_width: 640", r"calibrated for 640 x 240 pixels, but the images have 340 x 240"),
