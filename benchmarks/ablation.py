@@ -12,6 +12,7 @@ timesteps. Writes ``benchmarks/results/ablation.json`` and ``ablation.md``.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import typing
 from collections.abc import Callable, Sequence
@@ -298,12 +299,16 @@ def main() -> int:
     mifit.set_variant("auto")
     model = MorphableModel.load(MODEL)
     captures: dict[str, dict[str, Any]] = {}
-    before = conditions()
+    stored = RESULTS / f"{a.name}.json"
+    if stored.exists():  # captures that aren't named keep their figures
+        kept = json.loads(stored.read_text())["figures"]
+        captures = kept["captures"] if kept["size"] == a.size else {}
     for name in a.names:
+        before = conditions()
         scene = Scene(name, Capture.load(SHARED / "captures" / name), model, a.work)
-        captures[name] = ablate(scene, a.size, a.check)
+        captures[name] = {**ablate(scene, a.size, a.check), "conditions": [before, conditions()]}
         # After each capture, so that a run that is broken off leaves what it measured.
-        record(a.name, {"size": a.size, "conditions": [before, conditions()], "captures": captures})
+        record(a.name, {"size": a.size, "captures": captures})
         write_text(RESULTS / f"{a.name}.md", markdown(captures))
     print(markdown(captures))
     return 0
