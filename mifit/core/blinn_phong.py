@@ -6,6 +6,18 @@ The BRDF is ``f = C_d / pi + C_s N(m) (n . h)^m`` with the half vector h of view
   incidence and less elsewhere, or
 - plain: ``1 / pi``, which leaves the paper's ``C_s (n . h)^m`` in the units of the diffuse term.
 
+Carried lobe
+------------
+Microfacet surfaces reflect about the mirror direction r(v) at every angle and more so at grazing ones, where the half
+vector's lobe fades and leans towards the normal. With a Fresnel rise the lobe that a view along the normal has is
+therefore carried about r:
+``f = C_s (1 + fresnel (1 - h.v)^5) N(m) ((1 + c) / 2)^(m/2) c * 2 / (n.l + n.v)`` with ``c = max(r.l, 0)``.
+``r.l = 2 (n.v)(n.l) - v.l`` and ``h.v`` don't change when l and v change places, so f is reciprocal; at the mirror
+direction h is n, so the rise is that of ``1 + fresnel (1 - n.v)^5``. The last factor turns c, which is wanted of the
+outgoing light ``f n.l``, into a reciprocal f: ``1 / n.l`` isn't symmetric, ``1 / max(n.l, n.v)`` loses 40 % at grazing
+angles, and ``1 / sqrt(n.l n.v)`` has no bound there. With this one the lobe's albedo is at most 1 for every exponent
+and angle, and for exponents of 50 and more at least 0.8.
+
 Prefiltered form
 ----------------
 Under smooth lighting only a few moments of the lobe matter. For a view at the cosine mu from the normal, the reflected
@@ -51,6 +63,25 @@ def specular_brdf(
     above = ((li * n).sum(-1) > 0) & ((v * n).sum(-1) > 0)
     lobe = np.maximum((h * n).sum(-1), 0.0) ** np.asarray(exponent, dtype=np.float64)
     return np.where(above, normalization(exponent, normalized) * lobe, 0.0)
+
+
+def carried_brdf(
+    light: ArrayLike,
+    view: ArrayLike,
+    normal: ArrayLike,
+    exponent: ArrayLike,
+    fresnel: ArrayLike,
+    normalized: bool = True,
+) -> Array:
+    """The lobe carried about the mirror direction with its rise, for unit vectors (..., 3); zero below the horizon."""
+    li, v, n = (np.asarray(x, dtype=np.float64) for x in (light, view, normal))
+    nl, nv, lv = (li * n).sum(-1), (v * n).sum(-1), (li * v).sum(-1)
+    c = np.clip(2.0 * nl * nv - lv, 0.0, 1.0)
+    half = np.sqrt(np.maximum(0.5 * (1.0 + lv), 0.0))  # h.v
+    rise = 1.0 + np.asarray(fresnel) * (1.0 - half) ** 5
+    lobe = (0.5 * (1.0 + c)) ** (0.5 * np.asarray(exponent, dtype=np.float64)) * c
+    value = normalization(exponent, normalized) * rise * lobe * 2.0 / np.maximum(nl + nv, 1e-300)
+    return np.where((nl > 0) & (nv > 0), value, 0.0)
 
 
 def lobe_samples(cosine: float, exponent: float, count: int = 48) -> tuple[Array, Array]:

@@ -46,11 +46,12 @@ def write_scene(
     """Write ``NAME.xml`` with mifit's plugins, ``NAME_stock.xml`` for plain Mitsuba, and their files.
 
     Both read meshes and maps from the folder ``NAME_files`` beside them. The face area has the maps; other faces
-    have the fitted model's vertex albedo. In ``NAME.xml`` the skin is ``blinnphong`` with the refined normals as
-    slopes, and the light is ``shenv``. In ``NAME_stock.xml`` the skin blends ``diffuse`` with a ``roughconductor`` of
-    Beckmann roughness sqrt(2 / (m + 2)), under a ``normalmap``, and the light is a lat-long ``envmap``. A relit
-    reconstruction has its environment as ``envmap`` in both. The ambient term stands for light that local
-    shading leaves out, such as interreflection, so a path-traced scene doesn't have it.
+    have the fitted model's vertex albedo. In ``NAME.xml`` the skin is ``blinnphong`` with the fitted lobe's rise
+    and the refined normals as slopes, and the light is ``shenv``. In ``NAME_stock.xml`` the skin blends ``diffuse``
+    with a ``roughconductor`` of Beckmann roughness sqrt(2 / (m + 2)), which doesn't rise, under a ``normalmap``,
+    and the light is a lat-long ``envmap``. A relit reconstruction has its environment as ``envmap`` in both. The
+    ambient term stands for light that local shading leaves out, such as interreflection, so a path-traced scene
+    doesn't have it.
 
     Parameters
     ----------
@@ -246,11 +247,13 @@ def _skin(reconstruction: Reconstruction, files: str, stock: bool) -> str:
         </bsdf>
     </bsdf>"""
     normalized = reflectance is None or reflectance.shading_model != "paper"
+    risen = reflectance is not None and reflectance.fresnel is not None
+    rise = f'\n        <float name="fresnel" value="{reflectance.fresnel:.9g}"/>' if risen else ""
     return f"""    <bsdf type="blinnphong" id="skin">
         {_texture("diffuse_reflectance", f"{files}/diffuse.exr", False)}
         {_texture("specular_reflectance", f"{files}/specular.exr")}
         {_texture("normal_correction", f"{files}/slopes.exr")}
-        <float name="exponent" value="{exponent:.9g}"/>
+        <float name="exponent" value="{exponent:.9g}"/>{rise}
         <boolean name="normalized" value="{str(normalized).lower()}"/>
     </bsdf>"""
 

@@ -95,7 +95,7 @@ class Lobe:
         Per moment of ``core.blinn_phong.lobe_moments`` its Chebyshev coefficients in ``2 n.v - 1``.
     scale : float or Float
         Factor on the albedo: 1 for the normalised lobe.
-    fresnel : float or None
+    fresnel : float, Float or None
         None: Blinn-Phong as it is. A number: the lobe that a view along the normal has, carried about the mirror
         direction whatever the view, and rising as ``1 + fresnel (1 - n.v)^5``: what microfacet surfaces do.
     """
@@ -103,10 +103,10 @@ class Lobe:
     order: int
     polynomials: list[list[Any]]
     scale: Any
-    fresnel: float | None = None
+    fresnel: Any = None
 
 
-def lobe(exponent: Any, order: int, normalized: bool = True, fresnel: float | None = None) -> Lobe:
+def lobe(exponent: Any, order: int, normalized: bool = True, fresnel: Any = None) -> Lobe:
     """Prepare the lobe of an exponent: a Python float, or a Dr.Jit one (differentiable, of any width)."""
     import drjit as dr
     import mitsuba as mi
@@ -160,6 +160,31 @@ def normalization(exponent: Any) -> Any:
     return (exponent + 2.0) * (exponent + 4.0) / (8.0 * dr.pi * (exponent + dr.exp2(-0.5 * exponent)))
 
 
+def fresnel_rise(cosine: Any, fresnel: Any) -> Any:
+    """Factor by which the specular albedo rises towards grazing angles, Schlick's ``1 + fresnel (1 - cosine)^5``."""
+    import drjit as dr
+
+    return 1.0 + fresnel * (1.0 - dr.clip(cosine, 0.0, 1.0)) ** 5
+
+
+def carried_lobe(wi: Any, wo: Any, n: Any, exponent: Any) -> tuple[Any, Any]:
+    """The lobe about the mirror direction for single directions, see ``core.blinn_phong``.
+
+    Returns
+    -------
+    value, density
+        ``f / (C_s N(m) rise)``, and the density of wo when ``((1 + r.wo) / 2)^(m/2)`` is sampled.
+    """
+    import drjit as dr
+
+    cos_i, cos_o = dr.dot(wi, n), dr.dot(wo, n)
+    c = 2.0 * cos_i * cos_o - dr.dot(wi, wo)
+    # The power of a floor instead of zero: its logarithm, and so the derivative by the exponent, stays finite.
+    power = dr.power(dr.clip(0.5 + 0.5 * c, 1e-8, 1.0), 0.5 * exponent)
+    value = power * dr.clip(c, 0.0, 1.0) * 2.0 / dr.maximum(cos_i + cos_o, 1e-6)
+    return value, power * (exponent + 2.0) * (0.125 / float(np.pi))
+
+
 def specular_transfer(n: Any, v: Any, lobe: Lobe) -> list[Any]:
     """Transfer vector of the lobe with unit specular albedo, prefiltered about its mean direction."""
     return _lobe_transfer(lobe, *lobe_axis(n, v, lobe))
@@ -173,7 +198,7 @@ def lobe_axis(n: Any, v: Any, lobe: Lobe) -> tuple[Any, list[Any]]:
     mirror = 2.0 * cosine * n - v
     if lobe.fresnel is not None:
         moments = [sum(row[1:], row[0]) for row in lobe.polynomials]  # the polynomials at n.v = 1
-        moments[0] = moments[0] * (1.0 + lobe.fresnel * (1.0 - dr.clip(cosine, 0.0, 1.0)) ** 5)
+        moments[0] = moments[0] * fresnel_rise(cosine, lobe.fresnel)
         return mirror, moments
     t = _chebyshev(2.0 * dr.clip(cosine, 0.0, 1.0) - 1.0, len(lobe.polynomials[0]))
     moments = [_dot(row, t) for row in lobe.polynomials]
@@ -224,7 +249,7 @@ def shade(
     model: str,
     normalized: bool = True,
     traced: Sequence[Any] | None = None,
-    fresnel: float | None = None,
+    fresnel: Any = None,
 ) -> tuple[Any, Any]:
     """Radiance of a white diffuse and of a fully specular point under SH lighting.
 
@@ -242,7 +267,7 @@ def shade(
         Kind of lobe of the prefiltered models; ``paper`` always has the plain one.
     traced : B*B Floats, optional
         Shadowed diffuse transfer vectors; ``shadowed`` needs them.
-    fresnel : float, optional
+    fresnel : float or Float, optional
         See ``Lobe``; not for ``paper``, nor where a prepared lobe is given.
 
     Returns
@@ -273,5 +298,5 @@ def unoccluded(n: Any, axis: Any, traced: Sequence[Any], order: int) -> Any:
     import drjit as dr
 
     y = sh_basis(axis, order)
-    open_sky = _dot(diffuse_transfer(n, order), y)
-    return dr.clip(_dot(traced, y) / dr.maximum(open_sky, 0.02), 0.0, 1.0)
+    open_sky = radiance(diffuse_transfer(n, order), y)
+    return dr.clip(radiance(traced, y) / dr.maximum(open_sky, 0.02), 0.0, 1.0)

@@ -71,7 +71,9 @@ def test_path_tracing_a_convex_diffuse_ball_is_local_shading(flat):
     assert unbent[inside][:, :3].mean() == pytest.approx(smooth[inside][:, :3].mean(), rel=0.005)
 
 
-def test_specular_light_of_both_integrators_is_alike(flat):
+@pytest.mark.parametrize(("exponent", "fresnel"), [(12.0, None), (150.0, 8.0)])
+def test_specular_light_of_both_integrators_is_alike(flat, exponent, fresnel):
+    flat = replace(flat, reflectance=replace(flat.reflectance, exponent=exponent, fresnel=fresnel))
     camera = ball_camera(angle=10)
     glint = {}
     for integrator, samples in (("local", 2), ("path", 512)):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mifit
-from mifit.core import blinn_phong
+from mifit.core import blinn_phong, sh
 
 EXPONENTS = (1.0, 5.0, 50.0, 1000.0)
 ANGLES = (0.0, 45.0, 80.0)
@@ -65,11 +65,24 @@ def test_chi2(exponent: float, angle: float) -> None:
     assert test.run(significance_level=0.001, test_count=12), test.messages
 
 
-def test_chi2_with_a_corrected_normal() -> None:
+@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("exponent", (1.0, 50.0, 1000.0))
+def test_chi2_of_the_carried_lobe(exponent: float, angle: float) -> None:
     import mitsuba as mi
     from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
 
-    scene = {"type": "blinnphong", "specular_reflectance": 0.5, "normal_correction": raw(0.4, -0.3, 0.0)}
+    xml = f'<float name="exponent" value="{exponent}"/><float name="fresnel" value="8"/>'
+    sample, pdf = BSDFAdapter("blinnphong", xml, wi=mi.ScalarVector3f(direction(angle)))
+    test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=200_000, res=61, ires=16)
+    assert test.run(significance_level=0.001, test_count=9), test.messages
+
+
+@pytest.mark.parametrize("fresnel", [{}, {"fresnel": 8.0}])
+def test_chi2_with_a_corrected_normal(fresnel: dict) -> None:
+    import mitsuba as mi
+    from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
+
+    scene = {"type": "blinnphong", "specular_reflectance": 0.5, "normal_correction": raw(0.4, -0.3, 0.0), **fresnel}
     sample, pdf = BSDFAdapter("blinnphong", scene, wi=mi.ScalarVector3f(direction(40, 70)))
     test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=200_000, res=61, ires=16)
     assert test.run(significance_level=0.01), test.messages
@@ -88,11 +101,42 @@ def test_eval_is_the_float64_form(exponent: float, normalized: bool) -> None:
     assert np.abs(np.array(value)[0] - expected).max() < 3e-4 * expected.max()
 
 
+@pytest.mark.parametrize("normalized", [True, False])
 @pytest.mark.parametrize("exponent", EXPONENTS)
-def test_eval_pdf_and_sample_agree(exponent: float) -> None:
+def test_the_carried_lobe_is_the_float64_form(exponent: float, normalized: bool) -> None:
     import mitsuba as mi
 
-    plugin = bsdf(specular_reflectance=0.4, exponent=exponent, normal_correction=raw(0.2, 0.1, 0))
+    wi, wo = hemisphere(500), hemisphere(500, 1)
+    wo[::2] = wi[::2] * [-1, -1, 1] + 0.02 * wo[::2]  # near the mirror direction, where sharp lobes are
+    wo /= np.linalg.norm(wo, axis=1, keepdims=True)
+    plugin = bsdf(
+        diffuse_reflectance=0.3, specular_reflectance=0.05, exponent=exponent, normalized=normalized, fresnel=8.0
+    )
+    value = plugin.eval(mi.BSDFContext(), interaction(wi, 500), mi.Vector3f(wo.T.astype(np.float32)))
+    lobe = blinn_phong.carried_brdf(wo, wi, np.array([0.0, 0, 1]), exponent, 8.0, normalized)
+    expected = (0.3 / np.pi + 0.05 * lobe) * wo[:, 2]  # 9 * 0.05 + 0.3 < 1: the rise is never stopped
+    assert np.abs(np.array(value)[0] - expected).max() < 1e-3 * expected.max()
+
+
+def test_the_carried_lobe_rises_as_fitted() -> None:
+    """Its albedo is ``C_s (1 + k (1 - n.v)^5)``, which local shading has, but for the part below the horizon."""
+    d, w = sh.quadrature(256)
+    for angle in (0.0, 30.0, 50.0, 60.0):
+        cosine = np.cos(np.radians(angle))
+        lobe = blinn_phong.carried_brdf(d, np.array(direction(angle)), np.array([0.0, 0, 1]), 150.0, 8.0)
+        albedo = float((w * lobe * np.maximum(d[:, 2], 0)).sum())
+        assert albedo == pytest.approx(1 + 8 * (1 - cosine) ** 5, rel=0.05)
+        plain = blinn_phong.specular_brdf(d, np.array(direction(angle)), np.array([0.0, 0, 1]), 150.0)
+        if angle >= 50:
+            assert albedo > 1.8 * float((w * plain * np.maximum(d[:, 2], 0)).sum())
+
+
+@pytest.mark.parametrize("fresnel", [{}, {"fresnel": 8.0}])
+@pytest.mark.parametrize("exponent", EXPONENTS)
+def test_eval_pdf_and_sample_agree(exponent: float, fresnel: dict) -> None:
+    import mitsuba as mi
+
+    plugin = bsdf(specular_reflectance=0.4, exponent=exponent, normal_correction=raw(0.2, 0.1, 0), **fresnel)
     rng, si = np.random.default_rng(0), interaction(hemisphere(1000), 1000)
     u = rng.random((3, 1000)).astype(np.float32)
     ctx = mi.BSDFContext()
@@ -130,28 +174,30 @@ def test_reciprocity() -> None:
     import mitsuba as mi
 
     wi, wo = hemisphere(300), hemisphere(300, 1)
-    for normalized in (True, False):
-        plugin, ctx = bsdf(specular_reflectance=0.5, exponent=30.0, normalized=normalized), mi.BSDFContext()
+    kinds = ({}, {"normalized": False}, {"fresnel": 8.0}, {"fresnel": 8.0, "normalized": False})
+    for kind in kinds:
+        plugin, ctx = bsdf(specular_reflectance=0.2, exponent=30.0, **kind), mi.BSDFContext()
         one = plugin.eval(ctx, interaction(wi, 300), mi.Vector3f(wo.T.astype(np.float32)))
         two = plugin.eval(ctx, interaction(wo, 300), mi.Vector3f(wi.T.astype(np.float32)))
         assert np.allclose(np.array(one) * wi[:, 2], np.array(two) * wo[:, 2], rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.parametrize("fresnel", [{}, {"fresnel": 0.0}, {"fresnel": 8.0}])
 @pytest.mark.parametrize("exponent", [*EXPONENTS, 1e4])
-def test_a_white_furnace_never_gains_energy(exponent: float) -> None:
+def test_a_white_furnace_never_gains_energy(exponent: float, fresnel: dict) -> None:
     """Reflected share of constant light, for albedos that ask for twice the energy: at most one, to three sigma."""
     import mitsuba as mi
 
     count = 40_000
     u = np.random.default_rng(0).random((3, count)).astype(np.float32)
-    for diffuse, specular in ((1.0, 1.0), (0.0, 1.0), (1.0, 0.0)):
-        plugin = bsdf(diffuse_reflectance=diffuse, specular_reflectance=specular, exponent=exponent)
-        for angle in (0.0, 30.0, 60.0, 85.0):
+    for diffuse, specular in ((1.0, 1.0), (0.0, 1.0), (1.0, 0.0), (0.5, 0.2)):
+        plugin = bsdf(diffuse_reflectance=diffuse, specular_reflectance=specular, exponent=exponent, **fresnel)
+        for angle in (0.0, 30.0, 60.0, 85.0, 89.0):
             si = interaction(direction(angle), count)
             _, weight = plugin.sample(mi.BSDFContext(), si, mi.Float(u[0]), mi.Point2f(u[1:]))
             w = np.array(weight)[0]
             assert w.mean() <= 1.0 + 3 * w.std() / np.sqrt(count) + 1e-5
-            if (diffuse, angle) == (0.0, 0.0) or specular == 0.0:
+            if ((diffuse, angle) == (0.0, 0.0) and not fresnel) or specular == 0.0:
                 assert w.mean() > 0.97
 
 
@@ -163,14 +209,16 @@ def test_every_parameter_can_be_written() -> None:
         specular_reflectance=0.3,
         exponent=8.0,
         normal_correction=raw(0.0, 0.0, 0.0),
+        fresnel=2.0,
     )
-    si, wo = interaction(direction(20), 1), mi.Vector3f(*direction(35, 40))
+    si, wo = interaction(direction(60), 1), mi.Vector3f(*direction(50, 170))
     parameters = mi.traverse(plugin)
     expected = {
         "diffuse_reflectance.value",
         "specular_reflectance.value",
         "exponent.value",
         "normal_correction.data",
+        "fresnel.value",
     }
     assert expected <= set(parameters.keys())
     before = np.array(plugin.eval(mi.BSDFContext(), si, wo))
@@ -181,7 +229,7 @@ def test_every_parameter_can_be_written() -> None:
         after = np.array(plugin.eval(mi.BSDFContext(), si, wo))
         assert np.abs(after - before).max() > 1e-4, key
         before = after
-    assert "BlinnPhong[" in str(plugin) and "normal_correction" in str(plugin)
+    assert "BlinnPhong[" in str(plugin) and "normal_correction" in str(plugin) and "fresnel" in str(plugin)
 
 
 def test_textures_and_a_textured_exponent() -> None:
@@ -205,8 +253,9 @@ def test_the_correction_tilts_the_normal() -> None:
     plugin = bsdf(diffuse_reflectance=0.5, specular_reflectance=0.3, exponent=9.0, normal_correction=raw(*slopes, 0))
     value = plugin.eval(mi.BSDFContext(), interaction(wi, 200), mi.Vector3f(wo.T.astype(np.float32)))
     lobe = blinn_phong.specular_brdf(wo, wi, n, 9.0)
-    above = (wi @ n > 0) & (wo @ n > 0)
-    expected = np.where(above, (0.5 / np.pi + 0.3 * lobe) * (wo @ n), 0.0)
+    # The lobe is zero where either side is below the corrected normal; the base only where the light is.
+    expected = np.where(wo @ n > 0, (0.5 / np.pi + 0.3 * lobe) * (wo @ n), 0.0)
+    assert ((wi @ n <= 0) & (wo @ n > 0)).any()
     assert np.abs(np.array(value)[0] - expected).max() < 1e-4
 
 
@@ -224,7 +273,8 @@ def test_diffuse_reflectance_and_the_back() -> None:
 
 @pytest.mark.parametrize("exponent", [1.0, 1e4])
 @pytest.mark.parametrize("albedo", [0.0, 1.0])
-def test_values_and_gradients_are_finite_at_the_edges(exponent: float, albedo: float) -> None:
+@pytest.mark.parametrize("fresnel", [{}, {"fresnel": 0.0}, {"fresnel": 8.0}])
+def test_values_and_gradients_are_finite_at_the_edges(exponent: float, albedo: float, fresnel: dict) -> None:
     import drjit as dr
     import mitsuba as mi
 
@@ -233,6 +283,7 @@ def test_values_and_gradients_are_finite_at_the_edges(exponent: float, albedo: f
         specular_reflectance=albedo,
         exponent=exponent,
         normal_correction=raw(0.0, 0.0, 0.0),
+        **fresnel,
     )
     # Straight down, grazing, opposite directions (a half vector of zero), n . h = 0, in the surface, a zero vector.
     wi = np.array([[0, 0, 1], [1, 0, 1e-7], [1, 0, 0], [1, 0, 1e-4], [0, 1, 0], [0, 0, 0]], float)

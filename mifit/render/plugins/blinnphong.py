@@ -12,7 +12,7 @@ def make() -> type:
     import drjit as dr
     import mitsuba as mi
 
-    from mifit.render.shading import normalization
+    from mifit.render.shading import carried_lobe, fresnel_rise, normalization
 
     class BlinnPhong(mi.BSDF):
         r"""
@@ -30,20 +30,34 @@ def make() -> type:
           $n' = \mathrm{normalize}(n + a\,s + b\,t)$ in the shading frame $(s, t, n)$; raw slopes of either sign; a
           third channel is ignored
         - `normalized` (bool, default true): which $N(m)$
+        - `fresnel` (float or texture, optional): rise of the lobe towards grazing angles, see below; 0 or more
 
         Normalised, $N(m) = \frac{(m+2)(m+4)}{8\pi\,(m + 2^{-m/2})}$: the lobe alone reflects all light at normal
         incidence and less elsewhere; where $C_d + C_s > 1$ both are divided by their sum, so that no energy is gained.
         Otherwise $N = 1/\pi$: the paper's plain $C_s\,(n \cdot h)^m$ in the units of the diffuse term, which doesn't
         conserve energy.
 
+        With `fresnel`, $k$ below, the lobe is what fits of skin use: the one that a view along the normal has, carried
+        about the mirror direction $r$ of the view $v$ and rising as Schlick's approximation does,
+
+        $$f_s = C_s\, \big(1 + k\,(1 - h \cdot v)^5\big)\, N(m)\, \Big(\frac{1 + c}{2}\Big)^{m/2} c\;
+        \frac{2}{n' \cdot l + n' \cdot v}, \qquad c = \max(r \cdot l, 0)$$
+
+        It is reciprocal: $r \cdot l$ and $h \cdot v$ are the same when $l$ and $v$ change places. At the mirror
+        direction $h \cdot v = n' \cdot v$, which is the rise that `shdirect` and mifit's own renders have. A `fresnel`
+        of 0 is the carried lobe without a rise; without the parameter the lobe is Blinn-Phong's, which fades and leans
+        towards the normal at grazing angles. Normalised, the risen albedo stops at $1 - C_d$, so that no energy is
+        gained.
+
         The normal correction is the paper's $\delta_n$ as slopes in the tangent plane instead of spherical coordinates:
         those have a pole where the azimuth means nothing and its derivative vanishes, and for a small correction that
         pole is the uncorrected normal itself. Slopes are zero there, linear around it, and can't turn the normal over.
         The shading frame's $s$ follows the UV parametrisation.
 
-        Reflects on the side of the normal; wrap it in Mitsuba's `twosided` for both. `sample` draws half vectors in
-        proportion to $(n' \cdot h)^m$ and cosine-weighted directions, in proportion to the albedos. All parameters are
-        differentiable.
+        Reflects on the side of the normal; wrap it in Mitsuba's `twosided` for both. Where a corrected normal faces
+        away from the view, near silhouettes, the diffuse base still reflects and the lobe doesn't. `sample` draws half
+        vectors in proportion to $(n' \cdot h)^m$, or with `fresnel` directions about $r$, and cosine-weighted
+        directions, in proportion to the albedos. All parameters are differentiable.
         """
 
         def __init__(self, props: mi.Properties) -> None:
@@ -53,12 +67,13 @@ def make() -> type:
             self.exponent = props.get_unbounded_texture("exponent", 20.0)
             corrected = "normal_correction" in props
             self.correction = props.get_unbounded_texture("normal_correction") if corrected else None
+            self.fresnel = props.get_unbounded_texture("fresnel") if "fresnel" in props else None
             self.normalized = bool(props.get("normalized", True))
             self._set_flags()
 
         def _set_flags(self) -> None:
-            textures = [self.diffuse, self.specular, self.exponent]
-            varying = self.correction is not None or any(t.is_spatially_varying() for t in textures)
+            textures = [self.diffuse, self.specular, self.exponent, self.fresnel]
+            varying = self.correction is not None or any(t.is_spatially_varying() for t in textures if t is not None)
             common = mi.BSDFFlags.FrontSide | (mi.BSDFFlags.SpatiallyVarying if varying else mi.BSDFFlags.Empty)
             self.m_components = [
                 mi.BSDFFlags.GlossyReflection | common,
@@ -72,67 +87,86 @@ def make() -> type:
             callback.put("exponent", self.exponent, mi.ParamFlags.Differentiable)
             if self.correction is not None:
                 callback.put("normal_correction", self.correction, mi.ParamFlags.Differentiable)
+            if self.fresnel is not None:
+                callback.put("fresnel", self.fresnel, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys: list[str]) -> None:
             self._set_flags()
 
-        def parameters(self, si: mi.SurfaceInteraction3f, active: Any = True) -> tuple[Any, Any, Any, Any]:
-            """Diffuse and specular albedo, exponent and corrected local normal at a surface point."""
+        def parameters(self, si: mi.SurfaceInteraction3f, active: Any = True) -> tuple[Any, Any, Any, Any, Any]:
+            """Diffuse and specular albedo, exponent, rise (or None) and corrected local normal at a surface point."""
             diffuse = self.diffuse.eval(si, active)
             specular = self.specular.eval(si, active)
             if self.normalized:
                 total = dr.maximum(diffuse + specular, 1.0)
                 diffuse, specular = diffuse / total, specular / total
             exponent = dr.clip(self.exponent.eval_1(si, active), EXPONENT_MIN, EXPONENT_MAX)
+            fresnel = None if self.fresnel is None else dr.maximum(self.fresnel.eval_1(si, active), 0.0)
             if self.correction is None:
-                return diffuse, specular, exponent, mi.Normal3f(0.0, 0.0, 1.0)
+                return diffuse, specular, exponent, fresnel, mi.Normal3f(0.0, 0.0, 1.0)
             slopes = self.correction.eval_3(si, active)
-            return diffuse, specular, exponent, mi.Normal3f(dr.normalize(mi.Vector3f(slopes.x, slopes.y, 1.0)))
+            n = mi.Normal3f(dr.normalize(mi.Vector3f(slopes.x, slopes.y, 1.0)))
+            return diffuse, specular, exponent, fresnel, n
 
-        def _lobe(self, wi: Any, wo: Any, n: Any, exponent: Any) -> tuple[Any, Any]:
-            """``(n . h)^m`` and ``wi . h``."""
+        def risen(self, diffuse: Any, specular: Any, fresnel: Any, cosine: Any) -> Any:
+            """Specular albedo with its rise at a cosine, stopped where it would gain energy."""
+            if fresnel is None:
+                return specular
+            value = specular * fresnel_rise(cosine, fresnel)
+            return dr.minimum(value, dr.maximum(1.0 - diffuse, 0.0)) if self.normalized else value
+
+        def _half(self, wi: Any, wo: Any) -> Any:
             h = wi + wo
-            h = h * dr.rsqrt(dr.maximum(dr.squared_norm(h), 1e-12))
-            cos_h = dr.dot(h, n)
+            return h * dr.rsqrt(dr.maximum(dr.squared_norm(h), 1e-12))
+
+        def _lobe(self, wi: Any, wo: Any, n: Any, exponent: Any, fresnel: Any) -> tuple[Any, Any]:
+            """The lobe without albedo and N(m), and the density of wo when it is sampled."""
+            if fresnel is not None:
+                return carried_lobe(wi, wo, n, exponent)
+            h = self._half(wi, wo)
+            cos_h, wi_h = dr.dot(h, n), dr.dot(wi, h)
             # The power of a floor instead of zero keeps the derivative by the exponent finite.
             power = dr.select(cos_h > 0.0, dr.power(dr.clip(cos_h, 1e-4, 1.0), exponent), 0.0)
-            return power, dr.dot(wi, h)
+            density = (exponent + 1.0) * dr.inv_two_pi * power / dr.maximum(4.0 * wi_h, 1e-8)
+            return power, dr.select(wi_h > 0.0, density, 0.0)
 
-        def _specular_probability(self, ctx: Any, diffuse: Any, specular: Any) -> Any:
-            """Probability of sampling the lobe: the share of its albedo."""
+        def _specular_probability(self, ctx: Any, wi: Any, parameters: Any) -> Any:
+            """Probability of sampling the lobe: the share of its albedo; none where the normal faces away."""
             has_specular = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
             has_diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1)
             if not has_diffuse:
                 return mi.Float(1.0)
             if not has_specular:
                 return mi.Float(0.0)
-            s, d = dr.mean(dr.detach(specular)), dr.mean(dr.detach(diffuse))
-            return dr.select(s + d > 0.0, s / dr.maximum(s + d, 1e-12), 0.5)
+            diffuse, specular, _, fresnel, n = dr.detach(parameters)
+            cosine = dr.dot(wi, n)
+            s, d = dr.mean(self.risen(diffuse, specular, fresnel, cosine)), dr.mean(diffuse)
+            return dr.select(cosine > 0.0, dr.select(s + d > 0.0, s / dr.maximum(s + d, 1e-12), 0.5), 0.0)
 
-        def _reflects(self, wi: Any, wo: Any, n: Any) -> tuple[Any, Any]:
-            """Whether both directions are above the surface and its corrected normal; the corrected cosine of wo."""
+        def _reflects(self, wi: Any, wo: Any, n: Any) -> tuple[Any, Any, Any]:
+            """Where the base reflects, where the lobe does as well, and the corrected cosine of wo."""
             cosine = dr.dot(wo, n)
-            above = (mi.Frame3f.cos_theta(wi) > 0.0) & (mi.Frame3f.cos_theta(wo) > 0.0)
-            return above & (dr.dot(wi, n) > 0.0) & (cosine > 0.0), cosine
+            above = (mi.Frame3f.cos_theta(wi) > 0.0) & (mi.Frame3f.cos_theta(wo) > 0.0) & (cosine > 0.0)
+            return above, above & (dr.dot(wi, n) > 0.0), cosine
 
         def _value(self, ctx: Any, wi: Any, wo: Any, parameters: Any, active: Any) -> Any:
-            diffuse, specular, exponent, n = parameters
-            reflects, cosine = self._reflects(wi, wo, n)
+            diffuse, specular, exponent, fresnel, n = parameters
+            reflects, shines, cosine = self._reflects(wi, wo, n)
             value = mi.Spectrum(0.0)
             if ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
                 factor = normalization(exponent) if self.normalized else dr.inv_pi
-                value += specular * (factor * self._lobe(wi, wo, n, exponent)[0])
+                albedo = self.risen(diffuse, specular, fresnel, dr.dot(wi, self._half(wi, wo)))
+                lobe, _ = self._lobe(wi, wo, n, exponent, fresnel)
+                value += dr.select(shines, albedo * (factor * lobe), 0.0)
             if ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1):
                 value += diffuse * dr.inv_pi
             return dr.select(active & reflects, value * cosine, 0.0)
 
         def _density(self, ctx: Any, wi: Any, wo: Any, parameters: Any, active: Any) -> Any:
-            diffuse, specular, exponent, n = parameters
-            reflects, cosine = self._reflects(wi, wo, n)
-            p = self._specular_probability(ctx, diffuse, specular)
-            power, wi_h = self._lobe(wi, wo, n, exponent)
-            half = (exponent + 1.0) * dr.inv_two_pi * power
-            lobe = dr.select(wi_h > 0.0, half / dr.maximum(4.0 * wi_h, 1e-8), 0.0)
+            _, _, exponent, fresnel, n = parameters
+            reflects, shines, cosine = self._reflects(wi, wo, n)
+            p = self._specular_probability(ctx, wi, parameters)
+            lobe = dr.select(shines, self._lobe(wi, wo, n, exponent, fresnel)[1], 0.0)
             return dr.select(active & reflects, dr.lerp(cosine * dr.inv_pi, lobe, p), 0.0)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
@@ -150,16 +184,23 @@ def make() -> type:
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
             parameters = self.parameters(si, active)
-            diffuse, specular, exponent, n = parameters
-            p = self._specular_probability(ctx, diffuse, specular)
-            frame = mi.Frame3f(dr.detach(n))
+            _, _, exponent, fresnel, n = dr.detach(parameters)
+            p = self._specular_probability(ctx, si.wi, parameters)
+            frame = mi.Frame3f(n)
             take_lobe = sample1 < p
 
-            cos_h = dr.power(dr.maximum(sample2.x, 1e-30), 1.0 / (dr.detach(exponent) + 1.0))
+            # One warp for both lobes: the half vector about n, or half the angle to the mirror direction.
+            power = exponent + (1.0 if fresnel is None else 2.0)
+            cos_h = dr.power(dr.maximum(sample2.x, 1e-30), 1.0 / power)
             sin_h = dr.safe_sqrt(1.0 - dr.square(cos_h))
             sin_phi, cos_phi = dr.sincos(dr.two_pi * sample2.y)
-            h = frame.to_world(mi.Vector3f(sin_h * cos_phi, sin_h * sin_phi, cos_h))
-            about_h = dr.fma(h, 2.0 * dr.dot(si.wi, h), -si.wi)
+            if fresnel is None:
+                h = frame.to_world(mi.Vector3f(sin_h * cos_phi, sin_h * sin_phi, cos_h))
+                about_h = dr.fma(h, 2.0 * dr.dot(si.wi, h), -si.wi)
+            else:
+                mirror = mi.Frame3f(dr.fma(mi.Vector3f(n), 2.0 * dr.dot(si.wi, n), -si.wi))
+                sine = 2.0 * sin_h * cos_h
+                about_h = mirror.to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, 2.0 * dr.square(cos_h) - 1.0))
             about_n = frame.to_world(mi.warp.square_to_cosine_hemisphere(sample2))
 
             bs = dr.zeros(mi.BSDFSample3f)
@@ -180,12 +221,13 @@ def make() -> type:
             return self.parameters(si, active)[0]
 
         def to_string(self) -> str:
-            correction = "" if self.correction is None else f"  normal_correction = {self.correction},\n"
+            more = "" if self.correction is None else f"  normal_correction = {self.correction},\n"
+            more += "" if self.fresnel is None else f"  fresnel = {self.fresnel},\n"
             return (
                 "BlinnPhong[\n"
                 f"  diffuse_reflectance = {self.diffuse},\n"
                 f"  specular_reflectance = {self.specular},\n"
-                f"  exponent = {self.exponent},\n{correction}"
+                f"  exponent = {self.exponent},\n{more}"
                 f"  normalized = {self.normalized}\n]"
             )
 

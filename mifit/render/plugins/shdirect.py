@@ -50,7 +50,8 @@ def make() -> type:
           `mifit.render.shading`. Always the plain lobe.
         - `prefiltered`: $I_a + C_d \frac{E(n)}{\pi} + C_s \sum_{lm} a\, c_l\, L_{lm} Y_{lm}(\bar r)$, the lobe
           convolved with the lighting about its mean direction $\bar r$; $a$ is its directional albedo and $c_l$ its
-          Legendre factors for this angle and exponent.
+          Legendre factors for this angle and exponent. With `fresnel` those of the view along the normal, about the
+          mirror direction, and $a$ rises as $1 + k\,(1 - n \cdot v)^5$.
         - `shadowed`: as before with transfer vectors per vertex that hold the scene's own shadows, traced once per
           geometry, and the lobe dimmed by the part of its light that they let through. Meshes only.
 
@@ -115,8 +116,13 @@ def make() -> type:
                 local = mi.SurfaceInteraction3f(si)
                 flipped = own & (si.wi.z < 0.0) & two_sided
                 local.wi.z = dr.select(flipped, -si.wi.z, si.wi.z)
-                diffuse, specular, exponent, n = bsdf.parameters(local, own)
-                front = own & (local.wi.z > 0.0) & (dr.dot(local.wi, n) > 0.0)
+                diffuse, specular, exponent, fresnel, n = bsdf.parameters(local, own)
+                front, cosine = own & (local.wi.z > 0.0), dr.dot(local.wi, n)
+                specular = dr.select(cosine > 0.0, specular, 0.0)
+                if fresnel is not None and self.model != "paper":
+                    # The shading below brings the rise; here is only where it stops.
+                    rise = shading.fresnel_rise(cosine, fresnel)
+                    specular = bsdf.risen(diffuse, specular, fresnel, cosine) / rise
                 n.z = dr.select(flipped, -n.z, n.z)
                 white, glossy = shading.shade(
                     mi.Vector3f(si.sh_frame.to_world(n)),
@@ -126,6 +132,7 @@ def make() -> type:
                     self.model,
                     bsdf.normalized,
                     traced,
+                    fresnel,
                 )
                 radiance = dr.select(front, self.ambient + diffuse * white + specular * glossy, radiance)
             return radiance, si.is_valid() | (not self.hide), [], None
