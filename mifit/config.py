@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import sys
 import types
 import typing
 from dataclasses import dataclass, field
@@ -25,6 +26,7 @@ class GeometryConfig:
     rounds: int = 2  # outer steps: visibility is found anew in each
     landmark_noise: float = 1.0  # least standard deviation of a landmark coordinate, pixels; residuals may raise it
     scale_deviation: float = 0.0  # standard deviation of the model's log scale; 0: the units are trusted
+    camera_gains: bool = False  # find each camera's exposure and white balance relative to the first one's
     # objective "paper"
     landmark_weight: float = 10.0
     prior_weight: float = 5e-5
@@ -89,7 +91,7 @@ class ReflectanceConfig:
     exponent: float | None = None
     specular_difference_weight: float = 0.1
     smoothness_weight: float = 0.001
-    specular_smoothness: float = 30.0
+    specular_smoothness: float = 1000.0
     robust: bool = True
     max_iterations: int = 30
 
@@ -168,7 +170,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such configuration file") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # ValueError: also whole numbers of thousands of digits
         raise InputError(f"{path}: not a readable TOML file: {error}") from None
 
 
@@ -200,6 +202,10 @@ def from_mapping(cls: type, values: Any, where: str) -> Any:
             hint = f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(known)}"
             raise InputError(f"{where}: unknown key '{key}'; {hint}")
         arguments[key] = _convert(hints[key], value, f"{where}: {key}")
+    missing = dataclasses.MISSING
+    for f in dataclasses.fields(cls):
+        if f.name not in arguments and f.default is missing and f.default_factory is missing:
+            raise InputError(f"{where}: key '{f.name}' is missing")
     try:
         return cls(**arguments)
     except ValueError as error:
@@ -224,8 +230,8 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
             raise InputError(f"{where}: found {value!r}, expected a list")
         return tuple(_convert(options[0], v, where) for v in value)
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        if value != value or value in (float("inf"), float("-inf")):
-            raise InputError(f"{where}: found {value!r}, expected a finite number")
+        if not abs(value) <= sys.float_info.max:  # neither NaN, nor infinite, nor an integer of hundreds of digits
+            raise InputError(f"{where}: found {str(value)[:40]}, expected a finite number")
         return float(value)
     if isinstance(value, bool) != (hint is bool) or not isinstance(value, hint):
         raise InputError(f"{where}: found {value!r}, expected a value of type {hint.__name__}")

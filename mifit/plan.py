@@ -215,7 +215,7 @@ def _toml_value(text: str) -> Any:
         import tomli as tomllib  # type: ignore[no-redef]
     try:
         return tomllib.loads(f"x = {text}")["x"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return text
 
 

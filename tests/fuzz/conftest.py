@@ -15,13 +15,13 @@ from mifit.errors import MifitError
 T = TypeVar("T")
 
 
-def bounded(examples: int) -> settings:
-    """The same examples in every run; one that takes 20 seconds counts as a hang."""
+def bounded(examples: int, deadline: int | None = 20_000) -> settings:
+    """The same examples in every run; one that takes 20 seconds (milliseconds are given) counts as a hang."""
     return settings(
         max_examples=examples,
         derandomize=True,
         database=None,
-        deadline=20_000,
+        deadline=deadline,
         suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
     )
 

@@ -1,0 +1,94 @@
+"""Shading of finite input is finite, in value and in gradient, at every angle, exponent and lighting."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mifit.render import shading
+from tests.fuzz.conftest import bounded
+
+AXES = np.array([[0, 0, 1], [0, 0, -1], [0, 1, 0], [0, -1, 0], [1, 0, 0], [-1, 0, 0]], dtype=np.float64)
+TINY = 1e-7
+NEAR = np.array([[TINY, 0, 1], [1, 0, TINY], [1, 0, -TINY], [1, 1, 0], [1, -1, TINY], [-TINY, 1, -1]])
+DRAWN = 4
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(length > 1e-12, vectors / np.maximum(length, 1e-12), AXES[:1])
+
+
+directions = st.lists(
+    st.tuples(*[st.floats(-1, 1, width=32, allow_subnormal=False)] * 3), min_size=DRAWN, max_size=DRAWN
+)
+values = st.one_of(st.sampled_from([0.0, 1.0, -1.0, 1e-30, 1e6, -1e6, 1e-6]), st.floats(-10, 10, width=32))
+
+
+@pytest.mark.slow
+@bounded(24, deadline=None)  # the first of a kind compiles its kernels
+@given(
+    model=st.sampled_from(shading.MODELS),
+    order=st.sampled_from([1, 3]),
+    exponent=st.sampled_from([1.0, 1.5, 5.0, 200.0, 1e4]),
+    fresnel=st.sampled_from([None, 0.0, 8.0]),
+    drawn=directions,
+    lighting=st.lists(values, min_size=12, max_size=12),
+    seed=st.integers(0, 2**16),
+)
+def test_shade(
+    variant: str,
+    model: str,
+    order: int,
+    exponent: float,
+    fresnel: float | None,
+    drawn: list[tuple[float, float, float]],
+    lighting: list[float],
+    seed: int,
+) -> None:
+    import drjit as dr
+    import mitsuba as mi
+
+    rng = np.random.default_rng(seed)
+    pool = np.concatenate([AXES, unit(NEAR), unit(np.array(drawn))])
+    i, j = np.divmod(np.arange(len(pool) ** 2), len(pool))
+    n, v = (mi.Vector3f(*(mi.Float(np.ascontiguousarray(c)) for c in pool[k].T.astype(np.float32))) for k in (i, j))
+    numbers = rng.choice(np.array(lighting), (order * order, 3)).astype(np.float32)
+    coefficients = [mi.Color3f(*(dr.opaque(mi.Float, float(x)) for x in row)) for row in numbers]
+    m = dr.opaque(mi.Float, exponent)
+    traced: list[Any] | None = None
+    if model == "shadowed":
+        traced = [mi.Float(rng.choice([0.0, 0.3, -0.1], len(i)).astype(np.float32)) for _ in range(order * order)]
+    inputs = [n, v, m, *coefficients, *(traced or [])]
+    dr.enable_grad(inputs)
+    diffuse, specular = shading.shade(n, v, coefficients, m, model, traced=traced, fresnel=fresnel)
+    for part in (diffuse, specular):
+        assert np.isfinite(np.array(part)).all()
+    dr.backward(dr.sum(diffuse + specular, axis=None))
+    for value in inputs:
+        assert np.isfinite(np.array(dr.grad(value))).all()
+
+
+@bounded(20, deadline=None)
+@given(
+    order=st.sampled_from([1, 3]),
+    lighting=st.lists(values, min_size=12, max_size=12),
+    seed=st.integers(0, 2**16),
+)
+def test_dominant_direction(variant: str, order: int, lighting: list[float], seed: int) -> None:
+    import drjit as dr
+    import mitsuba as mi
+
+    numbers = np.random.default_rng(seed).choice(np.array(lighting), (order * order, 3)).astype(np.float32)
+    coefficients = [mi.Color3f(*(dr.opaque(mi.Float, float(x)) for x in row)) for row in numbers]
+    dr.enable_grad(coefficients)
+    d = shading.dominant_direction(coefficients)
+    assert abs(np.linalg.norm(np.array(d)) - 1) < 1e-3
+    if order > 1:  # with one band the direction depends on nothing
+        dr.backward(d.x + 2.0 * d.y + 3.0 * d.z)
+    for value in coefficients:
+        assert np.isfinite(np.array(dr.grad(value))).all()
