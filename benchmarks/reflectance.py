@@ -93,7 +93,10 @@ def main() -> int:
     base = ReflectanceConfig(texture_size=a.size)
     small = ReflectanceConfig(texture_size=a.adam_size, shading="paper", robust=False)
     for name in a.names:
-        runs = {f"als {shading}": replace(base, shading=shading) for shading in ("paper", "prefiltered", "shadowed")}
+        runs = {
+            f"als {shading}": replace(base, shading=shading)
+            for shading in ("paper", "prefiltered", "shadowed", "keyed")
+        }
         if a.adam_size and name == "gloss":
             runs["als paper objective"] = small
             runs["adam paper objective"] = replace(small, solver="adam")

@@ -67,7 +67,7 @@ class ReflectanceConfig:
         Side of the maps in texels.
     solver : {"als", "adam"}
         ``als``: lighting with the texels eliminated, then the maps by ADMM; ``adam``: the paper's gradient descent.
-    shading : {"auto", "paper", "prefiltered", "shadowed"}
+    shading : {"auto", "paper", "prefiltered", "shadowed", "keyed"}
         Image-formation model; ``auto`` takes the cheapest that explains the images.
     bands : int
         Bands of the lighting of ``prefiltered`` and ``shadowed``, 3 to 10; ``paper`` has 3.
@@ -86,7 +86,7 @@ class ReflectanceConfig:
 
     texture_size: int = 512
     solver: Literal["als", "adam"] = "als"
-    shading: Literal["auto", "paper", "prefiltered", "shadowed"] = "auto"
+    shading: Literal["auto", "paper", "prefiltered", "shadowed", "keyed"] = "auto"
     bands: int = 10
     exponent: float | None = None
     specular_difference_weight: float = 0.1

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 
 from numpy.typing import NDArray
 
+from mifit.core.keylight import KeyLight
+
 
 @dataclass(frozen=True)
 class Report:
@@ -99,6 +101,10 @@ class ReflectanceEstimate:
         ``"paper"``, ``"prefiltered"`` or ``"shadowed"``: how maps and lighting make an image.
     fresnel : float or None
         Rise of the specular lobe towards grazing views, see ``render.shading.Lobe``; None for plain Blinn-Phong.
+    key_direction, key_irradiance : (3,) float64 or None
+        A compact light beside ``radiance``, see ``core.keylight``; None where there is none.
+    key_radius : float
+        Its angular radius in radians.
     """
 
     diffuse: NDArray
@@ -110,6 +116,16 @@ class ReflectanceEstimate:
     shading_model: str
     report: Report
     fresnel: float | None = None
+    key_direction: NDArray | None = None
+    key_irradiance: NDArray | None = None
+    key_radius: float = 0.0
+
+    @property
+    def key(self) -> KeyLight | None:
+        """The compact light, where there is one."""
+        if self.key_direction is None or self.key_irradiance is None:
+            return None
+        return KeyLight(self.key_direction, self.key_radius, self.key_irradiance)
 
 
 @dataclass(frozen=True)

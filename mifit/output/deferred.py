@@ -160,16 +160,22 @@ def shade_methods(
     finer = [m for m in methods if m != "pca"]
     if finer:
         from mifit.render.bent import shade_bent
+        from mifit.render.gbuffer import SurfaceScene
 
         reflectance = reconstruction.reflectance
         assert reflectance is not None
         material = surface_material(reconstruction, surface, timestep)
         base = _mesh_normals(reconstruction, surface, timestep)
         traced = _traced(reconstruction, surface, timestep) if reflectance.shading_model == "shadowed" else None
+        lit = None
+        if reflectance.key is not None:
+            vertices = reconstruction.geometry.vertices[reconstruction.index(timestep)]
+            scene = SurfaceScene(vertices, reconstruction.model.faces)
+            lit = scene.open_towards(surface.points, base, reflectance.key.samples())
         for method in finer:
             specular = material.specular if method == "full" else np.zeros_like(material.specular)
             out[method] = surface.image(
-                shade_bent(material.normal, base, surface.view, material.diffuse, specular, reflectance, traced)
+                shade_bent(material.normal, base, surface.view, material.diffuse, specular, reflectance, traced, lit)
             )
     return {m: out[m] for m in methods}
 

@@ -17,6 +17,7 @@ from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.files import replacing, write_text
 from mifit.core.image import encode_png, read_image, write_image
+from mifit.core.keylight import KeyLight
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
 from mifit.output.ply import read_ply, write_ply
@@ -136,6 +137,7 @@ def _document(result: Reconstruction) -> dict[str, Any]:
             "exponent": float(reflectance.exponent),
             "shading_model": reflectance.shading_model,
             "fresnel": reflectance.fresnel,
+            "key": _key_document(reflectance.key),
         }
     return _finite(
         {
@@ -184,6 +186,12 @@ def _source(source: str) -> str:
 def _camera_document(camera: Camera) -> dict[str, Any]:
     keys = ("name", "width", "height", "fx", "fy", "cx", "cy")
     return {k: getattr(camera, k) for k in keys} | {"world_to_camera": camera.world_to_camera.tolist()}
+
+
+def _key_document(key: KeyLight | None) -> dict[str, Any] | None:
+    if key is None:
+        return None
+    return {"direction": key.direction.tolist(), "radius": key.radius, "irradiance": key.irradiance.tolist()}
 
 
 def _report_document(report: Report) -> dict[str, Any]:
@@ -369,6 +377,7 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
         return None
     lighting = document["lighting"]
     order = int(lighting["order"])
+    key = lighting.get("key")
     diffuse = _read_map(folder / "maps" / "diffuse.exr", 3)
     return ReflectanceEstimate(
         diffuse=diffuse,
@@ -380,6 +389,9 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
         shading_model=str(lighting["shading_model"]),
         report=_report(document, "reflectance"),
         fresnel=None if lighting.get("fresnel") is None else float(lighting["fresnel"]),
+        key_direction=None if key is None else _array(key["direction"], (3,), "key direction"),
+        key_irradiance=None if key is None else _array(key["irradiance"], (3,), "key irradiance"),
+        key_radius=0.0 if key is None else float(key["radius"]),
     )
 
 

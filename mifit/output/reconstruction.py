@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
-from mifit.core.sh import SHLighting, bands, cosine_coefficients
+from mifit.core.sh import SHLighting, bands, cosine_coefficients, order_of
 from mifit.errors import InputError
 
 if TYPE_CHECKING:
@@ -99,9 +99,13 @@ class Reconstruction:
 
     @property
     def lighting(self) -> SHLighting:
-        """The recovered radiance; without stage 2, that whose irradiance gives stage 1's shading."""
+        """The recovered radiance; without stage 2, that whose irradiance gives stage 1's shading.
+
+        A compact light is in it as far as the bands can show one.
+        """
         if self.reflectance is not None:
-            return SHLighting(self.reflectance.radiance)
+            radiance, key = self.reflectance.radiance, self.reflectance.key
+            return SHLighting(radiance if key is None else radiance + key.coefficients(order_of(radiance)))
         return SHLighting(self.geometry.shading * (math.pi / cosine_coefficients(3)[bands(3)])[:, None])
 
     def index(self, timestep: int) -> int:

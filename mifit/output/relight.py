@@ -60,7 +60,7 @@ def relit(
         raise InputError(f"exposure: found {exposure!r}, expected a positive number")
     # The ambient term stands for light that the model leaves out, such as interreflection: it grows with the light.
     ambient = reflectance.ambient * exposure * after / before
-    changed = replace(reflectance, radiance=exposure * lighting.coefficients, ambient=ambient)
+    changed = replace(reflectance, radiance=exposure * lighting.coefficients, ambient=ambient, key_direction=None)
     return replace(reconstruction, reflectance=changed, environment=exposure * _turned(image, angle))
 
 

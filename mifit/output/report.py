@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import math
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -279,10 +280,18 @@ def _lighting(result: Reconstruction) -> str:
     panorama = np.maximum(lighting.to_latlong(), 0)
     codes = to_8_bit(panorama / max(float(panorama.max()), 1e-12))
     ambient = result.geometry.ambient if result.reflectance is None else result.reflectance.ambient
+    light = None if result.reflectance is None else result.reflectance.key
+    key = ""
+    if light is not None:
+        x, y, z = light.direction
+        key = (
+            f"; the sharp light towards ({x:.2f}, {y:.2f}, {z:.2f}), with an angular radius of "
+            f"{math.degrees(light.radius):.1f} degrees, was found apart from them"
+        )
     return f"""<div class="balls">{_figure(png_uri(matt), "White matt ball", "lighting on a matt ball")}
 {_figure(png_uri(mirror), "Mirror ball", "lighting in a mirror ball")}
 {_figure(jpeg_uri(codes), "All directions, latitude by longitude", "lighting panorama")}</div>
-<p class="soft">Recovered as spherical harmonics of {lighting.order} bands, so only broad light shows.
+<p class="soft">Recovered as spherical harmonics of {lighting.order} bands, so only broad light shows{key}.
 Ambient term {ambient:.4f}.</p>"""
 
 

@@ -46,6 +46,7 @@ def material_shade(
     specular: NDArray,
     views: Sequence[NormalView],
     traced: Sequence[NDArray] | None = None,
+    lit: Sequence[NDArray] | None = None,
 ) -> Shade:
     """Shading of texels by the model that stage 2 estimated them with.
 
@@ -58,6 +59,8 @@ def material_shade(
     views : sequence of NormalView
     traced : sequence of (N, B*B), optional
         Per view the shadowed diffuse transfer at the base normal, for the ``shadowed`` model.
+    lit : sequence of (N,) uint32, optional
+        Per view which directions of the key light each texel sees (``SurfaceScene.open_towards``), where there is one.
 
     Notes
     -----
@@ -83,18 +86,34 @@ def material_shade(
             raise InputError("shading model 'shadowed': found no transfer vectors, expected those of trace_transfer")
         for view, rows in zip(views, traced, strict=True):
             columns = [mi.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in np.asarray(rows).T]
-            lit = shading.radiance(columns, coefficients)
+            shadowed = shading.radiance(columns, coefficients)
             n, v = vector(mi.Vector3f, view.normal), vector(mi.Vector3f, view.direction)
             open_sky = shading.radiance(shading.diffuse_transfer(n, order), coefficients)
             open_light = dr.maximum(mi.luminance(open_sky), 1e-6)
-            passed = dr.clip(mi.luminance(lit) / open_light, 0.0, 1.0)
+            passed = dr.clip(mi.luminance(shadowed) / open_light, 0.0, 1.0)
             axis, _ = shading.lobe_axis(n, v, exponent)
             glint = shading.unoccluded(n, axis, columns, order)
-            base = lit - passed * open_sky
+            base = shadowed - passed * open_sky
             dr.eval(base, passed, glint)
             shadows.append((base, passed, glint))
 
+    key = reflectance.key
+    if key is not None:
+        if lit is None:
+            raise InputError("key light: found no visibility, expected that of SurfaceScene.open_towards")
+        irradiance = mi.Color3f(*map(float, key.irradiance))
+        directions = [mi.Vector3f(*map(float, d)) for d in key.samples()]
+        dr.make_opaque(irradiance, directions)
+        seen = [mi.UInt(bits) for bits in lit]
+
     def shade(n: Any, v: Any, view: int) -> Any:
+        colour = smooth(n, v, view)
+        if key is None:
+            return colour
+        matt, glossy = shading.key_transfer(n, v, exponent, directions, seen[view])
+        return colour + (albedo * matt + gloss * glossy) * irradiance
+
+    def smooth(n: Any, v: Any, view: int) -> Any:
         if model != "shadowed":
             body, glint = shading.shade(n, v, coefficients, exponent, model)
             return ambient + albedo * body + gloss * glint
@@ -113,6 +132,7 @@ def shade_bent(
     specular: NDArray,
     reflectance: ReflectanceEstimate,
     traced: NDArray | None = None,
+    lit: NDArray | None = None,
 ) -> NDArray[np.float32]:
     """Radiance (N, 3) of points, ambient included.
 
@@ -128,6 +148,8 @@ def shade_bent(
         Lighting, ambient term, exponent and shading model; its maps aren't used.
     traced : (N, B*B), optional
         Shadowed diffuse transfer at the mesh's normals; ``shadowed`` needs it.
+    lit : (N,) uint32, optional
+        Which directions of the key light the points see; needed where there is one.
     """
     import drjit as dr
     import mitsuba as mi
@@ -138,7 +160,8 @@ def shade_bent(
     nothing = np.zeros(count, np.float32)
     points = NormalView(nothing, nothing, view, base, nothing)
     n, v = vector(mi.Vector3f, normals), vector(mi.Vector3f, view)
-    shade = material_shade(reflectance, diffuse, specular, [points], None if traced is None else [traced])
+    shadows = [traced] if traced is not None else None
+    shade = material_shade(reflectance, diffuse, specular, [points], shadows, [lit] if lit is not None else None)
     colour = mi.Color3f(shade(n, v, 0))
     dr.eval(colour)
     return np.stack([np.array(c, dtype=np.float32) for c in (colour.x, colour.y, colour.z)], axis=1)

@@ -189,6 +189,45 @@ class SurfaceScene:
         hit = self._scene.ray_test(ray)
         return ~np.array(hit).astype(bool)
 
+    def open_towards(self, points: NDArray, normals: NDArray, directions: NDArray) -> NDArray[np.uint32]:
+        """Which distant directions surface points see past the mesh.
+
+        Rays start off the surface by ``SHADOW_EPSILON`` of the scene's diagonal along the normal. A direction
+        below the horizon counts as hidden.
+
+        Parameters
+        ----------
+        points, normals : (N, 3)
+            World space, on the mesh; unit.
+        directions : (D, 3)
+            Unit vectors, at most 32.
+
+        Returns
+        -------
+        (N,) uint32
+            Bit d tells of direction d.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        if len(directions) > 32:
+            raise InputError(f"directions: found {len(directions)}, expected at most 32")
+        if not len(points):
+            return np.zeros(0, np.uint32)
+        n = _vector(normals)
+        origin = _vector(points) + SHADOW_EPSILON * self._diagonal * n
+        toward = mi.Float(np.ascontiguousarray(directions, dtype=np.float32).ravel())
+
+        def body(i: Any, bits: Any) -> tuple[Any, Any]:
+            d = mi.Vector3f(*(dr.gather(mi.Float, toward, 3 * i + k) for k in range(3)))
+            above = dr.dot(n, d) > 0.0
+            seen = above & ~self._scene.ray_test(mi.Ray3f(mi.Point3f(origin), d), active=above)
+            return i + 1, bits | dr.select(seen, mi.UInt(1) << i, mi.UInt(0))
+
+        start = (mi.UInt(0), dr.zeros(mi.UInt, len(points)))
+        _, bits = dr.while_loop(state=start, cond=lambda i, bits: i < dr.opaque(mi.UInt, len(directions)), body=body)
+        return np.array(bits, dtype=np.uint32)
+
 
 def _vector(values: NDArray) -> Any:
     """(N, 3) array -> mi.Vector3f."""

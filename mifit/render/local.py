@@ -120,6 +120,36 @@ def specular_matrix(
     return matrix * _columns([shading.unoccluded(normal, axis, traced, order)], len(n))
 
 
+def key_columns(
+    normals: ArrayLike,
+    view: ArrayLike,
+    seen: NDArray[np.uint32],
+    directions: NDArray,
+    exponent: float,
+    fresnel: float | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Diffuse and specular radiance (N,) at unit albedo per unit of a compact light's irradiance.
+
+    Parameters
+    ----------
+    normals, view : (N, 3)
+    seen : (N,) uint32
+        Which of the directions each point sees, see ``SurfaceScene.open_towards``.
+    directions : (D, 3)
+        The light's disc, see ``core.keylight``.
+    exponent, fresnel
+        As in ``shade_points``.
+    """
+    import mitsuba as mi
+
+    count = len(np.asarray(normals))
+    n, v = (_vector(_expect(x, (count, 3), name)) for x, name in ((normals, "normals"), (view, "view")))
+    toward = _opaque([mi.Vector3f(*map(float, d)) for d in directions])
+    lobe = shading.lobe(float(exponent), 1, fresnel=fresnel)
+    both = _columns(list(shading.key_transfer(n, v, lobe, toward, mi.UInt(seen))), count)
+    return both[:, 0], both[:, 1]
+
+
 def _checked(normals: ArrayLike, view: ArrayLike, radiance: ArrayLike) -> tuple[NDArray, NDArray, int]:
     count = len(np.asarray(normals))
     n = _expect(normals, (count, 3), "normals")

@@ -95,6 +95,8 @@ class Lobe:
         Per moment of ``core.blinn_phong.lobe_moments`` its Chebyshev coefficients in ``2 n.v - 1``.
     scale : float or Float
         Factor on the albedo: 1 for the normalised lobe.
+    exponent, peak : float or Float
+        ``N (n . h)^m`` has the exponent m and the peak N.
     fresnel : float, Float or None
         None: Blinn-Phong as it is. A number: the lobe that a view along the normal has, carried about the mirror
         direction whatever the view, and rising as ``1 + fresnel (1 - n.v)^5``: what microfacet surfaces do.
@@ -103,6 +105,8 @@ class Lobe:
     order: int
     polynomials: list[list[Any]]
     scale: Any
+    exponent: Any
+    peak: Any
     fresnel: Any = None
 
 
@@ -118,14 +122,19 @@ def lobe(exponent: Any, order: int, normalized: bool = True, fresnel: Any = None
         # Opaque: a kernel is compiled once, not once per exponent.
         polynomials = [[dr.opaque(mi.Float, float(a)) for a in row] for row in values]
         ratio = blinn_phong.normalization(exponent, normalized) / blinn_phong.normalization(exponent)
-        return Lobe(order, polynomials, dr.opaque(mi.Float, float(ratio)), fresnel)
+        peak = float(blinn_phong.normalization(exponent, normalized))
+        own = (dr.opaque(mi.Float, float(value)) for value in (ratio, exponent, peak))
+        return Lobe(order, polynomials, *own, fresnel)
     m = dr.clip(exponent, blinn_phong.EXPONENT_MIN, blinn_phong.EXPONENT_MAX)
     y = dr.log(m) * (2.0 / float(np.log(blinn_phong.EXPONENT_MAX))) - 1.0
     t = _chebyshev(y, table.shape[2])
     polynomials = [[_dot(row, t) for row in moment] for moment in table]
     if dr.width(exponent) == 1 and not dr.grad_enabled(exponent):
         dr.eval(polynomials)  # computed once; with a gradient it is cheaper per point, with one sum at the end
-    return Lobe(order, polynomials, 1.0 if normalized else 1.0 / (dr.pi * normalization(exponent)), fresnel)
+    peak = normalization(exponent)
+    if normalized:
+        return Lobe(order, polynomials, 1.0, exponent, peak, fresnel)
+    return Lobe(order, polynomials, 1.0 / (dr.pi * peak), exponent, 1.0 / dr.pi, fresnel)
 
 
 def _clamped(exponent: float) -> float:
@@ -287,6 +296,49 @@ def shade(
     if traced is None:
         raise InputError("shading model 'shadowed': found no transfer vectors, expected those of trace_transfer")
     return radiance(traced, coefficients), specular * unoccluded(n, axis, traced, order)
+
+
+def key_transfer(n: Any, v: Any, lobe: Lobe, directions: Sequence[Any], seen: Any) -> tuple[Any, Any]:
+    """Radiance of a white diffuse and of a fully specular point per unit of a compact light's irradiance.
+
+    Nothing is band limited here: cosine and lobe are those of the light's own directions, and shadows are traced.
+
+    Parameters
+    ----------
+    n, v : Vector3f
+    lobe : Lobe
+    directions : sequence of Vector3f
+        Directions that stand for the light's disc (``core.keylight``).
+    seen : UInt
+        Bit d tells whether direction d is visible (``SurfaceScene.open_towards``).
+
+    Returns
+    -------
+    diffuse, specular : Float
+    """
+    import drjit as dr
+
+    cosine_view = dr.dot(n, v)
+    mirror = 2.0 * cosine_view * n - v
+    peak, rise = lobe.peak, 1.0
+    if lobe.fresnel is not None:
+        rise = fresnel_rise(cosine_view, lobe.fresnel)
+    diffuse, specular = 0.0, 0.0
+    for number, d in enumerate(directions):
+        visible = (seen & (1 << number)) != 0
+        cosine = dr.maximum(dr.dot(n, d), 0.0)
+        if lobe.fresnel is not None:
+            # About the mirror direction: the half vector's cosine of a view along the normal is that of half the angle.
+            off = dr.dot(mirror, d)
+            falloff = dr.maximum(off, 0.0) * dr.power(dr.clip(0.5 + 0.5 * off, 1e-6, 1.0), 0.5 * lobe.exponent)
+        else:
+            h = v + d
+            cos_h = dr.dot(n, h * dr.rsqrt(dr.maximum(dr.squared_norm(h), 1e-8)))
+            falloff = cosine * dr.power(dr.clip(cos_h, 1e-4, 1.0), lobe.exponent)
+        diffuse = diffuse + dr.select(visible, cosine, 0.0)
+        specular = specular + dr.select(visible, falloff, 0.0)
+    share = 1.0 / len(directions)
+    return diffuse * (share / np.pi), specular * (share * peak * rise)
 
 
 def unoccluded(n: Any, axis: Any, traced: Sequence[Any], order: int) -> Any:

@@ -92,17 +92,21 @@ def infer_reflectance(
     if config.solver == "adam" or not config.robust:
         terms = energies(surface, fitted.forward, fitted.radiance, fitted.ambient, fitted.maps, albedo, config)
         details["objective"] = {**terms, "total": sum(terms.values())}
+    key = fitted.forward.key
     outcome = "converged" if fitted.converged else "max_iterations"
     return ReflectanceEstimate(
         diffuse=diffuse,
         specular=specular,
         confidence=confidence,
-        radiance=fitted.radiance,
+        radiance=fitted.radiance[: fitted.forward.order**2],
         ambient=float(fitted.ambient),
         exponent=float(fitted.forward.exponent),
         shading_model=fitted.forward.model,
         fresnel=fitted.forward.fresnel,
         report=Report(outcome, fitted.energies, time.perf_counter() - started, warnings, details),
+        key_direction=key.direction if key else None,
+        key_irradiance=fitted.radiance[-1] if key else None,
+        key_radius=float(key.radius) if key else 0.0,
     )
 
 
@@ -117,6 +121,11 @@ def _check(config: ReflectanceConfig) -> None:
         raise InputError(f"reflectance.exponent: found {config.exponent}, expected 1 to 10000, or none to estimate it")
     if config.max_iterations < 1:
         raise InputError(f"reflectance.max_iterations: found {config.max_iterations}, expected 1 or more")
+    if config.solver == "adam" and config.shading == "keyed":
+        raise InputError(
+            "reflectance.shading: found 'keyed' with solver 'adam', which has no search for the light's direction; "
+            "use solver 'als', or shading 'shadowed'"
+        )
     for name in ("specular_difference_weight", "smoothness_weight", "specular_smoothness"):
         value = getattr(config, name)
         if not (np.isfinite(value) and value >= 0):

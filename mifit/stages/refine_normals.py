@@ -191,6 +191,7 @@ def frame_problem(
     Without a measured texel there is no optimisation: None.
     """
     from mifit.render.bent import NormalView, material_shade
+    from mifit.render.gbuffer import SurfaceScene
     from mifit.render.refine import NormalProblem, residual_scale
     from mifit.render.transfer import trace_transfer
 
@@ -218,7 +219,11 @@ def frame_problem(
         at_texels = interpolate(at_vertices, model.faces, texels.face[rows], texels.weights[rows])
         traced = [at_texels] * len(views)
     diffuse, specular = (texels.from_map(m)[rows] for m in (reflectance.diffuse, reflectance.specular))
-    shade = material_shade(reflectance, diffuse, specular, views, traced)
+    lit = None
+    if reflectance.key is not None:
+        scene = SurfaceScene(geometry.vertices[0], model.faces)
+        lit = [scene.open_towards(part.point[:, 0], base[rows], reflectance.key.samples())] * len(views)
+    shade = material_shade(reflectance, diffuse, specular, views, traced, lit)
     patch = TexelMap(texels.size, texels.index[rows], texels.face[rows], texels.weights[rows])
     drawn = None
     if aim is not None:

@@ -10,13 +10,9 @@ from numpy.typing import NDArray
 from mifit.config import ReflectanceConfig
 from mifit.progress import Progress
 from mifit.stages.observations import Observations, Surface
+from mifit.stages.reflectance.choice import choose_lighting, noise_weight
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.lighting import (
-    LightingProblem,
-    LightingSolution,
-    active_weight,
-    solve_lighting,
-)
+from mifit.stages.reflectance.lighting import LightingSolution, active_weight
 from mifit.stages.reflectance.maps import Smoothness, TexelSystems, solve_maps
 from mifit.stages.reflectance.objective import energies
 
@@ -24,19 +20,8 @@ LIGHTING_TEXELS = 6000
 """Texels that determine the lighting; a few hundred unknowns against 24 values of eight images each."""
 MAP_PASSES = 3
 """Passes over the maps: each takes new robust weights from the residuals of the last."""
-NOISE_FLOOR = 0.03
-"""Read noise over shot noise, as variance in units of linear colour; 8-bit sRGB is coded about so as well."""
-
-PAPER_EXPONENT = 5.0
 ROUNDS = 20
 """Rounds of `alternate` at the most."""
-EXPONENTS = (50.0, 150.0, 400.0)
-"""Exponents that are tried where none is given."""
-FRESNEL = 8.0
-"""Rise of the lobe towards grazing views. Schlick's for skin is 24 times the value at normal incidence, of which
-shadowing and masking between microfacets take a part; fits of path-traced skin change by about 0.1 dB from 8 to 24."""
-EXPLAINED = 0.03
-"""A costlier shading model is taken where it lowers the residual by more than this part."""
 
 
 @dataclass(frozen=True)
@@ -63,49 +48,6 @@ class Fitted:
     sigma: float
     energies: dict[str, list[float]]
     converged: bool
-
-
-def noise_weight(colour: NDArray, robust: bool) -> NDArray[np.float32]:
-    """(..., 3) inverse variance of read and shot noise, 1 at mid-grey; 1 everywhere when not robust."""
-    if not robust:
-        return np.ones_like(colour)
-    return ((NOISE_FLOOR + 0.3) / (NOISE_FLOOR + np.clip(colour, 0.0, 1.0))).astype(np.float32)
-
-
-def lighting_problem(
-    seen: Observations, forward: Forward, radiance: NDArray, albedo: NDArray, robust: bool
-) -> LightingProblem:
-    """Collect the transfer vectors and weights of some texels."""
-    diffuse, specular = forward.transfers(seen, radiance)
-    weight = seen.weight[..., None] * noise_weight(seen.colour, robust)
-    return LightingProblem(seen.colour, weight, seen.clipped, diffuse, specular, albedo)
-
-
-def fit_lighting(
-    seen: Observations,
-    forward: Forward,
-    albedo: NDArray,
-    config: ReflectanceConfig,
-    iterations: int,
-    specular: float = 0.05,
-) -> LightingSolution:
-    """Lighting and the subset's albedos; the paper's dominant direction is found anew as the lighting changes."""
-    radiance = np.zeros((forward.order**2, 3))
-    if forward.model != "paper":
-        problem = lighting_problem(seen, forward, radiance, albedo, config.robust)
-        return solve_lighting(problem, specular=specular, robust=config.robust, iterations=iterations)
-    # Without highlights first, so that there is a direction to start from.
-    problem = lighting_problem(seen, replace(forward, model="prefiltered"), radiance, albedo, config.robust)
-    problem = replace(problem, specular=np.zeros_like(problem.specular))
-    found = solve_lighting(problem, robust=config.robust, with_ambient=True, iterations=6)
-    energy = list(found.energy)
-    for _ in range(4):
-        problem = lighting_problem(seen, forward, found.radiance, albedo, config.robust)
-        found = solve_lighting(
-            problem, found.radiance, robust=config.robust, with_ambient=True, iterations=max(2, iterations // 4)
-        )
-        energy += found.energy
-    return replace(found, energy=energy)
 
 
 def fit_maps(
@@ -176,33 +118,7 @@ def fit_als(
     """
     subset = surface.sample(LIGHTING_TEXELS, np.random.default_rng(seed))
     seen = surface.observe(subset)
-    names = ("paper", "prefiltered", "shadowed") if config.shading == "auto" else (config.shading,)
-    exponent = config.exponent
-    tried: dict[str, tuple[Forward, LightingSolution]] = {}
-    for done, name in enumerate(names):
-        progress("Reflectance lighting", done, len(names))
-        if name == "paper":
-            forward = Forward(name, 3, config.exponent or PAPER_EXPONENT)
-        else:
-            if exponent is None:
-                exponent = _best_exponent(seen.take(slice(0, None, 3)), albedo[subset][::3], config)
-            traced = surface.trace(config.bands) if name == "shadowed" else ()
-            forward = Forward(name, config.bands, exponent, FRESNEL, traced, faces)
-        tried[name] = forward, fit_lighting(seen, forward, albedo[subset], config, config.max_iterations)
-    progress("Reflectance lighting", len(names), len(names))
-    chosen = names[0]
-    for name in names[1:]:
-        if tried[name][1].unexplained < (1.0 - EXPLAINED) * tried[chosen][1].unexplained:
-            chosen = name
-    forward, found = tried[chosen]
-    choice = {
-        "chosen": chosen,
-        "why": "as configured"
-        if config.shading != "auto"
-        else f"cheapest whose unexplained residual no costlier model lowers by more than {EXPLAINED:.0%}",
-        "residuals": {name: float(f.unexplained) for name, (_, f) in tried.items()},
-        "exponent": forward.exponent,
-    }
+    forward, found, choice = choose_lighting(surface, faces, seen, albedo[subset], config, progress)
     prior = np.zeros((surface.texels.size**2, 4), dtype=np.float32)
     prior[surface.texels.index, :3] = albedo
     prior[:, 3] = np.median(found.specular)
@@ -212,15 +128,6 @@ def fit_als(
         found, maps, energy = alternate(surface, forward, found, maps, prior, albedo, config, progress)
     energy = {"lighting": found.energy} if config.robust else energy
     return Fitted(forward, found.radiance, found.ambient, maps, sigma, energy, found.converged), choice, ()
-
-
-def _best_exponent(seen: Observations, albedo: NDArray, config: ReflectanceConfig) -> float:
-    """The exponent of `EXPONENTS` that explains some texels best."""
-    trials = {}
-    for exponent in EXPONENTS:
-        forward = Forward("prefiltered", config.bands, exponent, FRESNEL)
-        trials[exponent] = fit_lighting(seen, forward, albedo, config, 5).unexplained
-    return min(trials, key=lambda m: trials[m])
 
 
 def alternate(
@@ -264,7 +171,7 @@ def exact_lighting(
     surface: Surface, forward: Forward, found: LightingSolution, maps: NDArray, config: ReflectanceConfig
 ) -> tuple[NDArray[np.float64], float]:
     """Lighting, and for the paper's model ambient, that minimise data and difference terms for the maps given."""
-    k = forward.order**2
+    k = forward.lights
     system, right = np.zeros((3 * k + 1, 3 * k + 1)), np.zeros(3 * k + 1)
     values = maps.reshape(-1, 4)[surface.texels.index]
     for chunk in surface.chunks(8 * k):

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from mifit.config import ReflectanceConfig
 from mifit.progress import Progress
 from mifit.stages.observations import Observations, Surface
-from mifit.stages.reflectance.als import FRESNEL, PAPER_EXPONENT, Fitted, fit_lighting, noise_weight
+from mifit.stages.reflectance.als import Fitted
+from mifit.stages.reflectance.choice import FRESNEL, PAPER_EXPONENT, fit_lighting, noise_weight
 from mifit.stages.reflectance.forward import Forward
 
 STEPS_PER_ITERATION = 10

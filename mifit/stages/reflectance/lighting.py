@@ -8,6 +8,7 @@ determine a few hundred coefficients, so a random subset is enough; the maps are
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,13 +136,10 @@ def solve_lighting(
     tolerance : float
         Stop when the energy changes by less than this part.
     """
-    n, _, k = problem.specular.shape
-    band = bands(round(np.sqrt(k))).astype(np.float64)
-    stiffness = (band * (band + 1.0)) ** 2
+    n = len(problem.specular)
     diffuse = problem.albedo.astype(np.float32).copy()
     gloss = np.full(n, specular, dtype=np.float32)
-    light = _initial(problem, diffuse, gloss, stiffness) if radiance is None else np.array(radiance, dtype=np.float64)
-    sphere_basis = basis(_sphere(NEGATIVE_DIRECTIONS), round(np.sqrt(k)))
+    light = _initial(problem, diffuse, gloss) if radiance is None else np.array(radiance, dtype=np.float64)
     energy: list[float] = []
     ambient, sigma, unexplained, converged, damping = 0.0, 0.0, np.inf, False, 1e-3
     state = light, ambient, diffuse, gloss
@@ -162,12 +160,10 @@ def solve_lighting(
                 converged = True
             energy.append(current)
             best, sigma = state, spread
-            bounded = problem.weight * residual**2 / (1.0 + (residual / GROSS) ** 2)
-            bounded = np.where(problem.clipped[..., None] & (residual <= 0), np.float32(0.0), bounded)
-            unexplained = float(np.sqrt(bounded.sum() / max(float(problem.weight.sum()), 1e-12)))
+            bounded = float((bounded_weight(problem, residual) * residual**2).sum())
+            unexplained = float(np.sqrt(bounded / max(float(problem.weight.sum()), 1e-12)))
             damping = max(0.1 * damping, DAMPING)
-            system = _Normal.accumulate(problem, diffuse, gloss, shade, glint, residual, weight)
-            system.add_priors(priors, light, diffuse, gloss, problem.albedo, stiffness, sphere_basis)
+            system = linearize(problem, light, diffuse, gloss, shade, glint, residual, weight, priors)
             if converged:
                 break
         step = system.solve(with_ambient, damping)
@@ -180,6 +176,35 @@ def solve_lighting(
         state = light * gain, ambient, (diffuse / gain).astype(np.float32), (gloss / gain).astype(np.float32)
     light, ambient, diffuse, gloss = best
     return LightingSolution(light, ambient, diffuse, gloss, sigma, unexplained, energy, converged)
+
+
+def linearize(
+    problem: LightingProblem,
+    light: NDArray,
+    diffuse: NDArray,
+    gloss: NDArray,
+    shade: NDArray,
+    glint: NDArray,
+    residual: NDArray,
+    weight: NDArray,
+    priors: LightingPriors = LightingPriors(),
+) -> _Normal:
+    """Normal equations about a state, priors included."""
+    k = problem.specular.shape[-1]
+    order = math.isqrt(k)
+    system = _Normal.accumulate(problem, diffuse, gloss, shade, glint, residual, weight)
+    extra = k - order * order  # lights that are no coefficients are kept from negative values one by one
+    directions = np.pad(basis(fibonacci_sphere(NEGATIVE_DIRECTIONS), order), ((0, extra), (0, extra)))
+    directions[NEGATIVE_DIRECTIONS:, order * order :] = np.eye(extra)
+    system.add_priors(priors, light, diffuse, gloss, problem.albedo, _stiffness(k), directions)
+    return system
+
+
+def _stiffness(count: int) -> NDArray[np.float64]:
+    """(l (l + 1))^2 of each coefficient; 0 for lights beyond them, about which nothing is smooth."""
+    order = math.isqrt(count)
+    band = bands(order).astype(np.float64)
+    return np.pad((band * (band + 1.0)) ** 2, (0, count - order * order))
 
 
 def gauge(diffuse: NDArray, albedo: NDArray, weight: NDArray) -> float:
@@ -203,9 +228,16 @@ def active_weight(
     return active.astype(np.float32), sigma
 
 
-def _initial(problem: LightingProblem, diffuse: NDArray, gloss: NDArray, stiffness: NDArray) -> NDArray[np.float64]:
+def bounded_weight(problem: LightingProblem, residual: NDArray) -> NDArray[np.float32]:
+    """Weights under which each residual counts `GROSS` at the most, the same whatever the others are."""
+    weight = problem.weight / (1.0 + (residual / GROSS) ** 2)
+    return np.where(problem.clipped[..., None] & (residual <= 0), np.float32(0.0), weight)
+
+
+def _initial(problem: LightingProblem, diffuse: NDArray, gloss: NDArray) -> NDArray[np.float64]:
     """Linear least squares for the lighting with fixed maps."""
     k = problem.specular.shape[-1]
+    stiffness = _stiffness(k)
     light = np.zeros((k, 3))
     for c in range(3):
         rows = (diffuse[:, None, None, c] * problem.diffuse + gloss[:, None, None] * problem.specular).reshape(-1, k)
@@ -303,10 +335,8 @@ class _Normal:
             self.system[block, block] += pull * rows.T @ rows + np.diag(smooth)
             self.right[block] -= pull * rows.T @ radiance[negative, c] + smooth * light[:, c]
 
-    def solve(self, with_ambient: bool, damping: float) -> _Step:
-        """Eliminate the texels, solve for lighting and ambient, and substitute back."""
-        size = len(self.right)
-        count = size if with_ambient else size - 1
+    def eliminate(self, count: int, damping: float) -> tuple[NDArray, NDArray, NDArray]:
+        """Inverse blocks of the texels (n, 4, 4), and what remains for the first ``count`` lights."""
         diagonal = np.einsum("nii->ni", self.own)
         floor = 1e-6 * float(np.median(diagonal)) + 1e-12
         damped = self.own + np.eye(4, dtype=np.float32) * (damping * diagonal + floor)[:, :, None]
@@ -316,14 +346,21 @@ class _Normal:
         own_diagonal = np.diag(self.system)[:count]
         reduced = self.system[:count, :count] - cross.reshape(-1, count).T @ eliminated.reshape(-1, count)
         reduced += np.diag(damping * own_diagonal + 1e-8 * own_diagonal.mean())
-        right = self.right[:count] - np.einsum("nak,na->k", eliminated, self.own_right)
+        return inverse, reduced, self.right[:count] - np.einsum("nak,na->k", eliminated, self.own_right)
+
+    def solve(self, with_ambient: bool, damping: float) -> _Step:
+        """Eliminate the texels, solve for lighting and ambient, and substitute back."""
+        size = len(self.right)
+        count = size if with_ambient else size - 1
+        inverse, reduced, right = self.eliminate(count, damping)
         move = np.linalg.solve(reduced, right)
-        own_move = np.einsum("nab,nb->na", inverse, self.own_right) - eliminated @ move.astype(np.float32)
+        left = self.own_right - self.cross[:, :, :count] @ move.astype(np.float32)
+        own_move = np.einsum("nab,nb->na", inverse, left)
         light = move[: size - 1].reshape(3, -1).T
         return _Step(light, float(move[-1]) if with_ambient else 0.0, own_move[:, :3], own_move[:, 3])
 
 
-def _sphere(count: int) -> NDArray[np.float64]:
+def fibonacci_sphere(count: int) -> NDArray[np.float64]:
     """Evenly spread unit directions (Fibonacci lattice)."""
     i = np.arange(count) + 0.5
     z = 1.0 - 2.0 * i / count

@@ -1,0 +1,191 @@
+"""Where a compact light stands: a search over its direction and size, each judged by what it would explain.
+
+Given direction and size, a compact light adds three unknowns to the lighting, its irradiance per channel. What it would
+explain once lighting and maps have adapted follows in closed form from the normal equations without it, so a
+candidate costs its shadow rays and a few products instead of a solve.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.keylight import KeyLight
+from mifit.stages.observations import Observations
+from mifit.stages.reflectance.forward import Forward
+from mifit.stages.reflectance.lighting import (
+    LightingProblem,
+    LightingSolution,
+    bounded_weight,
+    fibonacci_sphere,
+    linearize,
+)
+
+TEXELS = 1000
+"""Texels that judge candidates."""
+SPACING, WIDE = np.radians([12.0, 8.0])
+"""First search: between directions all over the sphere, and angular radius; wide penumbras lead the way."""
+LEAST = 0.05
+"""Part of the texels that a light must reach to be looked at."""
+STEPS = np.radians([4.0, 0.2])
+"""Second search: from the first step to the last one."""
+RADII = np.radians([0.25, 10.0])
+"""Angular radii that count as compact; a search that ends at the upper one has found no compact light."""
+WORTH = 0.03
+"""Part of the energy that a compact light must explain to be tried."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """What a lighting leaves unexplained, ready to judge compact lights.
+
+    Attributes
+    ----------
+    seen : Observations
+        n texels in J images.
+    forward : Forward
+        The model without a compact light.
+    rows : three of (n * J, K)
+        Derivative of the image by the lighting, per channel.
+    weight, residual, shade, glint : (n, J, 3)
+    diffuse : (n, 3), gloss : (n,)
+    inverse : (n, 4, 4), cross : (n, 4, 3K), own_right : (n, 4)
+        The texels' blocks of the normal equations.
+    factor : (3K, 3K), right : (3K,)
+        Inverse and right-hand side of the equations for the lighting with the texels eliminated.
+    """
+
+    seen: Observations
+    forward: Forward
+    rows: list[NDArray]
+    weight: NDArray
+    residual: NDArray
+    shade: NDArray
+    glint: NDArray
+    diffuse: NDArray
+    gloss: NDArray
+    inverse: NDArray
+    cross: NDArray
+    own_right: NDArray
+    factor: NDArray
+    right: NDArray
+
+    @classmethod
+    def about(
+        cls, seen: Observations, forward: Forward, problem: LightingProblem, found: LightingSolution
+    ) -> Candidates:
+        """Linearise about a solution, whose own compact light, if any, is taken away: candidates are to replace it."""
+        k = forward.order**2
+        light = found.radiance.astype(np.float32)
+        x, y = found.diffuse[:, None], found.specular[:, None, None]
+        residual = problem.colour - x * (problem.diffuse @ light) - y * (problem.specular @ light)
+        weight = bounded_weight(problem, residual)
+        plain = replace(problem, diffuse=problem.diffuse[..., :k], specular=problem.specular[..., :k])
+        shade, glint = plain.diffuse @ light[:k], plain.specular @ light[:k]
+        residual = problem.colour - x * shade - y * glint
+        normal = linearize(plain, found.radiance[:k], found.diffuse, found.specular, shade, glint, residual, weight)
+        inverse, reduced, right = normal.eliminate(3 * k, 1e-4)
+        rows = [(x[..., c : c + 1] * plain.diffuse + y * plain.specular).reshape(-1, k) for c in range(3)]
+        return cls(
+            seen,
+            replace(forward, key=None),
+            rows,
+            weight,
+            residual,
+            shade,
+            glint,
+            found.diffuse,
+            found.specular,
+            inverse,
+            normal.cross[:, :, : 3 * k],
+            normal.own_right,
+            np.linalg.inv(reduced),
+            right,
+        )
+
+    def explained(self, direction: NDArray, radius: float, open_sky: NDArray[np.uint32] | None = None) -> float:
+        """Drop of the energy that a compact light brings, everything else adapting.
+
+        Its shadows are traced, unless bits tell which directions of its disc the texels (n, T) see.
+        """
+        key = KeyLight(direction, radius, np.zeros(3))
+        matt, glossy = replace(self.forward, key=key).key_columns(self.seen, open_sky)
+        k = self.rows[0].shape[1]
+        own = np.zeros((len(matt), 4, 3), np.float32)
+        system, right, across = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3 * k))
+        for c in range(3):
+            column = self.diffuse[:, None, c] * matt + self.gloss[:, None] * glossy
+            weighted = self.weight[..., c] * column
+            system[c, c] = (weighted * column).sum()
+            right[c] = (weighted * self.residual[..., c]).sum()
+            across[c, c * k : (c + 1) * k] = weighted.ravel() @ self.rows[c]
+            own[:, c, c] = (weighted * self.shade[..., c]).sum(1)
+            own[:, 3, c] = (weighted * self.glint[..., c]).sum(1)
+        moved = np.matmul(self.inverse, own)
+        system -= np.tensordot(own, moved, ([0, 1], [0, 1]))
+        right -= np.tensordot(moved, self.own_right, ([0, 1], [0, 1]))
+        across -= np.tensordot(moved, self.cross, ([0, 1], [0, 1]))
+        system -= across @ self.factor @ across.T
+        right -= across @ (self.factor @ self.right)
+        floor = 1e-9 * float(np.trace(system)) + 1e-12
+        irradiance = np.maximum(np.linalg.solve(system + floor * np.eye(3), right), 0.0)
+        return float(2 * right @ irradiance - irradiance @ system @ irradiance)
+
+
+def scan(candidates: Candidates) -> tuple[NDArray[np.float64], float]:
+    """The direction, among some all over the sphere, of the wide light that explains most, and how much.
+
+    All directions' shadows are traced first, a ray for each direction.
+    """
+    directions = fibonacci_sphere(round(4.0 * np.pi / SPACING**2))
+    best, most = directions[0], 0.0
+    for start in range(0, len(directions), 32):
+        part = directions[start : start + 32]
+        bits = candidates.forward.open_towards(candidates.seen, part)
+        for number, direction in enumerate(part):
+            lit = (bits >> np.uint32(number)) & 1
+            if lit.mean() > LEAST:
+                gain = candidates.explained(direction, WIDE, np.where(lit, np.uint32(0xFFFFFFFF), np.uint32(0)))
+                if gain > most:
+                    best, most = direction, gain
+    return best, most
+
+
+def find_key(candidates: Candidates, start: KeyLight | None = None) -> KeyLight | None:
+    """Search for the compact light that explains most of what is left; None where none is worth a trial.
+
+    Parameters
+    ----------
+    candidates : Candidates
+    start : KeyLight, optional
+        Search around this one only.
+    """
+    if start is None:
+        energy = float((candidates.weight * candidates.residual**2).sum())
+        direction, most = scan(candidates)
+        if not most > WORTH * energy:
+            return None
+        radius, step = WIDE, STEPS[0]
+    else:
+        direction, radius, step = start.direction, start.radius, 0.25 * STEPS[0]
+    gain = candidates.explained(direction, radius)
+    widen = 1.5
+    while step > STEPS[1]:
+        around = [(d, radius) for d in _ring(direction, step)]
+        around += [(direction, float(np.clip(radius * f, *RADII))) for f in (widen, 1.0 / widen)]
+        gains = [candidates.explained(*c) for c in around]
+        best = int(np.argmax(gains))
+        if gains[best] > gain:
+            (direction, radius), gain = around[best], gains[best]
+        else:
+            step, widen = 0.5 * step, np.sqrt(widen)
+    return KeyLight(direction, float(radius), np.zeros(3)) if radius < RADII[1] else None
+
+
+def _ring(direction: NDArray, angle: float, count: int = 6) -> NDArray[np.float64]:
+    """(count, 3) directions at an angle from one."""
+    across = np.linalg.svd(direction[None])[2][1:]
+    turn = 2.0 * np.pi * np.arange(count) / count
+    return np.cos(angle) * direction + np.sin(angle) * np.stack([np.cos(turn), np.sin(turn)], axis=1) @ across

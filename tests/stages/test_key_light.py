@@ -1,0 +1,166 @@
+"""The compact light: its disc, shadows and lobe, and how stage 2 finds it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stages.reflectance_scene import EXPONENT, SIZE, TurningDome, turning_dome
+
+from mifit.config import ReflectanceConfig
+from mifit.core.blinn_phong import specular_brdf
+from mifit.core.keylight import KeyLight, disc
+from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.uv import sample_map
+from mifit.errors import InputError
+from mifit.render.gbuffer import SurfaceScene
+from mifit.render.local import key_columns, shade_points
+from mifit.render.transfer import trace_transfer
+from mifit.stages.infer_reflectance import infer_reflectance
+
+CONFIG = ReflectanceConfig(texture_size=SIZE, shading="keyed", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
+KEY = KeyLight(normalize(np.array([0.75, 0.2, 0.6])), 0.02, np.array([4.0, 3.6, 3.0]))
+
+
+def test_disc_is_even_and_centred():
+    centre = normalize(np.array([0.3, -0.8, 0.5]))
+    d = disc(centre, 0.3, 4096)
+    cosine = d @ centre
+    np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1.0, atol=1e-12)
+    assert cosine.min() >= np.cos(0.3) - 1e-12
+    np.testing.assert_allclose(normalize(d.mean(0)), centre, atol=1e-3)
+    assert np.median(cosine) == pytest.approx(0.5 * (1 + np.cos(0.3)), abs=1e-4)  # even in solid angle
+    np.testing.assert_allclose(disc(centre, 0.0), np.tile(centre, (16, 1)), atol=1e-12)
+
+
+def test_a_roof_hides_what_is_behind_it(variant):
+    # A floor at z = 0, and a roof over x < 0 at z = 1.
+    floor = [[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]]
+    roof = [[-9, -9, 1], [0, -9, 1], [0, 9, 1], [-9, 9, 1]]
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    scene = SurfaceScene(np.array(floor + roof, np.float64), faces)
+    x = np.linspace(-2, 2, 41) + 0.05
+    points = np.stack([x, np.zeros(41), np.zeros(41)], axis=1)
+    directions = normalize(np.array([[0.0, 0, 1], [1, 0, 1], [-1, 0, 1], [0, 0, -1]]))
+    bits = scene.open_towards(points, np.tile([0.0, 0, 1], (41, 1)), directions)
+    for number, edge in enumerate((0.0, -1.0, 1.0)):
+        np.testing.assert_array_equal((bits >> number) & 1, x > edge)
+    assert not ((bits >> 3) & 1).any()  # below the horizon
+    with pytest.raises(InputError, match="found 33"):
+        scene.open_towards(points, points, np.zeros((33, 3)))
+
+
+def test_columns_are_cosine_and_lobe_at_the_lights_directions(variant):
+    rng = np.random.default_rng(0)
+    n = normalize(rng.normal(size=(200, 3)))
+    v = normalize(n + 0.6 * rng.normal(size=(200, 3)))
+    v = np.where((n * v).sum(1, keepdims=True) > 0, v, -v)
+    directions = disc(KEY.direction, 0.1)
+    seen = rng.integers(0, 1 << 16, 200).astype(np.uint32)
+    matt, glossy = key_columns(n, v, seen, directions, EXPONENT)
+    open_sky = (seen[:, None] >> np.arange(16)) & 1
+    cosine = np.maximum(n @ directions.T, 0.0)
+    brdf = np.stack([specular_brdf(np.broadcast_to(d, n.shape), v, n, EXPONENT) for d in directions], axis=1)
+    np.testing.assert_allclose(matt, (open_sky * cosine).mean(1) / np.pi, atol=1e-6)
+    np.testing.assert_allclose(glossy, (open_sky * cosine * brdf).mean(1), atol=2e-4 * brdf.max())
+
+
+@pytest.mark.parametrize("fresnel", [None, 8.0])
+def test_the_lobe_agrees_with_the_prefiltered_one(variant, fresnel):
+    """A wide dim disc is the same light as its spherical harmonics, seen through a lobe that is as smooth."""
+    light = KeyLight(KEY.direction, 0.6, np.ones(3))
+    rng = np.random.default_rng(1)
+    n = normalize(light.direction + 0.4 * rng.normal(size=(300, 3)))
+    v = normalize(n + 0.3 * rng.normal(size=(300, 3)))
+    ones = np.ones((300, 3))
+    _, smooth = shade_points(n, v, ones, ones[:, 0], light.coefficients(10), 0.0, 12.0, "prefiltered", fresnel=fresnel)
+    _, sharp = key_columns(n, v, np.full(300, 0xFFFF, np.uint32), light.samples(), 12.0, fresnel)
+    assert np.abs(sharp - smooth[:, 0]).max() < 0.06 * sharp.max()
+
+
+def walled_dome() -> TurningDome:
+    """The turning dome with a low wall across it that belongs to no map, under smooth light and a compact one."""
+    dome = turning_dome(steps=3)
+    count = len(dome.model.mean)
+    wall = np.array([[-0.05, -0.5, 0.6], [-0.05, 0.5, 0.6], [-0.05, 0.5, 1.15], [-0.05, -0.5, 1.15]])
+    faces = np.concatenate([dome.model.faces, count + np.array([[0, 1, 2], [0, 2, 3]])]).astype(np.int32)
+    grow = {
+        name: np.pad(getattr(dome.model, name), [(0, 4)] + [(0, 0)] * (getattr(dome.model, name).ndim - 1))
+        for name in ("identity", "expression", "mean_albedo", "albedo_modes")
+    }
+    model = replace(
+        dome.model,
+        mean=np.concatenate([dome.model.mean, wall]).astype(np.float32),
+        faces=faces,
+        faces_uv=np.concatenate([dome.model.faces_uv, np.zeros((2, 3), np.int32)]),
+        face_mask=np.arange(len(faces)) < len(faces) - 2,
+        **grow,
+    )
+    centre = np.array([0.0, 0.0, 0.6])
+    walls = np.stack([(wall - centre) @ r.T + centre for r in dome.geometry.rotation])
+    vertices = np.concatenate([dome.geometry.vertices, walls.astype(np.float32)], axis=1)
+    albedo = np.pad(dome.geometry.vertex_albedo, ((0, 4), (0, 0)), mode="edge")
+    dome = replace(dome, model=model, geometry=replace(dome.geometry, vertices=vertices, vertex_albedo=albedo))
+    for (name, t), frame in dome.frames.items():
+        view, v = dome.camera(name), vertices[t]
+        scene = SurfaceScene(v, faces)
+        buffer = scene.gbuffer(view)
+        hit = (buffer.face >= 0) & (buffer.face < len(faces) - 2) & frame.valid
+        face, weights = buffer.face[hit], buffer.weights[hit]
+        point = interpolate(v, faces, face, weights)
+        normal = normalize(interpolate(vertex_normals(v, faces), faces, face, weights))
+        toward = normalize(view.position - point)
+        open_sky = scene.open_towards(point, normal, KEY.samples())
+        matt, glossy = key_columns(normal, toward, open_sky, KEY.samples(), EXPONENT, dome.fresnel)
+        uv = interpolate(model.uv, model.faces_uv, face, weights)
+        x, y = sample_map(dome.diffuse, uv), sample_map(dome.specular, uv)
+        traced = interpolate(trace_transfer(v, faces, v, vertex_normals(v, faces), 4), faces, face, weights)
+        body, glint = shade_points(
+            normal, toward, x, y, dome.radiance, 0.0, EXPONENT, "shadowed", traced, fresnel=dome.fresnel
+        )
+        image = np.full_like(frame.image, 0.1)
+        sharp = (x * matt[:, None] + y[:, None] * glossy[:, None]) * KEY.irradiance.astype(np.float32)
+        image[hit] = body + glint + sharp
+        dome.frames[name, t] = replace(frame, image=image)
+    return dome
+
+
+@pytest.fixture(scope="module")
+def walled(variant):
+    return walled_dome()
+
+
+@pytest.fixture(scope="module")
+def found(walled):
+    return infer_reflectance(walled, walled.model, walled.geometry, ("left", "right"), CONFIG)
+
+
+def test_a_compact_light_is_found(walled, found):
+    assert found.report.details["shading"]["chosen"] == "keyed" and found.shading_model == "shadowed"
+    key = found.key
+    assert np.degrees(np.arccos(key.direction @ KEY.direction)) < 1.0
+    good = found.confidence > 0.9
+    gauge = walled.diffuse[good].mean() / found.diffuse[good].mean()
+    np.testing.assert_allclose(key.irradiance / gauge, KEY.irradiance, rtol=0.1)
+    residuals = found.report.details["shading"]["residuals"]
+    assert residuals["keyed"] < 0.3 * residuals["shadowed"]
+
+
+def test_auto_takes_it_where_it_explains_the_images(walled):
+    part = replace(CONFIG, texture_size=24, shading="auto")
+    choice = infer_reflectance(walled, walled.model, walled.geometry, ("left", "right"), part).report.details["shading"]
+    assert choice["chosen"] == "keyed"
+
+
+def test_without_a_compact_light_none_is_made_up(variant):
+    dome = turning_dome(steps=2)
+    estimate = infer_reflectance(dome, dome.model, dome.geometry, ("left", "right"), replace(CONFIG, texture_size=24))
+    assert estimate.key is None
+    assert estimate.report.details["shading"]["why"] == "no compact light explains enough"
+
+
+def test_adam_refuses_it(walled):
+    config = replace(CONFIG, solver="adam")
+    with pytest.raises(InputError, match="use solver 'als'"):
+        infer_reflectance(walled, walled.model, walled.geometry, ("left",), config)
