@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+import numpy as np
+
 import mifit
 from mifit import checkpoint
 from mifit.config import FitConfig
@@ -24,6 +26,8 @@ Stage = Literal["geometry", "reflectance", "normals"]
 STAGES: tuple[Stage, ...] = ("geometry", "reflectance", "normals")
 T = TypeVar("T")
 ESTIMATED_CAMERAS = "the capture is uncalibrated: focal length, camera poses and so the scale are estimates"
+BASELINE_DEGREES = 3.0
+"""Angle between the views below which a person is told that distance is not measured."""
 CALIBRATION_MODES = 30
 """Identity modes that may move with the cameras when those are estimated from landmarks."""
 
@@ -89,6 +93,7 @@ def fit(
     timesteps = choose("timestep", capture.timesteps, timesteps, 4)
     if until not in STAGES:
         raise InputError(f"until: found {until!r}, expected one of {', '.join(STAGES)}")
+    check_images(capture, cameras, timesteps)
     folder = None if checkpoints is None else Path(checkpoints)
     digest = capture.digest(cameras, timesteps)
     known_cameras = capture.calibrated
@@ -161,7 +166,7 @@ def fit(
         capture_digest=digest,
         units=capture.units,
         unit_mm=capture.unit_mm,
-        warnings=() if known_cameras else (ESTIMATED_CAMERAS,),
+        warnings=(*(() if known_cameras else (ESTIMATED_CAMERAS,)), *one_place(capture, cameras, geometry)),
         seconds=sum(s.report.seconds for s in (geometry, reflectance, normals, mesh) if s is not None),
         peak_memory=peak_memory(),
     )
@@ -174,6 +179,29 @@ def calibrated(capture: Capture, model: MorphableModel, cameras: Sequence[str], 
     scale = model.unit_mm / capture.unit_mm
     mean, modes = model.mean[model.landmarks], model.identity[model.landmarks][..., :CALIBRATION_MODES]
     return calibrate(capture, scale * mean, scale * modes, cameras, timesteps)
+
+
+def check_images(capture: Capture, cameras: Sequence[str], timesteps: Sequence[int]) -> None:
+    """Raise InputError for an image that is black throughout: a camera that dropped it, or a file written too early."""
+    for timestep in timesteps:
+        for name in cameras:
+            frame = capture.frame(name, timestep)
+            if not (frame.image[frame.valid] > 0).any():
+                raise InputError(
+                    f"camera {name}, timestep {timestep}: every usable pixel is black, expected a photograph; "
+                    "leave the camera or the timestep out, or check its mask"
+                )
+
+
+def one_place(capture: Capture, cameras: Sequence[str], geometry: GeometryEstimate) -> tuple[str, ...]:
+    """A warning when the head is seen from so nearly one place that its distance isn't measured."""
+    towards = np.array([capture.camera(name).position for name in cameras]) - geometry.vertices[0].mean(axis=0)
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    apart = float(np.degrees(np.arccos(np.clip((towards @ towards.T).min(), -1.0, 1.0))))
+    if apart >= BASELINE_DEGREES:
+        return ()
+    place = "one camera" if len(cameras) == 1 else f"cameras {apart:.1f} degrees apart"
+    return (f"{place}: how far away and so how large the head is rests on the model's size, not on the images",)
 
 
 def choose(kind: str, known: Sequence[T], wanted: Sequence[T] | None, default: int) -> tuple[T, ...]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mifit
+from mifit.config import MeshConfig
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.files import replacing, write_text
@@ -244,10 +245,7 @@ def load(folder: Path, model: MorphableModel | None) -> Reconstruction:
             normals=_normals(folder, document),
             mesh=_mesh(folder, document, model, geometry),
             config=document["config"],
-            cameras=tuple(
-                Camera(**{**c, "world_to_camera": np.array(c["world_to_camera"], dtype=np.float64)})
-                for c in capture["cameras"]
-            ),
+            cameras=tuple(_camera(entry) for entry in capture["cameras"]),
             capture_digest=capture["digest"],
             units=capture["units"],
             unit_mm=float(capture["unit_mm"]),
@@ -259,7 +257,7 @@ def load(folder: Path, model: MorphableModel | None) -> Reconstruction:
         raise
     except KeyError as error:
         raise InputError(f"{path}: key {error} is missing; the file is damaged, fit again") from None
-    except (TypeError, ValueError, IndexError) as error:
+    except (TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise InputError(f"{path}: holds a value of the wrong kind ({error}); fit again") from None
 
 
@@ -274,7 +272,7 @@ def _read_document(folder: Path, path: Path) -> dict[str, Any]:
             f"{path}: missing, so {folder} is no result or an unfinished one; "
             "name a folder that `mifit fit` wrote, or finish it with --resume"
         ) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: not readable as JSON ({error}); fit again") from None
     version = document.get("format_version") if isinstance(document, dict) else None
     if version != FORMAT_VERSION:
@@ -297,6 +295,16 @@ def _load_model(entry: dict[str, Any], path: Path) -> MorphableModel:
         return MorphableModel.load(entry["source"])
     except InputError as error:
         raise InputError(f"{path}: the model it was fitted with can't be read: {error}") from None
+
+
+def _camera(entry: dict[str, Any]) -> Camera:
+    """A camera from the keys of `_camera_document`, all of its numbers finite and its sizes positive."""
+    size, focal = (_array([entry[k] for k in keys], (2,), "camera") for keys in (("width", "height"), ("fx", "fy")))
+    if not (size.min() >= 1 and focal.min() > 0):
+        raise ValueError(f"camera: found size {size.tolist()}, focal lengths {focal.tolist()}, expected positive ones")
+    centre = _array([entry["cx"], entry["cy"]], (2,), "camera")
+    pose = _array(entry["world_to_camera"], (4, 4), "world_to_camera")
+    return Camera(str(entry["name"]), int(size[0]), int(size[1]), *focal.tolist(), *centre.tolist(), pose)
 
 
 def _report(document: dict[str, Any], stage: str) -> Report:
@@ -409,7 +417,8 @@ def _mesh(
     if "mesh" not in document["stages"]:
         return None
     report = _report(document, "mesh")
-    topology = split_faces(model, int(report.details["subdivisions"]))
+    subdivisions = MeshConfig(subdivisions=int(report.details["subdivisions"])).subdivisions  # in its bounds
+    topology = split_faces(model, subdivisions)
     timesteps = tuple(int(s["timestep"]) for s in document["timesteps"] if s["refined_mesh"])
     mesh = split_at_seams(topology)
     # Vertices that no face uses are in no mesh file: they stay where the fit left them.
