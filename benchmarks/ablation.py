@@ -33,7 +33,8 @@ from mifit.core.files import write_text
 from mifit.core.mesh import interpolate
 from mifit.errors import ConvergenceError, InputError
 from mifit.stages.observations import Observations, Surface
-from mifit.stages.reflectance.als import FRESNEL, LIGHTING_TEXELS, fit_lighting, fit_maps
+from mifit.stages.reflectance.als import LIGHTING_TEXELS, fit_maps
+from mifit.stages.reflectance.choice import FRESNEL, fit_lighting
 from mifit.stages.reflectance.fill import blend_unseen
 from mifit.stages.reflectance.forward import Forward
 

@@ -47,7 +47,8 @@ from mifit.stages.geometry.start import OUTLIER_PIXELS, initial_state, landmark_
 from mifit.stages.geometry.visibility import Visibility, spread_points
 from mifit.stages.observations import Surface
 from mifit.stages.refine_normals import frame_problem, one_timestep
-from mifit.stages.reflectance.als import FRESNEL, LIGHTING_TEXELS, lighting_problem
+from mifit.stages.reflectance.als import LIGHTING_TEXELS
+from mifit.stages.reflectance.choice import FRESNEL, lighting_problem
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import solve_lighting
 from mifit.stages.reflectance.maps import Smoothness, TexelSystems, solve_maps
