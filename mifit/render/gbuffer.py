@@ -151,7 +151,10 @@ class SurfaceScene:
         dr.eval(hit.t, hit.prim_uv, hit.prim_index)  # one kernel: each array read would trace the rays again
         valid = np.array(hit.is_valid()).astype(bool)
         face = np.where(valid, np.array(hit.prim_index).astype(np.int32), -1)
-        u, v, t = (np.array(x, dtype=np.float32) for x in (hit.prim_uv.x, hit.prim_uv.y, hit.t))
+        # Rays that hit nothing hold any bits in their coordinates: zeros, so that no sum of them warns.
+        u, v, t = (
+            np.where(valid, np.array(x, dtype=np.float32), np.float32(0)) for x in (hit.prim_uv.x, hit.prim_uv.y, hit.t)
+        )
         weights = np.where(valid[:, None], np.stack([1.0 - u - v, u, v], axis=1), 0.0).astype(np.float32)
         depth = np.where(valid, t * (directions @ camera.rotation[2]), np.inf).astype(np.float32)
         shape = (camera.height, camera.width)
