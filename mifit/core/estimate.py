@@ -6,8 +6,10 @@ morphable model's: ``world = scale * rotation @ object + translation``.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.keylight import KeyLight
@@ -58,6 +60,9 @@ class GeometryEstimate:
         Paper's l_k in I_d = C_d * sum l_k phi_k(n): SH coefficients in world axes, basis of ``core.sh``.
     ambient : float
         The paper's I_a, in linear image units.
+    gains : dict of camera name to (r, g, b)
+        Each camera's linear image over the first one's, where asked for; images are divided by it when they are
+        observed. A camera that isn't named has gain 1.
     """
 
     timesteps: tuple[int, ...]
@@ -72,6 +77,11 @@ class GeometryEstimate:
     shading: NDArray
     ambient: float
     report: Report
+    gains: Mapping[str, Sequence[float]] = field(default_factory=dict)
+
+    def gain(self, camera: str) -> NDArray:
+        """(3,) float32 gain of a camera; 1 where none is known."""
+        return np.array(self.gains.get(camera, (1.0, 1.0, 1.0)), dtype=np.float32)
 
     def index(self, timestep: int) -> int:
         """Position of a timestep in the per-timestep arrays; KeyError when it was not fitted."""

@@ -149,8 +149,14 @@ def compare(
     area &= frame.valid
     if not area.any():
         raise InputError(f"camera {camera}, timestep {timestep}: the face area is not visible, nothing to evaluate")
-    renders = {m: rgba_8_bit(image) for m, image in linear.items()}
+    renders = {m: rgba_8_bit(as_photographed(reconstruction, image, camera)) for m, image in linear.items()}
     return Comparison(timestep, to_8_bit(frame.image), area, renders)
+
+
+def as_photographed(reconstruction: Reconstruction, image: NDArray, camera: str) -> NDArray:
+    """A render (H, W, 4) with the exposure and white balance that the fit found for a camera."""
+    gain = reconstruction.geometry.gain(camera)
+    return image if (gain == 1).all() else image * np.append(gain, np.float32(1.0))
 
 
 def rgba_8_bit(linear: NDArray) -> NDArray[np.uint8]:

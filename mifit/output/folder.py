@@ -150,6 +150,7 @@ def _document(result: Reconstruction) -> dict[str, Any]:
                 "units": result.units,
                 "unit_mm": result.unit_mm,
                 "cameras": [_camera_document(c) for c in result.cameras],
+                "gains": {name: list(gain) for name, gain in geometry.gains.items()},
             },
             "model": {
                 "source": _source(result.model_source),
@@ -351,6 +352,10 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
         shading=_array(lighting["shading"], (9, 3), "shading"),
         ambient=float(lighting["shading_ambient"]),
         report=_report(document, "geometry"),
+        gains={
+            name: tuple(_array(gain, (3,), f"gain of {name}").tolist())
+            for name, gain in document["capture"].get("gains", {}).items()
+        },
     )
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import mifit
 from mifit.core.files import write_text
 from mifit.core.image import to_8_bit
-from mifit.output.evaluate import Comparison, compare, rgba_8_bit
+from mifit.output.evaluate import Comparison, as_photographed, compare, rgba_8_bit
 from mifit.output.figures import (
     HEAT_LIMIT,
     bounding_box,
@@ -224,7 +224,8 @@ def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]
         for camera in (c.name for c in result.cameras):
             view, frame = capture.camera(camera), capture.frame(camera, timestep)
             photograph = to_8_bit(frame.image)
-            render = rgba_8_bit(result.render(view, timestep, result.methods[-1], samples=1))
+            linear = result.render(view, timestep, result.methods[-1], samples=1)
+            render = rgba_8_bit(as_photographed(result, linear, camera))
             box = bounding_box(render[..., 3] > 0)
             marked = draw_landmarks(photograph, view, frame.landmarks, frame.visible, points)
             label = html.escape(camera)

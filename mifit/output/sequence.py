@@ -13,7 +13,7 @@ from mifit.core.files import replacing
 from mifit.core.image import to_8_bit
 from mifit.errors import InputError, MifitError
 from mifit.output.deferred import shade_methods, visible_surface
-from mifit.output.evaluate import rgba_8_bit
+from mifit.output.evaluate import as_photographed, rgba_8_bit
 from mifit.output.figures import overlay
 from mifit.output.gltf import write_glb
 from mifit.output.turntable import on_backdrop, orbit_camera, write_animation
@@ -120,7 +120,8 @@ def write_overlay(
         for k, timestep in enumerate(steps):
             progress(f"overlay {camera}", k, len(steps))
             photograph = to_8_bit(capture.frame(camera, timestep).image)
-            render = rgba_8_bit(reconstruction.render(view, timestep, reconstruction.methods[-1], samples=1))
+            linear = reconstruction.render(view, timestep, reconstruction.methods[-1], samples=1)
+            render = rgba_8_bit(as_photographed(reconstruction, linear, camera))
             yield np.concatenate([photograph, overlay(photograph, render)], axis=1)
         progress(f"overlay {camera}", len(steps), len(steps))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from mifit.errors import ConvergenceError, InputError
 from mifit.morphable import MorphableModel
 from mifit.progress import Progress, silent
 from mifit.solve import Solution
+from mifit.stages.gains import estimate_gains
 from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.landmarks import LandmarkView
 from mifit.stages.geometry.parameters import Frames, Layout
@@ -80,9 +81,20 @@ def fit_geometry(
     start = fit_landmarks(model, views, state, config.landmark_noise, priors_of(config))
     journal.phase("landmarks", _usable(start.solution, "landmarks"))
     config = replace(config, landmark_noise=start.noise)
-    return _refine_and_pack(
-        capture, model, cameras, timesteps, config, seed, journal, start.state, start.views, None, None
-    )
+
+    def refine(gains: Mapping[str, Sequence[float]]) -> GeometryEstimate:
+        return _refine_and_pack(
+            capture, model, cameras, timesteps, config, seed, journal, start.state, start.views, None, None, gains
+        )
+
+    found = refine({})
+    if not config.camera_gains:
+        return found
+    gains = estimate_gains(capture, model, found, cameras, seed, progress)
+    for name in cameras:
+        if name not in gains:
+            journal.warn(f"camera {name}: shares too little of the face with {cameras[0]} to tell its gain; taken as 1")
+    return refine(gains)
 
 
 def fit_pose_expression(
@@ -139,7 +151,7 @@ def fit_pose_expression(
         state = warm
         journal.warn(f"timestep {timestep}: too few landmarks; started from timestep {geometry.timesteps[-1]} alone")
     return _refine_and_pack(
-        capture, baked, cameras, (timestep,), config, seed, journal, state, views, reference, geometry
+        capture, baked, cameras, (timestep,), config, seed, journal, state, views, reference, geometry, geometry.gains
     )
 
 
@@ -180,9 +192,10 @@ def _refine_and_pack(
     views: tuple[LandmarkView, ...],
     reference: Reference | None,
     fixed: GeometryEstimate | None,
+    gains: Mapping[str, Sequence[float]],
 ) -> GeometryEstimate:
     """Photometric rounds, then albedo and lighting unless ``fixed`` has them."""
-    visibility = Visibility(capture, model, cameras, timesteps)
+    visibility = Visibility(capture, model, cameras, timesteps, gains)
     if config.objective == "paper" and fixed is None:
         appearance = _appearance(model, state, visibility, config, seed)
         for number in range(config.rounds):
@@ -205,7 +218,16 @@ def _refine_and_pack(
     for message in visibility.warnings:
         journal.warn(message)
     return pack(
-        model, state, coefficients, timesteps, visibility.world(state), journal, views, config.landmark_noise, fixed
+        model,
+        state,
+        coefficients,
+        timesteps,
+        visibility.world(state),
+        journal,
+        views,
+        config.landmark_noise,
+        fixed,
+        gains,
     )
 
 

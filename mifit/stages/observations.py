@@ -8,7 +8,7 @@ from far away counts for less.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import cv2
@@ -47,7 +47,7 @@ class Observations:
     step, camera : (J,) int
         Index of the timestep in the geometry and of the camera in the list of cameras.
     colour : (N, J, 3) float32
-        Linear image colour, bilinear; 0 where not observed.
+        Linear image colour over the camera's gain, bilinear; 0 where not observed.
     weight : (N, J) float32
         Pixels that the texel covers, faded at grazing angles; 0 where occluded, outside or invalid.
     clipped : (N, J) bool
@@ -79,6 +79,13 @@ class Observations:
     def image_normal(self) -> NDArray[np.float32]:
         """(N, J, 3) unit normal per image."""
         return self.normal[:, self.step]
+
+    @classmethod
+    def join(cls, parts: Sequence[Observations]) -> Observations:
+        """The observations of several sets of texels by the same images."""
+        shared = {"step": parts[0].step, "camera": parts[0].camera}
+        names = [f.name for f in fields(cls) if f.name not in shared]
+        return cls(**shared, **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
     def take(self, rows: NDArray | slice) -> Observations:
         """The observations of some of the texels."""
@@ -155,13 +162,14 @@ class Surface:
             for k, name in enumerate(cameras):
                 camera, frame = capture.camera(name), capture.frame(name, timestep)
                 covered, edge = _face_pixels(self.scenes[i], self.vertices[i], model, camera)
+                colour = frame.image / geometry.gain(name)
                 unusable = edge | ~covered | ~frame.valid | ~np.isfinite(frame.image).all(-1)
                 self._images.append(
                     _Image(
                         i,
                         k,
                         camera,
-                        np.where(np.isfinite(frame.image), frame.image, 0).astype(np.float32),
+                        np.where(np.isfinite(colour), colour, 0).astype(np.float32),
                         unusable.astype(np.float32),
                         frame.clipped.astype(np.float32),
                         _footprint(self.vertices[i], model.faces, camera, texel_area),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -55,8 +55,14 @@ class Visibility:
     """Ray-traced views of the surface at a state."""
 
     def __init__(
-        self, capture: Capture, model: MorphableModel, cameras: Sequence[str], timesteps: Sequence[int]
+        self,
+        capture: Capture,
+        model: MorphableModel,
+        cameras: Sequence[str],
+        timesteps: Sequence[int],
+        gains: Mapping[str, Sequence[float]] | None = None,
     ) -> None:
+        self._gains = gains or {}
         self.capture, self.model = capture, model
         self.cameras: list[Camera] = [capture.camera(name) for name in cameras]
         self.timesteps = tuple(timesteps)
@@ -143,7 +149,8 @@ class Visibility:
                 if not len(facial):
                     self._warn_unusable(camera, step)
                     continue
-                image = level(frame.image, frame.valid, sigma)
+                gain = np.asarray(self._gains.get(camera.name, 1.0), dtype=np.float32)
+                image = level(frame.image / gain, frame.valid, sigma)
                 out.append(
                     PixelView(
                         step, camera, image, buffer.face.reshape(-1)[facial], buffer.weights.reshape(-1, 3)[facial]

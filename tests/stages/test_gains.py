@@ -1,0 +1,83 @@
+"""Gains of cameras: found on captures whose right camera was scaled by known factors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stages.reflectance_scene import turning_dome
+from stages.test_infer_reflectance import held_out, infer
+
+from mifit.core.estimate import GeometryEstimate
+from mifit.stages.gains import estimate_gains
+from mifit.stages.observations import Surface
+from mifit.synth.compose import expose
+
+SCALE = (1.25, 0.9, 1.1)
+
+
+def scaled(scene, camera="right", scale=SCALE):
+    """The same scene with one camera's images multiplied."""
+    frames = {
+        key: replace(f, image=f.image * np.float32(scale)) if key[0] == camera else f for key, f in scene.frames.items()
+    }
+    return replace(scene, frames=frames)
+
+
+@pytest.fixture(scope="module")
+def dome(variant):
+    return turning_dome(gloss=0.12)
+
+
+@pytest.fixture(scope="module")
+def gains(dome):
+    return estimate_gains(scaled(dome), dome.model, dome.geometry, ("left", "right"))
+
+
+def test_gains_are_found_on_a_glossy_surface(gains):
+    assert gains["left"] == (1.0, 1.0, 1.0)
+    assert np.allclose(gains["right"], SCALE, rtol=0.02)
+
+
+def test_the_fit_is_as_good_as_without_the_scaling(dome):
+    """Against photographs with the noise of a sensor, as ``evaluate`` measures it."""
+    rng = np.random.default_rng(0)
+    noisy = dome.changed(lambda f: replace(f, image=np.where(f.valid[..., None], expose(f.image, rng), 0)))
+    images = scaled(noisy)
+    gains = estimate_gains(images, dome.model, dome.geometry, ("left", "right"))
+    plain = held_out(noisy, infer(noisy))
+    mended = held_out(noisy, infer(images, gains=gains))
+    spoilt = held_out(noisy, infer(images))
+    assert 20 * np.log10(mended / plain) < 0.3
+    assert 20 * np.log10(spoilt / plain) > 1.0  # or else the test shows nothing
+
+
+def test_unequal_cameras_are_brought_to_the_first(dome, gains):
+    images = scaled(dome)
+    corrected = Surface(images, dome.model, replace(dome.geometry, gains=gains), ("left", "right"), 32)
+    true = Surface(dome, dome.model, dome.geometry, ("left", "right"), 32)
+    rows = np.arange(len(true))
+    a, b = corrected.observe(rows), true.observe(rows)
+    assert np.allclose(a.colour[b.weight > 0], b.colour[b.weight > 0], rtol=0.02, atol=1e-4)
+
+
+def test_a_third_camera(dome):
+    cameras = ("left", "right", "third")
+    found = estimate_gains(scaled(dome, "third", (0.7, 0.7, 0.7)), dome.model, dome.geometry, cameras)
+    assert np.allclose(found["third"], 0.7, rtol=0.02) and np.allclose(found["right"], 1.0, rtol=0.02)
+
+
+def test_a_camera_that_shares_nothing_is_left_out(dome):
+    blind = replace(
+        dome,
+        frames={
+            key: replace(f, valid=np.zeros_like(f.valid)) if key[0] == "right" else f for key, f in dome.frames.items()
+        },
+    )
+    assert set(estimate_gains(blind, dome.model, dome.geometry, ("left", "right"))) == {"left"}
+
+
+def test_gains_are_one_unless_known(dome):
+    assert isinstance(dome.geometry, GeometryEstimate)
+    assert (dome.geometry.gain("left") == 1).all() and dome.geometry.gains == {}
