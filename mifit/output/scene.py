@@ -49,9 +49,9 @@ def write_scene(
     have the fitted model's vertex albedo. In ``NAME.xml`` the skin is ``blinnphong`` with the fitted lobe's rise
     and the refined normals as slopes, and the light is ``shenv``. In ``NAME_stock.xml`` the skin blends ``diffuse``
     with a ``roughconductor`` of Beckmann roughness sqrt(2 / (m + 2)), which doesn't rise, under a ``normalmap``,
-    and the light is a lat-long ``envmap``. A relit reconstruction has its environment as ``envmap`` in both. The
-    ambient term stands for light that local shading leaves out, such as interreflection, so a path-traced scene
-    doesn't have it.
+    and the light is a lat-long ``envmap``. A relit reconstruction has its environment as ``envmap`` in both. A
+    compact light is a stock ``directional`` emitter in both. The ambient term stands for light that local shading
+    leaves out, such as interreflection, so a path-traced scene doesn't have it.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def _write_files(reconstruction: Reconstruction, files: Path, timestep: int, met
     write_image(files / "diffuse_stock.exr", np.clip(base, 0, 1))
     environment = reconstruction.environment
     if environment is None:
-        environment = np.maximum(reconstruction.lighting.to_latlong(128, 256), 0.0)
+        environment = np.maximum(_without_key(reconstruction).lighting.to_latlong(128, 256), 0.0)
     write_image(files / "environment.exr", environment)
 
 
@@ -269,8 +269,26 @@ def _shape(name: str, files: str, bsdf: str) -> str:
 def _light(reconstruction: Reconstruction, files: str, method: Method, stock: bool) -> str:
     if stock or reconstruction.environment is not None:
         file = quoteattr(f"{files}/environment.exr")
-        return f'    <emitter type="envmap"><string name="filename" value={file}/></emitter>'
+        return f'    <emitter type="envmap"><string name="filename" value={file}/></emitter>' + _key(reconstruction)
     if method == "pca":
         reconstruction = replace(reconstruction, reflectance=None, normals=None)
-    rows = ",  ".join(" ".join(f"{x:.9g}" for x in row) for row in reconstruction.lighting.coefficients)
-    return f'    <emitter type="shenv"><string name="coefficients" value="{rows}"/></emitter>'
+    rows = ",  ".join(" ".join(f"{x:.9g}" for x in row) for row in _without_key(reconstruction).lighting.coefficients)
+    return f'    <emitter type="shenv"><string name="coefficients" value="{rows}"/></emitter>' + _key(reconstruction)
+
+
+def _key(reconstruction: Reconstruction) -> str:
+    """The compact light as a stock emitter, where there is one; a point at infinity, whatever its radius."""
+    key = None if reconstruction.reflectance is None else reconstruction.reflectance.key
+    if key is None:
+        return ""
+    along, power = (", ".join(f"{x:.9g}" for x in values) for values in (-key.direction, key.irradiance))
+    return (
+        f'\n    <emitter type="directional"><vector name="direction" value="{along}"/>'
+        f'<rgb name="irradiance" value="{power}"/></emitter>'
+    )
+
+
+def _without_key(reconstruction: Reconstruction) -> Reconstruction:
+    if reconstruction.reflectance is None:
+        return reconstruction
+    return replace(reconstruction, reflectance=replace(reconstruction.reflectance, key_direction=None))

@@ -60,3 +60,16 @@ def test_relighting_takes_it_away(keyed):
     np.testing.assert_allclose(
         lit.lighting.coefficients[0].mean(), keyed.lighting.coefficients[0] @ [0.2126, 0.7152, 0.0722], rtol=1e-5
     )
+
+
+def test_path_tracing_has_it_too(keyed):
+    """On a convex ball without ambient term a directional emitter adds what local shading adds."""
+    camera = keyed.cameras[0]
+    plain = replace(keyed, reflectance=replace(keyed.reflectance, key_direction=None))
+    added = {}
+    for integrator, samples in (("local", 2), ("path", 128)):
+        images = [r.render(camera, 0, "diffuse", integrator, samples, seed=1) for r in (keyed, plain)]
+        added[integrator] = (images[0] - images[1])[images[0][..., 3] == 1][:, :3]
+    bright = added["local"][:, 0] > 0.1
+    assert bright.sum() > 500
+    np.testing.assert_allclose(added["path"][bright].mean(0), added["local"][bright].mean(0), rtol=0.02)
