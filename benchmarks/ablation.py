@@ -16,9 +16,10 @@ import json
 import sys
 import typing
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -28,15 +29,14 @@ from benchmarks.record import RESULTS, SHARED, record
 from benchmarks.third_view import Error, ThirdView, pooled_psnr
 from mifit import Capture, MorphableModel, Reconstruction
 from mifit.config import FitConfig, GeometryConfig, NormalsConfig, ReflectanceConfig
-from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
+from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
 from mifit.core.files import write_text
-from mifit.core.mesh import interpolate
 from mifit.errors import ConvergenceError, InputError
+from mifit.progress import Progress
 from mifit.stages.observations import Observations, Surface
-from mifit.stages.reflectance.als import LIGHTING_TEXELS, fit_maps
-from mifit.stages.reflectance.choice import FRESNEL, fit_lighting
-from mifit.stages.reflectance.fill import blend_unseen
+from mifit.stages.reflectance.choice import choose_lighting, fit_lighting
 from mifit.stages.reflectance.forward import Forward
+from mifit.stages.reflectance.lighting import LightingSolution
 
 MODEL = SHARED / "models" / "ict_facekit" / "ict_facekit_head.npz"
 CAMERAS = ("left", "right")
@@ -55,6 +55,15 @@ class Diffuse(Forward):
     def shade(self, seen: Observations, radiance: Any) -> tuple[Any, Any]:
         shade, glint = super().shade(seen, radiance)
         return shade, np.zeros_like(glint)
+
+
+def choose_diffuse_lighting(
+    surface: Surface, faces: Any, seen: Observations, albedo: Any, config: ReflectanceConfig, progress: Progress
+) -> tuple[Forward, LightingSolution, dict]:
+    """The model that stage 2 chooses, and the lighting that explains the images best without its specular part."""
+    forward, _, choice = choose_lighting(surface, faces, seen, albedo, config, progress)
+    diffuse = Diffuse(**{f.name: getattr(forward, f.name) for f in fields(forward)})
+    return diffuse, fit_lighting(seen, diffuse, albedo, config, config.max_iterations, 0.0), choice
 
 
 @dataclass(frozen=True)
@@ -93,30 +102,9 @@ class Scene:
 
     def diffuse_only(self, geometry: GeometryEstimate, config: ReflectanceConfig) -> ReflectanceEstimate:
         """Stage 2 by the fast solver without any specular reflection: lighting and diffuse map fitted anew."""
-        surface = Surface(self.capture, self.model, geometry, CAMERAS, config.texture_size)
-        texels, faces = surface.texels, self.model.faces
-        albedo = interpolate(geometry.vertex_albedo, faces, texels.face, texels.weights)
-        albedo = np.clip(albedo, 0.01, 1.0).astype(np.float32)
-        shadowed = config.shading == "shadowed"
-        traced = surface.trace(config.bands) if shadowed else ()
-        forward = Diffuse("shadowed" if shadowed else "prefiltered", config.bands, 100.0, FRESNEL, traced, faces)
-        subset = surface.sample(LIGHTING_TEXELS, np.random.default_rng(0))
-        found = fit_lighting(surface.observe(subset), forward, albedo[subset], config, config.max_iterations, 0.0)
-        prior = np.concatenate([texels.to_map(albedo), np.zeros((texels.size, texels.size, 1), np.float32)], axis=-1)
-        maps, _, _ = fit_maps(surface, forward, found, prior, config, lambda *_: None)
-        maps[..., 3] = 0.0
-        diffuse, specular, confidence = blend_unseen(texels, albedo, maps, surface.quality())
-        return ReflectanceEstimate(
-            diffuse,
-            specular,
-            confidence,
-            found.radiance,
-            found.ambient,
-            forward.exponent,
-            forward.model,
-            Report("converged" if found.converged else "max_iterations"),
-            FRESNEL,
-        )
+        with patch("mifit.stages.reflectance.als.choose_lighting", choose_diffuse_lighting):
+            found = self.reflectance(geometry, config)
+        return replace(found, specular=np.zeros_like(found.specular))
 
 
 Fitted = tuple[GeometryEstimate, ReflectanceEstimate, NormalsEstimate | None]
@@ -163,7 +151,7 @@ class Table:
             "third_db": round(third, 3),
             "over_base_db": round(third - pooled_psnr(self.base[t] for t in errors), 3),
             "timesteps_compared": list(errors),
-            "shading": reflectance.shading_model,
+            "shading": reflectance.report.details["shading"]["chosen"],
             "exponent": reflectance.exponent,
             "outcome": reflectance.report.outcome,
             **cost,
@@ -175,7 +163,7 @@ def ablate(scene: Scene, size: int, check: int) -> dict[str, Any]:
     table = Table(scene)
     geometry = scene.geometry()
     config = ReflectanceConfig(texture_size=size)
-    chosen = scene.reflectance(geometry, config).shading_model
+    chosen = scene.reflectance(geometry, config).report.details["shading"]["chosen"]
     config = replace(config, shading=chosen)  # type: ignore[arg-type]
 
     def stage2(cameras: Sequence[str] = CAMERAS, count: int = len(TIMESTEPS), **changes: Any) -> Callable[[], Fitted]:

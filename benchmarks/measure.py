@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -50,14 +52,19 @@ class Cost:
 
 
 @contextmanager
-def measured() -> Iterator[Cost]:
-    """Measure the block; a Mitsuba variant must be active."""
+def measured(history: bool = True) -> Iterator[Cost]:
+    """Measure the block; a Mitsuba variant must be active.
+
+    The kernel history keeps the program of every launch: hundreds of megabytes for loops of hundreds of launches. With
+    ``history = False`` there is none, and compilation isn't told apart: call the work once before.
+    """
     import drjit as dr
 
     cost = Cost()
     dr.sync_thread()
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, history):
         dr.kernel_history_clear()
+        _give_back_memory()
         known = _reset_peak()
         wall, processor = time.perf_counter(), time.process_time()
         yield cost
@@ -67,6 +74,17 @@ def measured() -> Iterator[Cost]:
         cost.peak_mb = _peak_mb() if known else 0.0
         cost.kernels = [{k: v for k, v in kernel.items() if k != "ir"} for kernel in dr.kernel_history()]
         cost.compile_seconds = 1e-3 * sum(k.get("codegen_time", 0.0) + k.get("backend_time", 0.0) for k in cost.kernels)
+
+
+def _give_back_memory() -> None:
+    """Return freed memory to the system, or the peak of the next block would be that of the last one."""
+    import drjit as dr
+
+    gc.collect()
+    dr.flush_malloc_cache()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
+    if trim is not None:
+        trim(0)
 
 
 def _reset_peak() -> bool:

@@ -158,7 +158,10 @@ def reflectance() -> Row:
         configs += [small, *(replace(small, solver="adam", max_iterations=limit) for limit in (3, 10, 30))]
     rows = []
     for config in configs:
-        with measured() as cost:
+        adam = config.solver == "adam"
+        if adam:
+            d.reflectance(replace(config, max_iterations=1))
+        with measured(history=not adam) as cost:
             found = d.reflectance(config)
         row = {
             "solver": config.solver,
@@ -199,6 +202,7 @@ def work() -> Row:
     d = data()
     out: Row = {}
     rows = []
+    maps_of(64)  # kernels
     for size in (64, 128, 256, 512):
         with measured() as cost:
             found = d.reflectance(ReflectanceConfig(texture_size=size, shading="prefiltered"))
@@ -214,7 +218,7 @@ def work() -> Row:
         rows.append(note("work", {"size": size, "texels": texels, **cost.figures()}))
     out["stage 3 over texels"] = grown(rows, "texels")
     config = ReflectanceConfig(texture_size=SIZE, shading="prefiltered")
-    for views in (2, 1):
+    for views in VIEWS:
         rows = []
         for count in (1, 2, 4):
             used = first_timesteps(d.truth, count)
