@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from mifit.capture.transforms import View
 from mifit.core.camera import Camera
 from mifit.core.files import write_text
+from mifit.core.image import MAX_PIXELS
 from mifit.errors import InputError
 
 _MODELS = {  # where fx, fy, cx, cy and OpenCV's distortion coefficients are among the parameters
@@ -53,7 +54,12 @@ def read_colmap(folder: str | Path) -> tuple[ColmapImage, ...]:
             raise InputError(f"{where}: found camera model {found!r}, expected one of {', '.join(_MODELS)}")
         pinhole, lens = _MODELS[words[1]]
         values = _floats(words[2:], where)
-        size, parameters = (int(values[0]), int(values[1])), values[2:]
+        width, height, *parameters = values
+        if not (width >= 1 and height >= 1 and width * height <= MAX_PIXELS and width % 1 == height % 1 == 0):
+            raise InputError(
+                f"{where}: found {width:g} x {height:g} pixels, expected whole numbers of at most "
+                f"{MAX_PIXELS // 10**6} megapixels"
+            )
         if len(parameters) != max((*pinhole, *lens)) + 1:
             raise InputError(
                 f"{where}: found {len(parameters)} parameters, expected {max((*pinhole, *lens)) + 1} of {words[1]}"
@@ -64,7 +70,7 @@ def read_colmap(folder: str | Path) -> tuple[ColmapImage, ...]:
         distortion = tuple(parameters[i] for i in lens)
         if len(distortion) in (1, 2):
             distortion = (*distortion, 0.0, 0.0, 0.0)[:4]
-        cameras[words[0]] = (*size, intrinsics, distortion if any(distortion) else ())
+        cameras[words[0]] = (int(width), int(height), intrinsics, distortion if any(distortion) else ())
     images = []
     for where, words in _lines(folder / "images.txt", every=2):
         if len(words) < 10:
@@ -78,10 +84,9 @@ def read_colmap(folder: str | Path) -> tuple[ColmapImage, ...]:
         matrix = np.eye(4)
         matrix[:3, :3] = Rotation.from_quat([*pose[1:4], pose[0]]).as_matrix()
         matrix[:3, 3] = pose[4:]
-        width, height, intrinsics, distortion = cameras[words[8]]
+        columns, rows, (fx, fy, cx, cy), distortion = cameras[words[8]]
         name = " ".join(words[9:])
-        fx, fy, cx, cy = intrinsics
-        images.append(ColmapImage(name, View(view_name(name), width, height, (fx, fy, cx, cy), distortion, matrix)))
+        images.append(ColmapImage(name, View(view_name(name), columns, rows, (fx, fy, cx, cy), distortion, matrix)))
     if not images:
         raise InputError(f"{folder / 'images.txt'}: found no image, expected at least one")
     return tuple(images)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,9 @@ def read_landmarks(path: str | Path, first_pixel: float | None = None) -> Landma
         raise InputError(f"{path}: no such landmark file") from None
     except InputError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, EOFError, OverflowError, RecursionError) as error:
+    except (
+        OSError, ValueError, KeyError, TypeError, EOFError, OverflowError, RecursionError, SyntaxError, TokenError
+    ) as error:  # fmt: skip
         raise InputError(f"{path}: not a readable landmark file: {_brief(error)}") from None
     if points.shape != (COUNT, 2):
         raise InputError(

@@ -229,8 +229,8 @@ class _Entry:
         value = self.values.get(key)
         if isinstance(value, int) and not isinstance(value, bool):
             value = str(value)
-        if not isinstance(value, str) or not value or "\0" in value:
-            raise self.fail(key, "a non-empty string")
+        if not isinstance(value, str) or not value or any(c == "\0" or "\ud800" <= c <= "\udfff" for c in value):
+            raise self.fail(key, "a non-empty string")  # of characters that a file name may have
         return value
 
 
