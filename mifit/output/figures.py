@@ -18,6 +18,9 @@ from mifit.core.sh import SHLighting
 HEAT_LIMIT = 40.0
 """Error, in 8-bit steps, at which the heat map's colours end."""
 
+CLIPPED_TINT, UNEXPLAINED_TINT = (214, 39, 160), (0, 150, 255)
+"""RGB of the areas of the face mask: apart in hue and lightness, and from skin."""
+
 _CURVES = ("#0f6cbd", "#b3470a", "#2b7a3d", "#8a3ab9", "#a3262e", "#5b5f66", "#96750b", "#0b7a75")
 
 
@@ -49,6 +52,16 @@ def overlay(photograph: NDArray[np.uint8], render: NDArray[np.uint8]) -> NDArray
     """Lay a render (RGBA) over a photograph."""
     alpha = render[..., 3:].astype(np.float32) / 255
     return np.round(render[..., :3] * alpha + photograph * (1 - alpha)).astype(np.uint8)
+
+
+def tint(
+    photograph: NDArray[np.uint8], *areas: tuple[NDArray[np.bool_], tuple[int, int, int]], strength: float = 0.65
+) -> NDArray[np.uint8]:
+    """Colour areas (mask, RGB) of a picture so that what they cover stays visible."""
+    out = photograph.astype(np.float32)
+    for mask, colour in areas:
+        out[mask] = (1.0 - strength) * out[mask] + strength * np.asarray(colour, dtype=np.float32)
+    return np.round(out).astype(np.uint8)
 
 
 def draw_landmarks(

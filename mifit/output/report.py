@@ -16,8 +16,11 @@ import mifit
 from mifit.core.files import write_text
 from mifit.core.image import to_8_bit
 from mifit.output.evaluate import Comparison, as_photographed, compare, rgba_8_bit
+from mifit.output.face_mask import face_mask
 from mifit.output.figures import (
+    CLIPPED_TINT,
     HEAT_LIMIT,
+    UNEXPLAINED_TINT,
     bounding_box,
     draw_landmarks,
     energy_plot,
@@ -27,6 +30,7 @@ from mifit.output.figures import (
     lighting_balls,
     overlay,
     png_uri,
+    tint,
 )
 from mifit.output.viewer import viewer_data
 
@@ -233,10 +237,21 @@ def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]
             figures.append(
                 _figure(jpeg_uri(overlay(photograph, render)[box]), f"{label}: fit laid over", f"fit over {label}")
             )
+            mask = face_mask(result, capture, camera, timestep, linear)
+            caption = f"{label}: {mask.part(mask.clipped):.1%} clipped, {mask.part(mask.unexplained):.1%} unexplained"
+            tinted = tint(photograph, (mask.clipped, CLIPPED_TINT), (mask.unexplained, UNEXPLAINED_TINT))
+            figures.append(_figure(jpeg_uri(tinted[box]), caption, f"face mask of {label}"))
         parts.append(f'<h3>Timestep {timestep}</h3><div class="grid">{"".join(figures)}</div>')
     rest = len(result.timesteps) - len(timesteps)
     more = f'<p class="soft">{rest} more timesteps are in the result but not on this page.</p>' if rest else ""
-    key = '<p class="soft">Cyan rings: detected landmarks. Orange dots: the fitted model\'s.</p>'
+    swatches = "".join(
+        f'<span style="background:rgb{colour};padding:0 .6em;margin:0 .3em 0 1em"></span>{name}'
+        for colour, name in ((CLIPPED_TINT, "clipped"), (UNEXPLAINED_TINT, "explained by no lighting and albedo"))
+    )
+    key = (
+        '<p class="soft">Cyan rings: detected landmarks. Orange dots: the fitted model\'s.</p>'
+        f'<p class="scale">Not used, or outvoted by the other images:{swatches}. Percentages are of the face area.</p>'
+    )
     return key + "".join(parts) + more
 
 

@@ -47,6 +47,12 @@ def test_round_trip_is_exact(ball, saved):
         same(a, b)
 
 
+def test_gains_of_cameras_round_trip(ball, tmp_path):
+    geometry = dataclasses.replace(ball.geometry, gains={"left": (1.0, 1.0, 1.0), "right": (1.25, 0.9, 1.1)})
+    dataclasses.replace(ball, geometry=geometry).save(tmp_path)
+    assert Reconstruction.load(tmp_path, ball.model).geometry.gains == geometry.gains
+
+
 def test_folder_holds_the_files_of_the_contract(saved):
     names = {str(p.relative_to(saved)) for p in saved.rglob("*") if p.is_file()}
     assert names >= {

@@ -128,6 +128,15 @@ def test_evaluation_of_a_perfect_photograph_and_of_a_known_error(ball, variant):
     assert found["per_timestep"][1]["methods"]["full"]["rmse"] == pytest.approx(20, abs=0.2)
 
 
+def test_a_photograph_is_compared_at_its_cameras_gain(ball, variant):
+    gain = np.float32((1.25, 0.9, 1.1))
+    scaled = replace(ball, geometry=replace(ball.geometry, gains={"left": (1.0, 1.0, 1.0), "right": tuple(gain)}))
+    capture = FakeCapture(ball.cameras, lambda c, t: ball.render(c, t)[..., :3] * (gain if c.name == "right" else 1))
+    for camera in ("left", "right"):
+        assert evaluate(scaled, capture, camera)["methods"]["full"]["rmse"] < 0.6
+    assert evaluate(ball, capture, "right")["methods"]["full"]["rmse"] > 5
+
+
 def test_region_is_the_face_area_eroded_and_valid(ball, variant):
     camera = ball_camera("third", 5.0)
     area = face_area(ball.geometry.vertices[0], ball.model.faces, ball.model.face_mask, camera)

@@ -28,6 +28,7 @@ class LandmarkFrame:
     valid: np.ndarray
     landmarks: np.ndarray | None
     visible: np.ndarray
+    clipped: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,10 @@ class LandmarkCapture(FakeCapture):
     def frame(self, name, t):
         found = super().frame(name, t)
         points = np.random.default_rng(0).uniform(10, 50, (68, 2)) if name == "left" else None
-        return LandmarkFrame(found.image, found.valid, points, np.ones(68, bool))
+        clipped = np.zeros_like(found.valid)
+        if name == "right":
+            clipped[:, found.valid.shape[1] // 2 :] = True
+        return LandmarkFrame(found.image, found.valid, points, np.ones(68, bool), clipped)
 
 
 class Page(HTMLParser):
@@ -92,6 +96,9 @@ def test_report_is_whole_and_self_contained(ball, capture, variant, tmp_path):
     assert "1 Geometry: one landmark is hidden" in words
     assert "2 Reflectance: ended without convergence (max iterations)" in words
     assert words.count("Timestep 3") == 2
+    assert re.search(r"left: 0\.0% clipped, \d+\.\d% unexplained", words)
+    assert float(re.search(r"right: (\d+\.\d)% clipped", words)[1]) == pytest.approx(50, abs=15)
+    assert "explained by no lighting and albedo" in words
 
 
 def test_report_without_evaluation_and_of_stage_1(stage_1_ball, capture, variant, tmp_path):
