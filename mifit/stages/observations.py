@@ -157,6 +157,7 @@ class Surface:
         self.normals = [vertex_normals(v, model.faces) for v in self.vertices]
         self.scenes = [SurfaceScene(v, model.faces) for v in self.vertices]
         texel_area = _texel_area(model.uv, model.faces_uv, size)
+        self._kept: Observations | None = None
         self._images: list[_Image] = []
         for i, timestep in enumerate(geometry.timesteps):
             for k, name in enumerate(cameras):
@@ -240,7 +241,17 @@ class Surface:
         )
 
     def observe(self, texel: NDArray[np.int64]) -> Observations:
-        """Read all images at some of the texels (positions in the `TexelMap`)."""
+        """Read all images at some of the texels (positions in the `TexelMap`).
+
+        Where all texels fit into one of `chunks`, they are read once and kept.
+        """
+        if len(self.chunks()) > 1:
+            return self._observe(texel)
+        if self._kept is None:
+            self._kept = self._observe(np.arange(len(self)))
+        return self._kept.take(texel)
+
+    def _observe(self, texel: NDArray[np.int64]) -> Observations:
         face, weights = self.texels.face[texel], self.texels.weights[texel]
         n, j, t = len(texel), len(self._images), len(self.vertices)
         colour = np.zeros((n, j, 3), dtype=np.float32)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.config import ReflectanceConfig
+from mifit.core.sh import LUMINANCE
 from mifit.progress import Progress
 from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.choice import choose_lighting, noise_weight
@@ -142,15 +143,15 @@ def alternate(
 ) -> tuple[LightingSolution, NDArray[np.float32], dict[str, list[float]]]:
     """Minimise the paper's objective as it stands: exact lighting for the maps, maps for the lighting, and again.
 
-    The paper's specular light direction is held fixed while the lighting is solved for, so a step can be too long:
-    it is shortened until it lowers the objective.
+    Under the paper's model, whose specular light turns with the lighting, a step can be too long: it is shortened
+    until it lowers the objective.
     """
     terms = energies(surface, forward, found.radiance, found.ambient, maps, albedo, config)
     history = {name: [value] for name, value in terms.items()}
     for _ in range(ROUNDS):
         radiance, ambient = exact_lighting(surface, forward, found, maps, config)
         before = sum(terms.values())
-        for length in (1.0, 0.3, 0.1):
+        for length in (3.0, 1.0, 0.3, 0.1):  # alternation creeps: the longer step is right more often than not
             mixed = found.radiance + length * (radiance - found.radiance)
             trial = replace(found, radiance=mixed, ambient=found.ambient + length * (ambient - found.ambient))
             trial_maps, _, _ = fit_maps(surface, forward, trial, prior, config, progress, start=maps)
@@ -170,36 +171,88 @@ def alternate(
 def exact_lighting(
     surface: Surface, forward: Forward, found: LightingSolution, maps: NDArray, config: ReflectanceConfig
 ) -> tuple[NDArray[np.float64], float]:
-    """Lighting, and for the paper's model ambient, that minimise data and difference terms for the maps given."""
+    """Lighting, and for the paper's model ambient, that minimise data and difference terms for the maps given.
+
+    The paper's specular light turns with the lighting: there this is a Gauss-Newton step, whose length is to be tried.
+    """
+    if forward.model == "paper":
+        return _turning_step(surface, forward, found, maps, config)
     k = forward.lights
-    system, right = np.zeros((3 * k + 1, 3 * k + 1)), np.zeros(3 * k + 1)
+    system, right = np.zeros((3, k, k)), np.zeros((3, k))
     values = maps.reshape(-1, 4)[surface.texels.index]
     for chunk in surface.chunks(8 * k):
         seen = surface.observe(chunk)
         diffuse, specular = forward.transfers(seen, found.radiance)
-        x, y = values[chunk, :3], values[chunk, 3]
-        weight = seen.measured
-        glint = y[:, None, None] * specular
+        glint = values[chunk, 3][:, None, None] * specular
         for c in range(3):
-            block = slice(c * k, (c + 1) * k)
-            rows = (x[:, None, None, c] * diffuse + glint).reshape(-1, k)
-            weighted = rows * weight.reshape(-1, 1)
-            system[block, block] += weighted.T @ rows
-            system[block, -1] += weighted.sum(0)
-            right[block] += weighted.T @ seen.colour[..., c].ravel()
-            right[-1] += float((weight * seen.colour[..., c]).sum())
-            system[-1, -1] += float(weight.sum())
-            for a, b in surface.pairs:
-                both = config.specular_difference_weight * np.minimum(weight[:, a], weight[:, b])
-                step = glint[:, a] - glint[:, b]
-                system[block, block] += (step * both[:, None]).T @ step
-                right[block] += (step * both[:, None]).T @ (seen.colour[:, a, c] - seen.colour[:, b, c])
-    system[-1, :-1] = system[:-1, -1]
-    count = 3 * k + 1 if forward.model == "paper" else 3 * k
-    floor = 1e-9 * float(np.trace(system[:count, :count])) / count
-    solution = np.linalg.solve(system[:count, :count] + floor * np.eye(count), right[:count])
-    ambient = float(solution[-1]) if forward.model == "paper" else 0.0
-    if ambient < 0.0:
-        solution = np.linalg.solve(system[:-1, :-1] + floor * np.eye(3 * k), right[:-1])
-        ambient = 0.0
-    return solution[: 3 * k].reshape(3, k).T, ambient
+            rows = values[chunk, c][:, None, None] * diffuse + glint
+            _add(system[c], right[c], surface.pairs, seen, c, rows, glint, config.specular_difference_weight)
+    floor = 1e-9 * np.trace(system, axis1=1, axis2=2)[:, None, None] / k
+    return np.linalg.solve(system + floor * np.eye(k), right[..., None])[..., 0].T, 0.0
+
+
+def _turning_step(
+    surface: Surface, forward: Forward, found: LightingSolution, maps: NDArray, config: ReflectanceConfig
+) -> tuple[NDArray[np.float64], float]:
+    """Gauss-Newton step of lighting and ambient under the paper's model.
+
+    The factor that makes specular of diffuse shading depends on the direction of the linear band's luminance. It is
+    differentiated by differences; being the same for the lighting at any scale, it leaves the right-hand side as it is.
+    """
+    k = forward.lights
+    system, right = np.zeros((3 * k + 1, 3 * k + 1)), np.zeros(3 * k + 1)
+    values = maps.reshape(-1, 4)[surface.texels.index]
+    light = found.radiance.astype(np.float32)
+    reach = 1e-2 * float(np.linalg.norm(found.radiance[1:4] @ LUMINANCE))
+    turned = [np.zeros_like(found.radiance) for _ in range(3)]
+    for band, change in enumerate(turned):
+        change[band + 1] = reach
+    for chunk in surface.chunks(32 * k):
+        seen = surface.observe(chunk)
+        diffuse, specular = forward.transfers(seen, found.radiance)
+        y = values[chunk, 3][:, None, None]
+        turning = []
+        for change in turned:
+            ahead, behind = (forward.transfers(seen, found.radiance + s * change)[1] for s in (1.0, -1.0))
+            turning.append(y * ((ahead - behind) @ light) * np.float32(0.5 / reach))
+        for c in range(3):
+            glint = np.zeros((*diffuse.shape[:2], 3 * k + 1), np.float32)
+            glint[..., c * k : (c + 1) * k] = y * specular
+            for band, slope in enumerate(turning):
+                for other in range(3):
+                    glint[..., other * k + band + 1] += np.float32(LUMINANCE[other]) * slope[..., c]
+            rows = glint.copy()
+            rows[..., c * k : (c + 1) * k] += values[chunk, c][:, None, None] * diffuse
+            rows[..., -1] = 1.0
+            _add(system, right, surface.pairs, seen, c, rows, glint, config.specular_difference_weight)
+    floor = 1e-9 * float(np.trace(system)) / len(system)
+    solution = np.linalg.solve(system + floor * np.eye(len(system)), right)
+    if solution[-1] < 0.0:
+        solution[:-1] = np.linalg.solve(system[:-1, :-1] + floor * np.eye(3 * k), right[:-1])
+    return solution[:-1].reshape(3, k).T, max(float(solution[-1]), 0.0)
+
+
+def _add(
+    system: NDArray,
+    right: NDArray,
+    pairs: NDArray,
+    seen: Observations,
+    channel: int,
+    rows: NDArray,
+    glint: NDArray,
+    difference: float,
+) -> None:
+    """Add one channel's data and difference terms to normal equations, in place.
+
+    ``rows`` (N, J, K) are the derivatives of the image, ``glint`` those of its specular part.
+    """
+    colour, weight = seen.colour[..., channel], seen.measured
+    flat = rows.reshape(-1, rows.shape[-1])
+    weighted = flat * weight.reshape(-1, 1)
+    system += weighted.T @ flat
+    right += weighted.T @ colour.ravel()
+    for a, b in pairs:
+        both = difference * np.minimum(weight[:, a], weight[:, b])
+        step = glint[:, a] - glint[:, b]
+        system += (step * both[:, None]).T @ step
+        right += (step * both[:, None]).T @ (colour[:, a] - colour[:, b])
