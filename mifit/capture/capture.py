@@ -22,6 +22,8 @@ from mifit.errors import InputError
 
 CACHE_BYTES = 256 * 2**20
 """Decoded images that a capture keeps at most."""
+MAX_VALUE = 1e6
+"""Largest linear value that counts as light; beyond it a pixel is damage, as NaN is (white is 1, skies reach 1e5)."""
 
 
 @dataclass(frozen=True)
@@ -33,13 +35,15 @@ class Frame:
     image : (H, W, 3) float32
         Linear Rec. 709, gain applied; 0 where not valid.
     valid : (H, W) bool
-        Inside the stored image, the mask file and the alpha channel, and finite.
+        Inside the stored image, the mask file and the alpha channel, and a number within `MAX_VALUE`.
     clipped : (H, W) bool
         At the largest code value in some channel (touched by such a pixel after undistortion): no measurement.
     landmarks : (68, 2) float64 or None
         iBUG points in the undistorted image.
     visible : (68,) bool
         Landmarks to be trusted; all False without landmarks.
+    deviation : float
+        What the errors of the detector amount to, see `Landmarks`; 0 where it isn't known.
     """
 
     image: NDArray[np.float32]
@@ -47,6 +51,7 @@ class Frame:
     clipped: NDArray[np.bool_]
     landmarks: NDArray[np.float64] | None
     visible: NDArray[np.bool_]
+    deviation: float = 0.0
 
     @property
     def nbytes(self) -> int:
@@ -216,7 +221,7 @@ class Capture:
         found = read_landmarks(shot.landmarks)
         if view.intrinsics is None:
             return found
-        return Landmarks(undistort_points(_lens_camera(view), found.points), found.visible)
+        return Landmarks(undistort_points(_lens_camera(view), found.points), found.visible, found.deviation)
 
     def digest(self, cameras: Sequence[str] | None = None, timesteps: Sequence[int] | None = None) -> str:
         """Hex digest of calibration, images, masks and landmarks; only files of the named cameras are read."""
@@ -261,7 +266,7 @@ class Capture:
         view = self.views[shot.camera]
         found = load_image(shot.image)
         _check_size(found.pixels.shape[:2], view, shot.image)
-        valid: NDArray[np.bool_] = np.asarray(np.isfinite(found.pixels).all(axis=-1))
+        valid: NDArray[np.bool_] = np.asarray((np.abs(found.pixels) <= MAX_VALUE).all(axis=-1))  # NaN is not either
         if found.alpha is not None:
             valid &= found.alpha >= 0.5
         if shot.mask is not None:
@@ -283,7 +288,7 @@ class Capture:
         landmarks = self.landmarks(shot.camera, shot.timestep)
         if landmarks is None:
             return Frame(image, valid, clipped, None, np.zeros(COUNT, dtype=bool))
-        return Frame(image, valid, clipped, landmarks.points, landmarks.visible)
+        return Frame(image, valid, clipped, landmarks.points, landmarks.visible, landmarks.deviation)
 
 
 def _lens_camera(view: View) -> Camera:
