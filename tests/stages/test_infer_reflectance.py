@@ -12,6 +12,7 @@ from mifit.config import ReflectanceConfig
 from mifit.errors import InputError
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface
+from mifit.stages.reflectance.lighting import SPECULAR_LIMIT, expected_specular, specular_pull
 from mifit.stages.reflectance.maps import Smoothness, TexelSystems, laplacian, solve_maps
 
 CONFIG = ReflectanceConfig(texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
@@ -215,7 +216,7 @@ def test_admm_reaches_the_minimum_of_the_l1_problem():
         rough = np.abs(laplacian(image)).sum((0, 1))
         return ((image.reshape(n, 4) - target) ** 2).sum() + rough @ np.array([0.02, 0.02, 0.02, 0.05])
 
-    found = solve_maps(systems, np.arange(n), prior, weights, prior_weight=0, specular_weight=0, iterations=400)
+    found = solve_maps(systems, np.arange(n), prior, weights, prior_weight=0, iterations=400)
     best = energy(found.astype(np.float64))
     assert best < 0.9 * energy(target.reshape(size, size, 4).astype(np.float64))
     for _ in range(200):
@@ -229,3 +230,24 @@ def test_weights_ignore_the_map_size(dome):
         surface = Surface(dome, dome.model, dome.geometry, ("left",), size)
         sums.append(surface.observe(np.arange(len(surface))).weight.sum())
     assert abs(sums[0] / sums[1] - 1) < 0.1
+
+
+def test_few_images_leave_the_specular_albedo_to_what_skin_has():
+    found = np.full(9, 0.2)
+    assert expected_specular(found, np.ones((9, 2), bool)) == SPECULAR_LIMIT
+    assert expected_specular(found, np.ones((9, 8), bool)) == pytest.approx(0.2)
+    assert expected_specular(found / 20, np.ones((9, 2), bool)) == pytest.approx(0.01)
+
+
+def test_noise_decides_how_far_the_specular_albedo_is_told_by_the_images():
+    """Texels whose images say 0.1 with unit curvature: believed when the noise is small, not when it is large."""
+    n = 6
+    ones, none = np.ones((n * n, 3), np.float32), np.zeros((n * n, 3), np.float32)
+    systems = TexelSystems(ones, none, 0.4 * ones, ones[:, 0], 0.1 * ones[:, 0])
+    prior = np.full((n, n, 4), 0.01, np.float32)
+    values = [
+        solve_maps(systems, np.arange(n * n), prior, Smoothness(0, 0), specular_pull=specular_pull(0.01, sigma))
+        for sigma in (1e-5, 1.5e-3, 0.1)
+    ]
+    np.testing.assert_allclose([v[..., 3].mean() for v in values], [0.1, 0.055, 0.01], atol=2e-3)
+    np.testing.assert_allclose([v[..., :3].mean() for v in values], 0.4, atol=2e-3)

@@ -13,7 +13,7 @@ from mifit.progress import Progress
 from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.choice import choose_lighting, noise_weight
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.lighting import LightingSolution, active_weight
+from mifit.stages.reflectance.lighting import LightingSolution, active_weight, expected_specular, specular_pull
 from mifit.stages.reflectance.maps import Smoothness, TexelSystems, solve_maps
 from mifit.stages.reflectance.objective import energies
 
@@ -69,7 +69,7 @@ def fit_maps(
     energy: dict[str, list[float]] = {"data": []}
     passes = MAP_PASSES if config.robust else 1
     kept: tuple[Observations, NDArray, NDArray] | None = None
-    sigma = 0.0
+    sigma = found.sigma
     for number in range(passes):
         systems, data, sigmas = [], 0.0, []
         for done, chunk in enumerate(chunks):
@@ -97,7 +97,8 @@ def fit_maps(
         if sigmas:
             energy["data"].append(data)
             sigma = float(np.median(sigmas))
-        maps = solve_maps(TexelSystems.join(systems), index, prior, smoothness, maps)
+        pull = specular_pull(float(prior[0, 0, 3]), sigma) if config.robust else 0.0
+        maps = solve_maps(TexelSystems.join(systems), index, prior, smoothness, maps, specular_pull=pull)
     progress("Reflectance maps", passes * len(chunks), passes * len(chunks))
     assert maps is not None
     return maps, energy, sigma
@@ -122,7 +123,7 @@ def fit_als(
     forward, found, choice = choose_lighting(surface, faces, seen, albedo[subset], config, progress)
     prior = np.zeros((surface.texels.size**2, 4), dtype=np.float32)
     prior[surface.texels.index, :3] = albedo
-    prior[:, 3] = np.median(found.specular)
+    prior[:, 3] = expected_specular(found.specular, seen.weight > 0)
     prior = prior.reshape(surface.texels.size, surface.texels.size, 4)
     maps, energy, sigma = fit_maps(surface, forward, found, prior, config, progress)
     if not config.robust:

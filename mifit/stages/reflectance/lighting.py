@@ -24,6 +24,13 @@ SLACK = 1.02
 """A step may raise the energy by this factor: robust weights and the gauge move between steps."""
 GROSS = 0.1
 """Linear colour beyond which a residual tells of something that no shading model here explains."""
+SPECULAR_SPREAD = 0.15
+"""Standard deviation of the specular albedo over a face, relative to its median."""
+SPECULAR_LIMIT = 0.03
+"""Specular albedo expected of skin where the images are too few to tell: at the most what it reflects at normal
+incidence (index of refraction 1.4)."""
+FEW_IMAGES = 4
+"""Images of a texel from which its four albedos are told by the images."""
 CAUCHY = 3.0
 """Residuals of this many robust standard deviations get half the weight."""
 
@@ -56,6 +63,21 @@ class LightingProblem:
     albedo: NDArray[np.float32]
 
 
+def specular_pull(expected: float, sigma: float) -> float:
+    """Weight that ties a texel's specular albedo to the expected one, beside squared residuals of deviation `sigma`."""
+    return (sigma / (SPECULAR_SPREAD * max(expected, 1e-3))) ** 2
+
+
+def expected_specular(specular: NDArray, seen: NDArray) -> float:
+    """Specular albedo to expect of a texel, given those of others (n,) and which images see them (n, J).
+
+    Two or three images of a still head leave it open how much of the broad reflection is specular.
+    """
+    found = float(np.median(specular))
+    images = float(np.median(seen.sum(axis=1)))
+    return min(found, SPECULAR_LIMIT) if images < FEW_IMAGES else found
+
+
 @dataclass(frozen=True)
 class LightingPriors:
     """Weights of what is assumed where the images are silent, relative to the data's own scale.
@@ -69,7 +91,7 @@ class LightingPriors:
     albedo : float
         Pull of the diffuse albedo to the morphable model's: fixes the gauge between albedo and lighting.
     specular : float
-        Pull of each texel's specular albedo to the median.
+        Pull of each texel's specular albedo to the expected one, at the least; see `SPECULAR_SPREAD`.
     """
 
     roughness: float = 1e-7
@@ -163,7 +185,7 @@ def solve_lighting(
             bounded = float((bounded_weight(problem, residual) * residual**2).sum())
             unexplained = float(np.sqrt(bounded / max(float(problem.weight.sum()), 1e-12)))
             damping = max(0.1 * damping, DAMPING)
-            system = linearize(problem, light, diffuse, gloss, shade, glint, residual, weight, priors)
+            system = linearize(problem, light, diffuse, gloss, shade, glint, residual, weight, priors, spread)
             if converged:
                 break
         step = system.solve(with_ambient, damping)
@@ -188,15 +210,17 @@ def linearize(
     residual: NDArray,
     weight: NDArray,
     priors: LightingPriors = LightingPriors(),
+    sigma: float = 0.0,
 ) -> _Normal:
-    """Normal equations about a state, priors included."""
+    """Normal equations about a state, with priors beside residuals of standard deviation `sigma`."""
     k = problem.specular.shape[-1]
     order = math.isqrt(k)
     system = _Normal.accumulate(problem, diffuse, gloss, shade, glint, residual, weight)
     extra = k - order * order  # lights that are no coefficients are kept from negative values one by one
     directions = np.pad(basis(fibonacci_sphere(NEGATIVE_DIRECTIONS), order), ((0, extra), (0, extra)))
     directions[NEGATIVE_DIRECTIONS:, order * order :] = np.eye(extra)
-    system.add_priors(priors, light, diffuse, gloss, problem.albedo, _stiffness(k), directions)
+    expected = expected_specular(gloss, (problem.weight > 0).any(axis=2))
+    system.add_priors(priors, light, diffuse, gloss, problem.albedo, _stiffness(k), directions, sigma, expected)
     return system
 
 
@@ -314,17 +338,22 @@ class _Normal:
         albedo: NDArray,
         stiffness: NDArray,
         sphere_basis: NDArray,
+        sigma: float,
+        expected: float,
     ) -> None:
-        """Add the quadratic penalties of `LightingPriors`."""
+        """Add the quadratic penalties of `LightingPriors` beside residuals of standard deviation `sigma`.
+
+        `expected` is the specular albedo that texels are pulled to.
+        """
         k = len(stiffness)
         scale = float(np.trace(self.system[:-1, :-1])) / (3 * k)
         for c in range(3):
             pull = priors.albedo * float(np.median(self.own[:, c, c]))
             self.own[:, c, c] += pull
             self.own_right[:, c] += pull * (albedo[:, c] - diffuse[:, c])
-        pull = priors.specular * float(np.median(self.own[:, 3, 3]))
+        pull = max(priors.specular * float(np.median(self.own[:, 3, 3])), specular_pull(expected, sigma))
         self.own[:, 3, 3] += pull
-        self.own_right[:, 3] += pull * (np.median(gloss) - gloss)
+        self.own_right[:, 3] += pull * (expected - gloss)
         radiance = sphere_basis @ light
         for c in range(3):
             block = slice(c * k, (c + 1) * k)

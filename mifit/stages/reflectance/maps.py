@@ -124,7 +124,7 @@ def solve_maps(
     smoothness: Smoothness,
     start: NDArray | None = None,
     prior_weight: float = 1e-4,
-    specular_weight: float = 1e-4,
+    specular_pull: float = 0.0,
     iterations: int = 60,
     tolerance: float = 1e-4,
 ) -> NDArray[np.float32]:
@@ -141,8 +141,10 @@ def solve_maps(
     smoothness : Smoothness
     start : (S, S, 4), optional
         Start; the prior by default.
-    prior_weight, specular_weight : float
+    prior_weight : float
         Weak pull to the prior, relative to the median block, that decides where the images are silent.
+    specular_pull : float
+        Pull of the specular albedo to its prior in the blocks' own units, where it is above the weak one.
     iterations : int
     tolerance : float
         Stop when no map moves by more than this.
@@ -157,7 +159,8 @@ def solve_maps(
     base[..., 3] = 0.0  # the paper smooths the offset from the model's albedo, and C_s itself
     scale = np.array([float(np.median(systems.dd))] * 3 + [float(np.median(systems.ss))], dtype=np.float32)
     scale = np.maximum(scale, 1e-6)
-    pull = scale * np.array([prior_weight] * 3 + [specular_weight], dtype=np.float32)
+    pull = prior_weight * scale
+    pull[3] = max(pull[3], specular_pull)
     # Splitting weights near the blocks' own curvature let both sides of a split move at the same pace.
     rho = SPLIT * scale
     threshold = np.array([smoothness.diffuse] * 3 + [smoothness.specular], dtype=np.float32) / rho
