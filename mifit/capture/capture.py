@@ -42,8 +42,6 @@ class Frame:
         iBUG points in the undistorted image.
     visible : (68,) bool
         Landmarks to be trusted; all False without landmarks.
-    deviation : float
-        What the errors of the detector amount to, see `Landmarks`; 0 where it isn't known.
     """
 
     image: NDArray[np.float32]
@@ -51,7 +49,6 @@ class Frame:
     clipped: NDArray[np.bool_]
     landmarks: NDArray[np.float64] | None
     visible: NDArray[np.bool_]
-    deviation: float = 0.0
 
     @property
     def nbytes(self) -> int:
@@ -221,7 +218,7 @@ class Capture:
         found = read_landmarks(shot.landmarks)
         if view.intrinsics is None:
             return found
-        return Landmarks(undistort_points(_lens_camera(view), found.points), found.visible, found.deviation)
+        return Landmarks(undistort_points(_lens_camera(view), found.points), found.visible)
 
     def digest(self, cameras: Sequence[str] | None = None, timesteps: Sequence[int] | None = None) -> str:
         """Hex digest of calibration, images, masks and landmarks; only files of the named cameras are read."""
@@ -288,7 +285,7 @@ class Capture:
         landmarks = self.landmarks(shot.camera, shot.timestep)
         if landmarks is None:
             return Frame(image, valid, clipped, None, np.zeros(COUNT, dtype=bool))
-        return Frame(image, valid, clipped, landmarks.points, landmarks.visible, landmarks.deviation)
+        return Frame(image, valid, clipped, landmarks.points, landmarks.visible)
 
 
 def _lens_camera(view: View) -> Camera:
