@@ -48,9 +48,9 @@ def detect_landmarks(path: str | Path, detector: str | Detector | None = None, p
     capture = Capture.load(path)
     if detector is None or isinstance(detector, str):
         with open_detector(detector) as opened:
-            name, points = opened.name, _run(capture, opened, progress)
+            name, scatter, points = opened.name, opened.scatter, _run(capture, opened, progress)
     else:
-        name, points = detector.name, _run(capture, detector, progress)
+        name, scatter, points = detector.name, detector.scatter, _run(capture, detector, progress)
     without = [capture.shots[key].image for key, found in points.items() if not np.isfinite(found).all()]
     if len(without) == len(points):
         raise InputError(f"{capture.path}: detector {name} finds no face in any of {len(points)} images")
@@ -61,7 +61,8 @@ def detect_landmarks(path: str | Path, detector: str | Detector | None = None, p
             shots[key] = dataclasses.replace(shot, landmarks=None)
             continue
         file = capture.path / "landmarks" / shot.camera / f"{shot.timestep:04d}.json"
-        write_landmarks(file, Landmarks(points[key], ~hidden[key]))
+        deviation = scatter * float(np.ptp(points[key][:, 0]))
+        write_landmarks(file, Landmarks(points[key], ~hidden[key], deviation))
         shots[key] = dataclasses.replace(shot, landmarks=file)
     dataclasses.replace(capture, shots=shots).save()
     marked = sum(int(hidden[key].sum()) for key, shot in shots.items() if shot.landmarks is not None)

@@ -22,6 +22,8 @@ class Detector(Protocol):
     """Finds the landmarks of one face."""
 
     name: str
+    scatter: float
+    """Standard deviation that a coordinate's errors amount to, as a part of the face's width; 0: not known."""
 
     def detect(self, image: NDArray[np.uint8]) -> NDArray[np.float64] | None:
         """(68, 2) iBUG points in pixels of an RGB image (H, W, 3), the first pixel's centre at (0.5, 0.5).
@@ -73,7 +75,7 @@ def available() -> dict[str, bool]:
 class FaceAlignment:
     """The paper's FAN (Bulat and Tzimiropoulos 2017), from the package face-alignment when it is installed."""
 
-    name = "face-alignment"
+    name, scatter = "face-alignment", 0.0
 
     def __init__(self) -> None:
         try:
@@ -100,7 +102,7 @@ class FaceAlignment:
 class Lbf:
     """OpenCV's Facemark LBF (Ren et al. 2014) with a model file and a face finder from the user."""
 
-    name = "lbf"
+    name, scatter = "lbf", 0.0
 
     def __init__(self, folder: Path) -> None:
         model = folder / "lbfmodel.yaml"

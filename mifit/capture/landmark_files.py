@@ -32,10 +32,14 @@ class Landmarks:
         Pixel coordinates; finite, also where invisible.
     visible : (68,) bool
         Points to be trusted.
+    deviation : float
+        Standard deviation of a coordinate that the detector's errors amount to, in pixels, were they independent; 0
+        where it isn't known.
     """
 
     points: NDArray[np.float64]
     visible: NDArray[np.bool_]
+    deviation: float = 0.0
 
 
 def read_landmarks(path: str | Path, first_pixel: float | None = None) -> Landmarks:
@@ -44,8 +48,8 @@ def read_landmarks(path: str | Path, first_pixel: float | None = None) -> Landma
     Parameters
     ----------
     path : path
-        ``.json`` (``{"points": [[x, y], ...], "visible": [...]}``, or a bare list of points), ``.pts`` or ``.npy``
-        ((68, 2), or (68, 3) with visibility as third column). A point without finite coordinates is invisible.
+        ``.json`` (``{"points": [[x, y], ...], "visible": [...], "deviation": 0}``, or a bare list), ``.pts`` or
+        ``.npy`` ((68, 2), or (68, 3) with visibility as third column). A point without finite coordinates is invisible.
     first_pixel : float, optional
         Coordinate of the first pixel's centre in the file: 0.5 by default for JSON, 1 for ``.pts`` (iBUG's
         convention), 0 for ``.npy`` (image-array convention).
@@ -60,7 +64,7 @@ def read_landmarks(path: str | Path, first_pixel: float | None = None) -> Landma
     if reader is None:
         raise InputError(f"{path}: found suffix {path.suffix!r}, expected .json, .pts or .npy landmarks")
     try:
-        points, visible = reader(path)
+        points, visible, deviation = reader(path)
     except FileNotFoundError:
         raise InputError(f"{path}: no such landmark file") from None
     except InputError:
@@ -75,10 +79,12 @@ def read_landmarks(path: str | Path, first_pixel: float | None = None) -> Landma
         )
     if visible.shape != (COUNT,):
         raise InputError(f"{path}: found {visible.size} visibility flags, expected {COUNT}")
+    if not (np.isfinite(deviation) and deviation >= 0):
+        raise InputError(f"{path}: deviation: found {deviation}, expected a number of pixels not below 0")
     default = {".json": 0.5, ".pts": 1.0, ".npy": 0.0}[path.suffix.lower()]
     points = points + (0.5 - (default if first_pixel is None else first_pixel))
     finite = np.isfinite(points).all(axis=1)
-    return Landmarks(np.where(finite[:, None], points, 0.0), visible & finite)
+    return Landmarks(np.where(finite[:, None], points, 0.0), visible & finite, deviation)
 
 
 def write_landmarks(path: str | Path, landmarks: Landmarks) -> None:
@@ -88,12 +94,13 @@ def write_landmarks(path: str | Path, landmarks: Landmarks) -> None:
             "convention": "ibug68",
             "points": np.round(landmarks.points, 3).tolist(),
             "visible": [bool(v) for v in landmarks.visible],
+            "deviation": round(float(landmarks.deviation), 2),
         }
     )
     write_text(path, text + "\n")
 
 
-def _read_json(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _read_json(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
     data: Any = json.loads(path.read_text(encoding="utf-8"))
     if isinstance(data, list):
         data = {"points": data}
@@ -105,10 +112,10 @@ def _read_json(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     points = np.array([[np.nan, np.nan] if p is None else p for p in data["points"]], dtype=np.float64)
     flags = data.get("visible")
     visible = np.ones(len(points), dtype=bool) if flags is None else np.array(flags, dtype=bool)
-    return points, visible
+    return points, visible, float(data.get("deviation", 0.0))
 
 
-def _read_pts(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _read_pts(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
     text = path.read_text(encoding="utf-8", errors="replace")
     opened, closed = text.find("{"), text.find("}")
     if opened < 0 or closed < opened:
@@ -117,17 +124,17 @@ def _read_pts(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     if values.size % 2:
         raise InputError(f"{path}: found {values.size} numbers, expected {2 * COUNT} (x and y of 68 points)")
     points = values.reshape(-1, 2)
-    return points, np.ones(len(points), dtype=bool)
+    return points, np.ones(len(points), dtype=bool), 0.0
 
 
-def _read_npy(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _read_npy(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
     values = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped: a header that claims too much is refused
     if not isinstance(values, np.ndarray):
         raise InputError(f"{path}: found an archive of arrays, expected one array of shape (68, 2) or (68, 3)")
     if values.ndim != 2 or values.shape[1] not in (2, 3):
         raise InputError(f"{path}: found an array of shape {values.shape}, expected (68, 2) or (68, 3)")
     visible = values[:, 2] > 0.5 if values.shape[1] == 3 else np.ones(len(values), dtype=bool)
-    return values[:, :2].astype(np.float64), visible
+    return values[:, :2].astype(np.float64), visible, 0.0
 
 
 def _brief(error: Exception) -> str:

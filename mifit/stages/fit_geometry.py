@@ -76,6 +76,7 @@ def fit_geometry(
         raise InputError("fit_geometry: found no camera or no timestep, expected at least one of each")
     journal = Journal("fit geometry", 2 + config.rounds, progress)
     layout = Layout(len(timesteps), model.n_identity, model.n_expression, log_scale=int(config.scale_deviation > 0.0))
+    config = replace(config, landmark_noise=_landmark_noise(capture, cameras, timesteps, config))
     views = landmark_views(capture, model, cameras, timesteps, config.landmark_noise)
     state = initial_state(model, views, len(timesteps), layout, model.unit_mm / capture.unit_mm)
     start = fit_landmarks(model, views, state, config.landmark_noise, priors_of(config))
@@ -141,6 +142,7 @@ def fit_pose_expression(
     journal = Journal("track geometry", 2 + config.rounds, progress)
     baked = bake_identity(model, geometry.identity)
     warm = _state_of(geometry, geometry.timesteps[-1])
+    config = replace(config, landmark_noise=_landmark_noise(capture, cameras, (timestep,), config))
     views = landmark_views(capture, baked, cameras, (timestep,), config.landmark_noise, fewest=0)
     if sum(len(view.index) for view in views) >= FEWEST_LANDMARKS:
         state = initial_state(baked, views, 1, warm.layout, geometry.scale, warm)
@@ -153,6 +155,13 @@ def fit_pose_expression(
     return _refine_and_pack(
         capture, baked, cameras, (timestep,), config, seed, journal, state, views, reference, geometry, geometry.gains
     )
+
+
+def _landmark_noise(
+    capture: Capture, cameras: Sequence[str], timesteps: Sequence[int], config: GeometryConfig
+) -> float:
+    """The least noise of landmarks in pixels: the setting, or what the detector's errors amount to if that is more."""
+    return max(config.landmark_noise, *(capture.frame(c, t).deviation for c in cameras for t in timesteps))
 
 
 def bake_identity(model: MorphableModel, identity: NDArray) -> MorphableModel:

@@ -70,7 +70,7 @@ def test_the_fundamental_matrix_vanishes_on_true_pairs() -> None:
 class Fake:
     """Finds prepared landmarks; no face where the image is black."""
 
-    name = "fake"
+    name, scatter = "fake", 0.05
 
     def __init__(self) -> None:
         rng = np.random.default_rng(0)
@@ -93,6 +93,7 @@ def test_landmarks_are_written_and_images_without_a_face_named(folder: Path) -> 
     capture = Capture.load(folder)
     assert capture.frame("right", 1).landmarks is None
     np.testing.assert_allclose(capture.frame("left", 1).landmarks, Fake().points, atol=1e-3)
+    assert capture.frame("left", 1).deviation == pytest.approx(0.05 * np.ptp(Fake().points[:, 0]), abs=0.01)
 
 
 def test_a_capture_without_any_face_is_refused(folder: Path) -> None:

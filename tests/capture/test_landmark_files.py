@@ -16,10 +16,18 @@ POINTS = np.round(np.random.default_rng(2).uniform(0, 300, (68, 2)), 3)
 
 def test_json_round_trip(tmp_path: Path) -> None:
     visible = np.arange(68) % 3 > 0
-    write_landmarks(tmp_path / "a b.json", Landmarks(POINTS, visible))
+    write_landmarks(tmp_path / "a b.json", Landmarks(POINTS, visible, 12.5))
     found = read_landmarks(tmp_path / "a b.json")
     np.testing.assert_array_equal(found.points, POINTS)
     np.testing.assert_array_equal(found.visible, visible)
+    assert found.deviation == 12.5
+
+
+@pytest.mark.parametrize("value", ["-1", "NaN", '"wide"', "[1]"])
+def test_a_deviation_that_is_none_is_refused(tmp_path: Path, value: str) -> None:
+    (tmp_path / "a.json").write_text(f'{{"points": {json.dumps(POINTS.tolist())}, "deviation": {value}}}')
+    with pytest.raises(InputError, match=r"a\.json"):
+        read_landmarks(tmp_path / "a.json")
 
 
 def test_every_kind_gives_the_same_points(tmp_path: Path) -> None:

@@ -188,7 +188,7 @@ def fit_landmarks(
             poses = [state.frames.pose(layout, state.x, k) for k in range(layout.timesteps)]
             views = slide_contour(model, views, vertices, poses)
         if number == 3:
-            noise = max(noise, _coordinate_deviation(state, views))
+            noise = max(noise, coordinate_deviation(state, views))
             views = tuple(replace(view, weight=noise**-2) for view in views)
         term = LandmarkTerm(views, OUTLIER_PIXELS * noise * widening)
         problem = LandmarkProblem(layout, state.frames, term, priors)
@@ -206,7 +206,7 @@ def fit_landmarks(
     return LandmarkFit(state, solution, views, noise)
 
 
-def _coordinate_deviation(state: State, views: tuple[LandmarkView, ...]) -> float:
+def coordinate_deviation(state: State, views: tuple[LandmarkView, ...]) -> float:
     """Robust standard deviation of a landmark coordinate's residual, pixels."""
     term = LandmarkTerm(views, np.inf)
     residual = [term.distances(view, state.layout, state.frames, state.x).ravel() for view in views]

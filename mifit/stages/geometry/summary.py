@@ -13,9 +13,9 @@ from mifit.morphable import MorphableModel
 from mifit.progress import Progress
 from mifit.solve import Outcome, Solution
 from mifit.stages.geometry.landmarks import LandmarkTerm, LandmarkView
-from mifit.stages.geometry.start import State
+from mifit.stages.geometry.start import State, coordinate_deviation
 
-SCATTER_OF_WIDTH = 0.015  # landmark noise, as part of the image's width, that deserves a warning
+SCATTER_OF_WIDTH = 0.015  # deviation of landmarks from the fit, as part of the image's width, that deserves a warning
 
 
 class Journal:
@@ -100,9 +100,10 @@ def pack(
     if journal.last is not None and journal.last.system is not None:
         details["standard_deviations"] = _deviations(state, journal.last)
     width = min((view.camera.width for view in views), default=np.inf)
-    if noise > SCATTER_OF_WIDTH * width:
+    scatter = coordinate_deviation(state, views) if views else 0.0
+    if scatter > SCATTER_OF_WIDTH * width:
         journal.warn(
-            f"landmarks scatter by {noise:.1f} pixels about the fitted face: check the detector and the calibration"
+            f"landmarks scatter by {scatter:.1f} pixels about the fitted face: check the detector and the calibration"
         )
     identity = x[layout.at("identity")].copy() if fixed is None else fixed.identity
     if len(identity) and np.abs(identity).max() > 5.0:
