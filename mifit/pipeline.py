@@ -194,14 +194,15 @@ def check_images(capture: Capture, cameras: Sequence[str], timesteps: Sequence[i
 
 
 def one_place(capture: Capture, cameras: Sequence[str], geometry: GeometryEstimate) -> tuple[str, ...]:
-    """A warning when the head is seen from so nearly one place that its distance isn't measured."""
-    towards = np.array([capture.camera(name).position for name in cameras]) - geometry.vertices[0].mean(axis=0)
+    """A warning when the landmarks are seen from so nearly one place that the head's distance isn't measured."""
+    seen = [name for name in cameras if any(capture.frame(name, t).visible.any() for t in geometry.timesteps)]
+    towards = np.array([capture.camera(name).position for name in seen]) - geometry.vertices[0].mean(axis=0)
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     apart = float(np.degrees(np.arccos(np.clip((towards @ towards.T).min(), -1.0, 1.0))))
     if apart >= BASELINE_DEGREES:
         return ()
-    place = "one camera" if len(cameras) == 1 else f"cameras {apart:.1f} degrees apart"
-    return (f"{place}: how far away and so how large the head is rests on the model's size, not on the images",)
+    place = f"landmarks in camera {seen[0]} alone" if len(seen) == 1 else f"cameras {apart:.1f} degrees apart"
+    return (f"{place}: how far away and so how large the head is rests on the model's size more than on the images",)
 
 
 def choose(kind: str, known: Sequence[T], wanted: Sequence[T] | None, default: int) -> tuple[T, ...]:

@@ -25,8 +25,12 @@ def test_an_image_without_light_is_refused():
 
 
 def test_views_from_one_place_bring_a_warning():
-    cameras = {name: ball_camera(name, angle) for name, angle in (("a", 0.0), ("b", 1.0), ("c", 20.0))}
-    capture, geometry = SimpleNamespace(camera=cameras.get), ball_result().geometry
-    assert one_place(capture, ["a"], geometry)[0].startswith("one camera: how far away")
+    cameras = {name: ball_camera(name, angle) for name, angle in (("a", 0.0), ("b", 1.0), ("c", 20.0), ("blind", 40.0))}
+    capture = SimpleNamespace(
+        camera=cameras.get, frame=lambda name, t: SimpleNamespace(visible=np.full(68, name != "blind"))
+    )
+    geometry = ball_result().geometry
+    assert one_place(capture, ["a"], geometry)[0].startswith("landmarks in camera a alone: how far away")
     assert one_place(capture, ["a", "b"], geometry)[0].startswith("cameras 1.0 degrees apart")
+    assert one_place(capture, ["blind", "c"], geometry)[0].startswith("landmarks in camera c alone")
     assert one_place(capture, ["a", "b", "c"], geometry) == ()
