@@ -42,6 +42,8 @@ class Frame:
         iBUG points in the undistorted image.
     visible : (68,) bool
         Landmarks to be trusted; all False without landmarks.
+    deviation : float
+        What the errors of the detector amount to, see `Landmarks`; 0 where it isn't known.
     """
 
     image: NDArray[np.float32]
@@ -49,6 +51,7 @@ class Frame:
     clipped: NDArray[np.bool_]
     landmarks: NDArray[np.float64] | None
     visible: NDArray[np.bool_]
+    deviation: float = 0.0
 
     @property
     def nbytes(self) -> int:
@@ -218,7 +221,7 @@ class Capture:
         found = read_landmarks(shot.landmarks)
         if view.intrinsics is None:
             return found
-        return Landmarks(undistort_points(_lens_camera(view), found.points), found.visible)
+        return Landmarks(undistort_points(_lens_camera(view), found.points), found.visible, found.deviation)
 
     def digest(self, cameras: Sequence[str] | None = None, timesteps: Sequence[int] | None = None) -> str:
         """Hex digest of calibration, images, masks and landmarks; only files of the named cameras are read."""
@@ -285,7 +288,7 @@ class Capture:
         landmarks = self.landmarks(shot.camera, shot.timestep)
         if landmarks is None:
             return Frame(image, valid, clipped, None, np.zeros(COUNT, dtype=bool))
-        return Frame(image, valid, clipped, landmarks.points, landmarks.visible)
+        return Frame(image, valid, clipped, landmarks.points, landmarks.visible, landmarks.deviation)
 
 
 def _lens_camera(view: View) -> Camera:
