@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mifit.core.estimate import ReflectanceEstimate
 from mifit.errors import InputError
 from mifit.render import shading
+from mifit.render.arrays import aligned
 
 Shade = Callable[[Any, Any, int], Any]
 """Normals, view directions (Dr.Jit vectors), number of the view -> radiance (Color3f) of the texels."""
@@ -71,7 +72,7 @@ def material_shade(
     import mitsuba as mi
 
     albedo = vector(mi.Color3f, diffuse)
-    gloss = mi.Float(np.ascontiguousarray(specular, dtype=np.float32))
+    gloss = mi.Float(aligned(specular))
     coefficients = [mi.Color3f(*map(float, row)) for row in reflectance.radiance]
     ambient = mi.Float(float(reflectance.ambient))
     dr.make_opaque(coefficients, ambient)
@@ -85,7 +86,7 @@ def material_shade(
         if traced is None:
             raise InputError("shading model 'shadowed': found no transfer vectors, expected those of trace_transfer")
         for view, rows in zip(views, traced, strict=True):
-            columns = [mi.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in np.asarray(rows).T]
+            columns = [mi.Float(aligned(c)) for c in np.asarray(rows).T]
             shadowed = shading.radiance(columns, coefficients)
             n, v = vector(mi.Vector3f, view.normal), vector(mi.Vector3f, view.direction)
             open_sky = shading.radiance(shading.diffuse_transfer(n, order), coefficients)
@@ -169,4 +170,4 @@ def shade_bent(
 
 def vector(kind: Any, values: NDArray) -> Any:
     """(N, 3) array -> Dr.Jit vector."""
-    return kind(np.ascontiguousarray(np.asarray(values, dtype=np.float32).T))
+    return kind(*map(aligned, np.asarray(values).T))

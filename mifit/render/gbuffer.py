@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
 from mifit.errors import InputError
+from mifit.render.arrays import aligned
 
 MESH_POSITIONS = "vertex_positions"
 MESH_FACES = "faces"
@@ -219,7 +220,7 @@ class SurfaceScene:
             return np.zeros(0, np.uint32)
         n = _vector(normals)
         origin = _vector(points) + SHADOW_EPSILON * self._diagonal * n
-        toward = mi.Float(np.ascontiguousarray(directions, dtype=np.float32).ravel())
+        toward = mi.Float(aligned(directions).ravel())
 
         def body(i: Any, bits: Any) -> tuple[Any, Any]:
             d = mi.Vector3f(*(dr.gather(mi.Float, toward, 3 * i + k) for k in range(3)))
@@ -236,7 +237,7 @@ def _vector(values: NDArray) -> Any:
     """(N, 3) array -> mi.Vector3f."""
     import mitsuba as mi
 
-    return mi.Vector3f(np.ascontiguousarray(values.T, dtype=np.float32))
+    return mi.Vector3f(*map(aligned, values.T))
 
 
 def _diagonal(vertices: NDArray) -> float:

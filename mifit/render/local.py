@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from mifit.core.sh import order_of
 from mifit.errors import InputError
 from mifit.render import shading
+from mifit.render.arrays import aligned
 
 
 def shade_points(
@@ -71,7 +72,7 @@ def shade_points(
         if diffuse_transfer is None:
             raise InputError("shading model 'shadowed': found no transfer vectors, expected those of trace_transfer")
         rows = _expect(diffuse_transfer, (len(n), order * order), "diffuse_transfer")
-        traced = [mi.Float(np.ascontiguousarray(column)) for column in rows.T]
+        traced = [mi.Float(aligned(column)) for column in rows.T]
     coefficients = [mi.Color3f(*map(float, row)) for row in np.asarray(radiance, dtype=np.float64)]
     normal, toward = _vector(n), _vector(v)
     d, s = shading.shade(normal, toward, _opaque(coefficients), float(exponent), model, normalized, traced, fresnel)
@@ -116,7 +117,7 @@ def specular_matrix(
         return matrix
     rows = _expect(diffuse_transfer, (len(n), order * order), "diffuse_transfer")
     axis, _ = shading.lobe_axis(normal, toward, lobe)
-    traced = [mi.Float(np.ascontiguousarray(column)) for column in rows.T]
+    traced = [mi.Float(aligned(column)) for column in rows.T]
     return matrix * _columns([shading.unoccluded(normal, axis, traced, order)], len(n))
 
 
@@ -177,7 +178,7 @@ def _opaque(coefficients: list[Any]) -> list[Any]:
 def _vector(values: NDArray) -> Any:
     import mitsuba as mi
 
-    return mi.Vector3f(np.ascontiguousarray(values.T))
+    return mi.Vector3f(*map(aligned, values.T))
 
 
 def _rows(colour: Any, count: int) -> NDArray[np.float32]:

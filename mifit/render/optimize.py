@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mifit.core.sh import order_of
 from mifit.errors import InputError
 from mifit.render import shading
+from mifit.render.arrays import aligned
 
 HISTORY = ("data", "difference", "smoothness")
 
@@ -173,10 +174,10 @@ def fit_adam(
     if not with_ambient:
         upper[-1] = 0.0
     n = len(samples.albedo)
-    light = Variable(mi.Float(start.astype(np.float32)), rates[0], mi.Float(lower), mi.Float(upper))
+    light = Variable(mi.Float(aligned(start)), rates[0], mi.Float(aligned(lower)), mi.Float(aligned(upper)))
     begin = np.zeros(n, np.float32) if specular is None else np.asarray(specular, dtype=np.float32)
-    gloss = Variable(mi.Float(begin), rates[1], 0.0, 1.0)
-    base = mi.Float(np.ascontiguousarray(samples.albedo, dtype=np.float32).ravel())
+    gloss = Variable(mi.Float(aligned(begin)), rates[1], 0.0, 1.0)
+    base = mi.Float(aligned(samples.albedo).ravel())
     offset = Variable(dr.zeros(mi.Float, 3 * n), rates[2], -base, 1.0 - base)
     history: dict[str, list[float]] = {name: [] for name in HISTORY}
 
@@ -220,11 +221,11 @@ class _Objective:
         self.difference, self.smoothness = difference, smoothness
         self.normal, self.view = _vector(samples.normal), _vector(samples.view)
         self.colour, self.weight = _colour(samples.colour), _colour(samples.weight)
-        self.texel = mi.UInt(samples.texel.astype(np.uint32))
-        self.first, self.second = (mi.UInt(x.astype(np.uint32)) for x in (samples.first, samples.second))
+        self.texel = mi.UInt(aligned(samples.texel, np.uint32))
+        self.first, self.second = (mi.UInt(aligned(x, np.uint32)) for x in (samples.first, samples.second))
         self.traced = None
         if samples.traced is not None:
-            self.traced = [mi.Float(np.ascontiguousarray(column)) for column in samples.traced.T]
+            self.traced = [mi.Float(aligned(column)) for column in samples.traced.T]
         self.neighbours = _neighbours(samples.index, samples.size)
 
     def shade(self, coefficients: list[Any], ambient: Any) -> tuple[Any, Any, Any]:
@@ -282,19 +283,19 @@ def _neighbours(index: NDArray, size: int) -> list[Any]:
     for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
         other = own[row + dy, column + dx]
         out.append(np.where(other < 0, np.arange(len(index)), other))
-    return [mi.UInt(x.astype(np.uint32)) for x in out]
+    return [mi.UInt(aligned(x, np.uint32)) for x in out]
 
 
 def _vector(values: NDArray) -> Any:
     import mitsuba as mi
 
-    return mi.Vector3f(np.ascontiguousarray(values.T, dtype=np.float32))
+    return mi.Vector3f(*map(aligned, values.T))
 
 
 def _colour(values: NDArray) -> Any:
     import mitsuba as mi
 
-    return mi.Color3f(np.ascontiguousarray(values.T, dtype=np.float32))
+    return mi.Color3f(*map(aligned, values.T))
 
 
 def _at(colour: Any, index: Any) -> Any:

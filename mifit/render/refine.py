@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.progress import Progress, silent
+from mifit.render.arrays import aligned
 from mifit.render.bent import NormalView, Shade, vector
 from mifit.render.pairs import bend, bend_jacobian, conjugate_gradients, solve_blocks
 
@@ -77,12 +78,12 @@ class NormalProblem:
 
         self._count = len(normals)
         self._base = _frame(normals, tangents)
-        self._near = [mi.UInt32(np.ascontiguousarray(neighbours[:, i], dtype=np.uint32)) for i in range(4)]
+        self._near = [mi.UInt32(aligned(neighbours[:, i], np.uint32)) for i in range(4)]
         self._degree = sum(dr.select(n != dr.arange(mi.UInt32, self._count), mi.Float(1), 0) for n in self._near)
         self._views = [
             (
                 vector(mi.Color3f, v.colour),
-                mi.Float(np.ascontiguousarray(v.weight, dtype=np.float32)),
+                mi.Float(aligned(v.weight)),
                 vector(mi.Vector3f, v.direction),
                 _frame(v.normal, v.tangents),
             )
@@ -356,7 +357,7 @@ class NormalProblem:
 
         if offsets is None:
             return self._zeros(), self._zeros()
-        return tuple(mi.Float(np.ascontiguousarray(offsets[:, i], dtype=np.float32)) for i in range(2))  # type: ignore[return-value]
+        return tuple(mi.Float(aligned(offsets[:, i])) for i in range(2))  # type: ignore[return-value]
 
 
 def residual_scale(views: Sequence[NormalView], shade: Shade) -> float:

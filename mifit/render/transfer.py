@@ -11,6 +11,7 @@ from mifit.core.mesh import vertex_normals
 from mifit.core.sh import check_order
 from mifit.errors import InputError
 from mifit.render import shading
+from mifit.render.arrays import aligned
 from mifit.render.gbuffer import make_mesh
 from mifit.render.local import _columns, _vector
 
@@ -70,8 +71,8 @@ def trace_transfer(
     if bounce_albedo:
         vertex_n = vertex_normals(vertices, faces)
         lit = _trace(scene, offset, vertices, vertex_n, order, samples, seed, None, None, 0.0)
-        at_vertices = mi.Float(lit.ravel())
-    indices = mi.UInt(np.ascontiguousarray(faces, dtype=np.uint32).ravel())
+        at_vertices = mi.Float(aligned(lit).ravel())
+    indices = mi.UInt(aligned(faces, np.uint32).ravel())
     result = _trace(scene, offset, p, n, order, samples, seed + 1, at_vertices, indices, bounce_albedo or 0.0)
     dr.flush_malloc_cache()
     return result
