@@ -1,0 +1,291 @@
+"""Hard cases: what the public API does with inputs at or beyond the edge of what can be fitted.
+
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.hard_cases [NAMES ...] [--work out/hard_cases]
+
+Every case is a small capture, path traced or made from one by damage, that `mifit.fit` and `evaluate` meet as a user's
+would. A case fails when it ends in anything but a result or a mifit error, when a result holds values that aren't
+finite, when it is wrong without a word of warning, or when it is refused though it could be fitted. Failing cases
+stay in the table. Writes ``benchmarks/results/hard_cases.json`` and ``hard_cases.md``; captures are kept in the work
+folder and made again when it is deleted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import time
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+import mifit
+from benchmarks import hard_captures as captures
+from benchmarks.hard_captures import (
+    HEIGHT,
+    MODEL,
+    SEED,
+    TIMESTEPS,
+    WIDTH,
+    damaged,
+    exposed,
+    file_changed,
+    moved,
+    spot,
+    traced,
+)
+from benchmarks.record import RESULTS, machine, record
+from benchmarks.truth import mesh_error
+from mifit import Capture, MorphableModel, Reconstruction
+from mifit.config import FitConfig, ReflectanceConfig
+from mifit.core.files import write_text
+from mifit.core.image import write_image
+from mifit.errors import InputError, MifitError
+from mifit.output.evaluate import evaluate
+
+CONFIG = FitConfig(reflectance=ReflectanceConfig(texture_size=64))
+WRONG_MM, WRONG_DB = 5.0, 20.0
+"""A result is wrong when its vertices are further off, or its third view is worse, than this."""
+UNRELATED = "the lighting had not converged"
+"""A warning that says nothing about a wrong result: at these sizes good ones have it too."""
+SAME_MM = 0.01
+"""Vertices of two results that are the same."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One hard case.
+
+    Attributes
+    ----------
+    name, group : str
+    make : callable
+    expect : {"fit", "refuse", "either"}
+        What the toolkit should do.
+    cameras, timesteps : tuple, optional
+        As for `mifit.fit`.
+    until : str
+        Last stage.
+    same : bool
+        The result must be the base capture's.
+    """
+
+    name: str
+    group: str
+    make: captures.Make
+    expect: Literal["fit", "refuse", "either"] = "fit"
+    cameras: tuple[str, ...] = ("left", "right")
+    timesteps: tuple[int, ...] | None = None
+    until: Literal["geometry", "reflectance", "normals"] = "reflectance"
+    same: bool = False
+
+
+CASES = (
+    Case("base", "reference", traced(), until="normals"),
+    Case("uniform light", "light", traced(captures.uniform)),
+    Case("one small source in front", "light", traced(spot(64))),
+    Case("one small source at the side", "light", traced(spot(90))),
+    Case("one small source behind", "light", traced(spot(2, 0.05)), "either"),
+    Case("black environment", "light", traced(lambda: np.zeros((64, 128, 3))), "refuse"),
+    Case("one view", "views", damaged(), cameras=("left",)),
+    Case("one timestep", "views", damaged(), timesteps=(0,)),
+    Case("one view, one timestep", "views", damaged(), cameras=("left",), timesteps=(0,)),
+    Case("two views from one place", "views", traced(angles=(-20.0, -20.0))),
+    Case("views 1 degree apart", "views", traced(angles=(-0.5, 0.5))),
+    Case("views 140 degrees apart", "views", traced(angles=(-70.0, 70.0))),
+    Case("camera twice under two names", "views", damaged(document=captures.doubled), cameras=("left", "copy")),
+    Case("three times overexposed", "exposure", exposed(3.0)),
+    Case("thirty times overexposed", "exposure", exposed(30.0), "either"),
+    Case("all white", "exposure", exposed(1e6), "refuse"),
+    Case("one fiftieth of the exposure", "exposure", exposed(0.02)),
+    Case("exposed to two codes", "exposure", exposed(3e-4), "either"),
+    Case("all black", "exposure", exposed(0.0), "refuse"),
+    Case("noise of 0.1", "exposure", damaged(images=captures.noisy, cameras=("left", "right"))),
+    Case("8-bit grey", "exposure", damaged(images=lambda x, rng: x.mean(axis=-1))),
+    Case("black skin", "skin", traced(skin=captures.recoloured(lambda a: 0.05 * a))),
+    Case("white skin", "skin", traced(skin=captures.recoloured(lambda a: 0.95 + 0.0 * a))),
+    Case("mirror-like skin", "skin", traced(skin=captures.recoloured(lambda a: a, specular=1.0, roughness=0.05))),
+    Case("millimetres", "numbers", damaged(world=lambda x: 10 * x, document=captures.with_units("mm"))),
+    Case("metres", "numbers", damaged(world=lambda x: x / 100, document=captures.with_units("m"))),
+    Case("centimetres declared as metres", "numbers", damaged(document=captures.with_units("m")), "either"),
+    Case("world origin 100 m away", "numbers", damaged(world=lambda x: x + 1e4)),
+    Case("world origin 10 km away", "numbers", damaged(world=lambda x: x + 1e6), "either"),
+    Case("world origin 1000 km away", "numbers", damaged(world=lambda x: x + 1e8), "either"),
+    Case("NaN pixels in EXR", "numbers", captures.spoilt_exr(np.nan), until="normals"),
+    Case("infinite pixels in EXR", "numbers", captures.spoilt_exr(np.inf)),
+    Case("pixels of 1e30 in EXR", "numbers", captures.spoilt_exr(1e30)),
+    Case("negative pixels in EXR", "numbers", captures.spoilt_exr(-1.0)),
+    Case("landmarks 4 pixels to the right", "landmarks", moved(lambda p, rng: p + np.array([4.0, 0.0]))),
+    Case("landmarks 30 pixels to the right", "landmarks", moved(lambda p, rng: p + np.array([30.0, 0.0])), "either"),
+    Case("left taken for right", "landmarks", moved(lambda p, rng: p[captures.MIRRORED]), "either"),
+    Case("eight landmarks 35 pixels off", "landmarks", moved(captures.outliers)),
+    Case("half of the landmarks hidden", "landmarks", damaged(landmarks=captures.half_hidden)),
+    Case("all landmarks anywhere", "landmarks", moved(captures.anywhere), "either"),
+    Case("all landmarks in one point", "landmarks", moved(lambda p, rng: 0 * p + 70.0), "either"),
+    Case("NaN landmarks", "landmarks", moved(lambda p, rng: p * np.nan), "either"),
+    Case("no landmarks in one camera", "landmarks", damaged(document=captures.without_landmarks("right"))),
+    Case("no landmarks", "landmarks", damaged(document=captures.without_landmarks()), "refuse"),
+    Case("image missing", "data", file_changed(Path.unlink), "refuse"),
+    Case("image cut off", "data", file_changed(lambda p: p.write_bytes(p.read_bytes()[:2000])), "refuse"),
+    Case("image of another size", "data", file_changed(lambda p: write_image(p, np.ones((50, 60, 3)))), "refuse"),
+    Case("landmarks missing", "data", file_changed(Path.unlink, "landmarks/left/0001.json"), "refuse"),
+    Case("right half masked", "data", captures.masked(lambda x: x > 0.5)),
+    Case("everything masked", "data", captures.masked(lambda x: x >= 0), "refuse"),
+    Case("head rolled by 90 degrees", "pose", traced(turn=(0, 0, 90))),
+    Case("head upside down", "pose", traced(turn=(0, 0, 180))),
+    Case("head turned by 60 degrees", "pose", traced(turn=(0, 60, 0)), "either"),
+    Case("head nodding by 40 degrees", "pose", traced(turn=(40, 0, 0))),
+    Case("back of the head", "pose", traced(turn=(0, 180, 0)), "refuse"),
+    Case("frames shuffled in the file", "order", damaged(document=captures.shuffled), same=True),
+    Case("cameras named in reverse", "order", damaged(), cameras=("right", "left"), same=True),
+    Case("timesteps named in reverse", "order", damaged(), timesteps=(1, 0), same=True),
+)
+
+
+# -- running them -----------------------------------------------------------------------------------------------------
+
+
+def run_case(case: Case, work: Path, reference: NDArray | None) -> tuple[dict[str, Any], NDArray | None]:
+    """Make, fit and judge one case; returns its row and the vertices that were found, by timestep."""
+    row: dict[str, Any] = {"case": case.name, "group": case.group, "expect": case.expect, "commit": machine()["commit"]}
+    began, used = time.perf_counter(), time.process_time()
+    vertices = None
+    try:
+        folder = work / "_".join(case.name.replace(",", "").split())
+        if not (folder / "transforms.json").exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            case.make(work / "base", folder)
+        capture = Capture.load(folder)
+        result = mifit.fit(
+            capture,
+            MorphableModel.load(MODEL),
+            cameras=case.cameras,
+            timesteps=case.timesteps,
+            config=CONFIG,
+            until=case.until,
+        )
+        order = np.argsort(result.timesteps)
+        vertices = result.geometry.vertices[order]
+        row |= {
+            "outcome": "fitted",
+            "finite": is_finite(result),
+            "mesh_mm": mesh_error(result, folder)["mesh_mm"],
+            "third_db": third_view(result, capture),
+            "warnings": [*result.warnings, *(w for report in result.reports.values() for w in report.warnings)],
+        }
+        if case.same and reference is not None:
+            row["difference_mm"] = float(np.abs(vertices - reference).max()) * result.unit_mm
+    except MifitError as error:
+        row |= {"outcome": "refused", "message": str(error).replace(f"{work}/", "")}
+    except Exception as error:
+        traceback.print_exc()
+        row |= {"outcome": "traceback", "message": f"{type(error).__name__}: {error}"}
+    row["seconds"] = round(time.perf_counter() - began, 1)
+    row["cpu_seconds"] = round(time.process_time() - used, 1)
+    return row, vertices
+
+
+def third_view(result: Reconstruction, capture: Capture) -> float:
+    """Held-out error in dB; 0 where the fitted face isn't even in the picture."""
+    try:
+        return evaluate(result, capture, "third")["methods"]["full"]["psnr"]
+    except InputError:
+        return 0.0
+
+
+def is_finite(result: Reconstruction) -> bool:
+    """Whether every number of a result is one."""
+    arrays = [result.geometry.vertices, result.geometry.vertex_albedo, result.geometry.shading]
+    if result.reflectance is not None:
+        found = result.reflectance
+        arrays += [found.diffuse, found.specular, found.confidence, found.radiance]
+    if result.normals is not None:
+        arrays.append(result.normals.normal_object)
+    return all(np.isfinite(array).all() for array in arrays)
+
+
+def verdict(case: Case, row: dict[str, Any]) -> str:
+    """``ok``, or why the case fails."""
+    if row["outcome"] == "traceback":
+        return "fails: no mifit error"
+    if row["outcome"] == "refused":
+        return "ok" if case.expect != "fit" else "fails: refused"
+    if not row["finite"]:
+        return "fails: not finite"
+    if case.expect == "refuse":
+        return "fails: not refused"
+    if row.get("difference_mm", 0.0) > SAME_MM:
+        return f"fails: differs by {row['difference_mm']:.2g} mm"
+    wrong = not (row["mesh_mm"] <= WRONG_MM and row["third_db"] >= WRONG_DB)
+    said = [text for text in row["warnings"] if not text.startswith(UNRELATED)]
+    return "fails: wrong without a word" if wrong and not said else "ok"
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """All cases by group; a failing one says why."""
+    passed = sum(row["verdict"] == "ok" for row in rows)
+    lines = [
+        f"{passed} of {len(rows)} cases are met well. Images of {WIDTH} x {HEIGHT}, {TIMESTEPS} timesteps, the coarse",
+        "model; errors of vertices (face area, no alignment) and of the third view in the case's own exposure. Measured",
+        f"at commit {', '.join(dict.fromkeys(row['commit'] for row in rows))}.",
+        "",
+        "| case | outcome | vertices mm | third dB | what is said | verdict |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        words = [row["message"]] if "message" in row else row["warnings"]
+        text = _cell("; ".join(words))
+        mm, db = (f"{row[key]:.2f}" if key in row else "" for key in ("mesh_mm", "third_db"))
+        verdict = row["verdict"] if row["verdict"] == "ok" else f"**{row['verdict']}**"
+        lines.append(f"| {row['group']}: {row['case']} | {row['outcome']} | {mm} | {db} | {text} | {verdict} |")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(text: str, limit: int = 220) -> str:
+    text = " ".join(text.split()).replace("|", "/")
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", help="cases to run (default: all); the others keep their rows")
+    parser.add_argument("--work", type=Path, default=Path("out/hard_cases"))
+    a = parser.parse_args()
+    unknown = set(a.names) - {case.name for case in CASES}
+    if unknown:
+        parser.error(f"no case {sorted(unknown)[0]!r}; there are {', '.join(case.name for case in CASES)}")
+    mifit.set_variant("auto")
+    rows, reference = (stored_rows() if a.names else {}), None
+    for case in CASES:
+        if a.names and case.name not in {*a.names, "base"}:
+            continue
+        rows[case.name], vertices = run_case(case, a.work, reference)
+        row = rows[case.name]
+        reference = vertices if case.name == "base" else reference
+        figures = " ".join(f"{key} {row[key]:.2f}" for key in ("mesh_mm", "third_db") if key in row)
+        print(f"{case.name}: {row['outcome']} {figures}, {row['seconds']} s", file=sys.stderr, flush=True)
+        write(rows)  # after each case, so that a run that is broken off leaves what it measured
+    print((RESULTS / "hard_cases.md").read_text())
+    return 0
+
+
+def stored_rows() -> dict[str, dict[str, Any]]:
+    """The recorded rows by the name of their case."""
+    path = RESULTS / "hard_cases.json"
+    return {row["case"]: row for row in json.loads(path.read_text())["figures"]["cases"]} if path.exists() else {}
+
+
+def write(rows: dict[str, dict[str, Any]]) -> None:
+    """Judge all rows by the present measure and write both tables."""
+    judged = [{**rows[case.name], "verdict": verdict(case, rows[case.name])} for case in CASES if case.name in rows]
+    record("hard_cases", {"cases": judged}, seeds=SEED)
+    write_text(RESULTS / "hard_cases.md", markdown(judged))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
