@@ -231,8 +231,8 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     passed = sum(row["verdict"] == "ok" for row in rows)
     lines = [
         f"{passed} of {len(rows)} cases are met well. Images of {WIDTH} x {HEIGHT}, {TIMESTEPS} timesteps, the coarse",
-        "model; errors of vertices (face area, no alignment) and of the third view in the case's own exposure. Measured",
-        f"at commit {', '.join(dict.fromkeys(row['commit'] for row in rows))}.",
+        "model; errors of vertices (face area, no alignment) and of the third view in the case's own exposure.",
+        f"Measured at commit {', '.join(dict.fromkeys(row['commit'] for row in rows))}.",
         "",
         "| case | outcome | vertices mm | third dB | what is said | verdict |",
         "|---|---|---|---|---|---|",
