@@ -20,6 +20,7 @@ _EXPORTS = {
     "ReflectanceConfig": "mifit.config",
     "NormalsConfig": "mifit.config",
     "MeshConfig": "mifit.config",
+    "ShapeConfig": "mifit.config",
     "InputError": "mifit.errors",
     "MifitError": "mifit.errors",
     "VariantError": "mifit.errors",
@@ -33,6 +34,7 @@ _EXPORTS = {
     "infer_reflectance": "mifit.stages.infer_reflectance",
     "refine_normals": "mifit.stages.refine_normals",
     "refine_mesh": "mifit.stages.refine_mesh",
+    "refine_shape": "mifit.stages.refine_shape",
     "Reconstruction": "mifit.output.reconstruction",
 }
 

@@ -134,7 +134,7 @@ def build_parser() -> argparse.ArgumentParser:
     p = add("fit", "fit geometry, reflectance and normals to a capture")
     p.add_argument("capture", type=Path)
     p.add_argument("--out", type=Path, required=True, help="result folder to write")
-    p.add_argument("--config", type=Path, help="TOML file with tables geometry, reflectance, normals, mesh")
+    p.add_argument("--config", type=Path, help="TOML file with tables geometry, reflectance, shape, normals, mesh")
     p.add_argument("--model", default="builtin", help="morphable model: a path or builtin (default)")
     p.add_argument("--cameras", type=_names, help="cameras to use, e.g. left,right; default: the first two")
     p.add_argument("--timesteps", type=_timesteps, help="e.g. 0,1,2,3 or 0-3; default: the first four")

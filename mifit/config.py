@@ -58,6 +58,28 @@ class GeometryConfig:
 
 
 @dataclass(frozen=True)
+class ShapeConfig:
+    """Stage 1 once more with stage 2's light (``stages.refine_shape``), then stage 2 again.
+
+    Attributes
+    ----------
+    rounds : int
+        How often; 0 leaves it out. A round takes about as long as stage 2.
+    shading_weight : float
+        Independent measurements per pixel of shading, whose errors neighbours share.
+    """
+
+    rounds: int = 0
+    shading_weight: float = 0.015
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rounds <= 10:
+            raise ValueError(f"shape.rounds: found {self.rounds}, expected 0 to 10")
+        if not self.shading_weight > 0:
+            raise ValueError(f"shape.shading_weight: found {self.shading_weight}, expected a number above 0")
+
+
+@dataclass(frozen=True)
 class ReflectanceConfig:
     """Stage 2, reflectance inference (paper, section 5).
 
@@ -153,6 +175,7 @@ class FitConfig:
     reflectance: ReflectanceConfig = field(default_factory=ReflectanceConfig)
     normals: NormalsConfig = field(default_factory=NormalsConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
+    shape: ShapeConfig = field(default_factory=ShapeConfig)
 
     @classmethod
     def load(cls, path: str | Path) -> FitConfig:

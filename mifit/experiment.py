@@ -193,7 +193,7 @@ def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: 
         mifit.MorphableModel.load(fit.model),
         cameras=fit.cameras,
         timesteps=fit.timesteps,
-        config=FitConfig(fit.geometry, fit.reflectance, fit.normals, fit.mesh),
+        config=FitConfig(fit.geometry, fit.reflectance, fit.normals, fit.mesh, fit.shape),
         until=fit.until,
         seed=fit.seed,
         checkpoints=experiment_folder / "fits" / key[:10],

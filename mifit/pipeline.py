@@ -87,6 +87,7 @@ def fit(
     from mifit.stages.infer_reflectance import infer_reflectance
     from mifit.stages.refine_mesh import refine_mesh
     from mifit.stages.refine_normals import refine_normals
+    from mifit.stages.refine_shape import refine_shape
 
     config = config or FitConfig()
     cameras = choose("camera", capture.cameras, cameras, 2)
@@ -125,17 +126,36 @@ def fit(
         used,
         lambda: fit_geometry(capture, model, cameras, timesteps, config.geometry, seed=seed, progress=progress),
     )
-    reflectance, normals, mesh = None, None, None
+    reflectance, normals, mesh, seconds = None, None, None, 0.0
     if until != "geometry":
         used = {**used, "reflectance": settings["reflectance"]}
-        reflectance = stage(
-            "reflectance",
-            ReflectanceEstimate,
-            used,
-            lambda: infer_reflectance(
-                capture, model, geometry, cameras, config.reflectance, seed=seed, progress=progress
-            ),
-        )
+
+        def infer(name: str, shape: GeometryEstimate) -> ReflectanceEstimate:
+            return stage(
+                name,
+                ReflectanceEstimate,
+                used,
+                lambda: infer_reflectance(
+                    capture, model, shape, cameras, config.reflectance, seed=seed, progress=progress
+                ),
+            )
+
+        def reshape(name: str, shape: GeometryEstimate, light: ReflectanceEstimate) -> GeometryEstimate:
+            return stage(
+                name,
+                GeometryEstimate,
+                used,
+                lambda: refine_shape(
+                    capture, model, shape, light, cameras, config.shape, config.geometry, seed, progress
+                ),
+            )
+
+        reflectance = infer("reflectance", geometry)
+        for number in range(1, config.shape.rounds + 1):
+            used = {**used, "shape": {**settings["shape"], "rounds": number}}
+            seconds += reflectance.report.seconds
+            geometry = reshape(f"geometry_{number}", geometry, reflectance)
+            reflectance = infer(f"reflectance_{number}", geometry)
     if until == "normals":
         assert reflectance is not None
         found = reflectance
@@ -167,7 +187,7 @@ def fit(
         units=capture.units,
         unit_mm=capture.unit_mm,
         warnings=(*(() if known_cameras else (ESTIMATED_CAMERAS,)), *one_place(capture, cameras, geometry)),
-        seconds=sum(s.report.seconds for s in (geometry, reflectance, normals, mesh) if s is not None),
+        seconds=seconds + sum(s.report.seconds for s in (geometry, reflectance, normals, mesh) if s is not None),
         peak_memory=peak_memory(),
     )
 

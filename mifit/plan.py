@@ -13,7 +13,15 @@ from typing import Any, Literal
 
 import mifit
 from mifit import checkpoint
-from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, ReflectanceConfig, from_mapping, read_toml
+from mifit.config import (
+    GeometryConfig,
+    MeshConfig,
+    NormalsConfig,
+    ReflectanceConfig,
+    ShapeConfig,
+    from_mapping,
+    read_toml,
+)
 from mifit.errors import InputError
 
 BUILTIN = ("builtin", "builtin:coarse")
@@ -47,6 +55,7 @@ class FitRun:
     reflectance: ReflectanceConfig = field(default_factory=ReflectanceConfig)
     normals: NormalsConfig = field(default_factory=NormalsConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
+    shape: ShapeConfig = field(default_factory=ShapeConfig)
 
 
 @dataclass(frozen=True)

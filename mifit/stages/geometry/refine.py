@@ -72,6 +72,20 @@ def texture_reference(
     geometry : GeometryEstimate
         Its result.
     """
+    state = joint_state(model, geometry)
+    points = spread_points(model, config.surface_points, seed)
+    visibility = Visibility(capture, model, cameras, geometry.timesteps)
+    views = visibility.textures(state, points, config.texture_sigma, config.texture_window)
+    problem = ConsistencyProblem(
+        state.layout, state.frames, len(points.face), views, 1.0, np.inf, 1.0, LandmarkTerm((), np.inf), {}
+    )
+    problem = replace(problem, noise=problem.spread(state.x), robust=ROBUST_DEVIATIONS)
+    values, confidence = problem.texture(state.x)
+    return Reference(points.face, points.weights, values, confidence)
+
+
+def joint_state(model: MorphableModel, geometry: GeometryEstimate) -> State:
+    """The unknowns at a result: identity, and expression and pose of every timestep."""
     steps = len(geometry.timesteps)
     layout = Layout(steps, model.n_identity, model.n_expression)
     x = np.zeros(layout.size)
@@ -79,16 +93,7 @@ def texture_reference(
     for k in range(steps):
         x[layout.at("expression", k)] = geometry.expression[k]
         x[layout.at("translation", k)] = geometry.translation[k]
-    state = State(layout, Frames(geometry.rotation, geometry.scale), x)
-    points = spread_points(model, config.surface_points, seed)
-    visibility = Visibility(capture, model, cameras, geometry.timesteps)
-    views = visibility.textures(state, points, config.texture_sigma, config.texture_window)
-    problem = ConsistencyProblem(
-        layout, state.frames, len(points.face), views, 1.0, np.inf, 1.0, LandmarkTerm((), np.inf), {}
-    )
-    problem = replace(problem, noise=problem.spread(x), robust=ROBUST_DEVIATIONS)
-    values, confidence = problem.texture(x)
-    return Reference(points.face, points.weights, values, confidence)
+    return State(layout, Frames(geometry.rotation, geometry.scale), x)
 
 
 def refine_by_texture(
@@ -102,20 +107,7 @@ def refine_by_texture(
 ) -> tuple[State, Solution]:
     """One outer step of the fit by consistency."""
     state = state.recentred()
-    seen = visibility.textures(state, points, config.texture_sigma, config.texture_window)
-    problem = ConsistencyProblem(
-        state.layout,
-        state.frames,
-        len(points.face),
-        seen,
-        noise=1.0,
-        robust=np.inf,
-        independence=config.texture_weight,
-        landmarks=LandmarkTerm(views, OUTLIER_PIXELS * config.landmark_noise),
-        priors=priors_of(config),
-        known=None if reference is None else (reference.values, reference.confidence),
-    )
-    problem = replace(problem, noise=problem.spread(state.x), robust=ROBUST_DEVIATIONS)
+    problem = texture_problem(state, views, visibility, points, config, reference)
     low, high = bounds(state.layout, model.expression_bounds)
     solution = minimize(
         problem,
@@ -126,6 +118,30 @@ def refine_by_texture(
         energy_tolerance=ENERGY_TOLERANCE,
     )
     return replace(state, x=solution.value), solution
+
+
+def texture_problem(
+    state: State,
+    views: tuple[LandmarkView, ...],
+    visibility: Visibility,
+    points: SurfacePoints,
+    config: GeometryConfig,
+    reference: Reference | None = None,
+) -> ConsistencyProblem:
+    """Consistency, landmarks and priors with visibility and noise as they are at a state."""
+    problem = ConsistencyProblem(
+        state.layout,
+        state.frames,
+        len(points.face),
+        visibility.textures(state, points, config.texture_sigma, config.texture_window),
+        noise=1.0,
+        robust=np.inf,
+        independence=config.texture_weight,
+        landmarks=LandmarkTerm(views, OUTLIER_PIXELS * config.landmark_noise),
+        priors=priors_of(config),
+        known=None if reference is None else (reference.values, reference.confidence),
+    )
+    return replace(problem, noise=problem.spread(state.x), robust=ROBUST_DEVIATIONS)
 
 
 def refine_by_rendering(
