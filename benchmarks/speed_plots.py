@@ -61,7 +61,7 @@ def _plain_ticks(axes: Any) -> None:
 
 
 def _series(axes: Any, points: Iterable[tuple[float, float]], number: int, label: str, **style: Any) -> None:
-    x, y = zip(*sorted(points), strict=True)
+    x, y = zip(*points, strict=True)
     axes.plot(x, y, marker=MARKS[number % 7], color=COLOURS[number % 7], label=label, markersize=5, **style)
 
 
