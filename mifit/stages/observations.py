@@ -111,7 +111,7 @@ class _Image:
     step: int
     camera_index: int
     camera: Camera
-    colour: NDArray[np.float32]
+    colour: NDArray[np.float32]  # 0 where unusable
     unusable: NDArray[np.float32]  # 1 where invalid, not the face area, or at an occlusion edge
     clipped: NDArray[np.float32]
     footprint: NDArray[np.float32]  # (F,) pixels per texel, 0 for faces that face away
@@ -170,7 +170,7 @@ class Surface:
                         i,
                         k,
                         camera,
-                        np.where(np.isfinite(colour), colour, 0).astype(np.float32),
+                        np.where(unusable[..., None], 0, colour).astype(np.float32),
                         unusable.astype(np.float32),
                         frame.clipped.astype(np.float32),
                         _footprint(self.vertices[i], model.faces, camera, texel_area),
@@ -218,7 +218,7 @@ class Surface:
         if not total:
             raise InputError(
                 "reflectance: no image shows the fitted face; found 0 visible texels. Check the cameras' calibration "
-                "and the geometry"
+                "and the geometry, and whether all pixels of the face are clipped or invalid"
             )
         return np.sort(np.concatenate(found)[:count])
 
@@ -293,13 +293,14 @@ class Surface:
         weight = (image.footprint[face] * fade * inside).astype(np.float32)
         rows = np.flatnonzero(weight > 0)
         x, y = pixel[rows, 0] - 0.5, pixel[rows, 1] - 0.5
-        usable = bilinear(image.unusable, x, y) < 0.5
+        share = 1.0 - bilinear(image.unusable, x, y)
+        usable = share > 0.5
         usable &= self.scenes[image.step].visible_from(point[rows], camera.position)
         weight[rows[~usable]] = 0.0
-        rows, x, y = rows[usable], x[usable], y[usable]
+        rows, x, y, share = rows[usable], x[usable], y[usable], share[usable]
         colour = np.zeros((len(point), 3), dtype=np.float32)
         clipped = np.zeros(len(point), dtype=bool)
-        colour[rows] = bilinear(image.colour, x, y)
+        colour[rows] = bilinear(image.colour, x, y) / share[:, None]  # of the usable pixels alone
         clipped[rows] = bilinear(image.clipped, x, y) > 0.0
         return colour, weight, clipped
 

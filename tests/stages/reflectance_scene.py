@@ -13,6 +13,7 @@ from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import sample_map
 from mifit.render.gbuffer import SurfaceScene
 from mifit.render.local import shade_points
+from mifit.render.transfer import trace_transfer
 
 SIZE = 48
 EXPONENT = 60.0
@@ -63,9 +64,11 @@ def albedos(size=SIZE, gloss=0.12):
     return diffuse.astype(np.float32), specular.astype(np.float32)
 
 
-def turning_dome(shading="prefiltered", fresnel=8.0, gloss=0.12, radiance=None, exponent=EXPONENT, steps=4):
-    """Render the capture without noise."""
+def turning_dome(shading="prefiltered", fresnel=8.0, gloss=0.12, radiance=None, exponent=EXPONENT, steps=4, depth=1.0):
+    """Render the capture without noise; ``depth`` stretches the dome towards the cameras."""
     model = dome_model()
+    stretched = model.mean * [1.0, 1.0, depth] - [0.0, 0.0, 0.6 * (depth - 1.0)]
+    model = replace(model, mean=stretched.astype(np.float32))
     radiance = lighting(3 if shading == "paper" else 4) if radiance is None else radiance
     diffuse, specular = albedos(gloss=gloss)
     turns = [(0.0, 0.0), (0.35, 0.1), (-0.3, 0.2), (0.1, -0.35)][:steps]
@@ -111,7 +114,12 @@ def render(scene, name, t, diffuse, specular, radiance, exponent, shading, fresn
     uv = interpolate(model.uv, model.faces_uv, face, weights)
     x, y = sample_map(diffuse, uv), sample_map(specular, uv)
     toward = normalize(view.position - point)
-    d, s = shade_points(normal, toward, x, y, radiance, ambient, exponent, shading, fresnel=fresnel)
+    traced = None
+    if shading == "shadowed":
+        smooth = vertex_normals(vertices, model.faces)
+        traced = trace_transfer(vertices, model.faces, vertices, smooth, round(len(radiance) ** 0.5))
+        traced = interpolate(traced, model.faces, face, weights)
+    d, s = shade_points(normal, toward, x, y, radiance, ambient, exponent, shading, traced, fresnel=fresnel)
     image = np.zeros((*mask.shape, 3), np.float32)
     image[mask] = d + s
     return image, mask

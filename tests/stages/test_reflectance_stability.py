@@ -1,0 +1,285 @@
+"""Stage 2 under hard numerical conditions: starts, exposure, bad pixels, silent data, and float32 against float64."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from stages.reflectance_scene import EXPONENT, turning_dome
+from stages.reflectance_scene import SIZE as FINE
+
+from mifit.config import ReflectanceConfig
+from mifit.core import blinn_phong, sh
+from mifit.core.mesh import interpolate
+from mifit.core.uv import sample_map
+from mifit.errors import InputError
+from mifit.render.local import shade_points
+from mifit.render.shading import GUARD
+from mifit.stages.infer_reflectance import infer_reflectance
+from mifit.stages.observations import Surface
+from mifit.stages.reflectance import choice
+from mifit.stages.reflectance.choice import fit_lighting, lighting_problem
+from mifit.stages.reflectance.forward import Forward
+from mifit.stages.reflectance.lighting import LightingPriors, solve_lighting
+from mifit.stages.reflectance.maps import Smoothness, TexelSystems, laplacian, solve_maps
+
+SIZE = 24
+CONFIG = ReflectanceConfig(texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
+
+
+@pytest.fixture(scope="module")
+def dome(variant):
+    return turning_dome()
+
+
+@pytest.fixture(scope="module")
+def found(dome):
+    return infer(dome)
+
+
+def infer(scene, config=CONFIG, cameras=("left", "right")):
+    return infer_reflectance(scene, scene.model, scene.geometry, cameras, config)
+
+
+def errors(scene, estimate, exposure=1.0, least_seen=0.3):
+    """RMSE of the diffuse and of the specular map where seen well, and relative error of the lighting, in one gauge."""
+    size = len(estimate.diffuse)
+    at = (np.arange(size) + 0.5) / size
+    uv = np.stack(np.meshgrid(at, 1 - at), axis=-1).reshape(-1, 2)
+    diffuse = sample_map(scene.diffuse, uv).reshape(size, size, 3)
+    specular = sample_map(scene.specular, uv).reshape(size, size)
+    good = estimate.confidence > 0.9
+    assert good.mean() > least_seen
+    scale = diffuse[good].mean() / estimate.diffuse[good].mean()
+    light = np.linalg.norm(estimate.radiance / (scale * exposure) - scene.radiance) / np.linalg.norm(scene.radiance)
+    return rms(scale * estimate.diffuse - diffuse, good), rms(scale * estimate.specular - specular, good), light
+
+
+def rms(values, where=slice(None)):
+    return float(np.sqrt(np.mean(values[where] ** 2)))
+
+
+def problem_of(scene, shading="prefiltered", bands=4, exponent=EXPONENT, fresnel=8.0, size=SIZE):
+    """What the lighting is found from: observations, image-formation model, and the model's albedo."""
+    surface = Surface(scene, scene.model, scene.geometry, ("left", "right"), size)
+    seen = surface.observe(surface.sample(10**6, np.random.default_rng(0)))
+    albedo = interpolate(scene.geometry.vertex_albedo, scene.model.faces, seen.face, seen.barycentric)
+    return surface, seen, Forward(shading, bands, exponent, fresnel), albedo
+
+
+@pytest.mark.slow
+def test_lighting_has_one_minimum_whatever_the_specular_start(dome):
+    """From zero, saturated and random specular albedo: residual within 5 %, lighting 2 %, maps 0.01."""
+    _, seen, forward, albedo = problem_of(dome)
+    problem = lighting_problem(seen, forward, np.zeros((16, 3)), albedo, True)
+    random = np.random.default_rng(1).random(len(albedo))
+    ends = [solve_lighting(problem, specular=s, iterations=100, tolerance=1e-5) for s in (0.05, 0.0, 1.0, random)]
+    for end in ends[1:]:
+        assert abs(end.unexplained / ends[0].unexplained - 1) < 0.05
+        assert np.linalg.norm(end.radiance - ends[0].radiance) < 0.02 * np.linalg.norm(ends[0].radiance)
+        assert rms(end.specular - ends[0].specular) < 0.01 and rms(end.diffuse - ends[0].diffuse) < 0.01
+
+
+def test_maps_have_one_minimum_whatever_the_start(dome):
+    """With the lighting given the problem is convex: all starts end at the same energy, to 1e-3 of what they fell."""
+    surface, seen, forward, _ = problem_of(dome)
+    shade, glint = forward.shade(seen, dome.radiance)
+    weight = seen.measured[..., None] * np.ones(3, np.float32)
+    systems = TexelSystems.accumulate(seen.colour, weight, shade, glint, surface.pairs, 0.1)
+    prior = np.full((SIZE, SIZE, 4), 0.3, np.float32)
+    where = surface.texels.index[seen.texel]
+
+    def energy(image):
+        x, y = image.reshape(-1, 4)[where, :3].astype(np.float64), image.reshape(-1, 4)[where, 3].astype(np.float64)
+        blocks = (systems.dd * x * x - 2 * systems.dr * x + 2 * systems.ds * x * y[:, None]).sum()
+        blocks += (systems.ss * y * y - 2 * systems.sr * y).sum()
+        offset = image - [0.3, 0.3, 0.3, 0.0]
+        return blocks + np.abs(laplacian(offset)).sum((0, 1)) @ [1e-4, 1e-4, 1e-4, 1e-3]
+
+    starts = (np.zeros_like(prior), np.ones_like(prior), np.random.default_rng(2).random(prior.shape))
+    weights = Smoothness(1e-4, 1e-3)
+    ends = [solve_maps(systems, where, prior, weights, s, iterations=500, tolerance=1e-6) for s in starts]
+    found = [energy(end) for end in ends]
+    assert np.ptp(found) < 1e-3 * min(energy(start) - min(found) for start in starts)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exposure", [1e-3, 1e3])
+def test_exposure_changes_the_lighting_alone(dome, exposure):
+    """The noise model is that of images in 0..1, and so is the smoothness weight: left out, scale falls out exactly."""
+    scaled = dome.changed(lambda f: replace(f, image=f.image * np.float32(exposure)))
+    diffuse, specular, light = errors(dome, infer(scaled, replace(CONFIG, max_iterations=100)), exposure)
+    assert diffuse < 0.03 and specular < 0.05 and light < 0.15
+    plain = replace(CONFIG, robust=False, smoothness_weight=0.0, max_iterations=100)
+    one, other = infer(dome, plain), infer(scaled, plain)
+    good = one.confidence > 0.9
+    assert rms(one.diffuse - other.diffuse, good) < 2e-3 and rms(one.specular - other.specular, good) < 5e-3
+    np.testing.assert_allclose(other.radiance / exposure, one.radiance, atol=0.02 * np.abs(one.radiance).max())
+
+
+def test_pixels_that_are_not_numbers_lend_their_neighbours_nothing(dome, found):
+    rng = np.random.default_rng(0)
+
+    def spoil(frame):
+        image = frame.image.copy()
+        image[rng.random(image.shape[:2]) < 0.05] = rng.choice([np.nan, np.inf, -np.inf])
+        return replace(frame, image=image)
+
+    diffuse, specular, light = errors(dome, infer(dome.changed(spoil)))
+    plain = errors(dome, found)
+    assert diffuse < plain[0] + 0.004 and specular < plain[1] + 0.004 and light < plain[2] + 0.02
+
+
+def test_an_image_that_is_not_a_number_counts_for_nothing(dome):
+    spoiled = replace(dome, frames=dict(dome.frames))
+    for key in [("left", 0), ("right", 3)]:
+        frame = spoiled.frames[key]
+        spoiled.frames[key] = replace(frame, image=np.full_like(frame.image, np.nan))
+    estimate = infer(spoiled)
+    assert np.isfinite(estimate.radiance).all()
+    assert errors(dome, estimate)[0] < 0.02
+
+
+def test_two_equal_views_are_worth_one(dome):
+    twins, one = infer(dome, cameras=("left", "left")), infer(dome, cameras=("left",))
+    np.testing.assert_allclose(twins.radiance, one.radiance, atol=0.02 * np.abs(one.radiance).max())
+    good = one.confidence > 0.9
+    assert rms(twins.diffuse - one.diffuse, good) < 0.005 and rms(twins.specular - one.specular, good) < 0.01
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_without_highlights_the_specular_map_goes_to_zero_not_to_noise(variant, noise):
+    rng = np.random.default_rng(0)
+    matt = turning_dome(gloss=0.0).changed(
+        lambda f: replace(f, image=f.image + rng.normal(0, noise, f.image.shape).astype(np.float32))
+    )
+    estimate = infer(matt)
+    good = estimate.confidence > 0.9
+    assert estimate.specular[good].mean() < 0.006 and np.percentile(estimate.specular[good], 95) < 0.02
+    assert errors(matt, estimate)[0] < 0.01
+
+
+@pytest.mark.parametrize("exponent", [1000.0, 10_000.0])
+def test_mirror_like_highlights(variant, exponent):
+    shiny = turning_dome(exponent=exponent)
+    diffuse, specular, light = errors(shiny, infer(shiny, replace(CONFIG, exponent=exponent)))
+    assert diffuse < 0.01 and specular < 0.015 and light < 0.05
+
+
+@pytest.mark.parametrize("level", [0.6, 0.35])
+def test_saturated_images(dome, level):
+    """Clipped pixels bound from below: a third or nearly all of them leave finite maps in the box."""
+    clipped = dome.changed(
+        lambda f: replace(f, image=np.minimum(f.image, level), clipped=(f.image >= level).any(-1) & f.valid)
+    )
+    share = np.mean([f.clipped[f.valid].mean() for f in clipped.frames.values()])
+    assert 0.2 < share < 0.999
+    estimate = infer(clipped)
+    for image in (estimate.diffuse, estimate.specular):
+        assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
+    assert np.isfinite(estimate.radiance).all()
+    if level == 0.6:
+        assert errors(dome, estimate, least_seen=0.2)[0] < 0.02
+
+
+def test_images_that_are_wholly_clipped_are_refused(dome):
+    with pytest.raises(InputError, match="clipped or invalid"):
+        infer(dome.changed(lambda f: replace(f, clipped=f.valid.copy())))
+
+
+def directions(count=400, seed=0):
+    """Unit normals and views on their side."""
+    n, v = np.random.default_rng(seed).normal(size=(2, count, 3))
+    n, v = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (n, v))
+    return n, v * np.sign((n * v).sum(1))[:, None]
+
+
+@pytest.mark.parametrize("order", [4, 10])
+@pytest.mark.parametrize(("exponent", "fresnel"), [(5.0, None), (EXPONENT, 8.0), (1000.0, 8.0), (1000.0, None)])
+def test_prefiltered_shading_in_float32_is_that_in_float64(variant, order, exponent, fresnel):
+    n, v = directions()
+    radiance = np.random.default_rng(1).normal(size=(order**2, 3)) / (1 + sh.bands(order)[:, None])
+    cosine = (n * v).sum(1)
+    mirror = 2 * cosine[:, None] * n - v
+    moments = blinn_phong.lobe_table(order)(cosine if fresnel is None else np.ones_like(cosine), exponent)
+    if fresnel is None:
+        axis = mirror + moments[1][:, None] * (n - mirror)
+        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+        albedo = moments[0]
+    else:
+        axis, albedo = mirror, moments[0] * (1 + fresnel * (1 - cosine) ** 5)
+    factors = albedo * np.concatenate([np.ones((1, len(n))), moments[2:]])
+    glint = (factors[sh.bands(order)].T * sh.basis(axis, order)) @ radiance
+    body = sh.SHLighting(radiance).irradiance(n) / np.pi
+    white = np.ones((len(n), 3))
+    d, s = shade_points(n, v, white, white[:, 0], radiance, 0.0, exponent, "prefiltered", fresnel=fresnel)
+    assert np.abs(d - body).max() < 1e-5 * np.abs(body).max()
+    assert np.abs(s - glint).max() < 3e-5 * np.abs(glint).max()
+
+
+@pytest.mark.parametrize("exponent", [1.0, 5.0, 1000.0])
+def test_the_papers_shading_in_float32_is_that_in_float64(variant, exponent):
+    n, v = directions()
+    # Grey: Mitsuba's luminance has one more digit than ours, which turns the dominant direction of coloured light.
+    radiance = np.repeat(np.random.default_rng(2).normal(size=(9, 1)), 3, axis=1)
+    radiance[0] = 4.0
+    light = sh.SHLighting(radiance)
+    d, body = light.dominant_direction(), light.irradiance(n) / np.pi
+    h = v + d
+    cos_h = np.maximum((n * (h / np.linalg.norm(h, axis=1, keepdims=True))).sum(1), 0.0)
+    c = np.maximum(n @ d, 0.0)
+    glint = body * (cos_h**exponent * c / (c**2 + GUARD**2))[:, None]
+    white = np.ones((len(n), 3))
+    _, s = shade_points(n, v, white, white[:, 0], radiance, 0.0, exponent, "paper")
+    assert np.abs(s - glint).max() < 2e-4 * np.abs(glint).max()
+
+
+WEAK = LightingPriors(roughness=1e-10, negative=0.0, albedo=1e-6, specular=1e-6)
+"""Data without noise need no more than what keeps the system regular."""
+
+
+def recover(scene, shading, bands, exponent, fresnel, monkeypatch):
+    """Lighting and maps from the fast solver's own start, both solved to the end."""
+    weak = {"priors": WEAK, "tolerance": 1e-7}
+    monkeypatch.setattr(choice, "solve_lighting", lambda *a, **k: solve_lighting(*a, **{**k, **weak}))
+    surface, seen, forward, albedo = problem_of(scene, shading, bands, exponent, fresnel, FINE)
+    if shading == "shadowed":
+        forward = replace(forward, traced=surface.trace(bands), faces=scene.model.faces)
+    config = replace(CONFIG, shading=shading, bands=bands, exponent=exponent)
+    light = fit_lighting(seen, forward, albedo, config, 100)
+    shade, glint = forward.shade(seen, light.radiance)
+    weight = seen.measured[..., None] * np.ones(3, np.float32)
+    colour = seen.colour - np.float32(light.ambient)
+    systems = TexelSystems.accumulate(colour, weight, shade, glint, surface.pairs, 0.1)
+    prior = np.full((FINE, FINE, 4), 0.3, np.float32)
+    where = surface.texels.index[seen.texel]
+    maps = solve_maps(systems, where, prior, Smoothness(0.0, 0.0), prior_weight=1e-7, iterations=1000, tolerance=1e-7)
+    confidence = surface.texels.to_map(surface.quality())
+    return light, maps, confidence
+
+
+RECOVERED = (0.005, 0.01, 0.01)
+"""RMSE of diffuse and specular albedo, relative error of the lighting."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shading", ["paper", "prefiltered", "shadowed"])
+def test_own_shading_is_recovered(variant, shading, monkeypatch):
+    """Data without noise, and priors that only keep the system regular.
+
+    With the default priors, which real images need, such data give 0.006, 0.008 and 0.02: most of it is the penalty
+    on negative radiance, which this lighting has in places, and the rest the pull to the model's albedo. The start is
+    `als`'s own: from zero specular albedo the default priors lead to the same minimum (tested above), but without
+    priors the solver ends elsewhere.
+    """
+    paper = shading == "paper"
+    exponent, fresnel, bands = (5.0, None, 3) if paper else (EXPONENT, 8.0, 4)
+    scene = turning_dome(shading, fresnel, exponent=exponent, depth=2.0)  # a shallow one shows too few normals
+    light, maps, confidence = recover(scene, shading, bands, exponent, fresnel, monkeypatch)
+    estimate = SimpleNamespace(
+        diffuse=maps[..., :3], specular=maps[..., 3], confidence=confidence, radiance=light.radiance
+    )
+    for value, limit in zip(errors(scene, estimate), RECOVERED, strict=True):
+        assert value < limit
