@@ -34,6 +34,8 @@ def test_nested_values_and_integers_for_floats():
         ({"reflectance": {"texture_size": True}}, "expected a value of type int"),
         ({"reflectance": {"solver": "sgd"}}, "expected one of"),
         ({"reflectance": 3}, "expected a table"),
+        ({"shape": {"rounds": -1}}, "shape.rounds: found -1, expected 0 to 10"),
+        ({"shape": {"shading_weight": 0}}, "shape.shading_weight: found 0.0, expected a number above 0"),
         ({"mesh": {"subdivisions": 9}}, "mesh.subdivisions: found 9, expected 0 to 3"),
         ({"mesh": {"detail": 0}}, "mesh.detail: found 0.0, expected a number above 0"),
     ],

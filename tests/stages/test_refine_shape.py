@@ -111,3 +111,31 @@ def test_shape_is_found_through_unknown_paint(scene):
 
     assert degrees(before) > 1.0
     assert degrees(after) < 0.1 * degrees(before)
+
+
+@pytest.mark.slow
+def test_a_fit_with_a_round_of_shading_keeps_every_stage(tiny_capture, variant, tmp_path):
+    import mifit
+    from mifit.config import FitConfig, ReflectanceConfig, ShapeConfig
+
+    capture, model = mifit.Capture.load(tiny_capture), mifit.MorphableModel.load("builtin:coarse")
+    reflectance = ReflectanceConfig(texture_size=64, shading="prefiltered", exponent=100.0)
+
+    def fit(rounds):
+        config = FitConfig(reflectance=reflectance, shape=ShapeConfig(rounds))
+        return mifit.fit(capture, model, ["left", "right"], [0, 1], config, "reflectance", checkpoints=tmp_path)
+
+    plain, found = fit(0), fit(1)
+    assert {p.name for p in tmp_path.glob("*.npz")} == {
+        f"{name}.npz" for name in ("geometry", "reflectance", "geometry_1", "reflectance_1")
+    }
+    energies = found.geometry.report.energies
+    assert sum(v[-1] for v in energies.values()) < sum(v[0] for v in energies.values())
+    assert energies["shading"][-1] < energies["shading"][0]
+    assert found.geometry.report.details["phases"][-1]["name"] == "shading"
+    moved = np.linalg.norm(found.geometry.vertices - plain.geometry.vertices, axis=-1)
+    assert 0 < moved.max() < 1.0  # centimetres
+    np.testing.assert_allclose(
+        found.geometry.rotation @ found.geometry.rotation.transpose(0, 2, 1), np.tile(np.eye(3), (2, 1, 1)), atol=1e-9
+    )
+    assert found.seconds > plain.seconds
