@@ -149,6 +149,7 @@ def alternate(
     """
     terms = energies(surface, forward, found.radiance, found.ambient, maps, albedo, config)
     history = {name: [value] for name, value in terms.items()}
+    converged = False
     for _ in range(ROUNDS):
         radiance, ambient = exact_lighting(surface, forward, found, maps, config)
         before = sum(terms.values())
@@ -160,13 +161,15 @@ def alternate(
             if sum(trial_terms.values()) < before:
                 break
         else:
+            converged = True
             break
         found, maps, terms = trial, trial_maps, trial_terms
         for name, value in terms.items():
             history[name].append(value)
         if before - sum(terms.values()) < 1e-3 * before:
+            converged = True
             break
-    return found, maps, history
+    return replace(found, converged=converged), maps, history
 
 
 def exact_lighting(

@@ -27,6 +27,8 @@ EXPLAINED = 0.03
 """A costlier shading model is taken where it lowers the residual by more than this part."""
 FAINT = 0.2
 """Irradiance of a compact light, relative to that of all other light: below, it is taken for a flaw of the model."""
+START_ITERATIONS = 5
+"""Gauss-Newton iterations where they are only a start: the objective over all texels is minimised afterwards."""
 MODELS = ("paper", "prefiltered", "shadowed", "keyed")
 """Image-formation models from cheap to costly."""
 
@@ -53,10 +55,11 @@ def choose_lighting(
     tried: dict[str, tuple[Forward, LightingSolution]] = {}
     auto = config.shading == "auto"
     total = len(MODELS) if auto else 1
+    iterations = config.max_iterations if config.robust else min(START_ITERATIONS, config.max_iterations)
 
     def attempt(name: str, forward: Forward) -> None:
         progress("Reflectance lighting", len(tried), total)
-        tried[name] = forward, fit_lighting(seen, forward, albedo, config, config.max_iterations)
+        tried[name] = forward, fit_lighting(seen, forward, albedo, config, iterations)
 
     if auto or config.shading == "paper":
         attempt("paper", Forward("paper", 3, config.exponent or PAPER_EXPONENT))
