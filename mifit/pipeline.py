@@ -202,13 +202,13 @@ def calibrated(capture: Capture, model: MorphableModel, cameras: Sequence[str], 
 
 
 def check_images(capture: Capture, cameras: Sequence[str], timesteps: Sequence[int]) -> None:
-    """Raise InputError for an image that is black throughout: a camera that dropped it, or a file written too early."""
+    """Raise InputError for an image that is black or clipped throughout: nothing of the face can be measured in it."""
     for timestep in timesteps:
         for name in cameras:
             frame = capture.frame(name, timestep)
-            if not (frame.image[frame.valid] > 0).any():
+            if not (frame.image[frame.valid & ~frame.clipped] > 0).any():
                 raise InputError(
-                    f"camera {name}, timestep {timestep}: every usable pixel is black, expected a photograph; "
+                    f"camera {name}, timestep {timestep}: every usable pixel is black or clipped, expected a photo; "
                     "leave the camera or the timestep out, or check its mask"
                 )
 

@@ -10,18 +10,21 @@ from mifit.pipeline import check_images, one_place
 from tests.output.conftest import ball_camera, ball_result
 
 
-def capture_of(image, valid):
-    return SimpleNamespace(frame=lambda name, timestep: SimpleNamespace(image=image, valid=valid))
+def capture_of(image, valid, clipped=False):
+    frame = SimpleNamespace(image=image, valid=valid, clipped=np.full(valid.shape, clipped))
+    return SimpleNamespace(frame=lambda name, timestep: frame)
 
 
 def test_an_image_without_light_is_refused():
     image, valid = np.zeros((4, 5, 3), np.float32), np.ones((4, 5), bool)
-    with pytest.raises(InputError, match="camera left, timestep 3: every usable pixel is black"):
+    with pytest.raises(InputError, match="camera left, timestep 3: every usable pixel is black or clipped"):
         check_images(capture_of(image, valid), ["left"], [3])
     image[1, 2, 0] = 1e-4
     check_images(capture_of(image, valid), ["left"], [3])
     with pytest.raises(InputError, match="black"):
         check_images(capture_of(image, image[..., 0] == 0), ["left"], [3])
+    with pytest.raises(InputError, match="clipped"):
+        check_images(capture_of(image + 1, valid, clipped=True), ["left"], [3])
 
 
 def test_views_from_one_place_bring_a_warning():
