@@ -105,7 +105,7 @@ def test_the_albedo_under_the_hand_stays_clean(occluded, clean):
     moved = np.abs(fitted.diffuse - before.diffuse).reshape(-1, 3)[row]
     painted = np.abs(np.float32(HAND) - clean.frames[VIEW].image[shape]).mean()
     assert under.sum() > 50 and painted > 0.1  # a hand unlike the skin under it
-    assert np.median(moved) < 0.004 and np.sqrt((moved**2).mean()) < 0.01
+    assert np.median(moved) < 0.01 and np.sqrt((moved**2).mean()) < 0.02  # of albedos about 0.4
 
 
 def test_clipped_pixels_are_counted_apart(clean):
