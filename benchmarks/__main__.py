@@ -10,7 +10,7 @@ from pathlib import Path
 from benchmarks.record import RESULTS, SHARED, renew_tables
 
 RUNS = (
-    ("table1", ["--reduced", "--subjects", "3", "--work", "out/table1_reduced"]),
+    ("table1", ["--reduced", "--subjects", "3", "--jobs", "2", "--work", "out/table1_reduced"]),
     ("captures", []),
 )
 README = Path(__file__).resolve().parents[1] / "README.md"

@@ -35,7 +35,7 @@ def run_capture(name: str, work: Path) -> dict[str, Any]:
     return {
         **{key: found[key] for key in ("region", "region_pixels", "methods")},
         **mesh_error(result, capture),
-        "shading": result.reflectance.shading_model if result.reflectance else None,
+        "shading": result.reports["reflectance"].details["shading"]["chosen"],
         "seconds": {stage: round(report.seconds, 1) for stage, report in result.reports.items()},
         "outcomes": {stage: report.outcome for stage, report in result.reports.items()},
         "peak_memory_mb": round(result.peak_memory / 2**20),
