@@ -116,6 +116,12 @@ def markdown(rows: list[dict[str, Any]], failures: dict[int, str]) -> str:
             lines.append(f"| {method} | {' | '.join(cells)} | {PAPER[method][0]} | {PAPER[method][1]} |")
         lines += ["", "| against the truth | mean ± spread |", "|---|---|"]
         lines += [f"| {text} | {_mean(table['truth'], key, digits)} |" for key, (_, text, digits) in TRUTHS.items()]
+        lines += ["", "| mean of | subjects | " + " | ".join(METHODS) + " |", "|---|---|" + "---|" * len(METHODS)]
+        for kind in ("light", "tone"):
+            for value in dict.fromkeys(sorted(row[kind] for row in rows)):
+                of = [row for row in rows if row[kind] == value]
+                means = (statistics.fmean(row["methods"][m]["psnr"] for row in of) for m in METHODS)
+                lines.append(f"| {kind} {value} | {len(of)} | " + " | ".join(f"{x:.2f}" for x in means) + " |")
     titles = ["subject", "light", "tone", *METHODS, "full SSIM", "full FLIP"]
     titles += [short for short, _, _ in TRUTHS.values()] + ["seconds"]
     lines += ["", "| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
