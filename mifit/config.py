@@ -102,6 +102,8 @@ class ReflectanceConfig:
     robust : bool
         Give outliers less weight, and weight by a noise model (``als``); without it ``als`` minimises the paper's
         objective as it stands.
+    symmetric_fill : bool
+        Fill what no image shows from the opposite half of the face, where that was seen.
     max_iterations : int
         Gauss-Newton iterations (``als``), or tens of gradient steps (``adam``).
     """
@@ -115,6 +117,7 @@ class ReflectanceConfig:
     smoothness_weight: float = 0.001
     specular_smoothness: float = 1000.0
     robust: bool = True
+    symmetric_fill: bool = False
     max_iterations: int = 30
 
 

@@ -16,7 +16,7 @@ from mifit.progress import Progress, silent
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.als import fit_als
 from mifit.stages.reflectance.descent import fit_adam
-from mifit.stages.reflectance.fill import blend_unseen
+from mifit.stages.reflectance.fill import blend_unseen, mirrored_coordinates
 from mifit.stages.reflectance.objective import energies
 
 if TYPE_CHECKING:
@@ -71,6 +71,7 @@ def infer_reflectance(
     config = config or ReflectanceConfig()
     _check(config)
     surface = Surface(capture, model, geometry, cameras, config.texture_size)
+    mirrored = mirrored_coordinates(model, surface.texels) if config.symmetric_fill else None
     albedo = interpolate(geometry.vertex_albedo, model.faces, surface.texels.face, surface.texels.weights)
     albedo = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float32)
     solve = fit_adam if config.solver == "adam" else fit_als
@@ -78,7 +79,7 @@ def infer_reflectance(
     if not (np.isfinite(fitted.maps).all() and np.isfinite(fitted.radiance).all()):
         raise ConvergenceError("stage 2 (reflectance): the maps or the lighting are not finite; see the images' range")
     quality = surface.quality()
-    diffuse, specular, confidence = blend_unseen(surface.texels, albedo, fitted.maps, quality)
+    diffuse, specular, confidence = blend_unseen(surface.texels, albedo, fitted.maps, quality, mirrored)
     if not fitted.converged:
         warnings = (*warnings, "the lighting had not converged when the iterations ran out; raise max_iterations")
     details: dict = {

@@ -6,14 +6,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.uv import TexelMap
+from mifit.core.mesh import interpolate
+from mifit.core.uv import TexelMap, sample_map
+from mifit.errors import InputError
+from mifit.morphable import MorphableModel
 
 BLEND = 0.05
 """Confidence at which a texel's own estimate counts as much as its surroundings'."""
 
 
 def blend_unseen(
-    texels: TexelMap, albedo: NDArray, maps: NDArray, quality: NDArray
+    texels: TexelMap, albedo: NDArray, maps: NDArray, quality: NDArray, mirrored: NDArray | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Replace texels that were hardly seen by the model's albedo plus a smooth offset from the seen ones.
 
@@ -26,23 +29,51 @@ def blend_unseen(
         Diffuse and specular albedo from the images.
     quality : (N,)
         How often and how well each texel was seen, 0..1.
+    mirrored : (N, 2), optional
+        Texture coordinates of the point opposite to each texel: a texel that was hardly seen first takes the offset
+        found there.
 
     Returns
     -------
     diffuse : (S, S, 3), specular : (S, S), confidence : (S, S) float32
+        Confidence counts what was seen, not what was filled in.
     """
     confidence = texels.to_map(quality.astype(np.float32))
     expected = texels.to_map(albedo.astype(np.float32))
     offset = maps.copy()
     offset[..., :3] -= expected
-    smooth = pull_push(offset, confidence)
-    share = (confidence / (confidence + BLEND))[..., None]
+    known = confidence
+    if mirrored is not None:
+        there = texels.to_map(sample_map(confidence, mirrored))
+        opposite = texels.to_map(sample_map(offset * confidence[..., None], mirrored))
+        opposite /= np.maximum(there, 1e-12)[..., None]
+        known = confidence + there * (1.0 - np.clip(confidence / BLEND, 0.0, 1.0))
+        own = (confidence / np.maximum(known, 1e-12))[..., None]
+        offset = own * offset + (1.0 - own) * opposite
+    smooth = pull_push(offset, known)
+    share = (known / (known + BLEND))[..., None]
     blended = share * offset + (1.0 - share) * smooth
     blended[..., :3] += expected
     blended = np.clip(blended, 0.0, 1.0)
     outside = ~texels.mask
     blended[outside] = 0.0
     return blended[..., :3].astype(np.float32), blended[..., 3].astype(np.float32), confidence
+
+
+def mirrored_coordinates(model: MorphableModel, texels: TexelMap) -> NDArray[np.float64]:
+    """(N, 2) texture coordinates of the point opposite to each texel on the other half of the face.
+
+    Raises
+    ------
+    InputError
+        The model doesn't say which vertices are opposite to one another.
+    """
+    if model.symmetry is None:
+        raise InputError(f"reflectance.symmetric_fill: model {model.name!r} has no symmetry; leave it false")
+    inside = model.face_mask
+    of_vertex = np.zeros((len(model.mean), 2))
+    of_vertex[model.faces[inside].ravel()] = model.uv[model.faces_uv[inside].ravel()]
+    return interpolate(of_vertex[model.symmetry], model.faces, texels.face, texels.weights)
 
 
 def pull_push(image: NDArray, weight: NDArray) -> NDArray[np.float32]:
