@@ -91,7 +91,7 @@ def main() -> int:
     model = MorphableModel.load(MODEL)
     rows: dict[str, dict[str, Any]] = {}
     base = ReflectanceConfig(texture_size=a.size)
-    small = ReflectanceConfig(texture_size=a.adam_size, shading="paper", robust=False)
+    small = ReflectanceConfig(texture_size=a.adam_size, shading="paper", robust=False, specular_smoothness=30.0)
     for name in a.names:
         runs = {
             f"als {shading}": replace(base, shading=shading)
