@@ -245,12 +245,13 @@ def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]
     rest = len(result.timesteps) - len(timesteps)
     more = f'<p class="soft">{rest} more timesteps are in the result but not on this page.</p>' if rest else ""
     swatches = "".join(
-        f'<span style="background:rgb{colour};padding:0 .6em;margin:0 .3em 0 1em"></span>{name}'
+        f'<span><i style="background:rgb{colour};height:12px"></i>{name}</span>'
         for colour, name in ((CLIPPED_TINT, "clipped"), (UNEXPLAINED_TINT, "explained by no lighting and albedo"))
     )
     key = (
         '<p class="soft">Cyan rings: detected landmarks. Orange dots: the fitted model\'s.</p>'
-        f'<p class="scale">Not used, or outvoted by the other images:{swatches}. Percentages are of the face area.</p>'
+        f'<p class="legend"><span>Not used, or outvoted by the other images:</span>{swatches}'
+        "<span>Percentages are of the face area.</span></p>"
     )
     return key + "".join(parts) + more
 
