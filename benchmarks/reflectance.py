@@ -10,6 +10,7 @@ The third view is rendered by `mifit.output` and compared over the true face are
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from dataclasses import replace
 from typing import Any
@@ -81,6 +82,13 @@ def markdown(rows: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def recorded_rows(size: int, adam_size: int) -> dict[str, dict[str, Any]]:
+    """Rows of an earlier run at the same sizes: captures that are not named now keep them."""
+    path = RESULTS / "reflectance.json"
+    figures = json.loads(path.read_text())["figures"] if path.exists() else {}
+    return figures["rows"] if (figures.get("size"), figures.get("adam_size")) == (size, adam_size) else {}
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", default=["soft", "gloss", "hard"])
@@ -89,7 +97,7 @@ def main() -> int:
     a = parser.parse_args()
     mifit.set_variant("auto")
     model = MorphableModel.load(MODEL)
-    rows: dict[str, dict[str, Any]] = {}
+    rows = recorded_rows(a.size, a.adam_size)
     base = ReflectanceConfig(texture_size=a.size)
     small = ReflectanceConfig(texture_size=a.adam_size, shading="paper", robust=False, specular_smoothness=30.0)
     for name in a.names:
