@@ -84,9 +84,7 @@ def rasterize_uv(uv: NDArray, faces_uv: NDArray, size: int, face_mask: NDArray |
         w = np.stack([1.0 - w1 - w2, w1, w2], axis=1)  # degenerate faces give NaN or infinity, refused below
     inside = (w >= -1e-9).all(1) & np.isfinite(w).all(1)
     flat, first = np.unique((y * size + x)[inside], return_index=True)
-    return TexelMap(
-        size, flat, selected[tri[inside][first]].astype(np.int32), w[inside][first].astype(np.float32)
-    )
+    return TexelMap(size, flat, selected[tri[inside][first]].astype(np.int32), w[inside][first].astype(np.float32))
 
 
 def sample_map(image: NDArray, uv: NDArray) -> NDArray:
