@@ -170,7 +170,7 @@ def ablate(scene: Scene, size: int, check: int) -> dict[str, Any]:
         """Stage 2 with changed settings on the base's geometry, of its first timesteps."""
 
         def fit() -> Fitted:
-            used = first_timesteps(geometry, count)
+            used = geometry.at(geometry.timesteps[:count])
             return geometry, scene.reflectance(used, replace(config, **changes), cameras), None
 
         return fit
@@ -218,19 +218,6 @@ def ablate(scene: Scene, size: int, check: int) -> dict[str, Any]:
     if check != size:
         table.add(f"texture: {check} texels", stage2(texture_size=check))
     return {"rows": table.rows, "geometry_seconds": round(geometry.report.seconds, 2)}
-
-
-def first_timesteps(geometry: GeometryEstimate, count: int) -> GeometryEstimate:
-    """The first timesteps of a fit."""
-    part = slice(0, count)
-    return replace(
-        geometry,
-        timesteps=geometry.timesteps[part],
-        expression=geometry.expression[part],
-        rotation=geometry.rotation[part],
-        translation=geometry.translation[part],
-        vertices=geometry.vertices[part],
-    )
 
 
 def markdown(captures: dict[str, dict[str, Any]]) -> str:

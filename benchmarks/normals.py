@@ -28,7 +28,7 @@ from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.output.evaluate import evaluate
 from mifit.output.tracking import extend
 from mifit.stages.refine_mesh import refine_mesh, split_faces
-from mifit.stages.refine_normals import frame_problem, one_timestep, refine_normals
+from mifit.stages.refine_normals import frame_problem, refine_normals
 from mifit.stages.track import track
 
 WEIGHTS = (0.3, 3.0)
@@ -43,7 +43,7 @@ def solver_speed(result: Reconstruction, capture: Capture, texels: TexelMap) -> 
         problem, rows, _ = frame_problem(
             capture,
             result.model,
-            one_timestep(result.geometry, 0),
+            result.geometry.at(result.geometry.timesteps[:1]),
             result.reflectance,
             [c.name for c in result.cameras],
             NormalsConfig(magnitude_weight=weight),

@@ -46,7 +46,7 @@ from mifit.stages.geometry.refine import priors_of
 from mifit.stages.geometry.start import OUTLIER_PIXELS, initial_state, landmark_views
 from mifit.stages.geometry.visibility import Visibility, spread_points
 from mifit.stages.observations import Surface
-from mifit.stages.refine_normals import frame_problem, one_timestep
+from mifit.stages.refine_normals import frame_problem
 from mifit.stages.reflectance.als import LIGHTING_TEXELS
 from mifit.stages.reflectance.choice import FRESNEL, lighting_problem
 from mifit.stages.reflectance.forward import Forward
@@ -315,7 +315,7 @@ def stage3(capture: Capture, model: MorphableModel, truth: Any, size: int) -> di
         capture, model, truth, CAMERAS, ReflectanceConfig(texture_size=size, shading="prefiltered", max_iterations=3)
     )
     texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
-    problem, _, _ = frame_problem(capture, model, one_timestep(truth, 0), maps, CAMERAS, NormalsConfig(), texels)
+    problem, _, _ = frame_problem(capture, model, truth.at(truth.timesteps[:1]), maps, CAMERAS, NormalsConfig(), texels)
     assert problem is not None
     one, two = (
         of_history(lambda: problem.gauss_newton(1, tolerance=0.0)),

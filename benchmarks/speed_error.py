@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 import mifit
-from benchmarks.ablation import MODEL, first_timesteps
+from benchmarks.ablation import MODEL
 from benchmarks.fit_geometry import vertex_errors
 from benchmarks.measure import Cost, conditions, exponent, measured
 from benchmarks.record import RESULTS, SHARED, record
@@ -44,7 +44,7 @@ from mifit.core.files import write_text
 from mifit.core.mesh import vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.stages.fit_geometry import fit_geometry
-from mifit.stages.refine_normals import frame_problem, one_timestep, refine_normals
+from mifit.stages.refine_normals import frame_problem, refine_normals
 
 CAPTURE, CAMERAS = "gloss", ("left", "right")
 TIMESTEPS = (0, 1, 2, 3)
@@ -181,7 +181,7 @@ def normals() -> Row:
     d = data()
     texels = rasterize_uv(d.model.uv, d.model.faces_uv, SIZE, d.model.face_mask)
     problem, rows, _ = frame_problem(
-        d.capture, d.model, one_timestep(d.truth, 0), maps_of(SIZE), CAMERAS, NormalsConfig(), texels
+        d.capture, d.model, d.truth.at(d.truth.timesteps[:1]), maps_of(SIZE), CAMERAS, NormalsConfig(), texels
     )
     assert problem is not None
     problem.adam(2)
@@ -210,7 +210,7 @@ def work() -> Row:
         rows.append({"size": size, "texels": seen, "third_db": d.third_db(found), **cost.figures()})
         note("work", rows[-1])
     out["stage 2 over texels"] = grown(rows, "texels")
-    rows, frame = [], one_timestep(d.truth, 0)
+    rows, frame = [], d.truth.at(d.truth.timesteps[:1])
     for size in (64, 128, 256):
         maps = maps_of(size)
         cost = best(lambda m=maps: refine_normals(d.capture, d.model, frame, m, CAMERAS, NormalsConfig()), 1)
@@ -221,7 +221,7 @@ def work() -> Row:
     for views in VIEWS:
         rows = []
         for count in (1, 2, 4):
-            used = first_timesteps(d.truth, count)
+            used = d.truth.at(d.truth.timesteps[:count])
             with measured() as cost:
                 found = d.reflectance(config, used, CAMERAS[:views])
             row = {"views": views, "timesteps": count, "third_db": d.third_db(found), **cost.figures()}
@@ -318,7 +318,7 @@ def first() -> Row:
 def cold() -> Row:
     """What `first` runs in its process."""
     d = data()
-    frame = one_timestep(d.truth, 0)
+    frame = d.truth.at(d.truth.timesteps[:1])
     maps = {name: ReflectanceConfig(texture_size=64, shading=name) for name in ("paper", "prefiltered", "shadowed")}  # type: ignore
     camera = d.capture.camera("third")
     found: dict[str, ReflectanceEstimate] = {}

@@ -7,7 +7,7 @@ morphable model's: ``world = scale * rotation @ object + translation``.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +88,18 @@ class GeometryEstimate:
         if timestep not in self.timesteps:
             raise KeyError(timestep)
         return self.timesteps.index(timestep)
+
+    def at(self, timesteps: Sequence[int]) -> GeometryEstimate:
+        """The fit of some of its timesteps, in the given order; KeyError as in `index`."""
+        rows = [self.index(t) for t in timesteps]
+        return replace(
+            self,
+            timesteps=tuple(timesteps),
+            expression=self.expression[rows],
+            rotation=self.rotation[rows],
+            translation=self.translation[rows],
+            vertices=self.vertices[rows],
+        )
 
 
 @dataclass(frozen=True)

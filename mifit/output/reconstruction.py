@@ -146,13 +146,12 @@ class Reconstruction:
             The result has no refined mesh.
         """
         from mifit.stages.refine_mesh import finer_model, split_faces
-        from mifit.stages.track import subset
 
         if self.mesh is None:
             raise InputError("this result has no refined mesh; fit with --until normals, which makes it")
         matrix = split_faces(self.model, self.mesh.subdivisions).matrix
         geometry = replace(
-            subset(self.geometry, self.mesh.timesteps),
+            self.geometry.at(self.mesh.timesteps),
             vertices=self.mesh.vertices,
             vertex_albedo=(matrix @ self.geometry.vertex_albedo).astype(np.float32),
         )

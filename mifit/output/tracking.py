@@ -15,7 +15,7 @@ from mifit.errors import InputError
 from mifit.output.folder import add_timestep
 from mifit.progress import Progress, silent
 from mifit.stages.refine_mesh import MeshRefiner
-from mifit.stages.track import TrackedFrame, subset, track
+from mifit.stages.track import TrackedFrame, track
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -156,7 +156,7 @@ def _without(result: Reconstruction, dropped: Sequence[int]) -> Reconstruction:
     details = {**report.details, "tracked": [t for t in report.details["tracked"] if t not in dropped]}
     return replace(
         result,
-        geometry=subset(result.geometry, [t for t in result.timesteps if t not in dropped]),
+        geometry=result.geometry.at([t for t in result.timesteps if t not in dropped]),
         normals=NormalsEstimate(
             tuple(normals.timesteps[i] for i in rows), normals.normal_object[rows], replace(report, details=details)
         ),

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -83,7 +83,7 @@ def refine_normals(
     outcome = "converged"
     for i, timestep in enumerate(geometry.timesteps):
         progress("refine normals", i, len(geometry.timesteps))
-        frame = refine_frame(capture, model, one_timestep(geometry, i), reflectance, cameras, config, texels, seed=seed)
+        frame = refine_frame(capture, model, geometry.at((timestep,)), reflectance, cameras, config, texels, seed=seed)
         normals.append(texels.to_map(frame.normal_object))
         if frame.seen == 0.0:
             warnings.append(f"timestep {timestep}: no camera measures the face; normals are the model's")
@@ -240,19 +240,6 @@ def frame_problem(
         drawn,
     )
     return problem, rows, base
-
-
-def one_timestep(geometry: GeometryEstimate, index: int) -> GeometryEstimate:
-    """The part of a fit that belongs to one of its timesteps."""
-    part = slice(index, index + 1)
-    return replace(
-        geometry,
-        timesteps=geometry.timesteps[part],
-        expression=geometry.expression[part],
-        rotation=geometry.rotation[part],
-        translation=geometry.translation[part],
-        vertices=geometry.vertices[part],
-    )
 
 
 def check_maps(reflectance: ReflectanceEstimate) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +24,7 @@ from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
 from mifit.stages.fit_geometry import fit_pose_expression
 from mifit.stages.geometry.refine import texture_reference
-from mifit.stages.refine_normals import check_maps, one_timestep, refine_frame
+from mifit.stages.refine_normals import check_maps, refine_frame
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -110,14 +110,14 @@ def track(
     config, geometry_config = config or NormalsConfig(), geometry_config or GeometryConfig()
     check_timesteps(capture.timesteps, geometry.timesteps, timesteps)
     texels = rasterize_uv(model.uv, model.faces_uv, check_maps(reflectance), model.face_mask)
-    home = subset(geometry, geometry.timesteps if fitted is None else fitted)
+    home = geometry.at(geometry.timesteps if fitted is None else fitted)
     reference = texture_reference(capture, model, home, cameras, geometry_config, seed)
-    last = one_timestep(geometry, len(geometry.timesteps) - 1)
+    last = geometry.at(geometry.timesteps[-1:])
     memory = _Memory(model, texels)
     if normals is not None:
         for timestep in [t for t in geometry.timesteps if t in normals.timesteps][-MEMORY:]:
             memory.add(
-                one_timestep(geometry, geometry.index(timestep)),
+                geometry.at((timestep,)),
                 texels.from_map(normals.normal_object[normals.timesteps.index(timestep)]),
             )
     progress("track", 0, len(timesteps))
@@ -235,16 +235,3 @@ class _Memory:
     def _base(self, vertices: NDArray) -> NDArray:
         faces, texels = self._model.faces, self._texels
         return normalize(interpolate(vertex_normals(vertices, faces), faces, texels.face, texels.weights))
-
-
-def subset(geometry: GeometryEstimate, timesteps: Sequence[int]) -> GeometryEstimate:
-    """Some timesteps of a fit."""
-    rows = [geometry.index(t) for t in timesteps]
-    return replace(
-        geometry,
-        timesteps=tuple(timesteps),
-        expression=geometry.expression[rows],
-        rotation=geometry.rotation[rows],
-        translation=geometry.translation[rows],
-        vertices=geometry.vertices[rows],
-    )

@@ -19,7 +19,6 @@ from mifit.output.figures import overlay
 from mifit.output.sequence import write_moving_pictures, write_overlay, write_sequence, write_video
 from mifit.output.surface import part_of, split_at_seams
 from mifit.output.turntable import on_backdrop, orbit_camera
-from mifit.stages.track import subset
 from tests.output.test_export import read_glb
 from tests.output.test_render_evaluate import FakeCapture
 
@@ -35,7 +34,7 @@ def read_video(path):
 @pytest.fixture(scope="module")
 def backwards(ball):
     """The ball with its later timestep first, as tracking back in time leaves it."""
-    return replace(ball, geometry=subset(ball.geometry, (3, 0)))
+    return replace(ball, geometry=ball.geometry.at((3, 0)))
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +114,7 @@ def test_quaternions_turn_the_short_way(ball, tmp_path):
     """A head that turns all around: each step's quaternion is the nearer of the two."""
     angles = np.radians(np.arange(0, 360, 60))
     geometry = replace(
-        subset(ball.geometry, (0,) * len(angles)),
+        ball.geometry.at((0,) * len(angles)),
         timesteps=tuple(range(len(angles))),
         rotation=Rotation.from_rotvec(angles[:, None] * [[0.0, 1.0, 0.0]]).as_matrix(),
     )

@@ -34,14 +34,13 @@ def scene(variant):
 def fit_truth(monkeypatch, scene):
     """Stand in for stage 1: its answer is the truth, and it notes what it was started from."""
     from mifit.stages import track
-    from mifit.stages.refine_normals import one_timestep
 
     starts = []
 
     def fit(capture, model, geometry, cameras, timestep, config, seed=0, progress=None, reference=None):
         assert reference == "texture"
         starts.append((timestep, geometry.timesteps[-1]))
-        return one_timestep(scene.geometry, timestep)
+        return scene.geometry.at((timestep,))
 
     monkeypatch.setattr(track, "fit_pose_expression", fit)
     monkeypatch.setattr(track, "texture_reference", lambda *arguments: "texture")
@@ -49,9 +48,7 @@ def fit_truth(monkeypatch, scene):
 
 
 def first(scene):
-    from mifit.stages.refine_normals import one_timestep
-
-    return one_timestep(scene.geometry, 0)
+    return scene.geometry.at((0,))
 
 
 def run(scene, timesteps=(1, 2, 3), normals=None, **options):
