@@ -1,4 +1,4 @@
-"""The result folder: `Reconstruction` on disk (docs/formats.md)."""
+"""Writing the result folder, a `Reconstruction` on disk (docs/formats.md)."""
 
 from __future__ import annotations
 
@@ -13,21 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mifit
-from mifit.config import MeshConfig
 from mifit.core.camera import Camera
-from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
+from mifit.core.estimate import Report
 from mifit.core.files import replacing, write_text
-from mifit.core.image import encode_png, read_image, write_image
+from mifit.core.image import encode_png, write_image
 from mifit.core.keylight import KeyLight
 from mifit.core.mesh import vertex_normals
-from mifit.errors import InputError
-from mifit.output.ply import read_ply, write_ply
+from mifit.output.ply import write_ply
 from mifit.output.scene import write_scene
 from mifit.output.surface import SplitMesh, split_at_seams, tangent_space_map
 from mifit.stages.refine_mesh import split_faces
 
 if TYPE_CHECKING:
-    from mifit.morphable import MorphableModel
     from mifit.output.reconstruction import Reconstruction
 
 FORMAT_VERSION = 1
@@ -219,224 +216,3 @@ def _finite(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-def load(folder: Path, model: MorphableModel | None) -> Reconstruction:
-    """Read a result folder; see `Reconstruction.load`."""
-    from mifit.output.reconstruction import Reconstruction
-
-    path = folder / "result.json"
-    document = _read_document(folder, path)
-    try:
-        if model is None:
-            model = _load_model(document["model"], path)
-        if model.digest != document["model"]["digest"]:
-            raise InputError(
-                f"{path}: was made with model {document['model']['name']!r} "
-                f"(digest {document['model']['digest']}), but {document['model']['source']} is now "
-                f"{model.name!r} (digest {model.digest}); fit again, or bring the model back"
-            )
-        geometry = _geometry(folder, document, model)
-        capture = document["capture"]
-        return Reconstruction(
-            model=model,
-            model_source=document["model"]["source"],
-            geometry=geometry,
-            reflectance=_reflectance(folder, document),
-            normals=_normals(folder, document),
-            mesh=_mesh(folder, document, model, geometry),
-            config=document["config"],
-            cameras=tuple(_camera(entry) for entry in capture["cameras"]),
-            capture_digest=capture["digest"],
-            units=capture["units"],
-            unit_mm=float(capture["unit_mm"]),
-            seconds=float(document["seconds"]),
-            peak_memory=int(document["peak_memory"]),
-            warnings=tuple(document["warnings"]),
-        )
-    except InputError:
-        raise
-    except KeyError as error:
-        raise InputError(f"{path}: key {error} is missing; the file is damaged, fit again") from None
-    except (TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
-        raise InputError(f"{path}: holds a value of the wrong kind ({error}); fit again") from None
-
-
-def _read_document(folder: Path, path: Path) -> dict[str, Any]:
-    """Parse ``result.json`` and check that it is one, of this version."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder, expected a result that `mifit fit` wrote")
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(
-            f"{path}: missing, so {folder} is no result or an unfinished one; "
-            "name a folder that `mifit fit` wrote, or finish it with --resume"
-        ) from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error}); fit again") from None
-    version = document.get("format_version") if isinstance(document, dict) else None
-    if version != FORMAT_VERSION:
-        raise InputError(
-            f"{path}: found format_version {version!r}, this mifit reads {FORMAT_VERSION}; "
-            "fit again, or use the mifit version named in the file"
-        )
-    return document
-
-
-def _load_model(entry: dict[str, Any], path: Path) -> MorphableModel:
-    from mifit.morphable import MorphableModel
-
-    if not entry["source"]:
-        raise InputError(
-            f"{path}: doesn't say which file holds its model {entry['name']!r}; "
-            "give it: Reconstruction.load(folder, model=...)"
-        )
-    try:
-        return MorphableModel.load(entry["source"])
-    except InputError as error:
-        raise InputError(f"{path}: the model it was fitted with can't be read: {error}") from None
-
-
-def _camera(entry: dict[str, Any]) -> Camera:
-    """A camera from the keys of `_camera_document`, all of its numbers finite and its sizes positive."""
-    size, focal = (_array([entry[k] for k in keys], (2,), "camera") for keys in (("width", "height"), ("fx", "fy")))
-    if not (size.min() >= 1 and focal.min() > 0):
-        raise ValueError(f"camera: found size {size.tolist()}, focal lengths {focal.tolist()}, expected positive ones")
-    centre = _array([entry["cx"], entry["cy"]], (2,), "camera")
-    pose = _array(entry["world_to_camera"], (4, 4), "world_to_camera")
-    return Camera(str(entry["name"]), int(size[0]), int(size[1]), *focal.tolist(), *centre.tolist(), pose)
-
-
-def _report(document: dict[str, Any], stage: str) -> Report:
-    entry = document["stages"][stage]
-    energies = {k: [math.nan if x is None else float(x) for x in v] for k, v in entry["energies"].items()}
-    return Report(entry["status"], energies, float(entry["seconds"]), tuple(entry["warnings"]), entry["details"])
-
-
-def _array(value: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float64]:
-    """A float64 array of a given shape, all finite."""
-    out = np.array(value, dtype=np.float64)
-    if out.shape != shape or not np.isfinite(out).all():
-        raise ValueError(f"{name}: found shape {out.shape}, expected {shape} of finite numbers")
-    return out
-
-
-def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> GeometryEstimate:
-    entry, steps, lighting = document["model"], document["timesteps"], document["lighting"]
-    identity = _array(entry["identity"], (model.identity.shape[2],), "identity")
-    albedo = _array(entry["albedo"], (model.albedo_modes.shape[2],), "albedo")
-    n = len(steps)
-    expression = _array([s["expression"] for s in steps], (n, model.expression.shape[2]), "expression")
-    mesh = split_at_seams(model)
-    vertices = np.empty((n, len(model.mean), 3), dtype=np.float32)
-    vertex_albedo = model.albedo(albedo).astype(np.float32)
-    for i, step in enumerate(steps):
-        # Vertices that no face uses are in no mesh file: they follow from the coefficients.
-        rotation, translation = np.array(step["rotation"]), np.array(step["translation"])
-        shape = model.shape(identity, expression[i])
-        vertices[i] = entry["scale"] * shape @ rotation.T + translation
-        stored = _read_mesh(folder / "geometry" / f"{step['timestep']:04d}.ply", mesh)
-        vertices[i, mesh.origin] = stored["vertices"]
-        vertex_albedo[mesh.origin] = stored["albedo"]
-    return GeometryEstimate(
-        timesteps=tuple(int(s["timestep"]) for s in steps),
-        identity=identity,
-        albedo=albedo,
-        expression=expression,
-        rotation=_array([s["rotation"] for s in steps], (n, 3, 3), "rotation"),
-        translation=_array([s["translation"] for s in steps], (n, 3), "translation"),
-        scale=float(entry["scale"]),
-        vertices=vertices,
-        vertex_albedo=vertex_albedo,
-        shading=_array(lighting["shading"], (9, 3), "shading"),
-        ambient=float(lighting["shading_ambient"]),
-        report=_report(document, "geometry"),
-        gains={
-            name: tuple(_array(gain, (3,), f"gain of {name}").tolist())
-            for name, gain in document["capture"].get("gains", {}).items()
-        },
-    )
-
-
-def _read_mesh(path: Path, mesh: SplitMesh) -> dict[str, NDArray]:
-    """Read a mesh file and check that it has the vertices that the model gives it."""
-    stored = read_ply(path)
-    if len(stored["vertices"]) != len(mesh.origin) or not np.isfinite(stored["vertices"]).all():
-        raise InputError(
-            f"{path}: found {len(stored['vertices'])} vertices, expected {len(mesh.origin)} finite ones "
-            "as the model has; fit again"
-        )
-    return stored
-
-
-def _read_map(path: Path, channels: int, size: int | None = None) -> NDArray[np.float32]:
-    """Read one map and check its shape and that it is finite."""
-    image = read_image(path)
-    if channels == 1 and image.ndim == 3:
-        image = image[..., 0]
-    shape = image.shape[:2]
-    expected = (size, size) if size else (shape[0], shape[0])
-    if shape != expected or (channels == 3 and image.shape[2:] != (3,)) or not np.isfinite(image).all():
-        raise InputError(
-            f"{path}: found an image of shape {image.shape}, expected {expected[0]} x {expected[1]} texels "
-            f"of {channels} finite channels; fit again"
-        )
-    return np.ascontiguousarray(image, dtype=np.float32)
-
-
-def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate | None:
-    if "reflectance" not in document["stages"]:
-        return None
-    lighting = document["lighting"]
-    order = int(lighting["order"])
-    key = lighting.get("key")
-    diffuse = _read_map(folder / "maps" / "diffuse.exr", 3)
-    return ReflectanceEstimate(
-        diffuse=diffuse,
-        specular=_read_map(folder / "maps" / "specular.exr", 1, len(diffuse)),
-        confidence=_read_map(folder / "maps" / "confidence.exr", 1, len(diffuse)),
-        radiance=_array(lighting["radiance"], (order * order, 3), "radiance"),
-        ambient=float(lighting["ambient"]),
-        exponent=float(lighting["exponent"]),
-        shading_model=str(lighting["shading_model"]),
-        report=_report(document, "reflectance"),
-        fresnel=None if lighting.get("fresnel") is None else float(lighting["fresnel"]),
-        key_direction=None if key is None else _array(key["direction"], (3,), "key direction"),
-        key_irradiance=None if key is None else _array(key["irradiance"], (3,), "key irradiance"),
-        key_radius=0.0 if key is None else float(key["radius"]),
-    )
-
-
-def _normals(folder: Path, document: dict[str, Any]) -> NormalsEstimate | None:
-    if "normals" not in document["stages"]:
-        return None
-    timesteps = [int(s["timestep"]) for s in document["timesteps"] if s["refined_normals"]]
-    maps = [_read_map(folder / "maps" / f"normal_object_{t:04d}.exr", 3) for t in timesteps]
-    return NormalsEstimate(tuple(timesteps), np.stack(maps), _report(document, "normals"))
-
-
-def _mesh(
-    folder: Path, document: dict[str, Any], model: MorphableModel, geometry: GeometryEstimate
-) -> MeshEstimate | None:
-    if "mesh" not in document["stages"]:
-        return None
-    report = _report(document, "mesh")
-    subdivisions = MeshConfig(subdivisions=int(report.details["subdivisions"])).subdivisions  # in its bounds
-    topology = split_faces(model, subdivisions)
-    timesteps = tuple(int(s["timestep"]) for s in document["timesteps"] if s["refined_mesh"])
-    mesh = split_at_seams(topology)
-    # Vertices that no face uses are in no mesh file: they stay where the fit left them.
-    vertices = np.stack([topology.matrix @ geometry.vertices[geometry.index(t)] for t in timesteps])
-    for k, timestep in enumerate(timesteps):
-        vertices[k, mesh.origin] = _read_mesh(folder / "refined" / f"{timestep:04d}.ply", mesh)["vertices"]
-    heights = [_read_map(folder / "maps" / f"displacement_{t:04d}.exr", 1) for t in timesteps]
-    return MeshEstimate(
-        timesteps,
-        vertices.astype(np.float32),
-        topology.faces,
-        topology.faces_uv,
-        topology.uv,
-        np.stack(heights),
-        report,
-    )

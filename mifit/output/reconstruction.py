@@ -178,7 +178,7 @@ class Reconstruction:
         InputError
             The folder is no result, damaged, of another format version, or the model is another one.
         """
-        from mifit.output.folder import load
+        from mifit.output.folder_reading import load
 
         return load(Path(folder), model)
 
