@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from pathlib import Path
 
 import pytest
@@ -23,12 +24,39 @@ def ict_path(shared: Path) -> Path:
     return shared / "models" / "ict_facekit" / "ict_facekit_head.npz"
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Let kernels be compiled as on another machine: rounding and the order of sums differ there."""
+    parser.addoption("--llvm-target", metavar="CPU:WIDTH", help="LLVM's processor, lanes: x86-64-v3:8, nehalem:4")
+    parser.addoption("--threads", type=int, help="threads of Dr.Jit")
+
+
 @pytest.fixture(scope="session")
-def variant() -> str:
+def variant(request: pytest.FixtureRequest) -> str:
     """Activate the CPU variant once for the session."""
     import mifit
 
-    return mifit.set_variant("llvm_ad_rgb")
+    name = mifit.set_variant("llvm_ad_rgb")
+    target, threads = request.config.getoption("--llvm-target"), request.config.getoption("--threads")
+    if target:
+        cpu, width = target.split(":")
+        compile_for(cpu, int(width))
+    if threads:
+        import drjit as dr
+
+        dr.set_thread_count(threads)
+    return name
+
+
+def compile_for(cpu: str, width: int) -> None:
+    """Have Dr.Jit compile for another processor: what ``jit_llvm_set_target`` of its C++ interface does."""
+    import drjit as dr
+
+    core = ctypes.CDLL(str(next(Path(dr.__file__).parent.glob("libdrjit-core.*"))))
+    dr.eval(dr.opaque(dr.llvm.Float, 0.0))  # the backend must be up, or its own choice comes after this one
+    core._Z19jit_llvm_set_targetPKcS0_j.argtypes = (ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint32)
+    core._Z19jit_llvm_set_targetPKcS0_j.restype = None
+    core._Z19jit_llvm_set_targetPKcS0_j(cpu.encode(), b"", width)
+    assert core._Z21jit_llvm_vector_widthv() == width
 
 
 @pytest.fixture(scope="session")

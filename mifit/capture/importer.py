@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import shutil
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from mifit.capture.landmark_files import read_landmarks, write_landmarks
 from mifit.capture.sources import ImageFiles, Source, Video, check_synchronous
 from mifit.capture.stereo import read_stereo
 from mifit.capture.transforms import UNITS_MM, Shot, Transforms, View, read_transforms, write_transforms
+from mifit.core.files import replacing_folder
 from mifit.core.image import load_image
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
@@ -90,18 +90,12 @@ def import_capture(
         units = scene.units
     steps = len(range(start, sources[0].length, every))
     steps = steps if count is None else min(count, steps)
-    part = out.with_name(f".{out.name}.{os.getpid()}.part")
-    try:
+    with replacing_folder(out) as part:
         shots = list(_copy(sources, part, start, every, steps, progress))
         if scene is not None and not (videos or images):
             shots = _copy_annotations(shots, scene, part, start, every)
         write_transforms(part / "transforms.json", views, shots, units)
         Capture.load(part)  # nothing is handed over that can't be read back
-        if out.exists():
-            out.rmdir()
-        os.replace(part, out)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     return out
 
 

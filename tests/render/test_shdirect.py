@@ -226,6 +226,10 @@ def test_gradients_agree_with_finite_differences(model: str, light: str, fresnel
     def loss() -> object:
         return dr.mean(mi.render(scene, parameters, spp=1) * weights, axis=None)
 
+    def precise() -> float:
+        """The loss summed in float64: its differences are small beside the rounding of a float32 sum."""
+        return float((np.array(mi.render(scene, parameters, spp=1), dtype=np.float64) * np.array(weights)).mean())
+
     keys = [k for k in parameters.keys() if k.split(".")[-1] in KEYS or any(f".{n}." in k for n in KEYS)]
     keys = [k for k in keys if not k.endswith("to_uv")]
     assert len(keys) == len(KEYS) - (fresnel is None)
@@ -249,13 +253,13 @@ def test_gradients_agree_with_finite_differences(model: str, light: str, fresnel
             parameters[key] = type(original)(moved if moved.ndim > 1 else moved.ravel())
             parameters.update()
             with dr.suspend_grad():
-                sides.append(float(np.array(loss()).ravel()[0]))
+                sides.append(precise())
         parameters[key] = original
         parameters.update()
         difference = (sides[0] - sides[1]) / (2 * step)
         analytic = float((gradients[key] * direction).sum())
         assert analytic != 0.0, key
-        assert abs(analytic - difference) < 0.01 * abs(difference), (key, analytic, difference)
+        assert abs(analytic - difference) < 0.002 * abs(difference), (key, analytic, difference)
 
 
 @pytest.mark.parametrize("lobe", [{"exponent": 6.0}, {"exponent": 60.0, "fresnel": 4.0}], ids=["plain", "carried"])
