@@ -37,7 +37,7 @@ from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, vertex_normals
 from mifit.core.uv import rasterize_uv
-from mifit.output.scene import MITSUBA_AXES
+from mifit.render.sensor import make_sensor
 
 MODEL = SHARED / "models" / "ict_facekit" / "ict_facekit_head.npz"
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "images" / "plain_loop.svg"
@@ -103,7 +103,7 @@ class Scenes:
         corners = np.stack([model.faces.ravel(), model.faces_uv.ravel()], axis=1)
         self.pairs, index = np.unique(corners, axis=0, return_inverse=True)
         self.faces = index.reshape(-1, 3)
-        self.sensors = {name: _sensor(camera) for name, camera in cameras.items()}
+        self.sensors = {name: make_sensor(camera, SPP) for name, camera in cameras.items()}
 
     def scene(self, step: int, diffuse: NDArray, specular: NDArray, radiance: NDArray) -> Any:
         import mitsuba as mi
@@ -135,22 +135,6 @@ class Scenes:
         mesh = make_mesh(vertices[at], self.faces, turned, normals[at], mi.load_dict(bsdf))
         light = {"type": "shenv", "coefficients": mi.TensorXf(np.asarray(radiance, dtype=np.float32))}
         return mifit.load_scene({"type": "scene", "mesh": mesh, "light": light})
-
-
-def _sensor(camera: Any) -> Any:
-    import mitsuba as mi
-
-    film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "rgb"}
-    return mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx))),
-            "principal_point_offset_x": camera.cx / camera.width - 0.5,
-            "principal_point_offset_y": camera.cy / camera.height - 0.5,
-            "to_world": mi.ScalarTransform4f(np.linalg.inv(camera.world_to_camera) @ MITSUBA_AXES),
-            "film": {**film, "rfilter": {"type": "box"}},
-        }
-    )
 
 
 def plain_loop(task: Task, start: NDArray, seconds: float, rate: float = RATE) -> list[tuple[float, float]]:
@@ -191,7 +175,7 @@ def plain_loop(task: Task, start: NDArray, seconds: float, rate: float = RATE) -
         image = mi.render(
             built[step], parameters[step], scenes.sensors[name], integrator=integrator, spp=SPP, seed=iteration
         )
-        dr.backward(dr.sum(weight * dr.square(image - target), axis=None) / dr.sum(weight, axis=None))
+        dr.backward(dr.sum(weight * dr.square(image[..., :3] - target), axis=None) / dr.sum(weight, axis=None))
         optimizer.step()
         for key in (keys["diffuse"], keys["specular"]):
             optimizer[key] = dr.clip(optimizer[key], 0.0, 1.0)

@@ -141,6 +141,7 @@ def path_replay(views: list[Camera], mesh: tuple, size: int, light: np.ndarray) 
     import mitsuba as mi
 
     from mifit.render.gbuffer import make_mesh
+    from mifit.render.sensor import make_sensor
 
     vertices, faces, uv, faces_uv = mesh
     # One vertex per corner pair of position and UV, as Mitsuba's meshes have it.
@@ -168,20 +169,7 @@ def path_replay(views: list[Camera], mesh: tuple, size: int, light: np.ndarray) 
     )
     emitter = {"type": "shenv", "coefficients": mi.TensorXf(light.astype(np.float32))}
     scene = mifit.load_scene({"type": "scene", "mesh": surface, "light": emitter})
-    sensors = []
-    for camera in views:
-        film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
-        to_world = np.array(camera.camera_to_world_opengl) @ np.diag([-1.0, 1.0, -1.0, 1.0])
-        sensors.append(
-            mi.load_dict(
-                {
-                    "type": "perspective",
-                    "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx))),
-                    "to_world": mi.ScalarTransform4f(to_world),
-                    "film": {**film, "pixel_format": "rgb"},
-                }
-            )
-        )
+    sensors = [make_sensor(camera, 4) for camera in views]
     integrator = mi.load_dict({"type": "prb", "max_depth": 2, "hide_emitters": True})
     parameters = mi.traverse(scene)
     keys = [k for k in parameters.keys() if k.endswith(("reflectance.data", "correction.data", "coefficients"))]
@@ -194,7 +182,7 @@ def path_replay(views: list[Camera], mesh: tuple, size: int, light: np.ndarray) 
         parameters.update()
         for seed, sensor in enumerate(sensors):
             image = mi.render(scene, parameters, sensor=sensor, integrator=integrator, spp=4, seed=seed)
-            dr.backward(dr.mean(dr.square(image - 0.5), axis=None))
+            dr.backward(dr.mean(dr.square(image[..., :3] - 0.5), axis=None))
         dr.eval([dr.grad(parameters[key]) for key in keys])
         dr.sync_thread()
 

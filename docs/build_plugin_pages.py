@@ -38,6 +38,17 @@ DICTIONARIES = {
     "shdirect": """
         {"type": "shdirect", "model": "shadowed", "samples": 256, "bounce_albedo": 0.4}
     """,
+    "pinhole": """
+        {
+            "type": "pinhole",
+            "fx": 1010.0,
+            "fy": 1000.0,
+            "cx": 340.0,
+            "cy": 240.0,
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 70], [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 680, "height": 480},
+        }
+    """,
 }
 
 

@@ -9,7 +9,8 @@ nerfstudio's ``transform_matrix`` has OpenGL axes (y up, z backward) and is conv
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +73,18 @@ class Camera:
     def matrix(self) -> NDArray[np.float64]:
         """(3, 3) intrinsic matrix for this module's pixel convention."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def with_square_pixels(self) -> Camera:
+        """This view with rows as high as columns are wide, for programs that know square pixels only.
+
+        Centre, axes and fx stay, fy becomes fx, and the number of rows grows or shrinks with it, rounded up: shrunk or
+        stretched to the old height the image is this camera's, up to the last row's fraction.
+        """
+        if self.fx == self.fy:
+            return self
+        ratio = self.fx / self.fy
+        rows = max(1, math.ceil(self.height * ratio - 1e-6))
+        return replace(self, height=rows, fy=self.fx, cy=self.cy * ratio)
 
     def to_camera(self, points: NDArray) -> NDArray:
         """World points (..., 3) -> camera points (..., 3)."""

@@ -6,12 +6,12 @@ The path integrator of ``mifit render`` reads the same file that a user gets, so
 from __future__ import annotations
 
 import math
+import re
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
-from xml.sax.saxutils import quoteattr
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,19 +21,17 @@ from mifit.core.files import write_text
 from mifit.core.image import write_image
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import rasterize_uv
-from mifit.errors import InputError
 from mifit.output.deferred import visible_surface
 from mifit.output.ply import write_ply
 from mifit.output.surface import SplitMesh, part_of, split_at_seams, surface_maps
+from mifit.render.description import Parameter, to_xml
+from mifit.render.sensor import sensor_description
 
 if TYPE_CHECKING:
     from mifit.output.reconstruction import Method, Reconstruction
 
 STEEPEST = 4.0
 """Largest slope of a normal correction: 76 degrees."""
-
-MITSUBA_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""OpenCV's camera axes (x right, y down) to Mitsuba's (x left, y up); both look along +z."""
 
 
 def write_scene(
@@ -51,7 +49,8 @@ def write_scene(
     with a ``roughconductor`` of Beckmann roughness sqrt(2 / (m + 2)), which doesn't rise, under a ``normalmap``,
     and the light is a lat-long ``envmap``. A relit reconstruction has its environment as ``envmap`` in both. A
     compact light is a stock ``directional`` emitter in both. The ambient term stands for light that local shading
-    leaves out, such as interreflection, so a path-traced scene doesn't have it.
+    leaves out, such as interreflection, so a path-traced scene doesn't have it. A camera whose pixels aren't square
+    is mifit's ``pinhole`` in ``NAME.xml``; in ``NAME_stock.xml`` it has square ones (`Camera.with_square_pixels`).
 
     Parameters
     ----------
@@ -63,16 +62,25 @@ def write_scene(
         Sensors in this order; default: the fitted cameras.
     method : {"full", "diffuse", "pca"}
         What to leave out, see `Reconstruction.render`.
+
+    Raises
+    ------
+    InputError
+        A camera with lens distortion; nothing is written then.
     """
     path = Path(path)
     cameras = reconstruction.cameras if cameras is None else cameras
-    files = path.with_name(f"{path.stem}_files")
+    files = path.with_name(re.sub(r"[^\w.-]", "_", path.stem) + "_files")
+    scenes = [
+        (name, scene_description(reconstruction, cameras, method, stock, files.name), needs)
+        for name, stock, needs in (
+            (path, False, "Needs mifit.register_plugins()."),
+            (path.with_name(f"{path.stem}_stock.xml"), True, "Plain Mitsuba renders this."),
+        )
+    ]
     _write_files(reconstruction, files, timestep, method)
-    has_rest = not reconstruction.model.face_mask.all()
-    for stock in (False, True):
-        name = path if not stock else path.with_name(f"{path.stem}_stock.xml")
-        text = _scene(reconstruction, files.name, cameras, method, has_rest, stock)
-        write_text(name, text)
+    for name, scene, needs in scenes:
+        write_text(name, to_xml(scene, f"Written by mifit. {needs}"))
 
 
 def render_path(
@@ -163,129 +171,94 @@ def _slopes(
     return flat
 
 
-def _scene(
-    reconstruction: Reconstruction,
-    files: str,
-    cameras: Sequence[Camera],
-    method: Method,
-    has_rest: bool,
-    stock: bool,
-) -> str:
-    needs = "Plain Mitsuba renders this." if stock else "Needs mifit.register_plugins()."
-    parts = [
-        '<scene version="3.0.0">',
-        f"    <!-- Written by mifit. {needs} -->",
-        '    <default name="spp" value="64"/>',
-        '    <default name="max_depth" value="5"/>',
-        '    <integrator type="path">',
-        '        <integer name="max_depth" value="$max_depth"/>',
-        '        <boolean name="hide_emitters" value="true"/>',
-        "    </integrator>",
-        *[_sensor(camera) for camera in cameras],
-        _skin(reconstruction, files, stock),
-        _shape("face", files, '<ref id="skin"/>'),
-    ]
-    if has_rest:
-        rest = (
-            '<bsdf type="diffuse"><texture name="reflectance" type="mesh_attribute">'
-            '<string name="name" value="vertex_color"/></texture></bsdf>'
-        )
-        parts.append(_shape("rest", files, rest))
-    parts.append(_light(reconstruction, files, method, stock))
-    return "\n".join([*parts, "</scene>", ""])
+def scene_description(
+    reconstruction: Reconstruction, cameras: Sequence[Camera], method: Method, stock: bool, files: str
+) -> dict[str, Any]:
+    """The scene of `write_scene` as a plain dictionary (`render.description`), its files in the folder ``files``.
 
-
-def _sensor(camera: Camera) -> str:
-    if any(camera.distortion) or abs(camera.fx / camera.fy - 1) > 1e-3:
-        raise InputError(
-            f"camera {camera.name}: found lens distortion or focal lengths {camera.fx:g} and {camera.fy:g}; "
-            "a Mitsuba sensor wants an undistorted camera with square pixels"
-        )
-    matrix = np.linalg.inv(camera.world_to_camera) @ MITSUBA_AXES
-    fov = math.degrees(2 * math.atan(0.5 * camera.width / camera.fx))
-    return f"""    <sensor type="perspective" id={quoteattr(camera.name)}>
-        <string name="fov_axis" value="x"/>
-        <float name="fov" value="{fov:.9g}"/>
-        <float name="principal_point_offset_x" value="{camera.cx / camera.width - 0.5:.9g}"/>
-        <float name="principal_point_offset_y" value="{camera.cy / camera.height - 0.5:.9g}"/>
-        <float name="near_clip" value="0.01"/>
-        <float name="far_clip" value="10000"/>
-        <transform name="to_world"><matrix value="{" ".join(f"{x:.9g}" for x in matrix.ravel())}"/></transform>
-        <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
-        <film type="hdrfilm">
-            <integer name="width" value="{camera.width}"/>
-            <integer name="height" value="{camera.height}"/>
-            <string name="pixel_format" value="rgba"/>
-            <string name="component_format" value="float32"/>
-            <rfilter type="box"/>
-        </film>
-    </sensor>"""
-
-
-def _texture(name: str, file: str, raw: bool = True) -> str:
-    return (
-        f'<texture name="{name}" type="bitmap"><string name="filename" value={quoteattr(file)}/>'
-        f'<boolean name="raw" value="{str(raw).lower()}"/><string name="wrap_mode" value="clamp"/></texture>'
-    )
-
-
-def _skin(reconstruction: Reconstruction, files: str, stock: bool) -> str:
-    reflectance = reconstruction.reflectance
-    exponent = reflectance.exponent if reflectance else 1.0
-    if stock:
-        alpha = math.sqrt(2.0 / (exponent + 2.0))
-        return f"""    <bsdf type="normalmap" id="skin">
-        {_texture("normalmap", f"{files}/normal.exr")}
-        <bsdf type="blendbsdf">
-            {_texture("weight", f"{files}/specular.exr")}
-            <bsdf type="diffuse">{_texture("reflectance", f"{files}/diffuse_stock.exr", False)}</bsdf>
-            <bsdf type="roughconductor">
-                <string name="material" value="none"/>
-                <string name="distribution" value="beckmann"/>
-                <float name="alpha" value="{alpha:.9g}"/>
-            </bsdf>
-        </bsdf>
-    </bsdf>"""
-    normalized = reflectance is None or reflectance.shading_model != "paper"
-    risen = reflectance is not None and reflectance.fresnel is not None
-    rise = f'\n        <float name="fresnel" value="{reflectance.fresnel:.9g}"/>' if risen else ""
-    return f"""    <bsdf type="blinnphong" id="skin">
-        {_texture("diffuse_reflectance", f"{files}/diffuse.exr", False)}
-        {_texture("specular_reflectance", f"{files}/specular.exr")}
-        {_texture("normal_correction", f"{files}/slopes.exr")}
-        <float name="exponent" value="{exponent:.9g}"/>{rise}
-        <boolean name="normalized" value="{str(normalized).lower()}"/>
-    </bsdf>"""
-
-
-def _shape(name: str, files: str, bsdf: str) -> str:
-    return f"""    <shape type="ply" id="{name}">
-        <string name="filename" value={quoteattr(f"{files}/{name}.ply")}/>
-        <boolean name="flip_tex_coords" value="true"/>
-        {bsdf}
-    </shape>"""
-
-
-def _light(reconstruction: Reconstruction, files: str, method: Method, stock: bool) -> str:
-    if stock or reconstruction.environment is not None:
-        file = quoteattr(f"{files}/environment.exr")
-        return f'    <emitter type="envmap"><string name="filename" value={file}/></emitter>' + _key(reconstruction)
+    Ids are ours, not the user's: ``skin`` and ``light`` (maps and lighting), ``key`` (the compact light), ``face`` and
+    ``rest`` (shapes), and ``camera_NAME`` (see `sensor_ids`).
+    """
     if method == "pca":
         reconstruction = replace(reconstruction, reflectance=None, normals=None)
-    rows = ",  ".join(" ".join(f"{x:.9g}" for x in row) for row in _without_key(reconstruction).lighting.coefficients)
-    return f'    <emitter type="shenv"><string name="coefficients" value="{rows}"/></emitter>' + _key(reconstruction)
-
-
-def _key(reconstruction: Reconstruction) -> str:
-    """The compact light as a stock emitter, where there is one; a point at infinity, whatever its radius."""
+    scene: dict[str, Any] = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": Parameter("max_depth", 5), "hide_emitters": True},
+    }
+    for name, camera in zip(sensor_ids(cameras), cameras, strict=True):
+        scene[name] = sensor_description(camera.with_square_pixels() if stock else camera, Parameter("spp", 64))
+    scene["skin"] = _skin(reconstruction, files, stock)
+    scene["face"] = _shape(f"{files}/face.ply", {"type": "ref", "id": "skin"})
+    if not reconstruction.model.face_mask.all():
+        scene["rest"] = _shape(f"{files}/rest.ply", _vertex_albedo(stock))
+    if stock or reconstruction.environment is not None:
+        scene["light"] = {"type": "envmap", "filename": f"{files}/environment.exr"}
+    else:
+        rows = _without_key(reconstruction).lighting.coefficients
+        text = ",  ".join(" ".join(f"{x:.9g}" for x in row) for row in rows)
+        scene["light"] = {"type": "shenv", "coefficients": text}
     key = None if reconstruction.reflectance is None else reconstruction.reflectance.key
-    if key is None:
-        return ""
-    along, power = (", ".join(f"{x:.9g}" for x in values) for values in (-key.direction, key.irradiance))
-    return (
-        f'\n    <emitter type="directional"><vector name="direction" value="{along}"/>'
-        f'<rgb name="irradiance" value="{power}"/></emitter>'
-    )
+    if key is not None:  # a point at infinity, whatever its radius
+        scene["key"] = {
+            "type": "directional",
+            "direction": [-float(x) for x in key.direction],
+            "irradiance": {"type": "rgb", "value": [float(x) for x in key.irradiance]},
+        }
+    return scene
+
+
+def sensor_ids(cameras: Sequence[Camera]) -> list[str]:
+    """``camera_NAME`` for each camera, of letters, digits, ``_`` and ``-`` alone; two of one id get a number."""
+    ids: list[str] = []
+    for camera in cameras:
+        base = "camera_" + re.sub(r"[^A-Za-z0-9_-]", "_", camera.name)
+        name, number = base, 2
+        while name in ids:
+            name, number = f"{base}_{number}", number + 1
+        ids.append(name)
+    return ids
+
+
+def _texture(file: str, raw: bool = True) -> dict[str, Any]:
+    return {"type": "bitmap", "filename": file, "raw": raw, "wrap_mode": "clamp"}
+
+
+def _skin(reconstruction: Reconstruction, files: str, stock: bool) -> dict[str, Any]:
+    reflectance = reconstruction.reflectance
+    exponent = float(reflectance.exponent) if reflectance else 1.0
+    if stock:
+        mirror = {
+            "type": "roughconductor",
+            "material": "none",
+            "distribution": "beckmann",
+            "alpha": math.sqrt(2.0 / (exponent + 2.0)),
+        }
+        base = {"type": "diffuse", "reflectance": _texture(f"{files}/diffuse_stock.exr", False)}
+        blend = {"type": "blendbsdf", "weight": _texture(f"{files}/specular.exr"), "base": base, "lobe": mirror}
+        return {"type": "normalmap", "normalmap": _texture(f"{files}/normal.exr"), "nested": blend}
+    skin = {
+        "type": "blinnphong",
+        "diffuse_reflectance": _texture(f"{files}/diffuse.exr", False),
+        "specular_reflectance": _texture(f"{files}/specular.exr"),
+        "normal_correction": _texture(f"{files}/slopes.exr"),
+        "exponent": exponent,
+        "normalized": reflectance is None or reflectance.shading_model != "paper",
+    }
+    if reflectance is not None and reflectance.fresnel is not None:
+        skin["fresnel"] = float(reflectance.fresnel)
+    return skin
+
+
+def _vertex_albedo(stock: bool) -> dict[str, Any]:
+    """The BSDF of what has no maps: the fitted model's vertex albedo, without a lobe."""
+    colour = {"type": "mesh_attribute", "name": "vertex_color"}
+    if stock:
+        return {"type": "diffuse", "reflectance": colour}
+    return {"type": "blinnphong", "diffuse_reflectance": colour, "specular_reflectance": 0.0}
+
+
+def _shape(file: str, bsdf: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "ply", "filename": file, "flip_tex_coords": True, "bsdf": bsdf}
 
 
 def _without_key(reconstruction: Reconstruction) -> Reconstruction:

@@ -14,11 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
-from mifit.errors import InputError
 from mifit.render.gbuffer import make_mesh
-
-OPENGL_FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""OpenCV camera axes (x right, y down) to Mitsuba's (x left, y up), both looking along +z."""
+from mifit.render.sensor import make_sensor
 
 
 @dataclass(frozen=True)
@@ -61,46 +58,6 @@ class Surface:
     uv: NDArray
     faces: NDArray
     material: str
-
-
-def sensor(camera: Camera, spp: int = 16) -> Any:
-    """Mitsuba's ``perspective`` sensor of an undistorted camera with square pixels.
-
-    Raises
-    ------
-    InputError
-        The camera has lens distortion or fx differs from fy by more than a thousandth.
-    """
-    import mitsuba as mi
-
-    if any(camera.distortion):
-        raise InputError(f"camera {camera.name}: found lens distortion, expected an undistorted camera")
-    if abs(camera.fx / camera.fy - 1.0) > 1e-3:
-        raise InputError(
-            f"camera {camera.name}: found focal lengths {camera.fx:g} and {camera.fy:g}, expected square pixels"
-        )
-    to_world = np.linalg.inv(camera.world_to_camera) @ OPENGL_FLIP
-    return mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": math.degrees(2.0 * math.atan(0.5 * camera.width / camera.fx)),
-            "fov_axis": "x",
-            "principal_point_offset_x": 0.5 - camera.cx / camera.width,  # Mitsuba moves the film, not the point
-            "principal_point_offset_y": 0.5 - camera.cy / camera.height,
-            "near_clip": 1e-2,
-            "far_clip": 1e4,
-            "to_world": mi.ScalarTransform4f(to_world),
-            "film": {
-                "type": "hdrfilm",
-                "width": camera.width,
-                "height": camera.height,
-                "pixel_format": "rgba",
-                "component_format": "float32",
-                "rfilter": {"type": "box"},
-            },
-            "sampler": {"type": "multijitter", "sample_count": spp},
-        }
-    )
 
 
 class PathTracer:
@@ -157,7 +114,7 @@ class PathTracer:
         scene = mi.load_dict(content)
         images = []
         for i, camera in enumerate(cameras):
-            view = sensor(camera, spp)
+            view = make_sensor(camera, spp, "multijitter")
             start = dr.opaque(mi.UInt32, (seed * 1000 + i) % 2**32)  # a literal would compile a kernel per seed
             image = mi.render(scene, sensor=view, integrator=self._integrator, spp=spp, seed=start)
             images.append(np.array(image, dtype=np.float32))

@@ -183,26 +183,35 @@ def test_a_lens_polynomial_that_folds_over_is_invalid_there() -> None:
     assert not valid[100, 190]
 
 
-def test_a_rendered_point_lands_where_the_camera_projects_it(variant: str) -> None:
+@pytest.mark.parametrize("fy", [700.0, 693.0, 490.0])
+def test_a_rendered_point_lands_where_the_camera_projects_it(variant: str, fy: float) -> None:
     import mitsuba as mi
 
-    from mifit.render.pathtrace import sensor
+    from mifit.render.sensor import make_sensor
 
-    camera = make_camera("a", 12.0)
-    camera = Camera("a", 340, 240, 700.0, 700.0, 171.3, 118.9, camera.world_to_camera)
-    for point in ((0.0, 0.0, 0.0), (7.0, 4.0, 1.0), (-8.0, -5.0, 3.0)):
+    pose = make_camera("a", 12.0).world_to_camera
+    camera = Camera("a", 340, 240, 700.0, fy, 240.3, 72.9, pose)  # the centre is off by 70 and 47 pixels
+    for point in ((0.0, 0.0, 0.0), (-5.0, 2.0, 1.0), (-12.0, -8.0, 3.0)):
         ball = {"type": "sphere", "center": list(point), "radius": 0.25, "light": {"type": "area"}}
         scene = mi.load_dict({"type": "scene", "ball": ball})
-        image = np.array(mi.render(scene, sensor=sensor(camera), integrator=mi.load_dict({"type": "direct"}), spp=64))
+        direct = mi.load_dict({"type": "direct"})
+        image = np.array(mi.render(scene, sensor=make_sensor(camera), integrator=direct, spp=64))
         weight = image[..., 0].astype(np.float64)
         found = (camera.pixel_centres() * weight[..., None]).sum((0, 1)) / weight.sum()
         assert np.hypot(*(found - camera.project(np.array(point)))) < 0.05
 
 
-def test_the_sensor_refuses_what_it_cannot_show(variant: str) -> None:
-    from mifit.render.pathtrace import sensor
+def test_square_pixels_show_the_same_view() -> None:
+    camera = Camera("a", 340, 240, 707.0, 700.0, 240.3, 72.9, np.eye(4))
+    square = camera.with_square_pixels()
+    assert square.fx == square.fy == camera.fx and (square.width, square.height) == (340, 243)
+    points = np.array([[0.1, -0.2, 3.0], [-0.4, 0.3, 2.0]])
+    np.testing.assert_allclose(square.project(points) / (1.0, 1.01), camera.project(points), rtol=1e-12)
+    assert square.with_square_pixels() is square
+
+
+def test_the_sensor_refuses_a_lens(variant: str) -> None:
+    from mifit.render.sensor import make_sensor
 
     with pytest.raises(InputError, match="lens distortion"):
-        sensor(make_camera("a", 0.0, LENSES[1]))
-    with pytest.raises(InputError, match="expected square pixels"):
-        sensor(make_camera("a", 0.0))
+        make_sensor(make_camera("a", 0.0, LENSES[1]))

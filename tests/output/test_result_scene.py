@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import mifit
+from mifit.core.camera import Camera
 from mifit.core.estimate import NormalsEstimate
 from mifit.core.image import to_8_bit, write_image
 from mifit.core.metrics import psnr
@@ -20,6 +21,7 @@ from mifit.output.relight import write_relit
 from mifit.output.scene import write_scene
 from mifit.output.surface import surface_maps
 from mifit.render.scene_image import render_scene
+from mifit.render.sensor import make_sensor
 from tests.output.conftest import ball_camera
 from tests.output.test_views import smooth_environment
 
@@ -130,7 +132,87 @@ def test_saved_result_has_a_scene_that_load_scene_renders(ball, variant, tmp_pat
     assert len(scene.sensors()) == 2 and len(scene.shapes()) == 2
 
 
-def test_cameras_that_mitsuba_lacks_are_refused(flat, tmp_path):
-    camera = replace(flat.cameras[0], fy=2 * flat.cameras[0].fx)
-    with pytest.raises(InputError, match="wants an undistorted camera with square pixels"):
+def off_centre(angle: float = 10.0) -> Camera:
+    """A calibrated camera as real ones are, only more so: the centre 30 % off both ways, fx / fy = 1.01."""
+    camera = ball_camera("real", angle, size=96)
+    shift = 0.3 * 96
+    return replace(camera, fy=camera.fx / 1.01, cx=camera.cx - shift, cy=camera.cy + shift)
+
+
+def edges(alpha: np.ndarray) -> np.ndarray:
+    """Left, right, upper and lower edge of a convex shape in the lines through its middle, in pixels."""
+    found = []
+    for image in (alpha, alpha.T):
+        weight = image.astype(np.float64)
+        places = np.arange(image.shape[1]) + 0.5
+        width = weight.sum(1)
+        rows = width > 0.7 * width.max()
+        centre = (weight * places).sum(1)[rows] / width[rows]
+        found += [(centre - 0.5 * width[rows]).mean(), (centre + 0.5 * width[rows]).mean()]
+    return np.array(found)
+
+
+def test_every_way_to_render_a_real_camera_shows_the_same(flat, variant, tmp_path):
+    """Path tracing, the scene file, the export and path-traced relighting against local rendering."""
+    lit = replace(flat, normals=None)
+    camera = off_centre()
+    relit = lit.relight(smooth_environment(), rotate=40)
+    write_scene(lit, tmp_path / "scene.xml", 0, [camera], "diffuse")
+    write_scene(relit, tmp_path / "relit.xml", 0, [camera], "diffuse")
+    seen = replace(lit, cameras=(camera,), reflectance=replace(lit.reflectance, specular=0 * lit.reflectance.specular))
+    export(seen, "mitsuba", tmp_path / "export.xml", timestep=0)
+    for result, names in ((lit, ("scene", "export")), (relit, ("relit",))):
+        local = result.render(camera, 0, method="diffuse", samples=8)
+        images = [render_scene(tmp_path / f"{name}.xml", {}, spp=256, seed=1) for name in names]
+        path = result.render(camera, 0, method="diffuse", integrator="path", samples=256)
+        inside = (local[..., 3] == 1) & np.all([image[..., 3] == 1 for image in images], axis=0)
+        assert inside.sum() > 300
+        for image in [*images, path]:
+            # Half of the ball is outside the image: the edges that are inside it count.
+            np.testing.assert_allclose(edges(image[..., 3]), edges(local[..., 3]), atol=0.1)
+            mean = image[inside][:, :3].mean(0)
+            np.testing.assert_allclose(mean, local[inside][:, :3].mean(0), rtol=0.01)
+
+
+def test_stock_scene_of_a_real_camera_has_square_pixels(flat, variant, tmp_path):
+    camera = off_centre()
+    write_scene(flat, tmp_path / "scene.xml", 0, [camera])
+    stock = render_scene(tmp_path / "scene_stock.xml", {}, spp=64, seed=1)
+    local = flat.render(camera.with_square_pixels(), 0, samples=8)
+    assert stock.shape == local.shape == (97, 96, 4)
+    np.testing.assert_allclose(edges(stock[..., 3]), edges(local[..., 3]), atol=0.1)
+
+
+def test_the_file_holds_the_sensor_that_is_rendered(flat, variant, tmp_path):
+    import mitsuba as mi
+
+    cameras = [flat.cameras[0], off_centre()]
+    write_scene(flat, tmp_path / "scene.xml", 0, cameras)
+    for loaded, camera in zip(mifit.load_scene(tmp_path / "scene.xml", spp=16).sensors(), cameras, strict=True):
+        rendered = mi.traverse(make_sensor(camera))
+        stored = mi.traverse(loaded)
+        names = list(rendered.keys())
+        assert [name.split(".")[-1] for name in names] == [name.split(".")[-1] for name in stored.keys()]
+        for ours, theirs in zip(names, stored.keys(), strict=True):
+            a, b = rendered[ours], stored[theirs]
+            if ours == "to_world":
+                np.testing.assert_allclose(np.array(a.matrix), np.array(b.matrix), rtol=1e-6, atol=1e-6)
+            else:
+                assert str(a) == str(b), ours
+        assert loaded.sampler().sample_count() == 16
+
+
+@pytest.mark.parametrize("name", ["face", "skin", "rest", "light", "$x", "a.b", "<", "", "ä b"])
+def test_names_of_cameras_are_not_ids(flat, variant, tmp_path, name):
+    cameras = [replace(c, name=name) for c in flat.cameras]
+    write_scene(flat, tmp_path / "scene.xml", 0, cameras)
+    scene = mifit.load_scene(tmp_path / "scene.xml", spp=1)
+    ids = [sensor.id() for sensor in scene.sensors()]
+    assert len(set(ids)) == 2 and all(i.startswith("camera_") for i in ids) and len(scene.shapes()) == 2
+
+
+def test_a_lens_is_refused_before_anything_is_written(flat, tmp_path):
+    camera = replace(flat.cameras[0], distortion=(0.1, 0.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="found lens distortion"):
         write_scene(flat, tmp_path / "x.xml", 0, [camera])
+    assert not list(tmp_path.iterdir())

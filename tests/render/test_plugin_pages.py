@@ -11,7 +11,7 @@ import pytest
 import mifit
 
 ROOT = Path(__file__).resolve().parents[2]
-NAMES = ("blinnphong", "shenv", "shdirect")
+NAMES = ("blinnphong", "shenv", "shdirect", "pinhole")
 
 
 @pytest.fixture(scope="module")
@@ -45,4 +45,4 @@ def test_the_dictionary_loads(variant: str, builder, name: str, monkeypatch: pyt
     monkeypatch.chdir(ROOT)
     mifit.register_plugins()
     dictionary = eval(builder.DICTIONARIES[name].strip(), {"mi": mi, "mifit": mifit})
-    assert type(mi.load_dict(dictionary)).__name__ in ("BlinnPhong", "SHEnvironment", "SHDirect")
+    assert type(mi.load_dict(dictionary)).__name__ in ("BlinnPhong", "SHEnvironment", "SHDirect", "Pinhole")

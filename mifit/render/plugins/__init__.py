@@ -10,7 +10,7 @@ _CLASSES: dict[str, dict[str, type]] = {}
 
 
 def register_plugins() -> dict[str, type]:
-    """Register ``blinnphong``, ``shenv`` and ``shdirect`` with the current variant; harmless to repeat.
+    """Register ``blinnphong``, ``shenv``, ``shdirect`` and ``pinhole`` with the current variant; harmless to repeat.
 
     Returns
     -------
@@ -25,15 +25,21 @@ def register_plugins() -> dict[str, type]:
     import mitsuba as mi
 
     from mifit.errors import VariantError
-    from mifit.render.plugins import blinnphong, shdirect, shenv
+    from mifit.render.plugins import blinnphong, pinhole, shdirect, shenv
 
     variant = mi.variant()
     if variant is None:
         raise VariantError("no Mitsuba variant is active; call mifit.set_variant() first")
     if variant not in _CLASSES:
-        made = {"blinnphong": blinnphong.make(), "shenv": shenv.make(), "shdirect": shdirect.make()}
+        made = {
+            "blinnphong": blinnphong.make(),
+            "shenv": shenv.make(),
+            "shdirect": shdirect.make(),
+            "pinhole": pinhole.make(),
+        }
         mi.register_bsdf("blinnphong", made["blinnphong"])
         mi.register_emitter("shenv", made["shenv"])
         mi.register_integrator("shdirect", made["shdirect"])
+        mi.register_sensor("pinhole", made["pinhole"])
         _CLASSES[variant] = made
     return _CLASSES[variant]

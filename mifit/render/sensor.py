@@ -1,0 +1,76 @@
+"""A calibrated camera as a Mitsuba sensor: the only place that turns one into the other."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from mifit.core.camera import Camera
+from mifit.errors import InputError
+from mifit.render.description import Parameter, to_mitsuba
+
+MITSUBA_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""OpenCV's camera axes (x right, y down) to Mitsuba's (x left, y up); both look along +z."""
+
+SQUARE = 1e-6
+"""Relative difference of the focal lengths up to which pixels count as square: a thousandth of a pixel in 1000."""
+
+
+def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str = "independent") -> dict[str, Any]:
+    """The sensor of an undistorted camera, as a plain dictionary (`render.description`).
+
+    Square pixels give Mitsuba's ``perspective``, others mifit's ``pinhole``; see `Camera.with_square_pixels` for
+    what programs without that plugin can be given.
+
+    Parameters
+    ----------
+    camera : Camera
+    spp : int or Parameter
+        Samples per pixel.
+    sampler : str
+        Mitsuba plugin that draws them.
+
+    Raises
+    ------
+    InputError
+        The camera has lens distortion.
+    """
+    if any(camera.distortion):
+        raise InputError(f"camera {camera.name}: found lens distortion, expected an undistorted camera")
+    if abs(camera.fx / camera.fy - 1.0) <= SQUARE:
+        lens: dict[str, Any] = {
+            "type": "perspective",
+            "fov": math.degrees(2.0 * math.atan(0.5 * camera.width / camera.fx)),
+            "fov_axis": "x",
+            # Mitsuba moves the film, not the point.
+            "principal_point_offset_x": 0.5 - camera.cx / camera.width,
+            "principal_point_offset_y": 0.5 - camera.cy / camera.height,
+        }
+    else:
+        lens = {"type": "pinhole"} | {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
+    return lens | {
+        "near_clip": 1e-2,
+        "far_clip": 1e4,
+        "to_world": np.linalg.inv(camera.world_to_camera) @ MITSUBA_AXES,
+        "film": {
+            "type": "hdrfilm",
+            "width": camera.width,
+            "height": camera.height,
+            "pixel_format": "rgba",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+        "sampler": {"type": sampler, "sample_count": spp},
+    }
+
+
+def make_sensor(camera: Camera, spp: int = 16, sampler: str = "independent") -> Any:
+    """The loaded ``mi.Sensor`` of `sensor_description`; InputError as there."""
+    import mitsuba as mi
+
+    from mifit.render.plugins import register_plugins
+
+    register_plugins()
+    return mi.load_dict(to_mitsuba(sensor_description(camera, spp, sampler)))
