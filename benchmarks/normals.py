@@ -24,12 +24,13 @@ from mifit import Capture, Reconstruction, set_variant
 from mifit.config import MeshConfig, NormalsConfig
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.mesh_update import interior_vertices
+from mifit.core.subdivision import split_faces
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.output.evaluate import evaluate
-from mifit.output.tracking import extend
-from mifit.stages.refine_mesh import refine_mesh, split_faces
+from mifit.stages.refine_mesh import refine_mesh
 from mifit.stages.refine_normals import frame_problem, refine_normals
 from mifit.stages.track import track
+from mifit.tracking import extend
 
 WEIGHTS = (0.3, 3.0)
 EQUAL = 1e-3

@@ -17,7 +17,7 @@ from mifit.core.estimate import GeometryEstimate
 from mifit.core.metrics import psnr_from_rmse
 from mifit.output.deferred import VisibleSurface, shade_methods, visible_surface
 from mifit.output.evaluate import compare, rgba_8_bit
-from mifit.output.reconstruction import Method
+from mifit.result import Method
 
 
 @dataclass(frozen=True)

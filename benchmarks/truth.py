@@ -13,7 +13,7 @@ from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.morphable import MorphableModel
-from mifit.output.reconstruction import Reconstruction
+from mifit.reconstruction import Reconstruction
 
 
 def true_geometry(capture: Capture, model: MorphableModel, timesteps: Sequence[int]) -> GeometryEstimate:

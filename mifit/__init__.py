@@ -35,7 +35,7 @@ _EXPORTS = {
     "refine_normals": "mifit.stages.refine_normals",
     "refine_mesh": "mifit.stages.refine_mesh",
     "refine_shape": "mifit.stages.refine_shape",
-    "Reconstruction": "mifit.output.reconstruction",
+    "Reconstruction": "mifit.reconstruction",
 }
 
 __all__ = ["__version__", *_EXPORTS]

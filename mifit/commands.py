@@ -16,7 +16,7 @@ from mifit.core.files import write_text
 from mifit.errors import InputError
 
 if TYPE_CHECKING:
-    from mifit.output.reconstruction import Reconstruction
+    from mifit.reconstruction import Reconstruction
 
 CHECKPOINTS = ".checkpoint"
 DEMO = {"model": "builtin:coarse", "width": 340, "height": 240, "spp": 32, "timesteps": 3}
@@ -186,7 +186,7 @@ def track(arguments: Namespace) -> None:
     capture = mifit.Capture.load(arguments.capture)
     _use_variant(arguments)
     from mifit.output.sequence import write_moving_pictures
-    from mifit.output.tracking import track_into
+    from mifit.tracking import track_into
 
     for name in arguments.overlay or ():
         capture.with_fitted(result.cameras).camera(name)  # an unknown one is refused now, not after the work

@@ -20,7 +20,7 @@ from mifit.progress import Progress, silent
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
-    from mifit.output.reconstruction import Reconstruction
+    from mifit.reconstruction import Reconstruction
 
 Stage = Literal["geometry", "reflectance", "normals"]
 STAGES: tuple[Stage, ...] = ("geometry", "reflectance", "normals")
@@ -82,7 +82,7 @@ def fit(
     The three stages of Song, Zheng, Cai, Cham, "Recovering Facial Reflectance and Geometry from Multi-view
     Images", sections 4 to 6. A Mitsuba variant must be active (``mifit.set_variant``).
     """
-    from mifit.output.reconstruction import Reconstruction
+    from mifit.reconstruction import Reconstruction
     from mifit.stages.fit_geometry import fit_geometry
     from mifit.stages.infer_reflectance import infer_reflectance
     from mifit.stages.refine_mesh import refine_mesh

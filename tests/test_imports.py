@@ -17,7 +17,8 @@ MAY_IMPORT = {
     "render": BASE | {"core", "render"},
     "synth": BASE | {"core", "morphable", "capture", "render", "synth"},
     "stages": BASE | {"core", "morphable", "capture", "solve", "render", "stages"},
-    "output": BASE | {"core", "morphable", "capture", "solve", "render", "stages", "output"},
+    "result": BASE | {"core", "morphable", "result"},
+    "output": BASE | {"core", "capture", "morphable", "render", "result", "output"},
 }
 FILES = sorted(p for part in MAY_IMPORT for p in (PACKAGE / part).rglob("*.py"))
 
@@ -41,6 +42,47 @@ def test_imports_go_one_way(path):
     assert parts - {"__version__"} <= MAY_IMPORT[part]
     if part != "render":
         assert not {name.split(".")[0] for name in names} & {"mitsuba", "drjit"}
+
+
+def imports_of(path: Path) -> set[str]:
+    """Modules of the package that a file imports, inside functions and for types included."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.update(f"{node.module}.{alias.name}" for alias in node.names)
+    modules = set()
+    for name in found:
+        while name not in MODULES and "." in name:
+            name = name.rpartition(".")[0]
+        modules.add(name)
+    return modules & set(MODULES)
+
+
+MODULES = {
+    ".".join(("mifit", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__"): path
+    for path in PACKAGE.rglob("*.py")
+}
+
+
+def circles() -> list[set[str]]:
+    """Sets of modules that import one another, directly or through others."""
+    edges = {name: imports_of(path) - {name} for name, path in MODULES.items()}
+    reach = {name: set(targets) for name, targets in edges.items()}
+    changed = True
+    while changed:
+        changed = False
+        for targets in reach.values():
+            more = set().union(*(reach[t] for t in targets)) - targets
+            changed |= bool(more)
+            targets |= more
+    found = {frozenset(other for other in reach[name] if name in reach[other]) for name in reach if name in reach[name]}
+    return [set(circle) for circle in found]
+
+
+def test_no_modules_import_one_another():
+    assert [c for c in circles() if not all(name.startswith("mifit.morphable") for name in c)] == []
 
 
 def test_importing_mifit_leaves_mitsuba_unloaded():

@@ -19,7 +19,7 @@ from mifit.core.uv import sample_map
 from mifit.output.surface import surface_maps
 
 if TYPE_CHECKING:
-    from mifit.output.reconstruction import Method, Reconstruction
+    from mifit.result import Method, Result
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,7 @@ class VisibleSurface:
         return out.reshape(height, width, 4)
 
 
-def visible_surface(
-    reconstruction: Reconstruction, camera: Camera, timestep: int, oversampling: int = 2
-) -> VisibleSurface:
+def visible_surface(reconstruction: Result, camera: Camera, timestep: int, oversampling: int = 2) -> VisibleSurface:
     """Find the front-facing surface under every sample of a camera's pixels."""
     i = reconstruction.index(timestep)
     return trace_mesh(reconstruction.geometry.vertices[i], reconstruction.model.faces, camera, oversampling)
@@ -123,7 +121,7 @@ class Material:
     specular: NDArray[np.float32]
 
 
-def surface_material(reconstruction: Reconstruction, surface: VisibleSurface, timestep: int) -> Material:
+def surface_material(reconstruction: Result, surface: VisibleSurface, timestep: int) -> Material:
     """Look up maps in the face area, and the fitted model's vertex albedo and the mesh's normals elsewhere."""
     model, geometry = reconstruction.model, reconstruction.geometry
     rotation = geometry.rotation[reconstruction.index(timestep)]
@@ -140,7 +138,7 @@ def surface_material(reconstruction: Reconstruction, surface: VisibleSurface, ti
 
 
 def render_local(
-    reconstruction: Reconstruction, camera: Camera, timestep: int, method: Method, oversampling: int = 2
+    reconstruction: Result, camera: Camera, timestep: int, method: Method, oversampling: int = 2
 ) -> NDArray[np.float32]:
     """Render one view by local shading; see `Reconstruction.render`."""
     surface = visible_surface(reconstruction, camera, timestep, oversampling)
@@ -148,7 +146,7 @@ def render_local(
 
 
 def shade_methods(
-    reconstruction: Reconstruction, surface: VisibleSurface, timestep: int, methods: tuple[Method, ...]
+    reconstruction: Result, surface: VisibleSurface, timestep: int, methods: tuple[Method, ...]
 ) -> dict[Method, NDArray[np.float32]]:
     """Images (H, W, 4) of one visible surface by several methods.
 
@@ -180,7 +178,7 @@ def shade_methods(
     return {m: out[m] for m in methods}
 
 
-def _traced(reconstruction: Reconstruction, surface: VisibleSurface, timestep: int) -> NDArray:
+def _traced(reconstruction: Result, surface: VisibleSurface, timestep: int) -> NDArray:
     """(N, B*B) shadowed transfer at the mesh's normals."""
     from mifit.render.transfer import trace_transfer
 
@@ -190,14 +188,14 @@ def _traced(reconstruction: Reconstruction, surface: VisibleSurface, timestep: i
     return interpolate(at_vertices, faces, surface.face, surface.weights)
 
 
-def _mesh_normals(reconstruction: Reconstruction, surface: VisibleSurface, timestep: int) -> NDArray:
+def _mesh_normals(reconstruction: Result, surface: VisibleSurface, timestep: int) -> NDArray:
     """(N, 3) unit normals of the fitted mesh in world space, interpolated."""
     faces = reconstruction.model.faces
     normals = vertex_normals(reconstruction.geometry.vertices[reconstruction.index(timestep)], faces)
     return normalize(interpolate(normals, faces, surface.face, surface.weights))
 
 
-def _shade_stage_1(reconstruction: Reconstruction, surface: VisibleSurface, timestep: int) -> NDArray:
+def _shade_stage_1(reconstruction: Result, surface: VisibleSurface, timestep: int) -> NDArray:
     """The paper's I_a + I_d (section 4.1) with the fitted model's albedo and normals."""
     geometry = reconstruction.geometry
     normal = _mesh_normals(reconstruction, surface, timestep)

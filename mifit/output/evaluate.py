@@ -22,7 +22,7 @@ from mifit.progress import Progress, silent
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
-    from mifit.output.reconstruction import Method, Reconstruction
+    from mifit.result import Method, Result
 
 EROSION = 2
 """Pixels by which the face area shrinks before errors are measured in it."""
@@ -49,7 +49,7 @@ class Comparison:
 
 
 def evaluate(
-    reconstruction: Reconstruction,
+    reconstruction: Result,
     capture: Capture,
     camera: str,
     timesteps: Sequence[int] | None = None,
@@ -65,7 +65,7 @@ def evaluate(
 
     Parameters
     ----------
-    reconstruction : Reconstruction
+    reconstruction : Result
     capture : Capture
     camera : str
         A camera of the capture.
@@ -121,7 +121,7 @@ def _figures(means: NDArray) -> dict[str, float]:
 
 
 def compare(
-    reconstruction: Reconstruction,
+    reconstruction: Result,
     capture: Capture,
     camera: str,
     timestep: int,
@@ -153,7 +153,7 @@ def compare(
     return Comparison(timestep, to_8_bit(frame.image), area, renders)
 
 
-def as_photographed(reconstruction: Reconstruction, image: NDArray, camera: str) -> NDArray:
+def as_photographed(reconstruction: Result, image: NDArray, camera: str) -> NDArray:
     """A render (H, W, 4) with the exposure and white balance that the fit found for a camera."""
     gain = reconstruction.geometry.gain(camera)
     return image if (gain == 1).all() else image * np.append(gain, np.float32(1.0))
@@ -175,9 +175,7 @@ def face_area(vertices: NDArray, faces: NDArray, face_mask: NDArray, camera: Cam
     return binary_erosion(area.reshape(camera.height, camera.width), np.ones((side, side)), border_value=1)
 
 
-def _truth(
-    capture: Capture, reconstruction: Reconstruction, timestep: int
-) -> tuple[NDArray, NDArray, NDArray[np.bool_]]:
+def _truth(capture: Capture, reconstruction: Result, timestep: int) -> tuple[NDArray, NDArray, NDArray[np.bool_]]:
     """Vertices, faces and face area of the capture's ground-truth mesh.
 
     The mesh's faces are those that the truth folder carries (``faces`` and ``face_mask`` in ``mesh.npz``), else

@@ -10,13 +10,14 @@ import numpy as np
 from mifit.core.files import replacing, write_text
 from mifit.core.image import encode_png, linear_to_srgb, to_8_bit, write_image
 from mifit.core.mesh import vertex_normals
+from mifit.core.ply import write_ply
+from mifit.core.split_mesh import part_of, split_at_seams, tangent_space_map
 from mifit.errors import InputError
 from mifit.output.gltf import write_glb
-from mifit.output.ply import write_ply
-from mifit.output.surface import part_of, split_at_seams, surface_maps, tangent_space_map
+from mifit.output.surface import surface_maps
 
 if TYPE_CHECKING:
-    from mifit.output.reconstruction import Reconstruction
+    from mifit.result import Result
 
 Format = Literal["glb", "obj", "ply", "mitsuba"]
 SUFFIXES = {"glb": ".glb", "obj": ".obj", "ply": ".ply", "mitsuba": ".xml"}
@@ -26,7 +27,7 @@ Mesh = Literal["fitted", "refined"]
 
 
 def export(
-    reconstruction: Reconstruction,
+    reconstruction: Result,
     format: Format,
     path: str | Path,
     timestep: int | None = None,
@@ -38,7 +39,7 @@ def export(
 
     Parameters
     ----------
-    reconstruction : Reconstruction
+    reconstruction : Result
     format : {"glb", "obj", "ply", "mitsuba"}
         ``glb``: binary glTF (`write_glb`). ``obj``: mesh in world space, ``.mtl`` and maps beside it. ``ply``: mesh
         in world space with UVs, normals and vertex colours. ``mitsuba``: a scene with mifit's plugins and, as
@@ -92,7 +93,7 @@ def export(
         write_scene(reconstruction, path, timestep)
 
 
-def _write_obj(reconstruction: Reconstruction, path: Path, timestep: int) -> None:
+def _write_obj(reconstruction: Result, path: Path, timestep: int) -> None:
     """OBJ with ``vt`` and ``vn``; the face area and the rest are two groups with a material each."""
     model, i = reconstruction.model, reconstruction.index(timestep)
     vertices = reconstruction.geometry.vertices[i]

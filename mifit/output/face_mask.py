@@ -19,7 +19,7 @@ from mifit.output.evaluate import as_photographed, face_area
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
-    from mifit.output.reconstruction import Reconstruction
+    from mifit.result import Result
 
 DEPARTURE = 6.0
 """Robust standard deviations of the residual from which a pixel is unexplained."""
@@ -59,7 +59,7 @@ class FaceMask:
 
 
 def face_mask(
-    reconstruction: Reconstruction,
+    reconstruction: Result,
     capture: Capture,
     camera: str,
     timestep: int,
@@ -69,7 +69,7 @@ def face_mask(
 
     Parameters
     ----------
-    reconstruction : Reconstruction
+    reconstruction : Result
     capture : Capture
     camera : str
         A camera of the capture; an occluder is found in an image of the fit or in any other.

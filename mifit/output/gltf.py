@@ -18,19 +18,13 @@ from mifit.core.blinn_phong import normalization
 from mifit.core.files import replacing
 from mifit.core.image import encode_png, to_8_bit
 from mifit.core.mesh import vertex_normals
-from mifit.output.surface import (
-    SplitMesh,
-    part_of,
-    split_at_seams,
-    surface_maps,
-    tangent_space_map,
-    tangents,
-)
+from mifit.core.split_mesh import SplitMesh, part_of, split_at_seams, tangent_space_map, tangents
+from mifit.output.surface import surface_maps
 
 if TYPE_CHECKING:
     from mifit.core.camera import Camera
     from mifit.core.estimate import GeometryEstimate
-    from mifit.output.reconstruction import Reconstruction
+    from mifit.result import Result
 
 _KINDS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
@@ -71,7 +65,7 @@ class _Buffer:
 
 
 def write_glb(
-    reconstruction: Reconstruction,
+    reconstruction: Result,
     path: str | Path,
     timestep: int | None = None,
     animate: Sequence[int] | None = None,
@@ -88,7 +82,7 @@ def write_glb(
 
     Parameters
     ----------
-    reconstruction : Reconstruction
+    reconstruction : Result
     path : path
     timestep : int, optional
         Whose mesh and normal map it has; default: the first that is animated, or else that was fitted.
@@ -206,7 +200,7 @@ def _primitive(
 
 
 def _skin(
-    out: _Buffer, reconstruction: Reconstruction, timestep: int, mesh: SplitMesh, vertices: NDArray, normals: NDArray
+    out: _Buffer, reconstruction: Result, timestep: int, mesh: SplitMesh, vertices: NDArray, normals: NDArray
 ) -> tuple[list[dict], list[dict], dict[str, Any]]:
     """Images, textures and material of the face area."""
     maps = surface_maps(reconstruction, timestep)

@@ -20,22 +20,23 @@ from mifit.output.evaluate import face_area
 from mifit.output.figures import HEAT_LIMIT, heat_map
 from mifit.output.turntable import sheet
 from mifit.progress import Progress, silent
+from mifit.result.record import R
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.core.camera import Camera
-    from mifit.output.reconstruction import Method, Reconstruction
+    from mifit.result import Method, Result
 
 MAP_ROWS = 512
 """Rows to which an environment is reduced; finer light than 0.35 degrees makes no difference on skin."""
 
 
 def relit(
-    reconstruction: Reconstruction,
+    reconstruction: R,
     environment: str | Path | NDArray,
     rotate: float = 0.0,
     exposure: float | None = None,
-) -> Reconstruction:
+) -> R:
     """Replace the lighting of a reconstruction; see `Reconstruction.relight`."""
     reflectance = reconstruction.reflectance
     if reflectance is None:
@@ -75,7 +76,7 @@ def _turned(image: NDArray[np.float32], angle: float) -> NDArray[np.float32]:
 
 
 def write_relit(
-    reconstruction: Reconstruction,
+    reconstruction: Result,
     environment: str | Path,
     folder: str | Path,
     rotate: float = 0.0,
@@ -130,7 +131,7 @@ def write_relit(
 
 
 def evaluate_relit(
-    reconstruction: Reconstruction,
+    reconstruction: Result,
     environment: str | Path | NDArray,
     capture: Capture,
     camera: str,
@@ -146,7 +147,7 @@ def evaluate_relit(
 
     Parameters
     ----------
-    reconstruction : Reconstruction
+    reconstruction : Result
         Fitted to the head under another lighting.
     environment, rotate
         As in `Reconstruction.relight`.

@@ -36,7 +36,7 @@ from mifit.output.viewer import viewer_data
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
-    from mifit.output.reconstruction import Reconstruction
+    from mifit.result import Result
 
 NAMES = {
     "pca": "Stage 1 (PCA)",
@@ -50,7 +50,7 @@ SHOWN_TIMESTEPS = 4
 
 def write_report(
     folder: str | Path,
-    reconstruction: Reconstruction,
+    reconstruction: Result,
     capture: Capture,
     evaluation: dict[str, Any] | None = None,
 ) -> Path:
@@ -59,7 +59,7 @@ def write_report(
     Parameters
     ----------
     folder : path
-    reconstruction : Reconstruction
+    reconstruction : Result
     capture : Capture
         Only the fitted cameras are read, and the evaluated one when an evaluation is given.
     evaluation : dict, optional
@@ -114,13 +114,13 @@ def _asset(name: str) -> str:
     return resources.files("mifit.output").joinpath("assets", name).read_text(encoding="utf-8")
 
 
-def _subtitle(result: Reconstruction) -> str:
+def _subtitle(result: Result) -> str:
     cameras = " and ".join(c.name for c in result.cameras)
     steps = ", ".join(map(str, result.timesteps[:12])) + (", ..." if len(result.timesteps) > 12 else "")
     return html.escape(f"Model {result.model.name}; fitted to cameras {cameras} at timesteps {steps}.")
 
 
-def _summary(result: Reconstruction, evaluation: dict[str, Any] | None) -> str:
+def _summary(result: Result, evaluation: dict[str, Any] | None) -> str:
     parts = []
     if evaluation is not None:
         held_out = evaluation["camera"] not in [c.name for c in result.cameras]
@@ -147,7 +147,7 @@ def _summary(result: Reconstruction, evaluation: dict[str, Any] | None) -> str:
     return "".join(parts)
 
 
-def all_warnings(result: Reconstruction) -> list[str]:
+def all_warnings(result: Result) -> list[str]:
     """Warnings of the fit and its stages, in words; a stage that did not converge counts as one."""
     out = list(result.warnings)
     for name, report in result.reports.items():
@@ -158,7 +158,7 @@ def all_warnings(result: Reconstruction) -> list[str]:
     return out
 
 
-def _view3d(result: Reconstruction, timestep: int) -> str:
+def _view3d(result: Result, timestep: int) -> str:
     modes = ["Full", "Diffuse only", "Diffuse albedo", "Specular albedo", "Normals", "Grey surface"]
     if result.reflectance is None:
         modes = ["Full", *modes[2:3], *modes[4:]]
@@ -177,7 +177,7 @@ def _view3d(result: Reconstruction, timestep: int) -> str:
 <script type="application/json" id="view3d-data">{data}</script>"""
 
 
-def _comparison(result: Reconstruction, capture: Capture, evaluation: dict[str, Any]) -> str:
+def _comparison(result: Result, capture: Capture, evaluation: dict[str, Any]) -> str:
     camera, parts = evaluation["camera"], []
     limit = f"{HEAT_LIMIT:.0f} of 255"
     parts.append(
@@ -220,7 +220,7 @@ def _slider(found: Comparison) -> str:
 <div class="controls" data-choice="{name}">{buttons}</div></div>"""
 
 
-def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]) -> str:
+def _inputs(result: Result, capture: Capture, timesteps: tuple[int, ...]) -> str:
     parts = []
     for timestep in timesteps:
         figures = []
@@ -256,7 +256,7 @@ def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]
     return key + "".join(parts) + more
 
 
-def _maps(result: Reconstruction, timestep: int) -> str:
+def _maps(result: Result, timestep: int) -> str:
     if result.reflectance is None:
         return ""
     reflectance = result.reflectance
@@ -291,7 +291,7 @@ def _grey(caption: str, values: NDArray, peak: float | None = None) -> str:
     return _figure(jpeg_uri(codes), f"{caption} (white = {white:.3g})", caption.lower())
 
 
-def _lighting(result: Reconstruction) -> str:
+def _lighting(result: Result) -> str:
     lighting = result.lighting
     matt, mirror = lighting_balls(lighting)
     panorama = np.maximum(lighting.to_latlong(), 0)
@@ -312,7 +312,7 @@ def _lighting(result: Reconstruction) -> str:
 Ambient term {ambient:.4f}.</p>"""
 
 
-def _convergence(result: Reconstruction) -> str:
+def _convergence(result: Result) -> str:
     rows = "".join(
         f"<tr><td>{STAGES[n]}</td><td>{html.escape(r.outcome.replace('_', ' '))}</td>"
         f"<td>{max((len(v) for v in r.energies.values()), default=0)}</td><td>{r.seconds:.1f}</td></tr>"
@@ -330,7 +330,7 @@ def _convergence(result: Reconstruction) -> str:
     )
 
 
-def _settings(result: Reconstruction) -> str:
+def _settings(result: Result) -> str:
     text = html.escape(json.dumps(result.config, indent=1, default=str))
     return f"<details><summary>Settings of this fit</summary><pre>{text}</pre></details>"
 

@@ -20,22 +20,23 @@ from mifit.core.camera import Camera
 from mifit.core.files import write_text
 from mifit.core.image import write_image
 from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.ply import write_ply
+from mifit.core.split_mesh import SplitMesh, part_of, split_at_seams
 from mifit.core.uv import rasterize_uv
 from mifit.output.deferred import visible_surface
-from mifit.output.ply import write_ply
-from mifit.output.surface import SplitMesh, part_of, split_at_seams, surface_maps
+from mifit.output.surface import surface_maps
 from mifit.render.description import Parameter, to_xml
 from mifit.render.sensor import sensor_description
 
 if TYPE_CHECKING:
-    from mifit.output.reconstruction import Method, Reconstruction
+    from mifit.result import Method, Result
 
 STEEPEST = 4.0
 """Largest slope of a normal correction: 76 degrees."""
 
 
 def write_scene(
-    reconstruction: Reconstruction,
+    reconstruction: Result,
     path: str | Path,
     timestep: int,
     cameras: Sequence[Camera] | None = None,
@@ -54,7 +55,7 @@ def write_scene(
 
     Parameters
     ----------
-    reconstruction : Reconstruction
+    reconstruction : Result
     path : path
         ``.xml`` file.
     timestep : int
@@ -84,7 +85,7 @@ def write_scene(
 
 
 def render_path(
-    reconstruction: Reconstruction, camera: Camera, timestep: int, method: Method, samples: int, seed: int
+    reconstruction: Result, camera: Camera, timestep: int, method: Method, samples: int, seed: int
 ) -> NDArray[np.float32]:
     """Path trace one view through the scene file; see `Reconstruction.render`."""
     from mifit.render.scene_image import render_scene
@@ -102,7 +103,7 @@ def render_path(
     return np.concatenate([colour, alpha], axis=-1).astype(np.float32)
 
 
-def _write_files(reconstruction: Reconstruction, files: Path, timestep: int, method: Method) -> None:
+def _write_files(reconstruction: Result, files: Path, timestep: int, method: Method) -> None:
     model, geometry = reconstruction.model, reconstruction.geometry
     if method == "pca":
         reconstruction = replace(reconstruction, reflectance=None, normals=None)
@@ -140,7 +141,7 @@ def _write_files(reconstruction: Reconstruction, files: Path, timestep: int, met
 
 
 def _slopes(
-    reconstruction: Reconstruction,
+    reconstruction: Result,
     timestep: int,
     normal_object: NDArray,
     vertices: NDArray,
@@ -172,7 +173,7 @@ def _slopes(
 
 
 def scene_description(
-    reconstruction: Reconstruction, cameras: Sequence[Camera], method: Method, stock: bool, files: str
+    reconstruction: Result, cameras: Sequence[Camera], method: Method, stock: bool, files: str
 ) -> dict[str, Any]:
     """The scene of `write_scene` as a plain dictionary (`render.description`), its files in the folder ``files``.
 
@@ -223,7 +224,7 @@ def _texture(file: str, raw: bool = True) -> dict[str, Any]:
     return {"type": "bitmap", "filename": file, "raw": raw, "wrap_mode": "clamp"}
 
 
-def _skin(reconstruction: Reconstruction, files: str, stock: bool) -> dict[str, Any]:
+def _skin(reconstruction: Result, files: str, stock: bool) -> dict[str, Any]:
     reflectance = reconstruction.reflectance
     exponent = float(reflectance.exponent) if reflectance else 1.0
     if stock:
@@ -261,7 +262,7 @@ def _shape(file: str, bsdf: dict[str, Any]) -> dict[str, Any]:
     return {"type": "ply", "filename": file, "flip_tex_coords": True, "bsdf": bsdf}
 
 
-def _without_key(reconstruction: Reconstruction) -> Reconstruction:
+def _without_key(reconstruction: Result) -> Result:
     if reconstruction.reflectance is None:
         return reconstruction
     return replace(reconstruction, reflectance=replace(reconstruction.reflectance, key_direction=None))

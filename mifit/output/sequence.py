@@ -21,14 +21,14 @@ from mifit.progress import Progress, silent
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
-    from mifit.output.reconstruction import Method, Reconstruction
+    from mifit.result import Method, Result
 
 CODECS = ("vp09", "mp4v")
 """Video codecs by preference: browsers play VP9; every OpenCV can write MPEG-4."""
 
 
 def write_sequence(
-    reconstruction: Reconstruction,
+    reconstruction: Result,
     path: str | Path,
     start: float = 0.0,
     stop: float = 0.0,
@@ -41,7 +41,7 @@ def write_sequence(
 
     Parameters
     ----------
-    reconstruction : Reconstruction
+    reconstruction : Result
         Fitted, tracked or relit.
     path : path
         ``.mp4``, or ``.webp`` for an animated picture.
@@ -86,7 +86,7 @@ def write_sequence(
 
 
 def write_overlay(
-    reconstruction: Reconstruction,
+    reconstruction: Result,
     capture: Capture,
     camera: str,
     path: str | Path,
@@ -97,7 +97,7 @@ def write_overlay(
 
     Parameters
     ----------
-    reconstruction : Reconstruction
+    reconstruction : Result
     capture : Capture
         Its images of ``camera``, at the timesteps of the result.
     camera : str
@@ -130,7 +130,7 @@ def write_overlay(
 
 def write_moving_pictures(
     folder: str | Path,
-    reconstruction: Reconstruction,
+    reconstruction: Result,
     capture: Capture,
     cameras: Sequence[str] | None = None,
     fps: float = 12.0,

@@ -19,13 +19,13 @@ from mifit.output.deferred import shade_methods, visible_surface
 from mifit.progress import Progress, silent
 
 if TYPE_CHECKING:
-    from mifit.output.reconstruction import Method, Reconstruction
+    from mifit.result import Method, Result
 
 BACKDROP = 0.35
 """Linear grey behind the head on sheets and in animations."""
 
 
-def orbit_camera(reconstruction: Reconstruction, timestep: int, degrees: float) -> Camera:
+def orbit_camera(reconstruction: Result, timestep: int, degrees: float) -> Camera:
     """A camera that looks at the face from an angle about the vertical; 0 is straight from the front.
 
     Image size, focal length and distance are those of the fitted cameras; positive angles move the camera to
@@ -57,7 +57,7 @@ def orbit_camera(reconstruction: Reconstruction, timestep: int, degrees: float) 
 
 
 def write_turntable(
-    reconstruction: Reconstruction,
+    reconstruction: Result,
     folder: str | Path,
     start: float = -35.0,
     stop: float = 35.0,
@@ -72,7 +72,7 @@ def write_turntable(
 
     Parameters
     ----------
-    reconstruction : Reconstruction
+    reconstruction : Result
     folder : path
         Made when it is missing.
     start, stop : float

@@ -13,14 +13,15 @@ from mifit.core.blinn_phong import lobe_table, normalization
 from mifit.core.image import to_8_bit
 from mifit.core.mesh import vertex_normals
 from mifit.core.sh import SHLighting, bands, cosine_coefficients
+from mifit.core.split_mesh import part_of, split_at_seams
 from mifit.output.figures import jpeg_uri, png_uri
-from mifit.output.surface import part_of, split_at_seams, surface_maps
+from mifit.output.surface import surface_maps
 
 if TYPE_CHECKING:
-    from mifit.output.reconstruction import Reconstruction
+    from mifit.result import Result
 
 
-def viewer_data(reconstruction: Reconstruction, timestep: int) -> str:
+def viewer_data(reconstruction: Result, timestep: int) -> str:
     """JSON for the 3D view of one timestep; quantised, for looking at only.
 
     Positions have 16 bits of the bounding sphere, normals 8, texture coordinates 16; the alpha of the vertex
@@ -69,7 +70,7 @@ def viewer_data(reconstruction: Reconstruction, timestep: int) -> str:
     return json.dumps(data)
 
 
-def _lighting(reconstruction: Reconstruction) -> dict[str, Any]:
+def _lighting(reconstruction: Result) -> dict[str, Any]:
     """Recovered lighting as the view's shader wants it.
 
     9 coefficients of what white reflects, and for the lobe a lat-long picture of the lighting that is convolved with

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mifit.config import MeshConfig
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, Report
 from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.mesh_update import MeshUpdater, displacement, interior_vertices, subdivide, wanted_face_normals
+from mifit.core.mesh_update import MeshUpdater, displacement, interior_vertices, wanted_face_normals
+from mifit.core.subdivision import split_faces
 from mifit.core.uv import rasterize_uv
 from mifit.progress import Progress, silent
 
@@ -71,71 +70,6 @@ def refine_mesh(
         topology.uv,
         heights,
         Report("converged", seconds=time.perf_counter() - began, details=details),
-    )
-
-
-@dataclass(frozen=True)
-class Topology:
-    """A model's mesh with its faces split.
-
-    Attributes
-    ----------
-    faces, faces_uv : (F', 3) int32
-    uv : (T', 2) float32
-    face_mask : (F',) bool
-    matrix : (V', V) sparse
-        Values at the model's vertices -> values at these; the model's come first, unchanged.
-    """
-
-    faces: NDArray[np.int32]
-    faces_uv: NDArray[np.int32]
-    uv: NDArray[np.float32]
-    face_mask: NDArray[np.bool_]
-    matrix: sp.csr_matrix
-
-    @property
-    def n_vertices(self) -> int:
-        """Number of vertices V'."""
-        return self.matrix.shape[0]
-
-
-def split_faces(model: MorphableModel, subdivisions: int) -> Topology:
-    """A model's mesh with every face split into four, ``subdivisions`` times."""
-    faces: NDArray = model.faces
-    faces_uv: NDArray = model.faces_uv
-    uv = model.uv.astype(np.float64)
-    matrix = sp.identity(len(model.mean), format="csr")
-    for _ in range(subdivisions):
-        split, split_uv = subdivide(faces, matrix.shape[0]), subdivide(faces_uv, len(uv))
-        matrix, uv = split.matrix @ matrix, split_uv.matrix @ uv
-        faces, faces_uv = split.faces, split_uv.faces
-    mask = np.repeat(model.face_mask, 4**subdivisions)
-    return Topology(faces.astype(np.int32), faces_uv.astype(np.int32), uv.astype(np.float32), mask, matrix)
-
-
-def finer_model(model: MorphableModel, subdivisions: int) -> MorphableModel:
-    """A model on the split mesh of `split_faces`: shapes and albedos are those of the model, landmarks its vertices."""
-    if not subdivisions:
-        return model
-    topology = split_faces(model, subdivisions)
-
-    def lift(values: NDArray) -> NDArray[np.float32]:
-        flat = topology.matrix @ values.reshape(len(values), -1)
-        return flat.reshape(topology.n_vertices, *values.shape[1:]).astype(np.float32)
-
-    return replace(
-        model,
-        mean=lift(model.mean),
-        identity=lift(model.identity),
-        expression=lift(model.expression),
-        mean_albedo=lift(model.mean_albedo),
-        albedo_modes=lift(model.albedo_modes),
-        faces=topology.faces,
-        faces_uv=topology.faces_uv,
-        uv=topology.uv,
-        face_mask=topology.face_mask,
-        symmetry=None,
-        fingerprint=f"{model.fingerprint}/{subdivisions}" if model.fingerprint else "",
     )
 
 

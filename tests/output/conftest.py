@@ -13,7 +13,7 @@ from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEs
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
-from mifit.output.reconstruction import Reconstruction
+from mifit.reconstruction import Reconstruction
 from mifit.stages.refine_mesh import refine_mesh
 
 RADIUS = 9.0

@@ -14,9 +14,9 @@ import trimesh
 
 from mifit.core.image import read_image
 from mifit.core.mesh import vertex_normals
+from mifit.core.split_mesh import part_of, split_at_seams
 from mifit.errors import InputError
 from mifit.output.export import SUFFIXES, export
-from mifit.output.surface import part_of, split_at_seams
 
 
 def read_glb(path):

@@ -12,7 +12,7 @@ from stages.test_infer_reflectance import infer
 
 from mifit.output.face_mask import face_mask
 from mifit.output.figures import tint
-from mifit.output.reconstruction import Reconstruction
+from mifit.reconstruction import Reconstruction
 from mifit.synth.compose import expose
 
 HAND = (0.42, 0.30, 0.24)

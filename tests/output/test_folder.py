@@ -12,10 +12,10 @@ import pytest
 import trimesh
 
 from mifit.core.mesh import vertex_normals
+from mifit.core.split_mesh import split_at_seams, tangents
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
-from mifit.output.reconstruction import Reconstruction
-from mifit.output.surface import split_at_seams, tangents
+from mifit.reconstruction import Reconstruction
 
 
 @pytest.fixture(scope="module")

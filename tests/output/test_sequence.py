@@ -12,12 +12,12 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mifit.core.image import to_8_bit
+from mifit.core.split_mesh import part_of, split_at_seams
 from mifit.errors import InputError
 from mifit.output.evaluate import rgba_8_bit
 from mifit.output.export import export
 from mifit.output.figures import overlay
 from mifit.output.sequence import write_moving_pictures, write_overlay, write_sequence, write_video
-from mifit.output.surface import part_of, split_at_seams
 from mifit.output.turntable import on_backdrop, orbit_camera
 from tests.output.test_export import read_glb
 from tests.output.test_render_evaluate import FakeCapture

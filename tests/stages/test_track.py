@@ -168,7 +168,7 @@ def test_landmark_error_is_in_pixels(scene):
 @pytest.fixture
 def saved(scene, tmp_path):
     """A result with timestep 0 in a folder, and its reload."""
-    from mifit.output.reconstruction import Reconstruction
+    from mifit.reconstruction import Reconstruction
     from mifit.stages.refine_mesh import refine_mesh
 
     scene.model.save(tmp_path / "dome.npz")
@@ -191,13 +191,13 @@ def saved(scene, tmp_path):
 
 
 def reload(folder):
-    from mifit.output.reconstruction import Reconstruction
+    from mifit.reconstruction import Reconstruction
 
     return Reconstruction.load(folder)
 
 
 def test_each_frame_is_on_disk_when_it_is_done(scene, fit_truth, saved, monkeypatch):
-    from mifit.output import tracking
+    from mifit import tracking
 
     seen = []
     write = tracking.add_timestep
@@ -216,8 +216,8 @@ def test_each_frame_is_on_disk_when_it_is_done(scene, fit_truth, saved, monkeypa
 
 
 def test_meshes_of_tracked_frames_are_refined_as_those_of_the_fit(scene, fit_truth, saved):
-    from mifit.output.tracking import track_into
     from mifit.stages.refine_mesh import refine_mesh
+    from mifit.tracking import track_into
 
     found = track_into(saved, reload(saved), scene, (1,), CONFIG)
     expected = refine_mesh(scene.model, found.geometry, found.normals, MeshConfig(subdivisions=1, detail=20.0))
@@ -233,8 +233,8 @@ def test_meshes_of_tracked_frames_are_refined_as_those_of_the_fit(scene, fit_tru
 def test_a_killed_run_resumes_to_the_same_result(scene, fit_truth, saved, tmp_path, monkeypatch, killed_after, moment):
     import shutil
 
-    from mifit.output import folder as folder_module
-    from mifit.output import tracking
+    from mifit import tracking
+    from mifit.result import writing as folder_module
 
     whole = tmp_path / "whole"
     shutil.copytree(saved, whole)
@@ -270,7 +270,7 @@ def test_a_killed_run_resumes_to_the_same_result(scene, fit_truth, saved, tmp_pa
 
 
 def test_without_resume_frames_are_tracked_anew(scene, fit_truth, saved):
-    from mifit.output.tracking import track_into
+    from mifit.tracking import track_into
 
     track_into(saved, reload(saved), scene, (1,), CONFIG)
     assert len(fit_truth) == 1
@@ -282,7 +282,7 @@ def test_without_resume_frames_are_tracked_anew(scene, fit_truth, saved):
 
 
 def test_a_result_without_reflectance_is_refused(scene, saved):
-    from mifit.output.tracking import track_into
+    from mifit.tracking import track_into
 
     with pytest.raises(InputError, match="without reflectance"):
         track_into(saved, replace(reload(saved), reflectance=None, normals=None), scene, (1,), CONFIG)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,21 +14,17 @@ from mifit.config import MeshConfig
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.image import read_image
+from mifit.core.ply import read_ply
+from mifit.core.split_mesh import SplitMesh, split_at_seams
+from mifit.core.subdivision import split_faces
 from mifit.errors import InputError
-from mifit.output.folder import FORMAT_VERSION
-from mifit.output.ply import read_ply
-from mifit.output.surface import SplitMesh, split_at_seams
-from mifit.stages.refine_mesh import split_faces
-
-if TYPE_CHECKING:
-    from mifit.morphable import MorphableModel
-    from mifit.output.reconstruction import Reconstruction
+from mifit.morphable import MorphableModel
+from mifit.result.record import R
+from mifit.result.writing import FORMAT_VERSION
 
 
-def load(folder: Path, model: MorphableModel | None) -> Reconstruction:
-    """Read a result folder; see `Reconstruction.load`."""
-    from mifit.output.reconstruction import Reconstruction
-
+def load(cls: type[R], folder: Path, model: MorphableModel | None = None) -> R:
+    """Read a result folder as a `Result` or a class made from it; see `Reconstruction.load`."""
     path = folder / "result.json"
     document = _read_document(folder, path)
     try:
@@ -42,7 +38,7 @@ def load(folder: Path, model: MorphableModel | None) -> Reconstruction:
             )
         geometry = _geometry(folder, document, model)
         capture = document["capture"]
-        return Reconstruction(
+        return cls(
             model=model,
             model_source=document["model"]["source"],
             geometry=geometry,
@@ -89,8 +85,6 @@ def _read_document(folder: Path, path: Path) -> dict[str, Any]:
 
 
 def _load_model(entry: dict[str, Any], path: Path) -> MorphableModel:
-    from mifit.morphable import MorphableModel
-
     if not entry["source"]:
         raise InputError(
             f"{path}: doesn't say which file holds its model {entry['name']!r}; "

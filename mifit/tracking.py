@@ -12,19 +12,20 @@ import numpy as np
 from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, from_mapping
 from mifit.core.estimate import NormalsEstimate, Report
 from mifit.errors import InputError
-from mifit.output.folder import add_timestep
 from mifit.progress import Progress, silent
+from mifit.result.record import R
+from mifit.result.writing import add_timestep
 from mifit.stages.refine_mesh import MeshRefiner
 from mifit.stages.track import TrackedFrame, track
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
-    from mifit.output.reconstruction import Reconstruction
+    from mifit.result import Result
 
 
 def track_into(
     folder: str | Path,
-    result: Reconstruction,
+    result: R,
     capture: Capture,
     timesteps: Sequence[int],
     config: NormalsConfig | None = None,
@@ -32,7 +33,7 @@ def track_into(
     seed: int = 0,
     resume: bool = False,
     progress: Progress = silent,
-) -> Reconstruction:
+) -> R:
     """Track timesteps and write each into the result folder as it is done.
 
     Parameters
@@ -91,7 +92,7 @@ def track_into(
     return result
 
 
-def mesh_refiner(result: Reconstruction) -> MeshRefiner:
+def mesh_refiner(result: Result) -> MeshRefiner:
     """What refines the meshes of further timesteps as those of a result are."""
     assert result.mesh is not None and result.reflectance is not None
     settings = from_mapping(MeshConfig, result.config.get("mesh", {}), "result.json: config: mesh")
@@ -99,7 +100,7 @@ def mesh_refiner(result: Reconstruction) -> MeshRefiner:
     return MeshRefiner(result.model, len(result.reflectance.diffuse), settings)
 
 
-def extend(result: Reconstruction, frame: TrackedFrame, refiner: MeshRefiner | None = None) -> Reconstruction:
+def extend(result: R, frame: TrackedFrame, refiner: MeshRefiner | None = None) -> R:
     """A result with one more timestep; its normals' report lists it under ``tracked``.
 
     With a refiner its refined mesh is made too.
@@ -138,7 +139,7 @@ def extend(result: Reconstruction, frame: TrackedFrame, refiner: MeshRefiner | N
     return replace(result, geometry=geometry, normals=normals, mesh=mesh)
 
 
-def _without(result: Reconstruction, dropped: Sequence[int]) -> Reconstruction:
+def _without(result: R, dropped: Sequence[int]) -> R:
     """A result less some of its tracked timesteps."""
     if not dropped or result.normals is None:
         return result

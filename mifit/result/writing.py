@@ -1,13 +1,13 @@
-"""Writing the result folder, a `Reconstruction` on disk (docs/formats.md)."""
+"""Writing the result folder, a `Result` on disk (docs/formats.md)."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,19 +19,16 @@ from mifit.core.files import replacing, write_text
 from mifit.core.image import encode_png, write_image
 from mifit.core.keylight import KeyLight
 from mifit.core.mesh import vertex_normals
-from mifit.output.ply import write_ply
-from mifit.output.scene import write_scene
-from mifit.output.surface import SplitMesh, split_at_seams, tangent_space_map
-from mifit.stages.refine_mesh import split_faces
-
-if TYPE_CHECKING:
-    from mifit.output.reconstruction import Reconstruction
+from mifit.core.ply import write_ply
+from mifit.core.split_mesh import SplitMesh, split_at_seams, tangent_space_map
+from mifit.core.subdivision import split_faces
+from mifit.result.record import Result
 
 FORMAT_VERSION = 1
 
 
-def save(result: Reconstruction, folder: Path) -> None:
-    """Write a result folder.
+def save(result: Result, folder: Path, write_scene: Callable[[Path], None]) -> None:
+    """Write a result folder; ``write_scene`` writes the scene file that it is given, and those beside it.
 
     An older ``result.json`` goes first and the new one comes last: a folder that has one is whole.
     """
@@ -56,17 +53,17 @@ def save(result: Reconstruction, folder: Path) -> None:
         for name in ("diffuse", "specular", "confidence"):
             write_image(folder / "maps" / f"{name}.exr", getattr(result.reflectance, name))
         write_image(folder / "lighting.exr", result.lighting.to_latlong())
-    write_scene(result, folder / "scene.xml", result.timesteps[0])
+    write_scene(folder / "scene.xml")
     write_text(folder / "result.json", json.dumps(_document(result), indent=1, allow_nan=False) + "\n")
 
 
-def add_timestep(result: Reconstruction, folder: Path, timestep: int) -> None:
+def add_timestep(result: Result, folder: Path, timestep: int) -> None:
     """Write the files of one timestep of a result into its folder, then ``result.json`` anew."""
     _write_timestep(result, folder, timestep, _surfaces(result))
     write_text(folder / "result.json", json.dumps(_document(result), indent=1, allow_nan=False) + "\n")
 
 
-def _surfaces(result: Reconstruction) -> list[_Surface]:
+def _surfaces(result: Result) -> list[_Surface]:
     """The fitted mesh and, where there is one, the refined mesh, as files hold them."""
     albedo = result.geometry.vertex_albedo
     found = [_Surface("geometry", split_at_seams(result.model), result.model.faces, albedo)]
@@ -92,7 +89,7 @@ class _Surface:
         write_ply(path, vertices[at], self.mesh.faces, normals[at], self.mesh.uv, self.albedo[at])
 
 
-def _write_timestep(result: Reconstruction, folder: Path, timestep: int, surfaces: Sequence[_Surface]) -> None:
+def _write_timestep(result: Result, folder: Path, timestep: int, surfaces: Sequence[_Surface]) -> None:
     """Meshes, normal maps and displacement map of one timestep."""
     i, fitted = result.index(timestep), surfaces[0]
     vertices = result.geometry.vertices[i]
@@ -119,7 +116,7 @@ def write_data_png(path: Path, values: NDArray) -> None:
         temporary.write_bytes(encode_png(np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)))
 
 
-def _document(result: Reconstruction) -> dict[str, Any]:
+def _document(result: Result) -> dict[str, Any]:
     """``result.json`` as a dictionary."""
     geometry, reflectance = result.geometry, result.reflectance
     lighting: dict[str, Any] = {
