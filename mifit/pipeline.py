@@ -1,29 +1,29 @@
-"""``mifit.fit``: capture and model -> geometry -> reflectance -> normals, mesh -> reconstruction."""
+"""``mifit.fit``: capture and model -> geometry -> reflectance -> normals, mesh -> reconstruction.
+
+The steps are a list (`mifit.steps`); here is what is checked before and said after them.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-import mifit
-from mifit import checkpoint
 from mifit.config import FitConfig
-from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate
+from mifit.core.estimate import GeometryEstimate
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
+from mifit.steps import STAGES, Source, Stage, run_steps, steps
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
     from mifit.reconstruction import Reconstruction
 
-Stage = Literal["geometry", "reflectance", "normals"]
-STAGES: tuple[Stage, ...] = ("geometry", "reflectance", "normals")
 T = TypeVar("T")
 ESTIMATED_CAMERAS = "the capture is uncalibrated: focal length, camera poses and so the scale are estimates"
 BASELINE_DEGREES = 3.0
@@ -83,11 +83,6 @@ def fit(
     Images", sections 4 to 6. A Mitsuba variant must be active (``mifit.set_variant``).
     """
     from mifit.reconstruction import Reconstruction
-    from mifit.stages.fit_geometry import fit_geometry
-    from mifit.stages.infer_reflectance import infer_reflectance
-    from mifit.stages.refine_mesh import refine_mesh
-    from mifit.stages.refine_normals import refine_normals
-    from mifit.stages.refine_shape import refine_shape
 
     config = config or FitConfig()
     cameras = choose("camera", capture.cameras, cameras, 2)
@@ -95,99 +90,25 @@ def fit(
     if until not in STAGES:
         raise InputError(f"until: found {until!r}, expected one of {', '.join(STAGES)}")
     check_images(capture, cameras, timesteps)
-    folder = None if checkpoints is None else Path(checkpoints)
     digest = capture.digest(cameras, timesteps)
     known_cameras = capture.calibrated
     if not known_cameras:
         capture = calibrated(capture, model, cameras, timesteps)
-    inputs = {
-        "version": mifit.__version__,
-        "capture": digest,
-        "model": model.digest,
-        "cameras": list(cameras),
-        "timesteps": list(timesteps),
-        "seed": seed,
-    }
-
-    def stage(name: str, cls: type[T], used: dict[str, Any], run: Callable[[], T]) -> T:
-        key = checkpoint.digest({**inputs, **used})
-        done = checkpoint.load(folder, name, cls, key) if folder else None
-        if done is None:
-            done = run()
-            if folder:
-                checkpoint.save(folder, name, done, key)
-        return done
-
-    settings = dataclasses.asdict(config)
-    used = {"geometry": settings["geometry"]}
-    geometry = stage(
-        "geometry",
-        GeometryEstimate,
-        used,
-        lambda: fit_geometry(capture, model, cameras, timesteps, config.geometry, seed=seed, progress=progress),
+    source = Source(capture, digest, model, cameras, timesteps, seed)
+    estimates, seconds = run_steps(
+        steps(config, until), source, progress, None if checkpoints is None else Path(checkpoints)
     )
-    reflectance, normals, mesh, seconds = None, None, None, 0.0
-    if until != "geometry":
-        used = {**used, "reflectance": settings["reflectance"]}
-
-        def infer(name: str, shape: GeometryEstimate) -> ReflectanceEstimate:
-            return stage(
-                name,
-                ReflectanceEstimate,
-                used,
-                lambda: infer_reflectance(
-                    capture, model, shape, cameras, config.reflectance, seed=seed, progress=progress
-                ),
-            )
-
-        def reshape(name: str, shape: GeometryEstimate, light: ReflectanceEstimate) -> GeometryEstimate:
-            return stage(
-                name,
-                GeometryEstimate,
-                used,
-                lambda: refine_shape(
-                    capture, model, shape, light, cameras, config.shape, config.geometry, seed, progress
-                ),
-            )
-
-        reflectance = infer("reflectance", geometry)
-        for number in range(1, config.shape.rounds + 1):
-            used = {**used, "shape": {**settings["shape"], "rounds": number}}
-            seconds += reflectance.report.seconds
-            geometry = reshape(f"geometry_{number}", geometry, reflectance)
-            reflectance = infer(f"reflectance_{number}", geometry)
-    if until == "normals":
-        assert reflectance is not None
-        found = reflectance
-        used = {**used, "normals": settings["normals"]}
-        normals = stage(
-            "normals",
-            NormalsEstimate,
-            used,
-            lambda: refine_normals(
-                capture, model, geometry, found, cameras, config.normals, seed=seed, progress=progress
-            ),
-        )
-        refined = normals
-        mesh = stage(
-            "mesh",
-            MeshEstimate,
-            {**used, "mesh": settings["mesh"]},
-            lambda: refine_mesh(model, geometry, refined, config.mesh, progress),
-        )
+    geometry = estimates["geometry"]
     return Reconstruction(
         model=model,
-        geometry=geometry,
-        reflectance=reflectance,
-        normals=normals,
-        mesh=mesh,
-        config={**settings, "seed": seed},
+        **estimates,
+        config={**dataclasses.asdict(config), "seed": seed},
         cameras=tuple(capture.camera(name) for name in cameras),
         capture_digest=digest,
         units=capture.units,
         unit_mm=capture.unit_mm,
         warnings=(*(() if known_cameras else (ESTIMATED_CAMERAS,)), *one_place(capture, cameras, geometry)),
-        seconds=seconds + sum(s.report.seconds for s in (geometry, reflectance, normals, mesh) if s is not None),
+        seconds=seconds,
         peak_memory=peak_memory(),
     )
 

@@ -1,12 +1,16 @@
 """What `mifit.fit` checks and says before and after its stages."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import mifit
+from mifit.config import FitConfig
 from mifit.errors import InputError
 from mifit.pipeline import check_images, one_place
+from mifit.steps import PARTS, Source, keys, steps
 from tests.output.conftest import ball_camera, ball_result
 
 
@@ -37,3 +41,119 @@ def test_views_from_one_place_bring_a_warning():
     assert one_place(capture, ["a", "b"], geometry)[0].startswith("cameras 1.0 degrees apart")
     assert one_place(capture, ["blind", "c"], geometry)[0].startswith("landmarks in camera c alone")
     assert one_place(capture, ["a", "b", "c"], geometry) == ()
+
+
+ORDER = ("geometry", "reflectance", "geometry_1", "reflectance_1", "normals", "mesh")
+FIRST = {"geometry": 0, "reflectance": 1, "shape": 2, "normals": 4, "mesh": 5}
+"""Section of the settings -> the first step that reads it; all later ones depend on that one's estimate."""
+
+
+def another(section, name, value):
+    """The settings of one section with one of them changed to something else that is allowed."""
+    allowed = {
+        "objective": "paper", "solver": "adam", "shading": "paper", "rounds": value + 1 if name == "rounds" else 0,
+        "exponent": 77.0, "subdivisions": 1, "bands": 5,
+    }  # fmt: skip
+    if name in allowed:
+        changed = allowed[name]
+    elif isinstance(value, bool):
+        changed = not value
+    else:
+        changed = type(value)(2 * value + 1) if name != "texture_sigma" else 2.0
+    return dataclasses.replace(section, **{name: changed})
+
+
+BASE = FitConfig(shape=mifit.ShapeConfig(rounds=1))
+SETTINGS = [
+    (section.name, setting.name)
+    for section in dataclasses.fields(FitConfig)
+    for setting in dataclasses.fields(getattr(BASE, section.name))
+]
+
+
+def changed_config(section, name):
+    part = getattr(BASE, section)
+    return dataclasses.replace(BASE, **{section: another(part, name, getattr(part, name))})
+
+
+class Stages:
+    """Stand-ins for all stages that give parts of a made-up result and remember what ran."""
+
+    def __init__(self, monkeypatch):
+        self.ran = []
+        result = ball_result()
+        for name, part in (
+            ("fit_geometry", "geometry"), ("infer_reflectance", "reflectance"), ("refine_shape", "geometry"),
+            ("refine_normals", "normals"), ("refine_mesh", "mesh"),
+        ):  # fmt: skip
+            monkeypatch.setattr(f"mifit.stages.{name}.{name}", self.stand_in(name, getattr(result, part)))
+
+    def stand_in(self, name, estimate):
+        def run(*arguments, **options):
+            self.ran.append(name)
+            return estimate
+
+        return run
+
+
+@pytest.fixture
+def fitted(monkeypatch):
+    """A function that fits a made-up capture with given settings, and the stages that it ran."""
+    stages = Stages(monkeypatch)
+    image = np.ones((4, 5, 3), np.float32)
+    frame = SimpleNamespace(image=image, valid=image[..., 0] > 0, clipped=image[..., 0] > 2, visible=np.ones(68, bool))
+    cameras = {c.name: c for c in ball_result().cameras}
+    capture = SimpleNamespace(
+        cameras=tuple(cameras), timesteps=(0, 3), camera=cameras.get, frame=lambda name, t: frame, calibrated=True,
+        digest=lambda cameras, timesteps: "digest", units="cm", unit_mm=10.0,
+    )  # fmt: skip
+    model = ball_result().model
+
+    def run(config, folder, **options):
+        stages.ran.clear()
+        mifit.fit(capture, model, config=config, checkpoints=folder, **options)
+        return list(stages.ran)
+
+    return run
+
+
+RUNS = ("fit_geometry", "infer_reflectance", "refine_shape", "infer_reflectance", "refine_normals", "refine_mesh")
+
+
+@pytest.mark.parametrize(("section", "name"), SETTINGS, ids=".".join)
+def test_a_changed_setting_reruns_the_steps_that_depend_on_it(fitted, tmp_path, section, name):
+    assert fitted(BASE, tmp_path) == list(RUNS)
+    assert fitted(BASE, tmp_path) == []
+    ran = fitted(changed_config(section, name), tmp_path)
+    if (section, name) == ("shape", "rounds"):
+        # One round more: those that were done serve, the new one and what comes after it run.
+        assert ran == ["refine_shape", "infer_reflectance", "refine_normals", "refine_mesh"]
+    else:
+        assert ran == list(RUNS[FIRST[section] :])
+
+
+@pytest.mark.parametrize("change", ["digest", "cameras", "timesteps", "seed", "model"])
+def test_a_changed_source_reruns_everything(change):
+    model = ball_result().model
+    source = Source(SimpleNamespace(), "digest", model, ("left",), (0,), 0)
+    other = {
+        "digest": "other", "cameras": ("left", "right"), "timesteps": (0, 1), "seed": 1,
+        "model": dataclasses.replace(model, mean=model.mean + np.float32(0.01)),
+    }  # fmt: skip
+    before = keys(steps(BASE), source)
+    after = keys(steps(BASE), dataclasses.replace(source, **{change: other[change]}))
+    assert tuple(before) == ORDER and not set(before.values()) & set(after.values())
+
+
+def test_stages_that_a_shorter_fit_ran_serve_a_longer_one(fitted, tmp_path):
+    assert fitted(BASE, tmp_path, until="geometry") == ["fit_geometry"]
+    assert fitted(BASE, tmp_path, until="reflectance") == list(RUNS[1:4])
+    assert fitted(BASE, tmp_path) == ["refine_normals", "refine_mesh"]
+
+
+def test_a_step_is_given_what_its_key_is_made_of():
+    """Names of inputs and settings are those that its function takes: there is nothing else that it could read."""
+    for step in steps(BASE):
+        code = step.run.__code__
+        assert step.run.__closure__ is None and code.co_argcount == 3 + len(step.settings)
+        assert {c for c in code.co_consts if c in PARTS} == set(step.inputs)

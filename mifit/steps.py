@@ -1,0 +1,231 @@
+"""The steps of a fit: a list of what runs, with which inputs and settings, and the cache that skips what is done.
+
+A step sees nothing but what it is given: the source (capture, model, cameras, timesteps, seed), the estimates that it
+names as inputs, and its settings. The key of its checkpoint is made of exactly these, so that any change of one runs
+it anew, with all that depends on it, and a change of anything else doesn't.
+
+To add a step, write ``_name(source, inputs, progress, *settings)`` and put a `Step` into `steps`. A step whose
+``part`` an earlier one has made already replaces that estimate for all that come after it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import mifit
+from mifit import checkpoint
+from mifit.config import FitConfig, GeometryConfig, MeshConfig, NormalsConfig, ReflectanceConfig, ShapeConfig
+from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate
+from mifit.progress import Progress
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+
+Stage = Literal["geometry", "reflectance", "normals"]
+STAGES: tuple[Stage, ...] = ("geometry", "reflectance", "normals")
+Part = Literal["geometry", "reflectance", "normals", "mesh"]
+PARTS: dict[Part, type] = {
+    "geometry": GeometryEstimate,
+    "reflectance": ReflectanceEstimate,
+    "normals": NormalsEstimate,
+    "mesh": MeshEstimate,
+}
+
+
+@dataclass(frozen=True)
+class Source:
+    """What every step starts from.
+
+    Attributes
+    ----------
+    capture : Capture
+        Calibrated, or with estimated cameras.
+    digest : str
+        Of the capture's files, for the chosen cameras and timesteps.
+    model : MorphableModel
+    cameras : tuple of str
+    timesteps : tuple of int
+    seed : int
+    """
+
+    capture: Capture
+    digest: str
+    model: MorphableModel
+    cameras: tuple[str, ...]
+    timesteps: tuple[int, ...]
+    seed: int
+
+    @property
+    def key(self) -> dict[str, Any]:
+        """All that a result depends on besides settings, as JSON values."""
+        return {
+            "version": mifit.__version__,
+            "capture": self.digest,
+            "model": self.model.digest,
+            "cameras": list(self.cameras),
+            "timesteps": list(self.timesteps),
+            "seed": self.seed,
+        }
+
+
+Inputs = Mapping[Part, Any]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a fit.
+
+    Attributes
+    ----------
+    name : str
+        Of its checkpoint; one of a kind in a list of steps.
+    part : str
+        What it makes: a key of `PARTS`.
+    inputs : tuple of str
+        Parts that it is given, each as the last step before it left it.
+    settings : tuple of dataclass
+        Settings that it is given.
+    run : callable
+        ``run(source, inputs, progress, *settings)`` -> estimate of the part; a function of the module, so that it can
+        read nothing else.
+    """
+
+    name: str
+    part: Part
+    inputs: tuple[Part, ...]
+    settings: tuple[Any, ...]
+    run: Callable[..., Any]
+
+
+def steps(config: FitConfig, until: Stage = "normals") -> list[Step]:
+    """The steps of a fit with these settings, in order."""
+    found = [Step("geometry", "geometry", (), (config.geometry,), _fit_geometry)]
+    if until == "geometry":
+        return found
+    found.append(Step("reflectance", "reflectance", ("geometry",), (config.reflectance,), _infer_reflectance))
+    # How many rounds there are is no matter of a round: those that are done serve when more are asked for.
+    shape = replace(config.shape, rounds=1)
+    for number in range(1, config.shape.rounds + 1):
+        found += [
+            Step(
+                f"geometry_{number}", "geometry", ("geometry", "reflectance"), (shape, config.geometry), _refine_shape
+            ),
+            Step(f"reflectance_{number}", "reflectance", ("geometry",), (config.reflectance,), _infer_reflectance),
+        ]
+    if until == "reflectance":
+        return found
+    return [
+        *found,
+        Step("normals", "normals", ("geometry", "reflectance"), (config.normals,), _refine_normals),
+        Step("mesh", "mesh", ("geometry", "normals"), (config.mesh,), _refine_mesh),
+    ]
+
+
+def keys(listed: Sequence[Step], source: Source) -> dict[str, str]:
+    """The key of each step's checkpoint, by its name: a digest of all that the step is given."""
+    found: dict[str, str] = {}
+    current: dict[Part, str] = {}
+    for step in listed:
+        given = {
+            "source": source.key,
+            "step": step.run.__name__,
+            "inputs": {part: current[part] for part in step.inputs},
+            "settings": [[type(s).__name__, dataclasses.asdict(s)] for s in step.settings],
+        }
+        found[step.name] = current[step.part] = checkpoint.digest(given)
+    return found
+
+
+def run_steps(
+    listed: Sequence[Step], source: Source, progress: Progress, folder: Path | None = None
+) -> tuple[dict[Part, Any], float]:
+    """Run steps, or read their checkpoints from the folder where these were made of the same.
+
+    Returns
+    -------
+    estimates : dict
+        By part, as the last step of each left it.
+    seconds : float
+        Wall time of all steps, those that were read included.
+    """
+    estimates: dict[Part, Any] = {}
+    before = 0.0
+    made = keys(listed, source)
+    for step in listed:
+        key = made[step.name]
+        done = checkpoint.load(folder, step.name, PARTS[step.part], key) if folder else None
+        if done is None:
+            inputs = {part: estimates[part] for part in step.inputs}
+            done = step.run(source, inputs, progress, *step.settings)
+            if folder:
+                checkpoint.save(folder, step.name, done, key)
+        if step.part in estimates and step.part not in step.inputs:
+            before += estimates[step.part].report.seconds  # one that goes on from another counts its time
+        estimates[step.part] = done
+    return estimates, before + sum(estimate.report.seconds for estimate in estimates.values())
+
+
+def _fit_geometry(source: Source, inputs: Inputs, progress: Progress, config: GeometryConfig) -> Any:
+    from mifit.stages.fit_geometry import fit_geometry
+
+    return fit_geometry(
+        source.capture, source.model, source.cameras, source.timesteps, config, seed=source.seed, progress=progress
+    )
+
+
+def _infer_reflectance(source: Source, inputs: Inputs, progress: Progress, config: ReflectanceConfig) -> Any:
+    from mifit.stages.infer_reflectance import infer_reflectance
+
+    return infer_reflectance(
+        source.capture,
+        source.model,
+        inputs["geometry"],
+        source.cameras,
+        config,
+        seed=source.seed,
+        progress=progress,
+    )
+
+
+def _refine_shape(
+    source: Source, inputs: Inputs, progress: Progress, shape: ShapeConfig, geometry: GeometryConfig
+) -> Any:
+    from mifit.stages.refine_shape import refine_shape
+
+    return refine_shape(
+        source.capture,
+        source.model,
+        inputs["geometry"],
+        inputs["reflectance"],
+        source.cameras,
+        shape,
+        geometry,
+        source.seed,
+        progress,
+    )
+
+
+def _refine_normals(source: Source, inputs: Inputs, progress: Progress, config: NormalsConfig) -> Any:
+    from mifit.stages.refine_normals import refine_normals
+
+    return refine_normals(
+        source.capture,
+        source.model,
+        inputs["geometry"],
+        inputs["reflectance"],
+        source.cameras,
+        config,
+        seed=source.seed,
+        progress=progress,
+    )
+
+
+def _refine_mesh(source: Source, inputs: Inputs, progress: Progress, config: MeshConfig) -> Any:
+    from mifit.stages.refine_mesh import refine_mesh
+
+    return refine_mesh(source.model, inputs["geometry"], inputs["normals"], config, progress)
