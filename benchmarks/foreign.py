@@ -1,0 +1,273 @@
+"""Faces that this project did not make: measured and scanned heads, photographed or path traced elsewhere.
+
+    python -m benchmarks.foreign [--captures emily scan_city ...] [--rows full refit ...] [--size 256]
+        [--timesteps 0,1] [--cameras left,right] [--config FILE.toml] [--judge RESULT] [--pictures DIR]
+    python -m benchmarks.foreign --captures FOLDER --cameras a,b --held-out c [--model M]
+
+Fits the named cameras and judges by the others: fitted and held-out views of the stage-1 model (`pca`), of a fit
+without specular reflection (`refit`), of the full fit and of image-based rendering on our mesh and on the scan, all
+on the same pixels; distances from the scan to the mesh; relit views against path-traced ones; albedo, specular map and
+normals at the scan's own surface points. Landmarks are a detector's, no head is in the span of a model, and no image
+is lit by a shading model of this project. ``--judge`` judges a result folder in place of fitting. With nothing but
+defaults the figures become ``benchmarks/results/foreign.json``, ``foreign.md`` and ``foreign_short.md``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mifit
+from benchmarks import foreign_tables, judge
+from benchmarks.matt import infer_matt
+from benchmarks.measure import conditions
+from benchmarks.record import RESULTS, SHARED, record
+from mifit import Capture, FitConfig, MorphableModel, Reconstruction
+from mifit.core.files import write_text
+from mifit.core.image import write_image
+from mifit.errors import MifitError
+from mifit.output.baseline import image_based
+
+ICT = str(SHARED / "models" / "ict_facekit" / "ict_facekit_head.npz")
+FITS = ("full", "refit", "paper")
+JUDGED = ("views", "mesh", "surface", "relit")
+RELIT_SAMPLES = 64
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Case:
+    """One fit of one capture.
+
+    Attributes
+    ----------
+    capture : str
+        A folder, or the name of one of the shared captures.
+    model : str
+    fitted, held_out : tuple of str
+        Cameras; the held-out ones are never read by a fit.
+    timesteps : tuple of int
+    """
+
+    capture: str
+    model: str
+    fitted: tuple[str, ...]
+    held_out: tuple[str, ...]
+    timesteps: tuple[int, ...]
+
+    @property
+    def path(self) -> Path:
+        """The capture's folder."""
+        shared = SHARED / "captures" / self.capture
+        return shared if shared.is_dir() else Path(self.capture)
+
+    @property
+    def label(self) -> str:
+        """What a table calls it."""
+        model = "ICT" if self.model == ICT else Path(self.model).stem
+        steps = "" if len(self.timesteps) > 1 or self.fitted[0].startswith("c") else ", one timestep"
+        return f"{Path(self.capture).name}{steps} ({model}), {','.join(self.fitted)} → {','.join(self.held_out)}"
+
+
+CASES = (
+    Case("emily", ICT, ("c3", "c4"), ("c2", "c5"), (0,)),
+    Case("emily", ICT, ("c2", "c5"), ("c3", "c4"), (0,)),
+    Case("emily", "builtin", ("c3", "c4"), ("c2", "c5"), (0,)),
+    Case("scan_city", "builtin", ("left", "right"), ("third",), (0, 1, 2, 3)),
+    Case("scan_city", ICT, ("left", "right"), ("third",), (0,)),
+    Case("scan_studio", "builtin", ("left", "right"), ("third",), (0, 1, 2, 3)),
+)
+
+
+def fits_of(case: Case, wanted: Sequence[str], config: FitConfig) -> dict[str, Reconstruction]:
+    """The reconstructions that the rows show; only fitted cameras are read."""
+    capture, model = Capture.load(case.path), MorphableModel.load(case.model)
+    found = {}
+    full = mifit.fit(capture, model, case.fitted, case.timesteps, config, seed=SEED)
+    if "full" in wanted:
+        found["full"] = full
+    if "refit" in wanted:
+        matt = infer_matt(capture, model, full.geometry, case.fitted, config.reflectance, SEED)
+        normals = mifit.refine_normals(capture, model, full.geometry, matt, case.fitted, config.normals, seed=SEED)
+        found["refit"] = replace(full, reflectance=matt, normals=normals, mesh=None)
+    if "paper" in wanted and hasattr(FitConfig, "paper"):
+        paper = replace_size(FitConfig.paper(), config.reflectance.texture_size)
+        found["paper"] = mifit.fit(capture, model, case.fitted, case.timesteps, paper, seed=SEED)
+    return found
+
+
+def replace_size(config: FitConfig, size: int) -> FitConfig:
+    """The same settings with maps of another size."""
+    return replace(config, reflectance=replace(config.reflectance, texture_size=size))
+
+
+def rows_of(fits: dict[str, Reconstruction]) -> dict[str, tuple[Reconstruction, Any]]:
+    """Rows of a table: reconstruction and method."""
+    rows: dict[str, tuple[Reconstruction, Any]] = {}
+    for name, result in fits.items():
+        if name == "refit":
+            rows["refit"] = (result, "diffuse")
+            continue
+        rows[name] = (result, "full")
+        rows[f"{name}: pca"] = (result, "pca")
+        rows[f"{name}: specular dropped"] = (result, "diffuse")
+    return {label: row for label, row in rows.items() if row[1] in row[0].methods}
+
+
+def judge_case(
+    case: Case, fits: dict[str, Reconstruction], parts: Sequence[str], samples: int = RELIT_SAMPLES
+) -> dict[str, Any]:
+    """All figures of one case."""
+    capture = Capture.load(case.path)
+    rows, main = rows_of(fits), next(iter(fits.values()))
+    has_scan = judge.scan.read_scan(capture, case.timesteps[0]) is not None
+    found: dict[str, Any] = {"label": case.label, "model": case.model if case.model == "builtin" else "ICT"}
+    if "views" in parts:
+        found["held_out"] = judge.judge_views(rows, capture, case.held_out, case.timesteps, case.fitted)
+        some = {label: row for label, row in rows.items() if not label.endswith("dropped")}
+        found["fitted"] = judge.judge_views(some, capture, case.fitted, case.timesteps, case.fitted)
+        found["fitted"] = {k: v for k, v in found["fitted"].items() if not k.startswith("image-based")}
+    if "mesh" in parts and has_scan:
+        meshes = {name: result for name, result in fits.items() if name != "refit"} or {"refit": main}
+        found["mesh"] = {name: judge.judge_mesh(result, capture, case.fitted) for name, result in meshes.items()}
+    if "surface" in parts and has_scan:
+        found["surface"] = {name: judge.judge_surface(r, capture, case.fitted) for name, r in fits.items()}
+    if "relit" in parts and judge.scan.relit_truths(capture):
+        lit = {label: row for label, row in rows.items() if not label.endswith("pca")}
+        found["relit"] = judge.judge_relit(
+            lit, capture, case.held_out[0], case.timesteps[0], ("local", "path"), samples
+        )
+    found["fits"] = {name: outcome(result) for name, result in fits.items()}
+    return found
+
+
+def outcome(result: Reconstruction) -> dict[str, Any]:
+    """How the stages of a fit ended."""
+    reports = result.reports
+    return {
+        "unconverged": [name for name, report in reports.items() if report.outcome != "converged"],
+        "seconds": {name: round(report.seconds, 1) for name, report in reports.items()},
+        "shading": reports["reflectance"].details.get("shading", {}).get("chosen")
+        if "reflectance" in reports
+        else None,
+        "exponent": result.reflectance.exponent if result.reflectance else None,
+        "warnings": [*result.warnings, *(w for report in reports.values() for w in report.warnings)],
+    }
+
+
+def write_pictures(folder: Path, case: Case, fits: dict[str, Reconstruction]) -> None:
+    """One strip: photograph, image-based rendering on our mesh, then every row, of the first held-out view."""
+    capture, timestep = Capture.load(case.path), case.timesteps[0]
+    at = judge.view(capture, case.held_out[0], timestep)
+    first = next(iter(fits.values()))
+    vertices = first.geometry.vertices[first.index(timestep)]
+    cameras = [capture.camera(c) for c in case.fitted]
+    base = image_based(capture, cameras, at.camera, timestep, vertices, first.model.faces, first.geometry.gains)
+    tiles = [capture.frame(at.name, timestep).image[at.box], base.colour]
+    tiles += [r.render(at.camera, timestep, m)[..., :3] for r, m in rows_of(fits).values()]
+    name = "".join(c if c.isalnum() else "_" for c in case.label)
+    write_image(folder / f"{name}.png", np.concatenate([np.asarray(t, np.float32) for t in tiles], axis=1))
+
+
+def cases_of(arguments: argparse.Namespace) -> tuple[list[Case], list[str]]:
+    """The cases asked for, and why others are left out."""
+    known = {case.capture for case in CASES}
+    cases, skipped = [], []
+    for name in arguments.captures:
+        if name in known:
+            cases += [case for case in CASES if case.capture == name]
+        else:
+            if not (arguments.cameras and arguments.held_out):
+                raise SystemExit(f"--captures {name}: no known capture; name --cameras and --held-out for a folder")
+            cases.append(Case(name, arguments.model or "builtin", (), (), arguments.timesteps or (0,)))
+    changes: dict[str, Any] = {
+        "fitted": arguments.cameras,
+        "held_out": arguments.held_out,
+        "timesteps": arguments.timesteps,
+        "model": ICT if arguments.model == "ict" else arguments.model,
+    }
+    changes = {key: value for key, value in changes.items() if value}
+    if arguments.cameras:  # the other cameras of a shared capture are held out
+        for i, case in enumerate(cases):
+            rest = tuple(c for c in (*case.fitted, *case.held_out) if c not in arguments.cameras)
+            cases[i] = replace(case, held_out=rest)
+    cases = list(dict.fromkeys(replace(case, **changes) for case in cases))
+    for case in list(cases):
+        missing = next((p for p in (case.path, Path(case.model)) if not p.exists() and str(p) != "builtin"), None)
+        if missing is not None:
+            skipped.append(f"{case.label}: {missing} is not there")
+            cases.remove(case)
+    return cases, skipped
+
+
+def main() -> int:
+    def names(text: str) -> tuple[str, ...]:
+        return tuple(text.split(","))
+
+    def numbers(text: str) -> tuple[int, ...]:
+        return tuple(map(int, text.split(",")))
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--captures", nargs="+", default=list(dict.fromkeys(case.capture for case in CASES)))
+    parser.add_argument("--rows", nargs="+", choices=FITS, default=list(FITS), help="fits to make")
+    parser.add_argument("--parts", nargs="+", choices=JUDGED, default=list(JUDGED), help="what to judge")
+    parser.add_argument("--size", type=int, help="texels along the side of the maps; default: that of the settings")
+    parser.add_argument("--timesteps", type=numbers, help="0,1,... instead of each case's")
+    parser.add_argument("--cameras", type=names, help="cameras to fit, instead of each case's")
+    parser.add_argument("--held-out", type=names, help="cameras to judge by")
+    parser.add_argument("--model", help="builtin, ict or a file, instead of each case's")
+    parser.add_argument("--config", type=Path, help="settings of the fit")
+    parser.add_argument("--judge", type=Path, help="a result folder to judge in place of fitting")
+    parser.add_argument("--relit-samples", type=int, default=RELIT_SAMPLES)
+    parser.add_argument("--pictures", type=Path, help="folder for one strip of images per case")
+    parser.add_argument("--json", type=Path, help="write the figures to a file of one's own")
+    a = parser.parse_args()
+    mifit.set_variant("auto")
+    before = conditions()
+    config = FitConfig.load(a.config) if a.config else FitConfig()
+    if a.size:
+        config = replace_size(config, a.size)
+    cases, skipped = cases_of(a)
+    found, started = [], time.perf_counter()
+    for text in skipped:
+        print(f"left out: {text}", file=sys.stderr, flush=True)
+    for case in cases:
+        began = time.perf_counter()
+        try:
+            fits = {"full": Reconstruction.load(a.judge)} if a.judge else fits_of(case, a.rows, config)
+            figures = judge_case(case, fits, a.parts, a.relit_samples)
+        except MifitError as error:  # a case that fails stays in the table as failing
+            found.append({"label": case.label, "failed": str(error)})
+            print(f"{case.label}: failed: {error}", file=sys.stderr, flush=True)
+            continue
+        if a.pictures:
+            write_pictures(a.pictures, case, fits)
+        found.append({**figures, "seconds": round(time.perf_counter() - began, 1)})
+        print(f"{case.label}: {found[-1]['seconds']:.0f} s\n{json.dumps(figures)}", file=sys.stderr, flush=True)
+    out = {
+        "cases": found,
+        "left_out": skipped,
+        "seconds": round(time.perf_counter() - started, 1),
+        "conditions": {"before": before, "after": conditions()},
+    }
+    whole = all(getattr(a, key) == parser.get_default(key) for key in vars(a) if key not in ("pictures", "json"))
+    if whole and not skipped:
+        record("foreign", out, seeds=SEED)
+        write_text(RESULTS / "foreign.md", foreign_tables.markdown(found))
+        write_text(RESULTS / "foreign_short.md", foreign_tables.short(found))
+    if a.json:
+        write_text(a.json, json.dumps(out, indent=2) + "\n")
+    print(foreign_tables.markdown(found))
+    return 1 if any("failed" in case for case in found) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,55 @@
+"""Stage 2 fitted without any specular reflection: what a matt model makes of the same images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+import mifit
+from mifit import Capture, MorphableModel
+from mifit.config import ReflectanceConfig
+from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate
+from mifit.progress import Progress
+from mifit.stages.observations import Observations, Surface
+from mifit.stages.reflectance.choice import choose_lighting, fit_lighting
+from mifit.stages.reflectance.forward import Forward
+from mifit.stages.reflectance.lighting import LightingSolution
+
+
+class Diffuse(Forward):
+    """A shading model without its specular reflection."""
+
+    def transfers(self, seen: Observations, radiance: Any) -> tuple[Any, Any]:
+        diffuse, specular = super().transfers(seen, radiance)
+        return diffuse, np.zeros_like(specular)
+
+    def shade(self, seen: Observations, radiance: Any) -> tuple[Any, Any]:
+        shade, glint = super().shade(seen, radiance)
+        return shade, np.zeros_like(glint)
+
+
+def choose_diffuse_lighting(
+    surface: Surface, faces: Any, seen: Observations, albedo: Any, config: ReflectanceConfig, progress: Progress
+) -> tuple[Forward, LightingSolution, dict]:
+    """The model that stage 2 chooses, and the lighting that explains the images best without its specular part."""
+    forward, _, choice = choose_lighting(surface, faces, seen, albedo, config, progress)
+    diffuse = Diffuse(**{f.name: getattr(forward, f.name) for f in fields(forward)})
+    return diffuse, fit_lighting(seen, diffuse, albedo, config, config.max_iterations, 0.0), choice
+
+
+def infer_matt(
+    capture: Capture,
+    model: MorphableModel,
+    geometry: GeometryEstimate,
+    cameras: Sequence[str],
+    config: ReflectanceConfig,
+    seed: int = 0,
+) -> ReflectanceEstimate:
+    """Lighting and diffuse map by the fast solver, under the shading model that stage 2 chooses; no specular map."""
+    with patch("mifit.stages.reflectance.als.choose_lighting", choose_diffuse_lighting):
+        found = mifit.infer_reflectance(capture, model, geometry, cameras, config, seed=seed)
+    return replace(found, specular=np.zeros_like(found.specular))

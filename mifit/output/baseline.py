@@ -1,0 +1,114 @@
+"""Image-based rendering on a mesh: what a view shows when nothing is known of light or skin.
+
+A pixel of the wanted view is traced to the mesh and takes the mean colour of the fitted views that see the point,
+weighted by the squared cosine between the view and the surface. A fit that doesn't beat it on a held-out view has
+recovered nothing of how the face is lit or what its skin is like.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.camera import Camera
+from mifit.core.mesh import face_cross, interpolate, normalize
+from mifit.core.uv import bilinear
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+
+LEAST_COSINE = 0.15
+"""Views that see a point at a flatter angle don't show it: a pixel of theirs covers too much of the surface."""
+
+
+@dataclass(frozen=True)
+class ImageBased:
+    """One view as the fitted photographs show it.
+
+    Attributes
+    ----------
+    colour : (H, W, 3) float32
+        Linear; 0 where nothing is hit.
+    hit : (H, W) bool
+        Pixels that see the front of the mesh.
+    seen : (H, W) bool
+        Pixels whose point of the mesh at least one fitted view sees. Elsewhere the colour is that of the fitted
+        view that faces the point best, whatever hides it.
+    """
+
+    colour: NDArray[np.float32]
+    hit: NDArray[np.bool_]
+    seen: NDArray[np.bool_]
+
+
+def image_based(
+    capture: Capture,
+    fitted: Sequence[Camera],
+    camera: Camera,
+    timestep: int,
+    vertices: NDArray,
+    faces: NDArray,
+    gains: Mapping[str, Sequence[float]] | None = None,
+) -> ImageBased:
+    """Render one view of one timestep from the photographs of other views.
+
+    Parameters
+    ----------
+    capture : Capture
+        Only images of the fitted cameras are read.
+    fitted : sequence of Camera
+        Undistorted cameras whose photographs give the colours.
+    camera : Camera
+        Undistorted camera of the wanted view.
+    timestep : int
+    vertices : (V, 3), faces : (F, 3)
+        Mesh in the capture's world space.
+    gains : dict of camera name to (r, g, b), optional
+        Linear image of each camera over the first one's; 1 for cameras that aren't named.
+
+    Raises
+    ------
+    InputError
+        A fitted camera or the timestep is not in the capture.
+    """
+    from mifit.render.gbuffer import SurfaceScene
+
+    scene = SurfaceScene(vertices, faces)
+    buffer = scene.gbuffer(camera)
+    index = np.flatnonzero(buffer.face.ravel() >= 0)
+    face = buffer.face.ravel()[index]
+    normal = normalize(face_cross(vertices, faces)[face])
+    point = interpolate(np.asarray(vertices, np.float64), faces, face, buffer.weights.reshape(-1, 3)[index])
+    front = np.sum(normal * (camera.position - point), axis=1) > 0
+    index, normal, point = index[front], normal[front], point[front]
+    total, weight = np.zeros((len(index), 3)), np.zeros(len(index))
+    spare, best = np.zeros((len(index), 3)), np.full(len(index), -np.inf)
+    for view in fitted:
+        frame = capture.frame(view.name, timestep)
+        gain = np.asarray((gains or {}).get(view.name, (1.0, 1.0, 1.0)))
+        x, y = (view.project(point) - 0.5).T
+        inside = (x >= 0) & (y >= 0) & (x <= view.width - 1) & (y <= view.height - 1)
+        x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
+        inside &= bilinear(frame.valid.astype(np.float32), x, y) > 0.999
+        colour = bilinear(frame.image, x, y) / gain
+        cosine = np.sum(normal * normalize(view.position - point), axis=1)
+        facing = np.where(inside, cosine, -np.inf)
+        spare[facing > best] = colour[facing > best]
+        best = np.maximum(best, facing)
+        visible = inside & (cosine > LEAST_COSINE) & scene.visible_from(point, view.position)
+        total += np.where(visible, cosine**2, 0.0)[:, None] * colour
+        weight += np.where(visible, cosine**2, 0.0)
+    total = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-12)[:, None], spare)
+    total *= np.asarray((gains or {}).get(camera.name, (1.0, 1.0, 1.0)))
+    shape = (camera.height, camera.width)
+    image, hit, seen = (
+        np.zeros((camera.height * camera.width, 3), np.float32),
+        np.zeros(shape, bool),
+        np.zeros(shape, bool),
+    )
+    image[index], hit.ravel()[index], seen.ravel()[index] = total, True, weight > 0
+    return ImageBased(image.reshape(*shape, 3), hit, seen)

@@ -1,0 +1,166 @@
+"""The benchmark of foreign faces: its measures on a ball that is known, and against the independent scorer."""
+
+import argparse
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import mifit
+from benchmarks import foreign, foreign_tables, judge, scan
+from benchmarks.record import SHARED
+from mifit.output.baseline import image_based
+from tests.output.conftest import RADIUS, ball_camera, ball_result
+
+TOOL = SHARED / "tools" / "held_out.py"
+
+
+def photographs(result, colour):
+    """What `image_based` asks of a capture: photographs of the ball whose points have a colour each."""
+
+    def frame(name, timestep):
+        camera = next(c for c in (ball_camera("left", -20), ball_camera("right", 20)) if c.name == name)
+        image = np.zeros((camera.height, camera.width, 3), np.float32)
+        rays = camera.pixel_rays(camera.pixel_centres())
+        b = rays @ camera.position
+        root = b**2 - (camera.position @ camera.position - RADIUS**2)
+        point = camera.position + (-b - np.sqrt(np.maximum(root, 0)))[..., None] * rays
+        image[:] = np.where(root[..., None] > 0, colour(point), 0)
+        return SimpleNamespace(image=image, valid=np.ones(image.shape[:2], bool))
+
+    return SimpleNamespace(frame=frame)
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    mifit.set_variant("auto")
+    result = ball_result()
+    fine = result.model.mean / np.linalg.norm(result.model.mean, axis=1, keepdims=True) * RADIUS
+    return result.model.faces, fine.astype(np.float64)
+
+
+def test_image_based_rendering_shows_the_points_colours_where_a_view_sees_them(sphere):
+    faces, vertices = sphere
+    capture = photographs(None, lambda p: 0.5 + p / (3 * RADIUS))
+    left, right, middle = ball_camera("left", -20), ball_camera("right", 20), ball_camera("third", 0)
+    found = image_based(capture, [left, right], middle, 0, vertices, faces)
+    assert found.hit.sum() > 500 and found.seen.sum() > 0.9 * found.hit.sum()
+    rays = middle.pixel_rays(middle.pixel_centres())
+    b = rays @ middle.position
+    root = np.maximum(b**2 - (middle.position @ middle.position - RADIUS**2), 0)
+    point = middle.position + (-b - np.sqrt(root))[..., None] * rays
+    inner = found.seen & (root > (0.6 * RADIUS) ** 2)
+    assert np.abs(found.colour - (0.5 + point / (3 * RADIUS)))[inner].max() < 0.03
+    one = image_based(capture, [left], middle, 0, vertices, faces)
+    assert (one.hit == found.hit).all() and one.seen.sum() < 0.95 * found.seen.sum()
+    columns = np.flatnonzero(found.seen[32] & ~one.seen[32])
+    assert len(columns) and columns.min() > 32  # what the left view doesn't see is on the right
+
+
+def test_a_gain_between_cameras_is_taken_out_of_the_colours(sphere):
+    faces, vertices = sphere
+    capture = photographs(None, lambda p: np.full(p.shape, 0.4))
+    plain = capture.frame
+
+    def brighter(name, timestep):
+        found = plain(name, timestep)
+        return SimpleNamespace(image=found.image * (2 if name == "right" else 1), valid=found.valid)
+
+    capture.frame = brighter
+    cameras, middle = [ball_camera("left", -20), ball_camera("right", 20)], ball_camera("third", 0)
+    gains = {"right": (2.0, 2.0, 2.0), "third": (0.5, 0.5, 0.5)}
+    found = image_based(capture, cameras, middle, 0, vertices, faces, gains)
+    inner = found.seen & (np.linalg.norm(middle.pixel_centres() - 32, axis=-1) < 15)
+    assert found.colour[inner] == pytest.approx(0.2, abs=0.005)
+
+
+def test_distances_are_those_to_the_nearest_point_of_a_face(sphere):
+    faces, vertices = sphere
+    middle = vertices[faces].mean(1)
+    away = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    distance, face, weights = scan.nearest(middle + 0.1 * away, vertices, faces)
+    assert distance == pytest.approx(0.1, abs=1e-6) and (face == np.arange(len(faces))).mean() > 0.99
+    assert weights == pytest.approx(1 / 3, abs=0.02)
+
+
+def test_relit_views_are_compared_after_one_factor_per_channel():
+    rng = np.random.default_rng(0)
+    truth, region = rng.uniform(0.1, 0.8, (20, 20, 3)), np.ones((20, 20), bool)
+    assert judge.scaled_psnr(truth * (0.5, 2.0, 3.0), truth, region) > 100
+    assert judge.scaled_psnr(truth[..., ::-1], truth, region) < 25
+    region[:, 10:] = False
+    spoilt = truth.copy()
+    spoilt[:, 10:] = 0
+    assert judge.scaled_psnr(spoilt, truth, region) > 100
+
+
+def test_options_choose_cases_and_hold_the_other_cameras_out(monkeypatch):
+    monkeypatch.setattr(foreign.Path, "exists", lambda path: True)
+    options = {"captures": ["emily"], "cameras": ("c2", "c3"), "held_out": None, "timesteps": None, "model": None}
+    cases, skipped = foreign.cases_of(argparse.Namespace(**options))
+    assert not skipped and {c.fitted for c in cases} == {("c2", "c3")}
+    assert all(set(c.held_out) == {"c4", "c5"} for c in cases) and {c.model for c in cases} == {"builtin", foreign.ICT}
+    assert all(not set(case.fitted) & set(case.held_out) for case in foreign.CASES)
+
+
+def test_captures_that_are_missing_are_left_out_with_the_reason(tmp_path):
+    options = {"captures": [str(tmp_path / "nowhere")], "cameras": ("a",), "held_out": ("b",)}
+    cases, skipped = foreign.cases_of(argparse.Namespace(**options, timesteps=None, model=None))
+    assert not cases and "nowhere is not there" in skipped[0]
+
+
+def test_tables_say_what_failed_and_what_did_not_converge():
+    figures = {"psnr": 21.34, "pixels": 9, "ssim": 0.5, "flip": 0.25}
+    case = {
+        "label": "a",
+        "held_out": {"full": {"skin": figures, "face": {**figures, "psnr": 18.0}}},
+        "fits": {"full": {"unconverged": ["geometry"]}, "refit": {"unconverged": []}},
+        "mesh": {"full": {"median_mm": 0.5, "mean_mm": 1.25, "p90_mm": 3.0}},
+        "relit": {"full, path": {"mean": 15.04}},
+        "seconds": 12.3,
+    }
+    text = foreign_tables.markdown([case, {"label": "b", "failed": "no | light"}])
+    assert "| b | failed: no / light |" in text and "full: geometry" in text and "0.50 / 1.25 / 3.00" in text
+    assert "| 21.3 |" in text and "| 18.0 |" in text and "15.0" in text
+    assert "| a | 21.3 | - |" in foreign_tables.short([case])
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    for table in (rows[:4], rows[4:8]):
+        assert len({line.count("|") for line in table}) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not TOOL.exists(), reason=f"needs {TOOL}")
+def test_the_independent_scorer_finds_the_same_figures(tmp_path):
+    mifit.set_variant("auto")
+    case = replace(next(c for c in foreign.CASES if c.capture == "scan_studio"), timesteps=(1,))
+    capture, model = mifit.Capture.load(case.path), mifit.MorphableModel.load(case.model)
+    config = foreign.replace_size(mifit.FitConfig(), 64)
+    result = mifit.fit(capture, model, case.fitted, case.timesteps, config, until="reflectance")
+    replace(result, model_source="builtin").save(tmp_path / "result")
+    program = tmp_path / "program"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m mifit "$@"\n')
+    program.chmod(0o755)
+    arguments = [program, tmp_path / "result", case.path, ",".join(case.fitted), ",".join(case.held_out), "1"]
+    done = subprocess.run([sys.executable, TOOL, *map(str, arguments)], capture_output=True, text=True, check=True)
+    theirs = json.loads(done.stdout.splitlines()[-1])
+    rows = judge.judge_views(foreign.rows_of({"full": result}), capture, case.held_out, (1,), case.fitted)
+    ours = {
+        "pca": rows["full: pca"]["face"],
+        "diffuse": rows["full: specular dropped"]["face"],
+        "full": rows["full"]["face"],
+        "full_skin": rows["full"]["seen"],
+        "ibr_skin": rows["image-based, mesh of full"]["seen"],
+        "ibr_scan_skin": rows["image-based, scan"]["skin"],
+    }
+    assert {key: figures["psnr"] for key, figures in ours.items()} == pytest.approx(
+        {key: theirs[key] for key in ours}, abs=0.05
+    )
+    mesh = judge.judge_mesh(result, capture, case.fitted)
+    assert mesh["median_mm"] == pytest.approx(theirs["mm_median"], abs=0.01)
+    assert mesh["mean_mm"] == pytest.approx(theirs["mm_mean"], abs=0.01)
+    assert mesh["p90_mm"] == pytest.approx(theirs["mm_p90"], abs=0.02)
