@@ -2,72 +2,87 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import itertools
-import json
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import mifit
 from mifit import checkpoint
-from mifit.config import (
-    GeometryConfig,
-    MeshConfig,
-    NormalsConfig,
-    ReflectanceConfig,
-    ShapeConfig,
-    from_mapping,
-    read_toml,
-)
+from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, ReflectanceConfig, ShapeConfig
 from mifit.errors import InputError
+from mifit.schema import (
+    Index,
+    Name,
+    choice,
+    flag,
+    from_mapping,
+    number,
+    parse_toml,
+    part,
+    part_or_none,
+    read_toml,
+    settings,
+    several,
+    table,
+    text,
+)
 
 BUILTIN = ("builtin", "builtin:coarse")
 
 
-@dataclass(frozen=True)
+SEEDS = 2**31 - 1  # what both NumPy and Mitsuba take
+SIDE = 16_384  # pixels
+SAMPLES = 1_048_576
+MOST_RUNS = 10_000
+
+
+@settings
 class SynthRun:
     """A capture made for the experiment (``mifit synth``)."""
 
-    timesteps: int = 4
-    width: int = 340
-    height: int = 240
-    spp: int = 48
-    seed: int = 0
-    env: str | None = None
-    model: str = "builtin"
+    timesteps: int = number(4, "how many", least=1, most=10_000)
+    width: int = number(340, "width of the images", "pixels", least=16, most=SIDE)
+    height: int = number(240, "height of the images", "pixels", least=16, most=SIDE)
+    spp: int = number(48, "samples per pixel", least=1, most=SAMPLES)
+    seed: int = number(0, "seed of everything random", least=0, most=SEEDS)
+    env: str | None = text(None, "lat-long HDR environment; none: a procedural studio")
+    model: str = text("builtin", "morphable model: a path or builtin")
 
 
-@dataclass(frozen=True)
+@settings
 class FitRun:
     """Fit a capture; the settings of ``mifit fit``."""
 
-    capture: str | None = None
-    synth: SynthRun | None = None
-    model: str = "builtin"
-    cameras: tuple[str, ...] = ("left", "right")
-    timesteps: tuple[int, ...] | None = None
-    until: Literal["geometry", "reflectance", "normals"] = "normals"
-    seed: int = 0
-    geometry: GeometryConfig = field(default_factory=GeometryConfig)
-    reflectance: ReflectanceConfig = field(default_factory=ReflectanceConfig)
-    normals: NormalsConfig = field(default_factory=NormalsConfig)
-    mesh: MeshConfig = field(default_factory=MeshConfig)
-    shape: ShapeConfig = field(default_factory=ShapeConfig)
+    capture: str | None = text(None, "capture folder")
+    synth: SynthRun | None = part_or_none("a capture made for the experiment, instead of a folder")
+    model: str = text("builtin", "morphable model: a path or builtin")
+    cameras: tuple[Name, ...] = several(("left", "right"), "cameras to use")
+    timesteps: tuple[Index, ...] | None = several(None, "timesteps to use; none: the first four")
+    until: Literal["geometry", "reflectance", "normals"] = choice("normals", "last stage")
+    seed: int = number(0, "seed of everything random", least=0, most=SEEDS)
+    geometry: GeometryConfig = part(GeometryConfig)
+    reflectance: ReflectanceConfig = part(ReflectanceConfig)
+    normals: NormalsConfig = part(NormalsConfig)
+    mesh: MeshConfig = part(MeshConfig)
+    shape: ShapeConfig = part(ShapeConfig)
 
 
-@dataclass(frozen=True)
+@settings
 class EvaluateRun:
     """Judge the fit on a view; the settings of ``mifit evaluate``."""
 
-    camera: str
-    region: Literal["model", "truth"] = "model"
-    timesteps: tuple[int, ...] | None = None
+    camera: str = text(..., "camera that is not fitted")
+    region: Literal["model", "truth"] = choice("model", "whose face area counts")
+    timesteps: tuple[Index, ...] | None = several(None, "timesteps to judge; none: all of the fit")
 
 
-@dataclass(frozen=True)
+@settings
 class RelightRun:
     """Light the fit by an environment and compare the fast path with path tracing.
 
@@ -75,52 +90,59 @@ class RelightRun:
     with ``synth``, that capture is made (``synth.env`` must be the environment).
     """
 
-    env: str
-    rotate: float = 0.0
-    capture: str | None = None
-    synth: SynthRun | None = None
-    camera: str = "third"
+    env: str = text(..., "lat-long environment, .hdr or .exr")
+    rotate: float = number(0.0, "turn of the environment about the vertical", "degrees", least=-3600, most=3600)
+    capture: str | None = text(None, "capture folder")
+    synth: SynthRun | None = part_or_none("a capture made for the experiment, instead of a folder")
+    camera: str = text("third", "camera of that capture")
 
 
-@dataclass(frozen=True)
+@settings
 class RenderRun:
     """Render a Mitsuba scene; its ``<default>`` names take values from ``parameters``."""
 
-    scene: str
-    parameters: dict = field(default_factory=dict)
-    spp: int = 64
-    seed: int = 0
+    scene: str = text(..., "scene file")
+    parameters: dict[str, bool | int | float | str] = table("values of the scene's <default> names")
+    spp: int = number(64, "samples per pixel", least=1, most=SAMPLES)
+    seed: int = number(0, "seed of the samples", least=0, most=SEEDS)
 
 
-@dataclass(frozen=True)
+@settings
 class ReferenceRun:
     """The render of the same scene that a `RenderRun` is compared with."""
 
-    parameters: dict = field(default_factory=dict)
-    spp: int = 1024
-    seed: int = 1
+    parameters: dict[str, bool | int | float | str] = table("values of the scene's <default> names")
+    spp: int = number(1024, "samples per pixel", least=1, most=SAMPLES)
+    seed: int = number(1, "seed of the samples", least=0, most=SEEDS)
 
 
-@dataclass(frozen=True)
+@settings
 class Outputs:
     """What a run leaves in its folder besides ``run.json``."""
 
-    result: bool = True
-    report: bool = False
-    images: bool = True
+    result: bool = flag(True, "the result folder")
+    report: bool = flag(False, "report.html")
+    images: bool = flag(True, "renders")
 
 
-@dataclass(frozen=True)
+@settings
+class Jobs:
+    """How many runs at a time."""
+
+    jobs: int = number(1, "processes at a time on one machine", least=1, most=1024)
+
+
+@settings
 class Experiment:
     """One run: either ``fit`` with ``evaluate`` and ``relight``, or ``render`` with ``reference``."""
 
-    name: str
-    fit: FitRun | None = None
-    evaluate: EvaluateRun | None = None
-    relight: RelightRun | None = None
-    render: RenderRun | None = None
-    reference: ReferenceRun | None = None
-    outputs: Outputs = field(default_factory=Outputs)
+    name: str = text(..., "names the folder of the runs", pattern=r"^[^\x00-\x1f/\\\\.][^\x00-\x1f/\\\\]{0,99}$")
+    fit: FitRun | None = part_or_none()
+    evaluate: EvaluateRun | None = part_or_none()
+    relight: RelightRun | None = part_or_none()
+    render: RenderRun | None = part_or_none()
+    reference: ReferenceRun | None = part_or_none()
+    outputs: Outputs = part(Outputs)
 
 
 @dataclass(frozen=True)
@@ -187,28 +209,28 @@ def load_plan(path: str | Path, overrides: Sequence[str] = (), seed: int = 0) ->
         The file, a key, a value, a sweep or an input is not what it must be.
     """
     path = Path(path)
-    table = read_toml(path)
-    for text in overrides:
-        key, equals, value = text.partition("=")
+    document = read_toml(path)
+    for override in overrides:
+        key, equals, value = override.partition("=")
         if not equals or not key.strip():
-            raise InputError(f"--set {text}: expected KEY=VALUE, such as --set fit.reflectance.exponent=8")
-        _assign(table, key.strip(), _toml_value(value.strip()), f"--set {text}")
-    sweep = table.pop("sweep", {})
-    jobs = table.pop("jobs", 1)
-    if isinstance(jobs, bool) or not isinstance(jobs, int) or jobs < 1:
-        raise InputError(f"{path}: jobs: found {jobs!r}, expected a whole number of at least 1")
-    table.setdefault("name", path.stem)
-    digests: dict[tuple[str, ...], str] = {}
-    runs = []
+            raise InputError(f"--set {override}: expected KEY=VALUE, such as --set fit.reflectance.exponent=8")
+        _assign(document, key.strip(), _toml_value(value.strip()), f"--set {override}")
+    sweep = document.pop("sweep", {})
+    jobs = from_mapping(Jobs, {"jobs": document.pop("jobs", 1)}, str(path)).jobs
+    document.setdefault("name", path.stem)
+    points = []
     for swept in _points(sweep, str(path)):
-        point = json.loads(json.dumps(table, default=str))
+        point = copy.deepcopy(document)
         where = f"{path}: sweep {swept}" if swept else str(path)
         for key, value in swept.items():
             _assign(point, key, value, where)
         for kind in ("fit", "render"):
             if isinstance(point.get(kind), dict):
                 point[kind].setdefault("seed", seed)
-        experiment = _resolved(from_mapping(Experiment, point, where), path.parent, where)
+        points.append((_resolved(from_mapping(Experiment, point, where), path.parent, where), swept, where))
+    digests: dict[tuple[str, ...], str] = {}
+    runs = []
+    for experiment, swept, where in points:
         inputs = _check_inputs(experiment, where, digests)
         key = checkpoint.digest({"version": mifit.__version__, "settings": dataclasses.asdict(experiment), **inputs})
         runs.append(Run(experiment, swept, key))
@@ -219,11 +241,7 @@ def load_plan(path: str | Path, overrides: Sequence[str] = (), seed: int = 0) ->
 
 def _toml_value(text: str) -> Any:
     try:
-        import tomllib
-    except ModuleNotFoundError:  # Python 3.10
-        import tomli as tomllib  # type: ignore[no-redef]
-    try:
-        return tomllib.loads(f"x = {text}")["x"]
+        return parse_toml(f"x = {text}")["x"]
     except (ValueError, RecursionError):
         return text
 
@@ -250,6 +268,8 @@ def _points(sweep: Any, where: str) -> Iterator[dict[str, Any]]:
         for key, values in grid.items():
             if not isinstance(values, list) or not values:
                 raise InputError(f"{where}: sweep.grid: {key}: found {values!r}, expected a list of values")
+        if (found := math.prod(map(len, grid.values()))) > MOST_RUNS:
+            raise InputError(f"{where}: sweep.grid: found {found} runs, expected at most {MOST_RUNS}")
         for values in itertools.product(*grid.values()):
             yield dict(zip(grid, values, strict=True))
     elif "list" in sweep:

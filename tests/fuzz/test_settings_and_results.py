@@ -200,7 +200,7 @@ def test_a_result_that_claims_endless_subdivisions_is_refused(saved: tuple[Path,
     document["stages"]["mesh"]["details"]["subdivisions"] = count
     try:
         path.write_text(json.dumps(document))
-        with pytest.raises(InputError, match=r"mesh\.subdivisions: found .*, expected 0 to 3"):
+        with pytest.raises(InputError, match=r"mesh\.subdivisions: found .*, expected a whole number from 0 to 3"):
             use(*saved)
     finally:
         path.write_text(whole)

@@ -1,0 +1,47 @@
+"""What mkdocs fills in while it builds: tables that are made from the code itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+SETTINGS = "<!-- settings of {name} -->"
+
+
+def settings_tables(text: str) -> str:
+    """Put a table in the place of every ``<!-- settings of NAME -->``."""
+    from mifit import config, plan
+
+    tables = {
+        "fit": (config.FitConfig, ""),
+        "experiment": (plan.Experiment, ""),
+    }
+    for name, (cls, prefix) in tables.items():
+        text = text.replace(SETTINGS.format(name=name), settings_table(cls, prefix, skip=name == "experiment"))
+    return text
+
+
+def settings_table(cls: type, prefix: str, skip: bool = False) -> str:
+    """A Markdown table of all settings below a class; ``skip``: without those of the stages."""
+    from mifit.config import FitConfig
+    from mifit.schema import describe
+
+    stages = {f"fit.{key}" for key, *_ in describe(FitConfig)} if skip else set()
+    lines = ["| key | default | expected | meaning |", "| --- | --- | --- | --- |"]
+    for key, default, expected, meaning in describe(cls, prefix):
+        if key not in stages:
+            shown = "" if default is None else f"`{_toml(default)}`"
+            lines.append(f"| `{key}` | {shown} | {expected} | {meaning} |")
+    return "\n".join(lines)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return f'"{value}"' if isinstance(value, str) else str(value)
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Fill in a page (mkdocs calls this)."""
+    return settings_tables(markdown)
