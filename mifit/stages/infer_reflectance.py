@@ -70,7 +70,7 @@ def infer_reflectance(
     started = time.perf_counter()
     config = config or ReflectanceConfig()
     _check(config)
-    surface = Surface(capture, model, geometry, cameras, config.texture_size)
+    surface = Surface(capture, model, geometry, cameras, config.texture_size, trust=config.robust)
     mirrored = mirrored_coordinates(model, surface.texels) if config.symmetric_fill else None
     albedo = interpolate(geometry.vertex_albedo, model.faces, surface.texels.face, surface.texels.weights)
     albedo = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float32)

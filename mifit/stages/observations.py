@@ -2,7 +2,8 @@
 
 Photometric terms are sums over pixels. Here they are sums over texels, each weighted by the number of pixels that
 it covers in a view, so that both sums agree whatever the size of the map, and a texel seen at a grazing angle or
-from far away counts for less.
+from far away counts for less. Where the images are to be trusted only as far as the mesh is, an observation also weighs
+no more than the probability that it shows the point (`stages.trust`).
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +20,7 @@ from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, bilinear, rasterize_uv
 from mifit.errors import InputError
+from mifit.stages.trust import agreement, elsewhere, outline_distance
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -29,9 +30,10 @@ CHUNK_VALUES = 1 << 22
 """Texels x images that are held at a time."""
 GRAZING = (0.1, 0.3)
 """Cosines between which the weight of an observation fades in: below, interpolated normals and footprints mislead."""
-SECOND = np.array([[1.0, -2.0, 1.0]], dtype=np.float32)
 EDGE_STEP = 0.01
 """Second difference of depth, relative to the diagonal of the mesh, that makes a pixel part of an occlusion edge."""
+EDGE_PIXELS = 2.0
+"""Distance to an occlusion edge within which pixels hold colours of both sides."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +51,11 @@ class Observations:
     colour : (N, J, 3) float32
         Linear image colour over the camera's gain, bilinear; 0 where not observed.
     weight : (N, J) float32
-        Pixels that the texel covers, faded at grazing angles; 0 where occluded, outside or invalid.
+        Pixels that the texel covers, faded at grazing angles, times ``right``; 0 where occluded, outside or invalid.
     clipped : (N, J) bool
         The colour touches a clipped pixel: a lower bound, not a measurement.
+    right : (N, J) float32
+        Probability that the image shows the point, and not something beside or in front of it.
     point : (N, T, 3), normal : (N, T, 3) float32
         World position and unit normal per timestep.
     view : (N, J, 3) float32
@@ -66,6 +70,7 @@ class Observations:
     colour: NDArray[np.float32]
     weight: NDArray[np.float32]
     clipped: NDArray[np.bool_]
+    right: NDArray[np.float32]
     point: NDArray[np.float32]
     normal: NDArray[np.float32]
     view: NDArray[np.float32]
@@ -98,6 +103,7 @@ class Observations:
             self.colour[rows],
             self.weight[rows],
             self.clipped[rows],
+            self.right[rows],
             self.point[rows],
             self.normal[rows],
             self.view[rows],
@@ -115,6 +121,7 @@ class _Image:
     unusable: NDArray[np.float32]  # 1 where invalid, not the face area, or at an occlusion edge
     clipped: NDArray[np.float32]
     footprint: NDArray[np.float32]  # (F,) pixels per texel, 0 for faces that face away
+    outline: NDArray[np.float32]  # (H, W) pixels to the nearest outline times millimetres per unit of length
 
 
 class Surface:
@@ -128,6 +135,8 @@ class Surface:
         Cameras to read; no other camera of the capture is touched.
     size : int
         Side of the map in texels.
+    trust : bool
+        Weigh observations by how likely they show the point; without it by pixels alone, as the paper's sums do.
 
     Raises
     ------
@@ -142,6 +151,7 @@ class Surface:
         geometry: GeometryEstimate,
         cameras: Sequence[str],
         size: int,
+        trust: bool = True,
     ) -> None:
         if not cameras or not geometry.timesteps:
             raise InputError(
@@ -152,6 +162,7 @@ class Surface:
         self.texels: TexelMap = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
         if not len(self.texels.index):
             raise InputError(f"model {model.name}: its face area covers no texel of a map of {size} texels a side")
+        self.trust = trust
         self.faces = model.faces
         self.vertices = [np.asarray(v, dtype=np.float64) for v in geometry.vertices]
         self.normals = [vertex_normals(v, model.faces) for v in self.vertices]
@@ -162,7 +173,7 @@ class Surface:
         for i, timestep in enumerate(geometry.timesteps):
             for k, name in enumerate(cameras):
                 camera, frame = capture.camera(name), capture.frame(name, timestep)
-                covered, edge = _face_pixels(self.scenes[i], self.vertices[i], model, camera)
+                covered, edge, outline = _face_pixels(self.scenes[i], self.vertices[i], model, camera)
                 colour = frame.image / geometry.gain(name)
                 unusable = edge | ~covered | ~frame.valid | ~np.isfinite(frame.image).all(-1)
                 self._images.append(
@@ -174,6 +185,7 @@ class Surface:
                         unusable.astype(np.float32),
                         frame.clipped.astype(np.float32),
                         _footprint(self.vertices[i], model.faces, camera, texel_area),
+                        (outline * (model.unit_mm / geometry.scale)).astype(np.float32),
                     )
                 )
 
@@ -223,12 +235,12 @@ class Surface:
         return np.sort(np.concatenate(found)[:count])
 
     def quality(self) -> NDArray[np.float32]:
-        """(N,) how often and how well each texel was measured: 0 never, 1 by half of the images or more."""
+        """(N,) how often, how well and how surely each texel was measured: 0 never, 1 by half of the images or more."""
         out = np.zeros(len(self), dtype=np.float32)
         for part in self.chunks():
             seen = self.observe(part)
             cosine = np.einsum("njk,njk->nj", seen.image_normal, seen.view)
-            good = np.where(seen.measured > 0, np.clip(cosine, 0.0, 1.0), 0.0)
+            good = np.where(seen.measured > 0, np.clip(cosine, 0.0, 1.0) * seen.right, 0.0)
             out[part] = np.minimum(good.sum(1) / max(1.0, 0.35 * self.image_count), 1.0)
         return out
 
@@ -257,6 +269,7 @@ class Surface:
         colour = np.zeros((n, j, 3), dtype=np.float32)
         weight = np.zeros((n, j), dtype=np.float32)
         clipped = np.zeros((n, j), dtype=bool)
+        wrong = np.zeros((n, j), dtype=np.float32)
         view = np.zeros((n, j, 3), dtype=np.float32)
         point = np.zeros((n, t, 3), dtype=np.float32)
         normal = np.zeros((n, t, 3), dtype=np.float32)
@@ -266,16 +279,24 @@ class Surface:
         for k, image in enumerate(self._images):
             p = point[:, image.step].astype(np.float64)
             view[:, k] = normalize(image.camera.position - p)
-            colour[:, k], weight[:, k], clipped[:, k] = self._read(image, p, normal[:, image.step], view[:, k], face)
+            colour[:, k], weight[:, k], clipped[:, k], wrong[:, k] = self._read(
+                image, p, normal[:, image.step], view[:, k], face
+            )
+        step = np.array([m.step for m in self._images])
+        right = np.float32(1.0) - wrong
+        if self.trust:
+            right = agreement(colour, weight, wrong, clipped, step)
+            weight *= np.minimum(right, 1.0 - wrong)  # confirmed or not, a twin of a view adds nothing new
         return Observations(
             texel,
             face,
             weights,
-            np.array([m.step for m in self._images]),
+            step,
             np.array([m.camera_index for m in self._images]),
             colour,
             weight,
             clipped,
+            right,
             point,
             normal,
             view,
@@ -283,8 +304,8 @@ class Surface:
 
     def _read(
         self, image: _Image, point: NDArray, normal: NDArray, view: NDArray, face: NDArray
-    ) -> tuple[NDArray, NDArray, NDArray]:
-        """Colour, weight and clipping of one image at surface points."""
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Colour, weight, clipping and probability of showing something else of one image at surface points."""
         camera = image.camera
         pixel = np.nan_to_num(camera.project(point), nan=-1e6)
         inside = (pixel >= 0.5).all(-1) & (pixel[:, 0] <= camera.width - 0.5) & (pixel[:, 1] <= camera.height - 0.5)
@@ -302,7 +323,11 @@ class Surface:
         clipped = np.zeros(len(point), dtype=bool)
         colour[rows] = bilinear(image.colour, x, y) / share[:, None]  # of the usable pixels alone
         clipped[rows] = bilinear(image.clipped, x, y) > 0.0
-        return colour, weight, clipped
+        wrong = np.zeros(len(point), dtype=np.float32)
+        if self.trust:
+            depth = np.sum((point[rows] - camera.position) * camera.rotation[2], axis=1)
+            wrong[rows] = elsewhere(cosine[rows], bilinear(image.outline, x, y) * depth / camera.fx)
+        return colour, weight, clipped, wrong
 
 
 def _texel_area(uv: NDArray, faces_uv: NDArray, size: int) -> NDArray[np.float64]:
@@ -321,18 +346,13 @@ def _footprint(vertices: NDArray, faces: NDArray, camera: Camera, texel_area: ND
     return (area / np.maximum(texel_area, 1e-9)).astype(np.float32)
 
 
-def _face_pixels(scene, vertices: NDArray, model: MorphableModel, camera: Camera) -> tuple[NDArray, NDArray]:
-    """Pixels whose centre shows the front of the face area, and pixels at occlusion edges (two wide)."""
+def _face_pixels(scene, vertices: NDArray, model: MorphableModel, camera: Camera) -> tuple[NDArray, NDArray, NDArray]:
+    """Pixels whose centre shows the front of the face area, pixels at occlusion edges, and pixels to the outline."""
     buffer = scene.gbuffer(camera)
     face = buffer.face
     toward = camera.position - vertices[model.faces[:, 0]]
     front = np.sum(face_cross(vertices, model.faces) * toward, axis=1) > 0
     covered = (face >= 0) & (front & model.face_mask)[np.maximum(face, 0)]
-    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    depth = np.where(covered, buffer.depth, 0.0).astype(np.float32)
-    kernel = np.ones((3, 3), dtype=np.uint8)
-    # Second differences: an oblique surface has none, however steep.
-    bend = [np.abs(cv2.filter2D(depth, -1, k)) for k in (SECOND, SECOND.T)]
-    jump = np.maximum(*bend) > EDGE_STEP * diagonal
-    edge = cv2.dilate(jump.astype(np.uint8), kernel) > 0
-    return covered, edge
+    step = EDGE_STEP * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    outline = outline_distance(np.where((face >= 0) & front[np.maximum(face, 0)], buffer.depth, np.inf), step)
+    return covered, outline < EDGE_PIXELS, outline

@@ -23,6 +23,7 @@ class Quad:
     uv: np.ndarray = None
     faces_uv: np.ndarray = None
     face_mask: np.ndarray = None
+    unit_mm: float = 10.0
 
 
 @dataclass(frozen=True)
@@ -101,10 +102,10 @@ def capture(angles=(0.0,), image=None, valid=None, clipped=None, distance=4.0):
     )
 
 
-def observe(shot, model=None, cameras=("left",), geo=None):
+def observe(shot, model=None, cameras=("left",), geo=None, trust=False):
     from mifit.stages.observations import Surface
 
-    surface = Surface(shot, model or quad(), geo or geometry(), cameras, SIZE)
+    surface = Surface(shot, model or quad(), geo or geometry(), cameras, SIZE, trust)
     return surface, surface.observe(np.arange(len(surface)))
 
 
@@ -135,6 +136,22 @@ def test_oblique_views_weigh_less_and_see_along_the_right_direction(variant):
     toward = camera(0.7, distance=far).position - seen.point[:, 0]
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     np.testing.assert_allclose(seen.view[:, 1], toward, atol=1e-5)
+
+
+def test_the_background_beside_a_mesh_that_is_too_wide_counts_for_little(variant):
+    image = np.full((48, 48, 3), 0.5, np.float32)
+    photo = capture((0.0, 1.2), image)
+    dark = np.full_like(image, 0.01)
+    photo._images["right"] = replace(photo._images["left"], image=dark)  # grazing, and of something else
+    _, plain = observe(photo, cameras=("left", "right"))
+    surface, seen = observe(photo, cameras=("left", "right"), trust=True)
+    both = (plain.weight > 0).all(1)
+    assert both.sum() > 50
+    assert (seen.weight[both, 1] < 0.1 * plain.weight[both, 1]).all()
+    inside = both & (np.abs(seen.point[:, 0, :2]) < 0.5).all(-1)
+    assert (seen.weight[inside, 0] > 0.9 * plain.weight[inside, 0]).all()
+    edge, middle = (np.linalg.norm(seen.point[:, 0, :2] - (x, 0), axis=1).argmin() for x in (-0.8, 0.0))
+    assert surface.quality()[edge] < surface.quality()[middle]
 
 
 def test_only_named_cameras_are_read(variant):
