@@ -234,10 +234,8 @@ def judge_relit(
         for label, (result, method) in rows.items():
             lit = result.relight(str(light))
             for integrator in integrators:
-                if integrator == "path":
-                    image = lit.render(capture.camera(name), timestep, method, "path", samples)[at.box]  # type: ignore[arg-type]
-                else:
-                    image = lit.render(at.camera, timestep, method)  # type: ignore[arg-type]
+                count = samples if integrator == "path" else None
+                image = lit.render(at.camera, timestep, method, integrator, count)  # type: ignore[arg-type]
                 key = f"{label}, {integrator}"
                 found.setdefault(key, {})[environment] = round(scaled_psnr(image[..., :3], truth, at.relit), 2)
     for figures in found.values():

@@ -156,6 +156,7 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--camera", required=True)
     p.add_argument("--timesteps", type=_timesteps, help="default: all of the result")
     p.add_argument("--region", choices=["model", "truth"], default="model", help="whose face area counts")
+    p.add_argument("--baseline", action="store_true", help="compare image-based rendering on the same mesh and pixels")
     p.add_argument("--json", type=Path, help="file to write the figures to")
 
     p = add("render", "render a reconstruction from a camera of the capture")

@@ -90,6 +90,7 @@ def demo(arguments: Namespace) -> None:
             camera="third",
             timesteps=None,
             region="model",
+            baseline=True,
             json=out / "third.json",
         )
     )
@@ -225,16 +226,29 @@ def evaluate(arguments: Namespace) -> None:
         timesteps=arguments.timesteps,
         region=arguments.region,
         progress=console_progress(arguments.quiet),
+        baseline=arguments.baseline,
     )
     if arguments.camera in [camera.name for camera in result.cameras]:
         _say(arguments, f"mifit: warning: camera {arguments.camera!r} was fitted, so this is no held-out error")
     if arguments.json:
         write_text(arguments.json, json.dumps(found, indent=2) + "\n")
     print(f"camera {found['camera']}, timesteps {found['timesteps']}, {found['region_pixels']} pixels")
-    print(f"{'method':<10}{'PSNR dB':>9}{'RMSE':>8}{'SSIM':>8}{'FLIP':>8}")
-    for method, f in found["methods"].items():
-        print(f"{method:<10}{f['psnr']:>9.2f}{f['rmse']:>8.2f}{f['ssim']:>8.4f}{f['flip']:>8.4f}")
+    if "resected" in found:
+        print(
+            f"camera {found['camera']} is not calibrated: placed from its landmarks against the fitted head, "
+            f"{found['resected']['landmark_pixels']:.1f} pixels beside them"
+        )
+    _print_measures(found["methods"])
+    if "baseline" in found:
+        print(f"image-based rendering on the same mesh, {found['baseline']['region_pixels']} pixels that it can fill")
+        _print_measures(found["baseline"]["methods"])
     write_report(arguments.result, result, capture, evaluation=found)
+
+
+def _print_measures(methods: dict[str, dict[str, float]]) -> None:
+    print(f"{'method':<12}{'PSNR dB':>9}{'RMSE':>8}{'SSIM':>8}{'FLIP':>8}")
+    for method, f in methods.items():
+        print(f"{method:<12}{f['psnr']:>9.2f}{f['rmse']:>8.2f}{f['ssim']:>8.4f}{f['flip']:>8.4f}")
 
 
 def render(arguments: Namespace) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,7 +17,9 @@ from mifit.core.flip import flip
 from mifit.core.image import to_8_bit
 from mifit.core.metrics import mean_squared_error, psnr_from_rmse, ssim
 from mifit.errors import InputError
+from mifit.output.baseline import image_based
 from mifit.output.deferred import shade_methods, trace_mesh, visible_surface
+from mifit.output.resect import needs_resection, resect
 from mifit.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -40,12 +42,18 @@ class Comparison:
         Pixels that count, the same for all methods.
     renders : dict of method to (H, W, 4) uint8
         Colour and coverage; colour is 0 where the model covers nothing.
+    baseline : (H, W, 3) uint8, optional
+        Image-based rendering from the fitted views on the fitted mesh (`output.baseline`), where asked for.
+    seen : (H, W) bool, optional
+        Pixels of the region whose point a fitted view sees: those that the baseline is compared on.
     """
 
     timestep: int
     photograph: NDArray[np.uint8]
     region: NDArray[np.bool_]
     renders: dict[Method, NDArray[np.uint8]]
+    baseline: NDArray[np.uint8] | None = None
+    seen: NDArray[np.bool_] | None = None
 
 
 def evaluate(
@@ -55,6 +63,7 @@ def evaluate(
     timesteps: Sequence[int] | None = None,
     region: Literal["model", "truth"] = "model",
     progress: Progress = silent,
+    baseline: bool = False,
 ) -> dict[str, Any]:
     """Compare renders with photographs over the face area.
 
@@ -62,6 +71,8 @@ def evaluate(
     all methods. A pixel of the region that the fitted model does not cover is an error pixel: it was rendered as 0.
     Pixels that undistortion left without a value do not count. Over several timesteps the squared error is pooled
     over all pixels before PSNR and RMSE are taken.
+
+    A camera of an uncalibrated capture that was not fitted is placed from its landmarks against the fitted head.
 
     Parameters
     ----------
@@ -74,12 +85,17 @@ def evaluate(
     region : {"model", "truth"}
         ``model``: face area of the fitted model; ``truth``: face area of the capture's ground-truth mesh.
     progress : Progress
+    baseline : bool
+        Compare image-based rendering on the fitted mesh as well (`output.baseline`).
 
     Returns
     -------
     dict
         ``{"camera", "timesteps", "region", "region_pixels", "methods": {method: {"psnr", "rmse", "ssim",
         "flip"}}, "per_timestep": [{"timestep", "region_pixels", "methods"}]}``; PSNR in dB, RMSE 0..255, FLIP 0..1.
+        With ``baseline`` also ``"baseline": {"region_pixels", "methods"}``, over the pixels of the region that a
+        fitted view sees, with ``"image_based"`` among the methods; for a camera that had to be placed,
+        ``"resected": {"landmark_pixels", "focal_pixels"}``.
 
     Raises
     ------
@@ -87,31 +103,59 @@ def evaluate(
         Unknown camera or timestep, no ground truth, or a face area that is not visible.
     """
     steps = reconstruction.timesteps if timesteps is None else tuple(timesteps)
+    placed = resect(reconstruction, capture, camera) if needs_resection(reconstruction, capture, camera) else None
+    if placed is not None:
+        capture = capture.with_estimate([*reconstruction.cameras, placed.camera])
     per_timestep = []
-    # Sums over pixels of squared error, similarity and FLIP error.
-    sums = {method: np.zeros(3) for method in reconstruction.methods}
-    pixels = 0
+    whole, seen = _Sums(), _Sums()
     progress("Evaluating", 0, len(steps))
     for done, timestep in enumerate(steps):
-        found = compare(reconstruction, capture, camera, timestep, region)
-        count = int(found.region.sum())
-        pixels += count
-        figures = {}
-        for method, render in found.renders.items():
-            pair = (render[..., :3], found.photograph, found.region)
-            means = np.array([mean_squared_error(*pair), ssim(*pair), flip(*pair)])
-            sums[method] += count * means
-            figures[method] = _figures(means)
-        per_timestep.append({"timestep": timestep, "region_pixels": count, "methods": figures})
+        found = compare(reconstruction, capture, camera, timestep, region, baseline=baseline)
+        renders = {str(method): render[..., :3] for method, render in found.renders.items()}
+        figures = whole.add(renders, found.photograph, found.region)
+        if found.baseline is not None and found.seen is not None:
+            seen.add({"image_based": found.baseline, **renders}, found.photograph, found.seen)
+        per_timestep.append({"timestep": timestep, "region_pixels": int(found.region.sum()), "methods": figures})
         progress("Evaluating", done + 1, len(steps))
-    return {
+    out = {
         "camera": camera,
         "timesteps": list(steps),
         "region": region,
-        "region_pixels": pixels,
-        "methods": {m: _figures(total / pixels) for m, total in sums.items()},
+        "region_pixels": whole.pixels,
+        "methods": whole.figures(),
         "per_timestep": per_timestep,
     }
+    if baseline:
+        out["baseline"] = {"region_pixels": seen.pixels, "methods": seen.figures()}
+    if placed is not None:
+        out["resected"] = {"landmark_pixels": placed.landmark_pixels, "focal_pixels": placed.camera.fx}
+    return out
+
+
+class _Sums:
+    """Squared error, similarity and FLIP error of some images, summed over the pixels of regions."""
+
+    def __init__(self) -> None:
+        self.pixels, self._sums = 0, dict[str, NDArray]()
+
+    def add(
+        self, images: Mapping[str, NDArray], photograph: NDArray, region: NDArray[np.bool_]
+    ) -> dict[str, dict[str, float]]:
+        """Add the pixels of one photograph; returns its own figures."""
+        count, figures = int(region.sum()), {}
+        if not count:
+            return {}
+        self.pixels += count
+        for name, image in images.items():
+            pair = (image, photograph, region)
+            means = np.array([mean_squared_error(*pair), ssim(*pair), flip(*pair)])
+            self._sums[name] = self._sums.get(name, np.zeros(3)) + count * means
+            figures[name] = _figures(means)
+        return figures
+
+    def figures(self) -> dict[str, dict[str, float]]:
+        """Of all pixels together."""
+        return {name: _figures(total / self.pixels) for name, total in self._sums.items()}
 
 
 def _figures(means: NDArray) -> dict[str, float]:
@@ -128,9 +172,10 @@ def compare(
     region: Literal["model", "truth"] = "model",
     methods: tuple[Method, ...] | None = None,
     oversampling: int = 2,
+    baseline: bool = False,
 ) -> Comparison:
     """Render one view by some methods (default: all) and find the region in which to compare it; see `evaluate`."""
-    capture = capture.with_fitted(reconstruction.cameras)
+    capture = located(capture, reconstruction, camera)
     view = capture.camera(camera)
     reconstruction.index(timestep)
     if timestep not in capture.timesteps:
@@ -150,7 +195,18 @@ def compare(
     if not area.any():
         raise InputError(f"camera {camera}, timestep {timestep}: the face area is not visible, nothing to evaluate")
     renders = {m: rgba_8_bit(as_photographed(reconstruction, image, camera)) for m, image in linear.items()}
-    return Comparison(timestep, to_8_bit(frame.image), area, renders)
+    if not baseline:
+        return Comparison(timestep, to_8_bit(frame.image), area, renders)
+    vertices, gains = reconstruction.geometry.vertices[reconstruction.index(timestep)], reconstruction.geometry.gains
+    shown = image_based(capture, reconstruction.cameras, view, timestep, vertices, reconstruction.model.faces, gains)
+    return Comparison(timestep, to_8_bit(frame.image), area, renders, to_8_bit(shown.colour), area & shown.seen)
+
+
+def located(capture: Capture, reconstruction: Result, camera: str) -> Capture:
+    """The capture with the fitted cameras, and with the named one placed where it is neither calibrated nor fitted."""
+    if needs_resection(reconstruction, capture, camera):
+        return capture.with_estimate([*reconstruction.cameras, resect(reconstruction, capture, camera).camera])
+    return capture if camera in capture.estimated else capture.with_fitted(reconstruction.cameras)
 
 
 def as_photographed(reconstruction: Result, image: NDArray, camera: str) -> NDArray:

@@ -31,6 +31,8 @@ class FakeCapture:
     path: object = None
     timesteps: tuple = (0, 3)
     hidden: tuple = field(default=())
+    calibrated: bool = True
+    estimated: dict = field(default_factory=dict)
 
     def camera(self, name):
         return next(c for c in self.cameras if c.name == name)
