@@ -171,11 +171,13 @@ def run_steps(
 
 
 def _fit_geometry(source: Source, inputs: Inputs, progress: Progress, config: GeometryConfig) -> Any:
+    from mifit.stages.eyes import behind_lids
     from mifit.stages.fit_geometry import fit_geometry
 
-    return fit_geometry(
+    found = fit_geometry(
         source.capture, source.model, source.cameras, source.timesteps, config, seed=source.seed, progress=progress
     )
+    return behind_lids(source.model, found)
 
 
 def _infer_reflectance(source: Source, inputs: Inputs, progress: Progress, config: ReflectanceConfig) -> Any:
@@ -195,9 +197,10 @@ def _infer_reflectance(source: Source, inputs: Inputs, progress: Progress, confi
 def _refine_shape(
     source: Source, inputs: Inputs, progress: Progress, shape: ShapeConfig, geometry: GeometryConfig
 ) -> Any:
+    from mifit.stages.eyes import behind_lids
     from mifit.stages.refine_shape import refine_shape
 
-    return refine_shape(
+    found = refine_shape(
         source.capture,
         source.model,
         inputs["geometry"],
@@ -208,6 +211,7 @@ def _refine_shape(
         source.seed,
         progress,
     )
+    return behind_lids(source.model, found)
 
 
 def _refine_normals(source: Source, inputs: Inputs, progress: Progress, config: NormalsConfig) -> Any:
