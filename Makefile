@@ -28,7 +28,7 @@ quick:
 	$(BIN)/python -m pytest -m "not slow"
 
 bench:
-	@.ci/setup
+	@.ci/setup bench
 	$(BIN)/python -m benchmarks
 
 notebooks:

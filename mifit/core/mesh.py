@@ -13,6 +13,22 @@ def face_cross(vertices: NDArray, faces: NDArray) -> NDArray:
     return np.cross(b - a, c - a)
 
 
+def edges(faces: NDArray) -> tuple[NDArray, NDArray]:
+    """Undirected edges (E, 2), each with its lower vertex first, and the number of faces at each (E,)."""
+    unique, count = np.unique(_sides(faces), axis=0, return_counts=True)
+    return unique, count
+
+
+def edges_of_faces(faces: NDArray) -> tuple[NDArray, NDArray]:
+    """As `edges`, but with the edge of every side: (E, 2), and (3, F) for the sides 01, 12 and 20 of each face."""
+    unique, which = np.unique(_sides(faces), axis=0, return_inverse=True)
+    return unique, which.reshape(3, len(faces))
+
+
+def _sides(faces: NDArray) -> NDArray:
+    return np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+
+
 def vertex_sum_matrix(faces: NDArray, n_vertices: int) -> sp.csr_matrix:
     """(V, F) 0/1 matrix that sums face values over the faces around each vertex."""
     f = np.repeat(np.arange(len(faces)), 3)

@@ -22,7 +22,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
 
-from mifit.core.mesh import face_cross, normalize
+from mifit.core.mesh import edges, edges_of_faces, face_cross, normalize
 from mifit.core.uv import TexelMap
 
 MIN_COTANGENT = 0.05
@@ -184,9 +184,8 @@ class Subdivision:
 def subdivide(faces: NDArray, n_vertices: int) -> Subdivision:
     """Split every face into four at the midpoints of its edges; works for positions and for texture vertices."""
     f = np.asarray(faces, dtype=np.int64)
-    edges = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
-    unique, which = np.unique(edges, axis=0, return_inverse=True)
-    ab, bc, ca = n_vertices + which.reshape(3, len(f))
+    unique, which = edges_of_faces(f)
+    ab, bc, ca = n_vertices + which
     a, b, c = f.T
     new = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
     rows = np.repeat(np.arange(len(unique)), 2)
@@ -200,8 +199,7 @@ def interior_vertices(faces: NDArray, face_mask: NDArray[np.bool_], n_vertices: 
     outside[faces[~face_mask].ravel()] = True
     used = np.zeros(n_vertices, dtype=bool)
     used[faces[face_mask].ravel()] = True
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    unique, count = np.unique(edges, axis=0, return_counts=True)
+    unique, count = edges(faces)
     border = np.zeros(n_vertices, dtype=bool)
     border[unique[count == 1].ravel()] = True
     return used & ~outside & ~border

@@ -11,7 +11,7 @@ from mifit.core.files import replacing
 from mifit.core.image import to_8_bit
 from mifit.errors import InputError
 
-_FACE = np.dtype([("count", "u1"), ("index", "<i4", (3,))])
+_GROUPS = {"vertices": "xyz", "normals": ("nx", "ny", "nz"), "uv": "uv", "albedo": "rgb"}
 
 
 def write_ply(
@@ -37,24 +37,20 @@ def write_ply(
     viewer_colours : bool
         Also writes ``red green blue``, 8-bit sRGB, what mesh viewers show and Mitsuba warns of.
     """
-    layout = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz", "u", "v", "r", "g", "b")]
-    if viewer_colours:
-        layout += [(name, "u1") for name in ("red", "green", "blue")]
-    table = np.empty(len(vertices), dtype=layout)
-    columns = np.concatenate([vertices, normals, uv, albedo], axis=1)
-    for i, (name, _) in enumerate(layout[:11]):
-        table[name] = columns[:, i]
-    colour = to_8_bit(albedo)
-    for i, (name, _) in enumerate(layout[11:]):
-        table[name] = colour[:, i]
-    rows = np.empty(len(faces), dtype=_FACE)
-    rows["count"], rows["index"] = 3, faces
-    kinds = {"<f4": "float", "u1": "uchar"}
-    header = ["ply", "format binary_little_endian 1.0", "comment written by mifit"]
-    header += [f"element vertex {len(table)}", *(f"property {kinds[k]} {n}" for n, k in layout)]
-    header += [f"element face {len(rows)}", "property list uchar int vertex_indices", "end_header", ""]
+    from trimesh import Trimesh
+    from trimesh.exchange.ply import export_ply
+
+    columns = {**dict(zip("uv", uv.T, strict=True)), **dict(zip("rgb", albedo.T, strict=True))}
+    mesh = Trimesh(
+        vertices,
+        faces,
+        vertex_normals=normals,
+        vertex_colors=to_8_bit(albedo) if viewer_colours else None,
+        vertex_attributes={name: np.asarray(column, dtype=np.float32) for name, column in columns.items()},
+        process=False,
+    )
     with replacing(path) as temporary:
-        temporary.write_bytes("\n".join(header).encode() + table.tobytes() + rows.tobytes())
+        temporary.write_bytes(export_ply(mesh, vertex_normal=True))
 
 
 def read_ply(path: str | Path) -> dict[str, NDArray]:
@@ -70,20 +66,16 @@ def read_ply(path: str | Path) -> dict[str, NDArray]:
     InputError
         The file is missing, cut short or of another layout.
     """
+    from trimesh.exchange.ply import load_ply
+
     try:
-        data = Path(path).read_bytes()
+        with open(path, "rb") as stream:
+            stored = load_ply(stream, fix_texture=False)
+        table = stored["metadata"]["_ply_raw"]["vertex"]["data"]  # as it is stored: nothing merged or normalised
+        out = {key: np.stack([table[n] for n in names], 1).astype("<f4") for key, names in _GROUPS.items()}
+        faces = np.asarray(stored["faces"], dtype=np.int32).reshape(-1, 3)
     except OSError as error:
         raise InputError(f"{path}: not readable: {error.strerror}") from None
-    end = data.find(b"end_header\n") + len(b"end_header\n")
-    lines = data[:end].decode("ascii", "replace").split("\n")
-    kinds = {"float": "<f4", "uchar": "u1"}
-    try:
-        counts = {w[1]: int(w[2]) for w in map(str.split, lines) if w[:1] == ["element"]}
-        layout = [(w[2], kinds[w[1]]) for w in map(str.split, lines) if w[:1] == ["property"] and len(w) == 3]
-        table = np.frombuffer(data, layout, counts["vertex"], end)
-        rows = np.frombuffer(data, _FACE, counts["face"], end + table.nbytes)
-        groups = {"vertices": "xyz", "normals": ("nx", "ny", "nz"), "uv": "uv", "albedo": "rgb"}
-        out = {key: np.stack([table[n] for n in names], 1) for key, names in groups.items()}
-    except (ValueError, KeyError, IndexError) as error:
+    except Exception as error:  # whatever a damaged file makes the reader raise
         raise InputError(f"{path}: not a mesh that mifit wrote ({error}); fit again, or restore the file") from None
-    return {**out, "faces": rows["index"].copy()}
+    return {**out, "faces": faces}

@@ -10,12 +10,13 @@ from numpy.typing import ArrayLike
 from mifit.errors import InputError
 from mifit.morphable.assemble import check_mesh, complete, face_area, transfer_landmarks
 from mifit.morphable.builtin.identity import deformation_modes
-from mifit.morphable.model import MorphableModel
+from mifit.morphable.model import MorphableModel, provides
 
 _EXPRESSION_KERNELS = ((22.0, 40, (1.2, 1.5, 1.2)), (11.0, 90, (0.5, 0.7, 0.5)))
 _N_EXPRESSION = 30
 
 
+@provides("from_template")
 def model_of_template(
     mesh: Any, landmarks: ArrayLike | None, kernels: tuple | None, unit_mm: float, modes: int, name: str
 ) -> MorphableModel:

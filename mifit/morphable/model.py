@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +16,22 @@ from mifit.core.mesh import face_cross
 from mifit.errors import InputError
 
 _LANDMARKS = 68
+_PROVIDED: dict[str, Callable[..., Any]] = {}
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def provides(method: str) -> Callable[[F], F]:
+    """Make a function what a method of `MorphableModel` calls.
+
+    Formats, templates and the built-in model are made of models, so they import this module and it imports none of
+    them; they enter themselves here when ``mifit.morphable`` is imported.
+    """
+
+    def enter(function: F) -> F:
+        _PROVIDED[method] = function
+        return function
+
+    return enter
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,9 +314,7 @@ class MorphableModel:
         modes : int
             Identity modes.
         """
-        from mifit.morphable.from_template import model_of_template
-
-        return model_of_template(mesh, landmarks, kernels, unit_mm, modes, name)
+        return _PROVIDED["from_template"](mesh, landmarks, kernels, unit_mm, modes, name)
 
     # -- files --------------------------------------------------------------------------------------------
 
@@ -319,15 +335,11 @@ class MorphableModel:
         InputError
             The file is missing, damaged or of no known kind; the message says what was found.
         """
-        from mifit.morphable.recognise import load_model
-
-        return load_model(path, kind)
+        return _PROVIDED["load"](path, kind)
 
     def save(self, path: str | Path) -> None:
         """Write the model as an ``.npz`` file, whole or not at all."""
-        from mifit.morphable.formats.own import save_model
-
-        save_model(self, path)
+        _PROVIDED["save"](self, path)
 
 
 def _checked(name: str, key: str, value: ArrayLike, shape: tuple, dtype: type) -> NDArray:

@@ -19,7 +19,7 @@ from mifit.morphable.formats.ict import is_ict_folder, is_ict_npz, load_ict_fold
 from mifit.morphable.formats.mat5 import is_mat5, mat_names
 from mifit.morphable.formats.own import FORMAT_KEY, load_own
 from mifit.morphable.formats.pickles import is_pickle
-from mifit.morphable.model import MorphableModel
+from mifit.morphable.model import MorphableModel, provides
 
 BUILTIN = ("builtin", "builtin:coarse")
 
@@ -38,6 +38,7 @@ KINDS: dict[str, Callable[[Path], MorphableModel]] = {
 """Every kind of model file and its loader; ``mifit model convert --kind`` takes these names."""
 
 
+@provides("load")
 def load_model(path: str | Path, kind: str | None = None) -> MorphableModel:
     """Load ``"builtin"``, ``"builtin:coarse"``, or a file or folder of a known kind.
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
-from mifit.core.mesh import face_cross, vertex_normals
+from mifit.core.mesh import vertex_normals
 from mifit.morphable.model import MorphableModel
 
 
@@ -108,7 +109,7 @@ def register(
         prior = np.concatenate([np.ones(len(c)), np.full(6, 1e-3)])
         step = np.linalg.solve(a.T @ a + np.diag(prior), -(a.T @ b) - prior * np.concatenate([c, np.zeros(6)]))
         c = c + step[: len(c)]
-        turn = rotation_of(step[len(c) : len(c) + 3])
+        turn = Rotation.from_rotvec(step[len(c) : len(c) + 3]).as_matrix()
         rotation, translation = turn @ rotation, turn @ translation + step[len(c) + 3 :]
     shape = mean + unit * (model.identity_jacobian @ c.astype(np.float32)).reshape(-1, 3)
     return Registration(c, 1.0, rotation, translation, shape @ rotation.T + translation)
@@ -117,17 +118,8 @@ def register(
 def rigid_between(source: NDArray, target: NDArray) -> tuple[NDArray, NDArray]:
     """Rotation and translation that best take points (N, 3) to points (N, 3) (Kabsch)."""
     cs, ct = source.mean(0), target.mean(0)
-    u, _, vt = np.linalg.svd((target - ct).T @ (source - cs))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    rotation = Rotation.align_vectors(target - ct, source - cs)[0].as_matrix()
     return rotation, ct - rotation @ cs
-
-
-def rotation_of(axis_angle: NDArray) -> NDArray:
-    """Rotation matrix of an axis-angle vector."""
-    angle = np.linalg.norm(axis_angle)
-    x, y, z = axis_angle / max(angle, 1e-12)
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
 
 
 def nose_tip(vertices: NDArray) -> NDArray:
@@ -139,26 +131,9 @@ def nose_tip(vertices: NDArray) -> NDArray:
 
 def distance_to_surface(points: NDArray, vertices: NDArray, faces: NDArray, candidates: int = 16) -> NDArray:
     """Distance of points (N, 3) from a surface: to the nearest of the triangles whose centres are closest."""
+    from trimesh.triangles import closest_point
+
     corners = vertices[faces]
     _, near = cKDTree(corners.mean(1)).query(points, k=min(candidates, len(faces)))
-    best = np.full(len(points), np.inf)
-    normals = face_cross(vertices, faces)
-    for k in near.reshape(len(points), -1).T:
-        a, b, c = (corners[k, i] for i in range(3))
-        best = np.minimum(best, _point_triangle(points, a, b, c, normals[k]))
-    return best
-
-
-def _point_triangle(p: NDArray, a: NDArray, b: NDArray, c: NDArray, n: NDArray) -> NDArray:
-    """Distance of each point from its own triangle."""
-    n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30)
-    height = ((p - a) * n).sum(1)
-    foot = p - height[:, None] * n
-    inside = np.ones(len(p), dtype=bool)
-    best = np.full(len(p), np.inf)
-    for u, v in ((a, b), (b, c), (c, a)):
-        edge = v - u
-        inside &= (np.cross(edge, foot - u) * n).sum(1) >= 0
-        t = np.clip(((p - u) * edge).sum(1) / np.maximum((edge * edge).sum(1), 1e-30), 0, 1)
-        best = np.minimum(best, np.linalg.norm(p - u - t[:, None] * edge, axis=1))
-    return np.where(inside, np.abs(height), best)
+    feet = [closest_point(corners[k], points) for k in near.reshape(len(points), -1).T]
+    return np.linalg.norm(np.stack(feet) - points, axis=-1).min(0)

@@ -8,14 +8,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
+from mifit.core.mesh import edges
+
 EYES_AND_MOUTH = (range(36, 42), range(42, 48), range(60, 68))
 """iBUG landmarks around the three openings of a face."""
-
-
-def edges(faces: NDArray) -> tuple[NDArray, NDArray]:
-    """Undirected edges (E, 2), sorted, and the number of faces at each (E,)."""
-    e = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    return np.unique(e, axis=0, return_counts=True)
 
 
 def adjacency(faces: NDArray, n_vertices: int, lengths_of: NDArray | None = None) -> sp.csr_matrix:

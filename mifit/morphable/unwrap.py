@@ -7,7 +7,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 
-from mifit.morphable.topology import edges
+from mifit.core.mesh import edges
 
 
 def unwrap(mean: NDArray, faces: NDArray, mask: NDArray) -> tuple[NDArray[np.float32], NDArray[np.int32]]:

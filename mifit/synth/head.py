@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from mifit.core.mesh import vertex_normals
+from mifit.core.mesh import edges, vertex_normals
 from mifit.morphable import MorphableModel
 from mifit.synth.noise import smooth_noise
 
@@ -139,8 +139,7 @@ def split_eyeball(model: MorphableModel, chosen: NDArray[np.bool_]) -> SplitMesh
 
 def eye_openings(vertices: NDArray, faces: NDArray, landmarks: NDArray) -> list[NDArray[np.int64]]:
     """Vertices around each eye's hole in the mesh; empty when the model's eyes are closed surfaces."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    unique, count = np.unique(edges, axis=0, return_counts=True)
+    unique, count = edges(faces)
     border = unique[count == 1]
     if not len(border):
         return []

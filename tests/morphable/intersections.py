@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mifit.morphable.topology import edges
+from mifit.core.mesh import edges
 
 
 def intersections(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -5,20 +5,21 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 import tracemalloc
 
 import numpy as np
 import pytest
 from intersections import intersections
 
-from mifit.core.mesh import face_cross
+from mifit.core.mesh import edges, face_cross
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
 from mifit.morphable.builtin import cache, sculpt
 from mifit.morphable.builtin.head import make_head
 from mifit.morphable.builtin.template import EYEBALL, SKIN, make_template
 from mifit.morphable.landmarks import IBUG_MIRROR
-from mifit.morphable.topology import boundary_loops, edges
+from mifit.morphable.topology import boundary_loops
 
 
 @pytest.fixture(scope="module")
@@ -132,6 +133,18 @@ def test_cache_is_used_and_a_damaged_one_replaced(tmp_path, monkeypatch, coarse)
     file.write_bytes(file.read_bytes()[:5000])
     assert fresh(True).digest == first.digest and made == [True, True]
     assert fresh(True).digest == first.digest and made == [True, True]
+
+
+def test_models_of_other_versions_stay_while_they_are_used(tmp_path, monkeypatch, coarse):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(cache, "make_head", lambda c: coarse)
+    (tmp_path / "mifit").mkdir()
+    recent, old = (tmp_path / "mifit" / f"builtin-coarse-{n}.npz" for n in ("1" * 16, "2" * 16))
+    for file in (recent, old):
+        file.touch()
+    os.utime(old, (0, time.time() - cache.KEPT_SECONDS - 60))
+    cache.builtin_model.__wrapped__(True)
+    assert recent.exists() and not old.exists()
 
 
 def test_cache_folder_that_cannot_be_written_is_no_trouble(tmp_path, monkeypatch, coarse):

@@ -5,11 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel, describe
 from mifit.morphable.landmarks import IBUG_MIRROR, MEDIAPIPE_TO_IBUG68
-from mifit.morphable.register import distance_to_surface, register, rigid_between, rotation_of
+from mifit.morphable.register import distance_to_surface, register, rigid_between
 from mifit.morphable.topology import EYES_AND_MOUTH
 from mifit.morphable.unwrap import unwrap
 
@@ -34,7 +35,7 @@ def test_distance_to_surface_is_exact():
 def test_rigid_between():
     rng = np.random.default_rng(0)
     p = rng.standard_normal((9, 3))
-    r, t = rotation_of(np.array([0.3, -1.0, 0.4])), np.array([1.0, 2, 3])
+    r, t = Rotation.from_rotvec([0.3, -1.0, 0.4]).as_matrix(), np.array([1.0, 2, 3])
     rotation, translation = rigid_between(p, p @ r.T + t)
     np.testing.assert_allclose(rotation, r, atol=1e-12)
     np.testing.assert_allclose(translation, t, atol=1e-12)
@@ -42,7 +43,7 @@ def test_rigid_between():
 
 def test_model_registers_to_a_subject_of_its_own(coarse):
     subject = 10.0 * coarse.shape(coarse.sample(1, 0.7)[0]).astype(float)
-    r = rotation_of(np.array([0.1, 0.2, 0.0]))
+    r = Rotation.from_rotvec(np.array([0.1, 0.2, 0.0])).as_matrix()
     fit = register(coarse, subject @ r.T + 5.0, coarse.faces, coarse.landmarks, iterations=12)
     on_face = np.unique(coarse.faces[coarse.face_mask])
     assert np.linalg.norm(fit.vertices - subject @ r.T - 5.0, axis=1)[on_face].mean() < 1.0

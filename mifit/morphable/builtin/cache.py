@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
+import time
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 from mifit.errors import InputError
 from mifit.morphable.builtin.head import make_head
-from mifit.morphable.formats.own import load_own
+from mifit.morphable.formats.own import load_own, save_model
 from mifit.morphable.model import MorphableModel
+
+KEPT_SECONDS = 30 * 86400.0
+"""Models of other versions of mifit go when they have not been used for as long."""
 
 
 @cache
@@ -26,14 +31,19 @@ def builtin_model(coarse: bool = False) -> MorphableModel:
     path = cache_folder() / f"builtin-{'coarse' if coarse else 'full'}-{_DIGEST}.npz"
     if path.is_file():
         try:
-            return load_own(path)
+            model = load_own(path)
         except InputError:
             pass  # damaged: make it anew and replace it
+        else:
+            with contextlib.suppress(OSError):
+                os.utime(path)
+            return model
     model = replace(make_head(coarse), fingerprint=path.stem)
     try:
-        for stale in path.parent.glob(f"{path.name.rsplit('-', 1)[0]}-*.npz"):
-            stale.unlink(missing_ok=True)
-        model.save(path)
+        for other in path.parent.glob(f"{path.name.rsplit('-', 1)[0]}-*.npz"):
+            if time.time() - other.stat().st_mtime > KEPT_SECONDS:
+                other.unlink(missing_ok=True)
+        save_model(model, path)
     except (OSError, InputError):
         pass  # a cache that can't be written only costs time
     return model
@@ -55,6 +65,7 @@ def _source_digest() -> str:
         [
             *here.glob("*.py"),
             *(here.parent / f for f in ("gaussian_process.py", "pigment.py", "topology.py", "landmarks.py")),
+            here.parents[1] / "core" / "mesh.py",
         ]
     )
     h = hashlib.blake2b(digest_size=8)

@@ -10,12 +10,13 @@ import numpy as np
 from mifit.core.files import replacing
 from mifit.errors import InputError
 from mifit.morphable.formats.archive import read_npz
-from mifit.morphable.model import MorphableModel
+from mifit.morphable.model import MorphableModel, provides
 
 FORMAT_KEY = "mifit_model"
 _VERSION = 1
 
 
+@provides("save")
 def save_model(model: MorphableModel, path: str | Path) -> None:
     """Write a model; loading it gives back every array bit for bit.
 
