@@ -22,6 +22,8 @@ SEARCH_MM = 12.0
 """Depth of an eyeball outside the skin up to which it is found."""
 GAP_MM = 0.5
 """Distance that is left between lid and eyeball."""
+PASSES = 2
+"""Vertices that have moved have other normals, along which a few more stand out."""
 SMALLEST = 20
 """Vertices of an eyeball at the least."""
 
@@ -65,7 +67,7 @@ def behind_lids(model: MorphableModel, geometry: GeometryEstimate) -> GeometryEs
         return geometry
     unit = float(geometry.scale) / model.unit_mm  # of world length in a millimetre
     vertices = geometry.vertices.copy()
-    for world in vertices:
+    for world in (world for world in vertices for _ in range(PASSES)):
         normals = vertex_normals(world, model.faces)
         for eye in eyes:
             points = world[eye].astype(np.float64)

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from stages.normal_scene import dome_model
 
 from mifit.core.estimate import GeometryEstimate, Report
 from mifit.morphable import MorphableModel
 from mifit.stages.eyes import behind_lids, eyeballs
-from tests.stages.reflectance_scene import dome_model
 
 
 @pytest.fixture(scope="module")
