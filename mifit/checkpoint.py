@@ -10,8 +10,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,6 +17,7 @@ import numpy as np
 
 from mifit.core.estimate import Report
 from mifit.core.files import replacing
+from mifit.core.npz import read_npz
 
 T = TypeVar("T")
 
@@ -49,11 +48,10 @@ def load(folder: Path, stage: str, cls: type[T], key: str) -> T | None:
     """Read a stage's estimate back; None when there is none, it is damaged, or it has another key."""
     path = folder / f"{stage}.npz"
     try:
-        with np.load(path, allow_pickle=False) as data:
-            meta = json.loads(bytes(data["_meta"]).decode())
-            if meta["key"] != key:
-                return None
-            values: dict[str, Any] = {name: data[name] for name in data.files if name != "_meta"}
+        values: dict[str, Any] = dict(read_npz(path))
+        meta = json.loads(bytes(values.pop("_meta")).decode())
+        if meta["key"] != key:
+            return None
         for name, value in meta["scalars"].items():
             if name == "report":
                 value = Report(**{**value, "warnings": tuple(value["warnings"])})
@@ -61,5 +59,5 @@ def load(folder: Path, stage: str, cls: type[T], key: str) -> T | None:
                 value = tuple(value)
             values[name] = value
         return cls(**values)
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
+    except (OSError, ValueError, KeyError, TypeError):  # InputError is a ValueError
         return None

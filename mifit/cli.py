@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import mifit
+from mifit.console import drop_chatter
+from mifit.core.files import FULL
+from mifit.core.limits import MAX_RENDERED_PIXELS, MAX_SAMPLES, MAX_SEED, MAX_TIMESTEPS
 from mifit.errors import InputError, MifitError
 
 
@@ -36,25 +39,38 @@ def _timesteps(text: str) -> list[int]:
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")
         try:
-            found.extend(range(int(first), int(last if dash else first) + 1))
+            steps = range(int(first), int(last if dash else first) + 1)
         except ValueError:
-            raise argparse.ArgumentTypeError(f"found {text!r}, expected numbers such as 0,1,2 or 0-7") from None
+            raise argparse.ArgumentTypeError(f"found {text[:60]!r}, expected numbers such as 0,1,2 or 0-7") from None
+        if len(steps) > MAX_TIMESTEPS or (steps and steps[-1] > sys.maxsize):
+            raise argparse.ArgumentTypeError(f"found {text[:60]!r}, expected at most {MAX_TIMESTEPS} timesteps")
+        found.extend(steps)
     if not found:
         raise argparse.ArgumentTypeError(f"found {text!r}, expected a first number not above the last, such as 0-7")
     return found
 
 
-def _at_least(low: int) -> Callable[[str], int]:
+def _whole(low: int, high: int) -> Callable[[str], int]:
     def parse(text: str) -> int:
         try:
             value = int(text)
         except ValueError:
             value = low - 1
-        if value < low:
-            raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number of at least {low}")
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"found {text[:60]!r}, expected a whole number from {low} to {high}")
         return value
 
     return parse
+
+
+def _at_least(low: int) -> Callable[[str], int]:
+    return _whole(low, MAX_TIMESTEPS)
+
+
+def _path(text: str) -> Path:
+    if not text or "\0" in text:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a file or folder")
+    return Path(text)
 
 
 def _real(text: str) -> float:
@@ -84,7 +100,7 @@ def build_parser() -> argparse.ArgumentParser:
         default="auto",
         help="Mitsuba variant; auto: CUDA where it works, else LLVM (default: auto)",
     )
-    common.add_argument("--seed", type=_at_least(0), default=0, help="seed of everything random (default: 0)")
+    common.add_argument("--seed", type=_whole(0, MAX_SEED), default=0, help="seed of everything random (default: 0)")
 
     parser = _Parser(prog="mifit", description="Facial reflectance and geometry from two views.")
     parser.add_argument("--version", action="version", version=f"mifit {mifit.__version__}")
@@ -102,39 +118,41 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--json", action="store_true", help="print JSON")
 
     p = add("demo", "fit a small capture made on the spot, judge it on the held-out view, write a report")
-    p.add_argument("--out", type=Path, default=Path("out/demo"), help="folder to write (default: out/demo)")
+    p.add_argument("--out", type=_path, default=Path("out/demo"), help="folder to write (default: out/demo)")
 
     p = add("synth", "path-traced captures with ground truth")
-    p.add_argument("--out", type=Path, required=True, help="capture folder to write")
+    p.add_argument("--out", type=_path, required=True, help="capture folder to write")
     p.add_argument("--subjects", type=_at_least(1), default=1)
     p.add_argument("--timesteps", type=_at_least(1), default=4)
-    p.add_argument("--env", type=Path, help="lat-long HDR environment; default: a procedural studio")
+    p.add_argument("--env", type=_path, help="lat-long HDR environment; default: a procedural studio")
     p.add_argument("--model", default="builtin", help="morphable model: a path or builtin")
-    p.add_argument("--width", type=_at_least(16), default=680)
-    p.add_argument("--height", type=_at_least(16), default=480)
-    p.add_argument("--spp", type=_at_least(1), default=64, help="samples per pixel (default: 64)")
-    p.add_argument("--tone", type=float, help="skin from 0, fair, to 1, deep; default: drawn for each subject")
+    p.add_argument("--width", type=_whole(16, MAX_RENDERED_PIXELS // 16), default=680)
+    p.add_argument("--height", type=_whole(16, MAX_RENDERED_PIXELS // 16), default=480)
+    p.add_argument("--spp", type=_whole(1, MAX_SAMPLES), default=64, help="samples per pixel (default: 64)")
+    p.add_argument("--tone", type=_real, help="skin from 0, fair, to 1, deep; default: drawn for each subject")
+
+    p.add_argument("--force", action="store_true", help="write into a folder that holds something already")
 
     p = add("import", "a capture from videos, image folders, COLMAP text models or nerfstudio transforms.json")
-    p.add_argument("--video", type=Path, action="append", default=[], help="one camera's video; repeat per camera")
-    p.add_argument("--images", type=Path, action="append", default=[], help="one camera's folder of images; repeat")
-    p.add_argument("--calibration", type=Path, help="OpenCV stereo calibration, YAML or XML")
-    p.add_argument("--colmap", type=Path, help="folder with cameras.txt and images.txt")
-    p.add_argument("--transforms", type=Path, help="nerfstudio transforms.json")
+    p.add_argument("--video", type=_path, action="append", default=[], help="one camera's video; repeat per camera")
+    p.add_argument("--images", type=_path, action="append", default=[], help="one camera's folder of images; repeat")
+    p.add_argument("--calibration", type=_path, help="OpenCV stereo calibration, YAML or XML")
+    p.add_argument("--colmap", type=_path, help="folder with cameras.txt and images.txt")
+    p.add_argument("--transforms", type=_path, help="nerfstudio transforms.json")
     p.add_argument("--units", default="cm", help="unit of length of the calibration: mm, cm or m (default: cm)")
     p.add_argument("--every", type=_at_least(1), default=1, help="keep every N-th frame")
     p.add_argument("--start", type=_at_least(0), default=0, help="first frame")
     p.add_argument("--count", type=_at_least(1), help="number of frames to keep")
-    p.add_argument("--out", type=Path, required=True, help="capture folder to write")
+    p.add_argument("--out", type=_path, required=True, help="capture folder to write")
 
     p = add("landmarks", "detect 68 landmarks in every image and write them into the capture")
-    p.add_argument("capture", type=Path)
+    p.add_argument("capture", type=_path)
     p.add_argument("--detector", help="mediapipe, face-alignment or lbf:FOLDER; default: the first that is there")
 
     p = add("fit", "fit geometry, reflectance and normals to a capture")
-    p.add_argument("capture", type=Path)
-    p.add_argument("--out", type=Path, required=True, help="result folder to write")
-    p.add_argument("--config", type=Path, help="TOML file with tables geometry, reflectance, shape, normals, mesh")
+    p.add_argument("capture", type=_path)
+    p.add_argument("--out", type=_path, required=True, help="result folder to write")
+    p.add_argument("--config", type=_path, help="TOML file with tables geometry, reflectance, shape, normals, mesh")
     p.add_argument("--model", default="builtin", help="morphable model: a path or builtin (default)")
     p.add_argument("--cameras", type=_names, help="cameras to use, e.g. left,right; default: the first two")
     p.add_argument("--timesteps", type=_timesteps, help="e.g. 0,1,2,3 or 0-3; default: the first four")
@@ -143,34 +161,34 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--force", action="store_true", help="replace an existing result")
 
     p = add("track", "geometry and normals of further timesteps, reflectance and lighting fixed")
-    p.add_argument("capture", type=Path)
-    p.add_argument("--result", type=Path, required=True, help="result folder of mifit fit; extended in place")
+    p.add_argument("capture", type=_path)
+    p.add_argument("--result", type=_path, required=True, help="result folder of mifit fit; extended in place")
     p.add_argument("--timesteps", type=_timesteps, help="default: all that aren't in the result yet")
     p.add_argument("--resume", action="store_true", help="keep the frames that an earlier run has written")
     p.add_argument("--overlay", type=_names, help="cameras to write overlay videos of; default: the fitted ones")
     add_rate(p)
 
     p = add("evaluate", "error on a held-out view")
-    p.add_argument("result", type=Path)
-    p.add_argument("--capture", type=Path, required=True)
+    p.add_argument("result", type=_path)
+    p.add_argument("--capture", type=_path, required=True)
     p.add_argument("--camera", required=True)
     p.add_argument("--timesteps", type=_timesteps, help="default: all of the result")
     p.add_argument("--region", choices=["model", "truth"], default="model", help="whose face area counts")
     p.add_argument("--baseline", action="store_true", help="compare image-based rendering on the same mesh and pixels")
-    p.add_argument("--json", type=Path, help="file to write the figures to")
+    p.add_argument("--json", type=_path, help="file to write the figures to")
 
     p = add("render", "render a reconstruction from a camera of the capture")
-    p.add_argument("result", type=Path)
-    p.add_argument("--capture", type=Path, required=True)
+    p.add_argument("result", type=_path)
+    p.add_argument("--capture", type=_path, required=True)
     p.add_argument("--camera", required=True)
     p.add_argument("--timestep", type=_at_least(0), required=True)
-    p.add_argument("--out", type=Path, required=True, help="image to write: .png (8-bit sRGB) or .exr (linear)")
+    p.add_argument("--out", type=_path, required=True, help="image to write: .png (8-bit sRGB) or .exr (linear)")
     p.add_argument("--method", choices=["full", "diffuse", "pca"], default="full")
     p.add_argument("--integrator", choices=["local", "path"], default="local")
 
     p = add("turntable", "novel views about the vertical axis, with and without specular")
-    p.add_argument("result", type=Path)
-    p.add_argument("--out", type=Path, required=True)
+    p.add_argument("result", type=_path)
+    p.add_argument("--out", type=_path, required=True)
     p.add_argument("--from", dest="start", type=_real, default=-35.0, help="first angle in degrees")
     p.add_argument("--to", dest="stop", type=_real, default=35.0, help="last angle in degrees")
     p.add_argument("--steps", type=_at_least(1), default=7)
@@ -182,17 +200,17 @@ def build_parser() -> argparse.ArgumentParser:
     add_rate(p)
 
     p = add("relight", "relit views under a measured environment")
-    p.add_argument("result", type=Path)
-    p.add_argument("--env", type=Path, required=True, help="lat-long environment, .hdr or .exr")
-    p.add_argument("--out", type=Path, required=True)
+    p.add_argument("result", type=_path)
+    p.add_argument("--env", type=_path, required=True, help="lat-long environment, .hdr or .exr")
+    p.add_argument("--out", type=_path, required=True)
     p.add_argument("--rotate", type=_real, default=0.0, help="turn the environment about the vertical, degrees")
     p.add_argument("--sequence", action="store_true", help="also play the timesteps from the front: sequence.mp4")
     add_rate(p)
 
     p = add("export", "geometry with its maps for other programs")
-    p.add_argument("result", type=Path)
+    p.add_argument("result", type=_path)
     p.add_argument("--format", choices=["glb", "obj", "ply", "mitsuba"], required=True)
-    p.add_argument("--out", type=Path, required=True)
+    p.add_argument("--out", type=_path, required=True)
     p.add_argument("--timestep", type=_at_least(0), help="default: the first of the result")
     p.add_argument("--animate", action="store_true", help="glb: play all timesteps, from --timestep's maps")
     add_rate(p)
@@ -204,30 +222,37 @@ def build_parser() -> argparse.ArgumentParser:
     )
 
     p = add("run", "a scene-file driven experiment or a sweep of them")
-    p.add_argument("experiment", type=Path)
+    p.add_argument("experiment", type=_path)
     p.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
-    p.add_argument("--out", type=Path)
+    p.add_argument("--out", type=_path)
     p.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")
 
     p = add("model", "inspect and convert morphable models")
     actions = p.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser)
     q = actions.add_parser("info", help="print a table", parents=[common])
     q.add_argument("model", help="a path or builtin")
-    q.add_argument("--preview", type=Path, help="also write a sheet of the mean and the first modes")
+    q.add_argument("--preview", type=_path, help="also write a sheet of the mean and the first modes")
     q = actions.add_parser("convert", help="write a model in mifit's own format", parents=[common])
-    q.add_argument("source", type=Path)
-    q.add_argument("out", type=Path)
+    q.add_argument("source", type=_path)
+    q.add_argument("out", type=_path)
     q.add_argument("--kind", help="format of SOURCE; default: recognised by content")
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line; returns the exit code.
+
+    Without ``argv`` this is the program itself, which owns its process: what C libraries print is dropped.
+    """
     arguments = build_parser().parse_args(argv)
+    if argv is None and not arguments.debug:
+        drop_chatter()
     try:
         from mifit import commands
 
-        return _run(getattr(commands, arguments.command.replace("import", "import_")), arguments)
+        code = _run(getattr(commands, arguments.command.replace("import", "import_")), arguments)
+        sys.stdout.flush()  # a full disk behind a redirection is met here
+        return code
     except KeyboardInterrupt:
         print("mifit: interrupted", file=sys.stderr)
         return 130
@@ -250,9 +275,13 @@ def _report(error: Exception) -> int:
     if isinstance(error, MifitError):
         print(f"mifit: {message}", file=sys.stderr)
         return 2 if isinstance(error, InputError) else 1
-    if isinstance(error, OSError) and error.filename:
-        print(f"mifit: {error.filename}: {error.strerror}", file=sys.stderr)
+    if isinstance(error, OSError) and (error.filename or error.errno in FULL):
+        place = error.filename or "an output file"
+        print(f"mifit: {place}: {error.strerror}; what was there is unchanged", file=sys.stderr)
         return 2
+    if isinstance(error, MemoryError):
+        print("mifit: not enough memory; use fewer timesteps, smaller images or smaller maps", file=sys.stderr)
+        return 1
     print(f"mifit: internal error, {type(error).__name__}: {message}; run again with --debug", file=sys.stderr)
     return 1
 

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from mifit.config import FitConfig, NormalsConfig, from_mapping
 from mifit.console import console_progress
-from mifit.core.files import write_text
+from mifit.core.files import check_file, write_text
+from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 
 if TYPE_CHECKING:
@@ -99,6 +100,9 @@ def demo(arguments: Namespace) -> None:
 
 def synth(arguments: Namespace) -> None:
     """Write path-traced captures."""
+    out: Path = arguments.out
+    if out.exists() and not arguments.force and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"--out {out}: is there already and not empty; --force writes into it, or name another folder")
     _use_variant(arguments)
     from mifit.synth import synthesize
 
@@ -152,6 +156,8 @@ def fit(arguments: Namespace) -> None:
     out: Path = arguments.out
     if (out / "result.json").exists() and not (arguments.resume or arguments.force):
         raise InputError(f"--out {out}: holds a result already; --resume goes on with it, --force replaces it")
+    if arguments.config:
+        check_file(arguments.config, MAX_SETTINGS_BYTES, "configuration file")
     config = FitConfig.load(arguments.config) if arguments.config else FitConfig()
     capture = mifit.Capture.load(arguments.capture)
     model = mifit.MorphableModel.load(arguments.model)

@@ -1,11 +1,16 @@
-"""Progress on stderr: a bar on a terminal, plain lines elsewhere."""
+"""Progress on stderr: a bar on a terminal, plain lines elsewhere; and what C libraries print there, dropped."""
 
 from __future__ import annotations
 
+import contextlib
+import io
+import os
 import sys
 import time
+from collections.abc import Iterator
 from typing import TextIO
 
+from mifit.core.quiet import set_decoding_context
 from mifit.progress import Progress, silent
 
 LINE_SECONDS = 5.0
@@ -18,6 +23,37 @@ def console_progress(quiet: bool = False, stream: TextIO | None = None) -> Progr
         return silent
     out = stream or sys.stderr
     return _bars(out) if out.isatty() else _lines(out)
+
+
+def drop_chatter() -> None:
+    """Keep decoders (OpenEXR, FFmpeg, OpenCV) from printing about damaged input: mifit says it in one line of its own.
+
+    For the ``mifit`` command, which owns its process; a library must leave standard error alone.
+    """
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when FFmpeg is first used
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # read when OpenCV is loaded
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setLogLevel(0)
+    set_decoding_context(no_chatter)
+
+
+@contextlib.contextmanager
+def no_chatter() -> Iterator[None]:
+    """Send descriptor 2 and Python's standard output nowhere inside the block."""
+    try:
+        saved = os.dup(2)
+    except OSError:  # no standard error at all
+        yield
+        return
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 2)
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(sink)
 
 
 def _lines(out: TextIO) -> Progress:

@@ -15,5 +15,9 @@ class VariantError(MifitError, RuntimeError):
     """Mitsuba's variant, or the LLVM or CUDA behind it, can't run here; the message names the fix."""
 
 
+class UnknownVariantError(VariantError, InputError):
+    """No such variant of Mitsuba, or one that mifit doesn't run on: bad usage, not a fault of this machine."""
+
+
 class ConvergenceError(MifitError, RuntimeError):
     """An optimisation ended without a usable result; the message says in which stage and why."""

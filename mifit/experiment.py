@@ -21,7 +21,8 @@ from typing import Any
 
 import mifit
 from mifit import checkpoint
-from mifit.core.files import replacing, write_text
+from mifit.core.files import file_name, read_text, replacing, write_text
+from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError, MifitError
 from mifit.plan import Experiment, Plan, Run, SynthRun, load_plan
 from mifit.progress import Progress, silent
@@ -69,7 +70,7 @@ def run_experiment(
         Runs that failed, after all others have finished.
     """
     plan = load_plan(path, overrides, seed)
-    folder = Path(out) if out is not None else Path("out") / plan.name
+    folder = Path(out) if out is not None else Path("out") / file_name(plan.name)
     todo = [run for run in plan.runs if finished(folder / "runs" / run.folder, run) is None]
     total = len(plan.runs)
     progress("Runs", total - len(todo), total)
@@ -88,8 +89,8 @@ def run_experiment(
 def finished(folder: Path, run: Run) -> dict[str, Any] | None:
     """The record of a run that ended well, or None."""
     try:
-        record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        record = json.loads(read_text(folder / "run.json", MAX_SETTINGS_BYTES))
+    except (ValueError, RecursionError):  # InputError too
         return None
     return record if isinstance(record, dict) and record.get("digest") == run.digest else None
 
@@ -244,7 +245,7 @@ def _execute_render(e: Experiment, folder: Path, experiment_folder: Path, varian
         write_image(folder / "image.png", image)
     if e.reference:
         key = checkpoint.digest(
-            [run.scene, Path(run.scene).read_text(), run.parameters, dataclasses.asdict(e.reference)]
+            [run.scene, read_text(run.scene, MAX_SETTINGS_BYTES), run.parameters, dataclasses.asdict(e.reference)]
         )
         cache = experiment_folder / "references" / f"{key[:10]}.npy"
         if not cache.exists():

@@ -15,6 +15,8 @@ from typing import Any, Literal
 import mifit
 from mifit import checkpoint
 from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, ReflectanceConfig, ShapeConfig
+from mifit.core.files import check_file, file_digest, file_name
+from mifit.core.limits import MAX_IMAGE_BYTES, MAX_RUNS, MAX_SAMPLES, MAX_SEED, MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 from mifit.schema import (
     Index,
@@ -36,10 +38,9 @@ from mifit.schema import (
 BUILTIN = ("builtin", "builtin:coarse")
 
 
-SEEDS = 2**31 - 1  # what both NumPy and Mitsuba take
+SEEDS = MAX_SEED
 SIDE = 16_384  # pixels
-SAMPLES = 1_048_576
-MOST_RUNS = 10_000
+SAMPLES = MAX_SAMPLES
 
 
 @settings
@@ -166,8 +167,8 @@ class Run:
     @property
     def folder(self) -> str:
         """Name of the run's folder: its swept values, readable, and its digest."""
-        words = [f"{key.rsplit('.', 1)[-1]}={_plain(value)}" for key, value in self.swept.items()]
-        return "_".join([*words, self.digest[:10]])[-120:]
+        words = [f"{_plain(key.rsplit('.', 1)[-1])}={_plain(value)}" for key, value in self.swept.items()]
+        return "_".join([file_name("_".join(words)), self.digest[:10]] if words else [self.digest[:10]])
 
 
 def _plain(value: Any) -> str:
@@ -209,6 +210,7 @@ def load_plan(path: str | Path, overrides: Sequence[str] = (), seed: int = 0) ->
         The file, a key, a value, a sweep or an input is not what it must be.
     """
     path = Path(path)
+    check_file(path, MAX_SETTINGS_BYTES, "experiment file")
     document = read_toml(path)
     for override in overrides:
         key, equals, value = override.partition("=")
@@ -268,17 +270,22 @@ def _points(sweep: Any, where: str) -> Iterator[dict[str, Any]]:
         for key, values in grid.items():
             if not isinstance(values, list) or not values:
                 raise InputError(f"{where}: sweep.grid: {key}: found {values!r}, expected a list of values")
-        if (found := math.prod(map(len, grid.values()))) > MOST_RUNS:
-            raise InputError(f"{where}: sweep.grid: found {found} runs, expected at most {MOST_RUNS}")
+        _check_count(math.prod(map(len, grid.values())), where)
         for values in itertools.product(*grid.values()):
             yield dict(zip(grid, values, strict=True))
     elif "list" in sweep:
         points = sweep["list"]
         if not isinstance(points, list) or not points or not all(isinstance(p, dict) for p in points):
             raise InputError(f"{where}: sweep.list: found {points!r}, expected a list of tables")
+        _check_count(len(points), where)
         yield from (dict(_flatten(p)) for p in points)
     else:
         yield {}
+
+
+def _check_count(count: int, where: str) -> None:
+    if count > MAX_RUNS:
+        raise InputError(f"{where}: sweep: found {count} runs, expected at most {MAX_RUNS}; split the sweep")
 
 
 def _flatten(table: dict, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -352,10 +359,7 @@ def _check_inputs(e: Experiment, where: str, digests: dict[tuple[str, ...], str]
 
     def file(name: str) -> str:
         def compute() -> str:
-            try:
-                return checkpoint.digest(Path(name).read_bytes().hex())
-            except OSError as error:
-                raise InputError(f"{name}: can't be read: {error.strerror}") from None
+            return file_digest(name, MAX_IMAGE_BYTES).hex()
 
         return cached(("file", name), compute)
 

@@ -46,7 +46,7 @@ def test_help(capsys, command):
         (["nonsense"], "invalid choice: 'nonsense'"),
         (["fit", "x", "--out", "y", "--timesteps", "a"], "expected numbers such as"),
         (["fit", "x", "--out", "y", "--cameras", ","], "expected names separated by commas"),
-        (["synth", "--out", "x", "--spp", "0"], "expected a whole number of at least 1"),
+        (["synth", "--out", "x", "--spp", "0"], "expected a whole number from 1 to 1048576"),
         (["relight", "x", "--env", "e", "--out", "y", "--rotate", "nan"], "expected a finite number"),
     ],
 )

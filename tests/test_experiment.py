@@ -134,7 +134,7 @@ def test_a_failing_run_is_named_and_the_others_finish(done, tmp_path):
         (lambda s: s.replace("spp = 4", "sp = 4"), "unknown key 'sp'; did you mean 'spp'"),
         (lambda s: s.replace("[render]", "[rendr]"), "unknown key 'rendr'; did you mean 'render'"),
         (lambda s: s.replace("jobs = 2", "jobs = 0"), "jobs: found 0, expected a whole number from 1 to 1024"),
-        (lambda s: s.replace("scene.xml", "none.xml"), "none.xml: can't be read"),
+        (lambda s: s.replace("scene.xml", "none.xml"), "none.xml: no such file"),
         (lambda s: s.replace("[5, 50]", "[]"), r"found \[\], expected a list of values"),
         (lambda s: s.replace("[5, 50]", "[5, 5]"), "two runs have the same settings"),
         (lambda s: s.replace("render.parameters.exponent", "render.exponent"), "unknown key 'exponent'"),

@@ -18,11 +18,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from mifit.capture.capture import Capture
-from mifit.capture.landmark_files import COUNT
+from mifit.capture.landmark_files import COUNT, MIN_VISIBLE
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.errors import InputError
 
-MIN_VISIBLE = 6
 FOCAL_RANGE = (0.6, 8.0)
 """Focal lengths that are searched, in multiples of the longer image side."""
 

@@ -17,7 +17,9 @@ from mifit.capture.landmark_files import COUNT, Landmarks, read_landmarks
 from mifit.capture.lens import Undistortion, undistort_points
 from mifit.capture.transforms import UNITS_MM, Shot, Transforms, View, read_transforms, write_transforms
 from mifit.core.camera import Camera
+from mifit.core.files import file_digest
 from mifit.core.image import load_image
+from mifit.core.limits import MAX_IMAGE_BYTES
 from mifit.errors import InputError
 
 CACHE_BYTES = 256 * 2**20
@@ -235,7 +237,7 @@ class Capture:
             for timestep in self.timesteps if timesteps is None else timesteps:
                 shot = self._shot(name, timestep)
                 for file in (shot.image, shot.mask, shot.landmarks):
-                    result.update(b"-" if file is None else _file_digest(file))
+                    result.update(b"-" if file is None else file_digest(file, MAX_IMAGE_BYTES, "file of the capture"))
         return result.hexdigest()
 
     def with_estimate(self, cameras: Sequence[Camera]) -> Capture:
@@ -304,12 +306,3 @@ def _check_size(shape: tuple[int, ...], view: View, path: Path) -> None:
             f"{path}: found {shape[1]} x {shape[0]} pixels, expected {view.width} x {view.height} (w, h of camera "
             f"{view.name!r})"
         )
-
-
-def _file_digest(path: Path) -> bytes:
-    try:
-        return hashlib.sha256(path.read_bytes()).digest()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file, though the capture's transforms.json names it") from None
-    except OSError as error:
-        raise InputError(f"{path}: can't be read: {error.strerror}") from None

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from mifit.capture.transforms import View
 from mifit.core.camera import Camera
-from mifit.core.files import write_text
-from mifit.core.image import MAX_PIXELS
+from mifit.core.files import read_text, write_text
+from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_PIXELS
 from mifit.errors import InputError
 
 _MODELS = {  # where fx, fy, cx, cy and OpenCV's distortion coefficients are among the parameters
@@ -122,12 +122,9 @@ def _text(values: Iterable[float]) -> str:
 
 def _lines(path: Path, every: int = 1) -> Iterator[tuple[str, list[str]]]:
     """Every N-th line that is no comment, with its place for messages; blank lines count where N > 1."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; expected a COLMAP text model (cameras.txt, images.txt)") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a readable text file: {error}") from None
+    if not path.exists():
+        raise InputError(f"{path}: no such file; expected a COLMAP text model (cameras.txt, images.txt)")
+    text = read_text(path, MAX_DOCUMENT_BYTES, "text file")
     kept = [(i, line) for i, line in enumerate(text.splitlines(), start=1) if not line.startswith("#")]
     if every == 1:
         kept = [(i, line) for i, line in kept if line.strip()]

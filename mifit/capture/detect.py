@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
+import itertools
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,8 @@ from mifit.capture.detectors import Detector, open_detector
 from mifit.capture.landmark_files import COUNT, Landmarks, write_landmarks
 from mifit.capture.lens import undistort_points
 from mifit.capture.outliers import epipolar_outliers, temporal_outliers
+from mifit.capture.transforms import update_frames
+from mifit.core.files import check_no_links, file_name, replacing_folder
 from mifit.core.image import load_image, to_8_bit
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
@@ -28,7 +32,8 @@ def detect_landmarks(path: str | Path, detector: str | Detector | None = None, p
     Parameters
     ----------
     path : path
-        Capture folder; ``landmarks/CAMERA/NNNN.json`` and ``transforms.json`` are written there, whole or not at all.
+        Capture folder; ``landmarks/CAMERA/NNNN.json`` and the paths to them in ``transforms.json`` are written there,
+        each file whole or not at all. Landmarks that were there are kept in ``landmarks.before``.
     detector : str or Detector, optional
         See `open_detector`.
     progress : Progress
@@ -55,23 +60,41 @@ def detect_landmarks(path: str | Path, detector: str | Detector | None = None, p
     if len(without) == len(points):
         raise InputError(f"{capture.path}: detector {name} finds no face in any of {len(points)} images")
     hidden = _outliers(capture, points)
-    shots = {}
-    for key, shot in capture.shots.items():
-        if shot.image in without:
-            shots[key] = dataclasses.replace(shot, landmarks=None)
-            continue
-        file = capture.path / "landmarks" / shot.camera / f"{shot.timestep:04d}.json"
-        deviation = scatter * float(np.ptp(points[key][:, 0]))
-        write_landmarks(file, Landmarks(points[key], ~hidden[key], deviation))
-        shots[key] = dataclasses.replace(shot, landmarks=file)
-    dataclasses.replace(capture, shots=shots).save()
-    marked = sum(int(hidden[key].sum()) for key, shot in shots.items() if shot.landmarks is not None)
+    found = {
+        key: Landmarks(points[key], ~hidden[key], scatter * float(np.ptp(points[key][:, 0])))
+        for key, shot in capture.shots.items()
+        if shot.image not in without
+    }
+    names = {key: f"landmarks/{file_name(key[0])}/{key[1]:04d}.json" for key in found}
+    for name in names.values():
+        check_no_links(capture.path, capture.path / name)
+    kept = _keep_landmarks(capture.path)
+    for key, landmarks in found.items():
+        write_landmarks(capture.path / names[key], landmarks)
+    file = Path(path) if Path(path).is_file() else capture.path / "transforms.json"
+    update_frames(file, {key: {"landmark_path": names.get(key)} for key in capture.shots})
+    marked = sum(int(hidden[key].sum()) for key in found)
     lines = [
         f"{name}: landmarks in {len(points) - len(without)} of {len(points)} images; "
         f"{marked} of {COUNT * (len(points) - len(without))} points contradict others and are marked invisible"
     ]
     lines += [f"no face found: {image}" for image in without]
+    lines += [f"the landmarks that were there are in {kept}"] if kept else []
     return "\n".join(lines)
+
+
+def _keep_landmarks(folder: Path) -> Path | None:
+    """Copy a capture's ``landmarks``, which may be hand-made, to ``landmarks.before``; None where there are none."""
+    current = folder / "landmarks"
+    if not current.is_dir() or not any(current.iterdir()):
+        return None
+    for i in itertools.count(1):
+        kept = folder / f"landmarks.before{'' if i == 1 else i}"
+        if not os.path.lexists(kept):
+            break
+    with replacing_folder(kept) as part:
+        shutil.copytree(current, part, symlinks=True)
+    return kept
 
 
 def _run(capture: Capture, detector: Detector, progress: Progress) -> dict[tuple[str, int], NDArray[np.float64]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -13,8 +12,9 @@ from mifit.capture.landmark_files import read_landmarks, write_landmarks
 from mifit.capture.sources import ImageFiles, Source, Video, check_synchronous
 from mifit.capture.stereo import read_stereo
 from mifit.capture.transforms import UNITS_MM, Shot, Transforms, View, read_transforms, write_transforms
-from mifit.core.files import replacing_folder
-from mifit.core.image import load_image
+from mifit.core.files import file_name, read_bytes, replacing_folder, write_bytes
+from mifit.core.image import decode_image, image_kind
+from mifit.core.limits import MAX_IMAGE_BYTES
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
 
@@ -178,13 +178,14 @@ def _copy_annotations(shots: Sequence[Shot], scene: Transforms, folder: Path, st
     for shot in shots:
         source = original[shot.camera][start + every * shot.timestep]
         if source.mask is not None:
-            mask = folder / "masks" / shot.camera / f"{shot.timestep:04d}{source.mask.suffix.lower()}"
-            mask.parent.mkdir(parents=True, exist_ok=True)
-            load_image(source.mask)
-            shutil.copyfile(source.mask, mask)
+            content = read_bytes(source.mask, MAX_IMAGE_BYTES, "mask")
+            decode_image(content, source.mask)
+            name = f"{shot.timestep:04d}{image_kind(content, source.mask)}"
+            mask = folder / "masks" / file_name(shot.camera) / name
+            write_bytes(mask, content)
             shot = dataclasses.replace(shot, mask=mask)
         if source.landmarks is not None:
-            landmarks = folder / "landmarks" / shot.camera / f"{shot.timestep:04d}.json"
+            landmarks = folder / "landmarks" / file_name(shot.camera) / f"{shot.timestep:04d}.json"
             write_landmarks(landmarks, read_landmarks(source.landmarks))
             shot = dataclasses.replace(shot, landmarks=landmarks)
         copied.append(shot)
@@ -196,13 +197,12 @@ def _copy(
 ) -> Iterable[Shot]:
     total = steps * len(sources)
     for s, source in enumerate(sources):
-        target = folder / "images" / source.name
-        target.mkdir(parents=True)
+        target = folder / "images" / file_name(source.name)
         files = source.files(start, every)
         for t in range(steps):
             progress("Importing", s * steps + t, total)
             suffix, content = next(files)
             image = target / f"{t:04d}{suffix}"
-            image.write_bytes(content)
+            write_bytes(image, content)
             yield Shot(source.name, t, image)
     progress("Importing", total, total)

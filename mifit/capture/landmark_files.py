@@ -16,10 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.files import write_text
+from mifit.core.files import read_bytes, read_text, write_text
+from mifit.core.limits import MAX_SETTINGS_BYTES
+from mifit.core.npz import read_npy
 from mifit.errors import InputError
 
 COUNT = 68
+MIN_VISIBLE = 6
+"""Fewer visible landmarks than this give no pose of a head."""
+MIN_EXTENT = 4.0
+"""Pixels that the landmarks of a face span at least."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +71,6 @@ def read_landmarks(path: str | Path, first_pixel: float | None = None) -> Landma
         raise InputError(f"{path}: found suffix {path.suffix!r}, expected .json, .pts or .npy landmarks")
     try:
         points, visible, deviation = reader(path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such landmark file") from None
     except InputError:
         raise
     except (
@@ -81,10 +85,21 @@ def read_landmarks(path: str | Path, first_pixel: float | None = None) -> Landma
         raise InputError(f"{path}: found {visible.size} visibility flags, expected {COUNT}")
     if not (np.isfinite(deviation) and deviation >= 0):
         raise InputError(f"{path}: deviation: found {deviation}, expected a number of pixels not below 0")
+    _check_spread(path, points[visible & np.isfinite(points).all(axis=1)])
     default = {".json": 0.5, ".pts": 1.0, ".npy": 0.0}[path.suffix.lower()]
     points = points + (0.5 - (default if first_pixel is None else first_pixel))
     finite = np.isfinite(points).all(axis=1)
     return Landmarks(np.where(finite[:, None], points, 0.0), visible & finite, deviation)
+
+
+def _check_spread(path: Path, points: NDArray[np.float64]) -> None:
+    """Refuse points that are no face: a detector that failed puts all of them into one place."""
+    extent = float(np.ptp(points, axis=0).max()) if len(points) >= MIN_VISIBLE else MIN_EXTENT
+    if extent < MIN_EXTENT:
+        raise InputError(
+            f"{path}: found all {len(points)} visible landmarks within {extent:.2g} pixels, expected the points of a "
+            f"face, at least {MIN_EXTENT:g} across; mark them invisible or run mifit landmarks"
+        )
 
 
 def write_landmarks(path: str | Path, landmarks: Landmarks) -> None:
@@ -101,7 +116,7 @@ def write_landmarks(path: str | Path, landmarks: Landmarks) -> None:
 
 
 def _read_json(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
-    data: Any = json.loads(path.read_text(encoding="utf-8"))
+    data: Any = json.loads(read_text(path, MAX_SETTINGS_BYTES, "landmark file"))
     if isinstance(data, list):
         data = {"points": data}
     if not isinstance(data, dict) or "points" not in data:
@@ -116,7 +131,7 @@ def _read_json(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], floa
 
 
 def _read_pts(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
-    text = path.read_text(encoding="utf-8", errors="replace")
+    text = read_bytes(path, MAX_SETTINGS_BYTES, "landmark file").decode("utf-8", errors="replace")
     opened, closed = text.find("{"), text.find("}")
     if opened < 0 or closed < opened:
         raise InputError(f"{path}: found no {{ ... }} block, expected the iBUG .pts layout")
@@ -128,9 +143,7 @@ def _read_pts(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], float
 
 
 def _read_npy(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
-    values = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped: a header that claims too much is refused
-    if not isinstance(values, np.ndarray):
-        raise InputError(f"{path}: found an archive of arrays, expected one array of shape (68, 2) or (68, 3)")
+    values = read_npy(path, MAX_SETTINGS_BYTES, "landmark file")
     if values.ndim != 2 or values.shape[1] not in (2, 3):
         raise InputError(f"{path}: found an array of shape {values.shape}, expected (68, 2) or (68, 3)")
     visible = values[:, 2] > 0.5 if values.shape[1] == 3 else np.ones(len(values), dtype=bool)

@@ -10,16 +10,16 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
+from mifit.core.files import read_text
+from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 
-MAX_BYTES = 2**20
-"""A calibration is a few kilobytes."""
-
-_ENTRY = re.compile(r"^([A-Za-z_][\w.-]*)[ \t]*:(.*?)(?=^\S|\Z)", re.MULTILINE | re.DOTALL)
-_FIELD = {name: re.compile(rf"\b{name}[ \t]*:[ \t]*(\w+)") for name in ("rows", "cols", "dt")}
-_DATA = re.compile(r"\bdata[ \t]*:[ \t\n]*\[([^\]]*)\]")
+MAX_DEPTH = 16
+"""Nesting of YAML collections; OpenCV's matrices are two deep."""
+_FIELDS = ("rows", "cols", "dt")
 
 
 def read_nodes(path: Path) -> dict[str, NDArray[np.float64] | float]:
@@ -30,20 +30,12 @@ def read_nodes(path: Path) -> dict[str, NDArray[np.float64] | float]:
     InputError
         The file is missing, no YAML or XML of OpenCV's, or a matrix holds another number of values than it says.
     """
-    try:
-        content = path.read_bytes()
-        text = content.decode("utf-8-sig").lstrip()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such calibration file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise _unreadable(path, str(error)) from None
-    if len(content) > MAX_BYTES:
-        raise _unreadable(path, f"{len(content)} bytes, more than any calibration has")
+    text = read_text(path, MAX_SETTINGS_BYTES, "calibration file").lstrip("\ufeff \r\n\t")
     if not text.startswith(("%YAML", "<?xml", "<opencv_storage")):
         raise _unreadable(path, f"it starts with {text[:12]!r}, expected %YAML or <?xml")
     xml = text.startswith("<")
     found: dict[str, NDArray[np.float64] | float] = {}
-    for name, matrix, value in _xml(text, path) if xml else _yaml(text):
+    for name, matrix, value in _xml(text, path) if xml else _yaml(text, path):
         if matrix is not None:
             found[name] = _matrix(*matrix, f"{path}: {name}")
         elif (number := _number(value)) is not None:
@@ -57,26 +49,42 @@ Entry = tuple[str, "tuple[str, str, str, list[str]] | None", str]
 """Name, rows, cols, dt and data of a matrix, text of anything else."""
 
 
-def _yaml(text: str) -> Iterator[Entry]:
-    for entry in _ENTRY.finditer(text.replace("\r\n", "\n")):
-        name, body = entry[1], entry[2]
-        data = _DATA.search(body)
-        if data is None:
-            yield name, None, body.split("#")[0]
-            continue
-        fields = (pattern.search(body) for pattern in _FIELD.values())
-        rows, columns, kind = (field[1] if field else "" for field in fields)
-        yield name, (rows, columns, kind, data[1].replace(",", " ").split()), ""
+_Loader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
+"""Builds text, lists and maps and nothing else, whatever the tags say; numbers are made of the text here."""
+
+
+def _yaml(text: str, path: Path) -> Iterator[Entry]:
+    text = re.sub(r"\A%YAML:(\d)", r"%YAML \1", text)  # as OpenCV writes the directive
+    try:
+        depth = 0
+        for event in yaml.parse(text, Loader=_Loader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MAX_DEPTH:
+                raise _unreadable(path, f"nested more than {MAX_DEPTH} deep")
+            if isinstance(event, yaml.AliasEvent):
+                raise _unreadable(path, "an alias, which OpenCV never writes")
+        documents = list(yaml.load_all(text, Loader=_Loader))  # OpenCV appends as another document
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        raise _unreadable(path, str(error)) from None
+    for document in documents:
+        for name, value in document.items() if isinstance(document, dict) else ():
+            if isinstance(value, dict) and isinstance(value.get("data"), list):
+                rows, columns, kind = (str(value.get(key, "")) for key in _FIELDS)
+                yield str(name), (rows, columns, kind, [str(v) for v in value["data"]]), ""
+            else:
+                yield str(name), None, str(value)
 
 
 def _xml(text: str, path: Path) -> Iterator[Entry]:
+    if "<!DOCTYPE" in text:  # entities expand; OpenCV writes none
+        raise _unreadable(path, "a document type, which OpenCV never writes")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
         raise _unreadable(path, str(error)) from None
     for node in root:
         data = node.findtext("data")
-        fields = ((node.findtext(name) or "").strip() for name in _FIELD)
+        fields = ((node.findtext(name) or "").strip() for name in _FIELDS)
         if data is None:
             yield str(node.tag), None, node.text or ""
         else:

@@ -12,8 +12,10 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from mifit.core.image import SUFFIXES, encode_png, load_image
-from mifit.core.quiet import silenced_stderr
+from mifit.core.files import check_file, read_bytes
+from mifit.core.image import SUFFIXES, decode_image, encode_png, image_kind, load_image
+from mifit.core.limits import MAX_IMAGE_BYTES, MAX_PIXELS, MAX_VIDEO_BYTES, MAX_VIDEO_FRAMES
+from mifit.core.quiet import decoding
 from mifit.errors import InputError
 
 
@@ -66,15 +68,16 @@ class ImageFiles:
         return len(self.paths)
 
     def files(self, start: int, every: int) -> Iterator[tuple[str, bytes]]:
-        """Contents as they are on disk, once they have been seen to decode to the right size."""
+        """Contents as they are on disk, once they have been seen to decode to the right size; suffix by content."""
         for path in self.paths[start::every]:
-            height, width = load_image(path).pixels.shape[:2]
+            content = read_bytes(path, MAX_IMAGE_BYTES, "image file")  # once: what is checked is what is copied
+            height, width = decode_image(content, path).pixels.shape[:2]
             if (width, height) != self.size:
                 raise InputError(
                     f"{path}: found {width} x {height} pixels, expected {self.size[0]} x {self.size[1]} as in "
                     f"{self.paths[0].name}"
                 )
-            yield path.suffix.lower(), path.read_bytes()
+            yield image_kind(content, path), content
 
 
 @dataclass(frozen=True)
@@ -90,12 +93,11 @@ class Video:
     @classmethod
     def open(cls, path: Path, name: str) -> Video:
         """Read a video's header; InputError when it isn't one."""
-        if not path.is_file():
-            raise InputError(f"{path}: no such video file")
+        check_file(path, MAX_VIDEO_BYTES, "video file")
         with _reader(path) as reader:
             size = (int(reader.get(cv2.CAP_PROP_FRAME_WIDTH)), int(reader.get(cv2.CAP_PROP_FRAME_HEIGHT)))
             length, rate = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)), float(reader.get(cv2.CAP_PROP_FPS))
-        if length < 1 or min(size) < 1:
+        if not 1 <= length <= MAX_VIDEO_FRAMES or min(size) < 1 or size[0] * size[1] > MAX_PIXELS:
             raise InputError(f"{path}: found {length} frames of {size[0]} x {size[1]} pixels, expected a whole video")
         return cls(path, name, size, length, rate)
 
@@ -103,7 +105,7 @@ class Video:
         """Decode in order; frames between the wanted ones are passed over without conversion."""
         with _reader(self.path) as reader:
             for i in range(self.length):
-                with silenced_stderr():
+                with decoding():
                     there = reader.grab()
                 if not there:
                     raise InputError(
@@ -119,7 +121,7 @@ class Video:
 
 @contextlib.contextmanager
 def _reader(path: Path) -> Iterator[cv2.VideoCapture]:
-    with silenced_stderr():
+    with decoding():
         reader = cv2.VideoCapture(str(path))
     try:
         if not reader.isOpened():

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
-from mifit.core.files import write_text
-from mifit.core.image import MAX_PIXELS
+from mifit.core.files import read_text, write_text
+from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_PIXELS, MAX_TIMESTEP
 from mifit.errors import InputError
 
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0}
@@ -159,6 +159,34 @@ def write_transforms(path: str | Path, views: Iterable[View], shots: Iterable[Sh
     write_text(path, json.dumps(document, indent=1) + "\n")
 
 
+def update_frames(path: str | Path, changes: Mapping[tuple[str, int], Mapping[str, Any]]) -> None:
+    """Set keys of some images' entries in a ``transforms.json``; all else in it stays, keys unknown to mifit too.
+
+    Parameters
+    ----------
+    path : path
+        The file; it is replaced whole or not at all.
+    changes : dict of (camera, timestep) to dict
+        New values by key; None takes a key away.
+
+    Raises
+    ------
+    InputError
+        The file can't be read.
+    """
+    path = Path(path)
+    document = _load(path)
+    common = {k: v for k, v in document.items() if k != "frames"}
+    for i, frame in enumerate(document["frames"]):
+        shot = _shot(_Entry({**common, **frame}, f"{path}: frames[{i}]"), path.parent)
+        for key, value in changes.get((shot.camera, shot.timestep), {}).items():
+            if value is None and key not in common:
+                frame.pop(key, None)
+            else:
+                frame[key] = value
+    write_text(path, json.dumps(document, indent=1) + "\n")
+
+
 def _relative(file: Path, folder: Path) -> str:
     return file.relative_to(folder).as_posix()
 
@@ -172,10 +200,10 @@ def _camera_to_world(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; expected a capture folder with a transforms.json") from None
-    except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
+        document = json.loads(read_text(path, MAX_DOCUMENT_BYTES, "file of a capture"))
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a readable JSON file: {error}") from None
     if not isinstance(document, dict):
         raise InputError(f"{path}: found {_short(document)}, expected an object with a list 'frames'")
@@ -218,10 +246,10 @@ class _Entry:
             raise self.fail(key, expected)
         return value
 
-    def whole(self, key: str, low: int) -> int:
-        expected = f"a whole number of at least {low}"
+    def whole(self, key: str, low: int, high: int = MAX_TIMESTEP) -> int:
+        expected = f"a whole number of at least {low} and at most {high}"
         value = self.number(key, expected)
-        if value != int(value) or value < low:
+        if value != int(value) or not low <= value <= high:
             raise self.fail(key, expected)
         return int(value)
 

@@ -15,6 +15,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.errors import InputError
+
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -45,6 +47,13 @@ class Camera:
     cy: float
     world_to_camera: NDArray[np.float64] = field(repr=False)
     distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.height) < 1 or not (0 < self.fx < math.inf and 0 < self.fy < math.inf):
+            raise InputError(
+                f"camera {self.name!r}: found {self.width} x {self.height} pixels and focal lengths {self.fx:g}, "
+                f"{self.fy:g}, expected positive numbers"
+            )
 
     @property
     def rotation(self) -> NDArray[np.float64]:

@@ -1,19 +1,133 @@
-"""Files that are written whole or not at all."""
+"""Files: read within bounds, named from text safely, written whole or not at all."""
 
 from __future__ import annotations
 
+import errno
 import functools
+import hashlib
 import os
 import platform
 import re
 import shutil
+import stat
 import sys
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
+from mifit.core.limits import MAX_NAME_BYTES
+from mifit.errors import InputError
+
+FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
+"""Error numbers that say that there is no room for what is written."""
+
+_BLOCK = 2**20
 _MACHINE = re.sub(r"[^A-Za-z0-9-]", "-", platform.node()) or "here"
 _PART = re.compile(r"\..+\." + re.escape(_MACHINE) + r"-(\d+)\.part(\.[^.]+)?")
+
+
+@contextmanager
+def opened(path: str | Path, limit: int, what: str = "file") -> Iterator[tuple[BinaryIO, int]]:
+    """Open an input file of at most ``limit`` bytes; yields the stream and its size.
+
+    A pipe, a device or a folder is refused without waiting for it, and a file that is too large before it is read.
+
+    Raises
+    ------
+    InputError
+        The file is missing, can't be read, is no regular file, or larger than the limit.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such {what}") from None
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        raise InputError(f"{path}: can't be read: {getattr(error, 'strerror', None) or error}") from None
+    found = os.fstat(descriptor)
+    problem = None
+    if not stat.S_ISREG(found.st_mode):
+        problem = f"found {'a folder' if stat.S_ISDIR(found.st_mode) else 'a pipe or device'}, expected a {what}"
+    elif found.st_size > limit:
+        problem = f"found {found.st_size} bytes, expected a {what} of at most {limit}"
+    if problem:
+        os.close(descriptor)
+        raise InputError(f"{path}: {problem}")
+    with os.fdopen(descriptor, "rb") as stream:
+        yield stream, found.st_size
+
+
+def check_file(path: str | Path, limit: int, what: str = "file") -> int:
+    """Size in bytes of an input file that a library will open; InputError as `opened` raises it."""
+    with opened(path, limit, what) as (_, size):
+        return size
+
+
+def read_bytes(path: str | Path, limit: int, what: str = "file") -> bytes:
+    """Content of a file of at most ``limit`` bytes; InputError as `opened` raises it."""
+    with opened(path, limit, what) as (stream, size):
+        try:
+            return stream.read(size)
+        except OSError as error:
+            raise InputError(f"{path}: can't be read: {error.strerror}") from None
+
+
+def read_text(path: str | Path, limit: int, what: str = "file") -> str:
+    """UTF-8 text of a file of at most ``limit`` bytes; InputError as `opened` raises it, or when it is no text."""
+    try:
+        return read_bytes(path, limit, what).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not readable as UTF-8 text: {error}") from None
+
+
+def file_digest(path: str | Path, limit: int, what: str = "file") -> bytes:
+    """SHA-256 of a file's content, read block by block; InputError as `opened` raises it."""
+    result = hashlib.sha256()
+    with opened(path, limit, what) as (stream, _):
+        while block := stream.read(_BLOCK):
+            result.update(block)
+    return result.digest()
+
+
+def file_name(text: str) -> str:
+    """Make the name of a file or folder from any text, such as a camera's name in somebody's capture.
+
+    Letters and digits of any script, ``.``, ``-``, ``_``, ``+`` and ``=`` stay; text that is a name already is returned
+    as it is. Anything else is replaced and a digest of the text appended, so that different texts have different
+    names. The name is never empty, hidden, a path, one that Windows reserves, or longer than `MAX_NAME_BYTES`.
+    """
+    plain = unicodedata.normalize("NFC", text)
+    plain = "".join(c if c.isalnum() or c in ".-_+=" else "-" for c in plain).strip(".-")
+    while len(plain.encode("utf-8", "replace")) > MAX_NAME_BYTES:
+        plain = plain[:-1]
+    reserved = plain.split(".")[0].upper() in _RESERVED
+    if plain == text and plain and not reserved:
+        return plain
+    digest = hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    short = plain.encode("utf-8")[: MAX_NAME_BYTES - 10].decode("utf-8", "ignore").rstrip(".-")
+    return f"{'_' if reserved else ''}{short}-{digest}" if short else f"x-{digest}"
+
+
+_RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{port}{i}" for port in ("COM", "LPT") for i in range(1, 10))}
+
+
+def check_no_links(folder: str | Path, path: str | Path) -> None:
+    """Refuse to write through symbolic links below ``folder``: a folder from elsewhere may point anywhere.
+
+    Parameters
+    ----------
+    folder : path
+        Where the user said to write; it may be a link itself.
+    path : path
+        What will be written, below ``folder``.
+    """
+    folder, path = Path(folder), Path(path)
+    inside = folder
+    for part in path.relative_to(folder).parts:
+        inside = inside / part
+        if inside.is_symlink():
+            raise InputError(f"{inside}: found a symbolic link, expected a file or folder of its own; remove the link")
 
 
 @contextmanager
@@ -22,16 +136,22 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
     The folder is made when it is missing. When the block raises, the temporary file goes and ``path`` stays
     as it was. A process that is killed can't clean up: the next one that writes into the folder does it.
+
+    Raises
+    ------
+    InputError
+        The disk is full or the place can't be written; the message names ``path``.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    remove_abandoned(path.parent)
     temporary = _part(path)
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with _room(path, temporary):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        remove_abandoned(path.parent)
+        try:
+            yield temporary
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -42,19 +162,38 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
         if folder.is_dir() and folder.name.startswith(f".{path.name}.{_MACHINE}-"):
             shutil.rmtree(folder, ignore_errors=True)
     temporary = path.with_name(f".{path.name}.{_MACHINE}-{os.getpid()}.part")
+    with _room(path, temporary):
+        try:
+            yield temporary
+            if path.exists():
+                path.rmdir()
+            os.replace(temporary, path)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def _room(path: Path, temporary: Path) -> Iterator[None]:
+    """Name the target, not the temporary file, when there is no room or no right to write."""
     try:
-        yield temporary
-        if path.exists():
-            path.rmdir()
-        os.replace(temporary, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        yield
+    except OSError as error:
+        name = str(error.filename)
+        own = name in (str(temporary), str(path.parent)) or name.startswith(f"{temporary}{os.sep}")
+        if error.errno in FULL or own:
+            raise InputError(f"{path}: can't be written: {error.strerror}; what was there is unchanged") from None
+        raise
 
 
 def write_text(path: str | Path, text: str) -> None:
     """Write a UTF-8 text file whole or not at all."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write a file whole or not at all."""
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_bytes(data)
 
 
 @functools.lru_cache(maxsize=256)

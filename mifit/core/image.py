@@ -11,7 +11,6 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,12 +19,10 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mifit.core.files import replacing
-from mifit.core.quiet import silenced_stderr
+from mifit.core.files import read_bytes, write_bytes
+from mifit.core.limits import MAX_DECODED_BYTES, MAX_IMAGE_BYTES, MAX_PIXELS
+from mifit.core.quiet import decoding
 from mifit.errors import InputError
-
-MAX_PIXELS = 2**26
-"""Largest image that is decoded: 8192 x 8192."""
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".hdr")
 """Names that image folders are searched for."""
@@ -85,7 +82,7 @@ def read_image(path: str | Path) -> NDArray[np.float32]:
     Raises
     ------
     InputError
-        The file is missing, not an image, truncated, CMYK or larger than `MAX_PIXELS`.
+        The file is missing, not an image, truncated, CMYK or larger than `mifit.core.limits.MAX_PIXELS`.
     """
     return load_image(path).pixels
 
@@ -98,16 +95,20 @@ def load_image(path: str | Path) -> Image:
     Raises
     ------
     InputError
-        The file is missing, not an image, truncated, CMYK or larger than `MAX_PIXELS`.
+        The file is missing, not an image, truncated, CMYK or larger than `mifit.core.limits.MAX_PIXELS`.
     """
-    data = _read_bytes(path)
+    return decode_image(read_bytes(path, MAX_IMAGE_BYTES, "image file"), path)
+
+
+def decode_image(data: bytes, path: str | Path) -> Image:
+    """Decode the content of an image file; ``path`` is for messages. See `load_image`."""
     decode = {"exr": _decode_exr, "hdr": _decode_hdr, "raster": _decode_raster}[_kind(data, path)]
     try:
-        with silenced_stderr():
+        with decoding():
             return decode(data, path)
     except InputError:
         raise
-    except Exception as error:  # decoders raise all kinds; for the caller they mean one thing
+    except (Exception, MemoryError) as error:  # decoders raise all kinds; for the caller they mean one thing
         raise _damaged(path, error) from None
 
 
@@ -129,22 +130,13 @@ def _damaged(path: str | Path, error: Exception | None = None) -> InputError:
 
 def image_size(path: str | Path) -> tuple[int, int]:
     """(width, height) of an image file from its header, without decoding pixels; InputError when unreadable."""
-    data = _read_bytes(path)
+    data = read_bytes(path, MAX_IMAGE_BYTES, "image file")
     measure = {"exr": _exr_size, "hdr": _hdr_size, "raster": _raster_size}[_kind(data, path)]
     try:
-        with silenced_stderr():
+        with decoding():
             return measure(data)
     except Exception as error:
         raise _damaged(path, error) from None
-
-
-def _read_bytes(path: str | Path) -> bytes:
-    try:
-        return Path(path).read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such image file") from None
-    except OSError as error:
-        raise InputError(f"{path}: can't be read: {error.strerror}") from None
 
 
 def _check_size(size: tuple[int, int], path: str | Path) -> None:
@@ -218,41 +210,78 @@ def _float_image(colour: NDArray, alpha: NDArray | None) -> Image:
     return Image(pixels, coverage, np.zeros(pixels.shape[:2], dtype=bool), 32)
 
 
-def _exr_size(data: bytes) -> tuple[int, int]:
+def image_kind(data: bytes, path: str | Path) -> str:
+    """Suffix that belongs to an image file's content: ``.png``, ``.jpg``, ``.tif``, ``.exr`` or ``.hdr``."""
+    kind = _kind(data, path)
+    if kind != "raster":
+        return f".{kind}"
+    return ".png" if data[:1] == b"\x89" else ".jpg" if data[:1] == b"\xff" else ".tif"
+
+
+def _exr_header(data: bytes) -> tuple[tuple[int, int], int]:
+    """(width, height) of the first part and the bytes of all channels of all parts when decoded."""
     import OpenEXR
 
+    size, decoded = (0, 0), 0
     with OpenEXR.File(io.BytesIO(data), header_only=True) as file:
-        low, high = file.header()["dataWindow"]
-    width, height = (np.asarray(high, dtype=np.int64) - np.asarray(low, dtype=np.int64) + 1).tolist()
-    return width, height
+        for i, part in enumerate(file.parts):
+            low, high = part.header["dataWindow"]
+            width, height = (np.asarray(high, dtype=np.int64) - np.asarray(low, dtype=np.int64) + 1).tolist()
+            decoded += max(width, 0) * max(height, 0) * 4 * len(part.header["channels"])
+            size = (width, height) if i == 0 else size
+    return size, decoded
+
+
+def _exr_size(data: bytes) -> tuple[int, int]:
+    return _exr_header(data)[0]
 
 
 def _decode_exr(data: bytes, path: str | Path) -> Image:
     import OpenEXR
 
-    _check_size(_exr_size(data), path)
-    with redirect_stdout(io.StringIO()), OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:
+    size, decoded = _exr_header(data)
+    _check_size(size, path)
+    if decoded > MAX_DECODED_BYTES:
+        raise InputError(
+            f"{path}: the header claims {decoded} bytes in all channels and parts, expected at most "
+            f"{MAX_DECODED_BYTES}; save one part with R, G, B and A"
+        )
+    with OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:
         found = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
     names = next((n for n in (("R", "G", "B"), ("Y", "Y", "Y")) if set(n) <= set(found)), None)
     if names is None:
-        raise InputError(f"{path}: found channels {', '.join(sorted(found))}, expected R, G, B or Y")
+        raise InputError(f"{path}: found channels {', '.join(sorted(found))[:80]}, expected R, G, B or Y")
+    if any(found[name].shape != size[::-1] for name in names):
+        raise InputError(f"{path}: found channels of different resolutions, expected one; save them at full size")
     return _float_image(np.stack([found[name] for name in names], axis=-1), found.get("A"))
 
 
-_HDR_RESOLUTION = re.compile(rb"\n([-+][YX]) (\d+) ([-+][YX]) (\d+)\n")
+_HDR_RESOLUTION = re.compile(rb"-Y (\d{1,9}) \+X (\d{1,9})\n")
+_HDR_RUN = 16
+"""Pixels that a byte of run-length coded scanlines stands for at most: four channels, runs of 127 in two bytes."""
+
+
+def _hdr_header(data: bytes) -> tuple[tuple[int, int], int]:
+    """(width, height) and where the pixels start: the line behind the first blank one gives the resolution."""
+    blank = data.find(b"\n\n", 0, 65536)
+    match = _HDR_RESOLUTION.match(data, blank + 2) if blank > 0 else None
+    if match is None:
+        raise ValueError("no resolution line '-Y height +X width' behind the header's blank line")
+    return (int(match[2]), int(match[1])), match.end()
 
 
 def _hdr_size(data: bytes) -> tuple[int, int]:
-    match = _HDR_RESOLUTION.search(data[:65536])
-    if match is None or (match[1], match[3]) != (b"-Y", b"+X"):
-        raise ValueError("no resolution line '-Y height +X width' in the header")
-    return int(match[4]), int(match[2])
+    return _hdr_header(data)[0]
 
 
 def _decode_hdr(data: bytes, path: str | Path) -> Image:
-    width, height = _hdr_size(data)
+    (width, height), start = _hdr_header(data)
     _check_size((width, height), path)
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if width * height > (len(data) - start) * _HDR_RUN:
+        raise _damaged(path)
+    # OpenCV gets a header of ours: it can't find another resolution than the one that was checked
+    head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode()
+    pixels = cv2.imdecode(np.frombuffer(head + data[start:], np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.shape != (height, width, 3):
         raise _damaged(path)
     return _float_image(pixels[..., ::-1], None)
@@ -288,8 +317,7 @@ def write_image(path: str | Path, linear: ArrayLike) -> None:
         data = _encode_opencv(suffix, pixels)
     else:
         raise InputError(f"{path}: found suffix {suffix!r}, expected .png, .jpg, .exr or .hdr")
-    with replacing(path) as temporary:
-        temporary.write_bytes(data)
+    write_bytes(path, data)
 
 
 def encode_png(codes: NDArray[np.uint8]) -> bytes:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.files import replacing
+from mifit.core.files import read_bytes, write_bytes
 from mifit.core.image import to_8_bit
+from mifit.core.limits import MAX_MODEL_BYTES
 from mifit.errors import InputError
 
 _GROUPS = {"vertices": "xyz", "normals": ("nx", "ny", "nz"), "uv": "uv", "albedo": "rgb"}
@@ -49,8 +51,7 @@ def write_ply(
         vertex_attributes={name: np.asarray(column, dtype=np.float32) for name, column in columns.items()},
         process=False,
     )
-    with replacing(path) as temporary:
-        temporary.write_bytes(export_ply(mesh, vertex_normal=True))
+    write_bytes(path, export_ply(mesh, vertex_normal=True))
 
 
 def read_ply(path: str | Path) -> dict[str, NDArray]:
@@ -68,14 +69,12 @@ def read_ply(path: str | Path) -> dict[str, NDArray]:
     """
     from trimesh.exchange.ply import load_ply
 
+    data = read_bytes(path, MAX_MODEL_BYTES, "mesh")
     try:
-        with open(path, "rb") as stream:
-            stored = load_ply(stream, fix_texture=False)
+        stored = load_ply(io.BytesIO(data), fix_texture=False)
         table = stored["metadata"]["_ply_raw"]["vertex"]["data"]  # as it is stored: nothing merged or normalised
         out = {key: np.stack([table[n] for n in names], 1).astype("<f4") for key, names in _GROUPS.items()}
         faces = np.asarray(stored["faces"], dtype=np.int32).reshape(-1, 3)
-    except OSError as error:
-        raise InputError(f"{path}: not readable: {error.strerror}") from None
     except Exception as error:  # whatever a damaged file makes the reader raise
         raise InputError(f"{path}: not a mesh that mifit wrote ({error}); fit again, or restore the file") from None
     return {**out, "faces": faces}

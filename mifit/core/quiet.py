@@ -1,29 +1,23 @@
-"""Silence for C libraries that print to standard error by themselves."""
+"""What C libraries print by themselves while they decode: left alone by the library, dropped by the command line.
+
+Standard error belongs to the program. Redirecting its descriptor from a library would race with the program's other
+threads, so decoders only mark where they run; `mifit.console` decides what that means for the ``mifit`` command.
+"""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+
+_around: Callable[[], AbstractContextManager[None]] = nullcontext
 
 
-@contextmanager
-def silenced_stderr() -> Iterator[None]:
-    """Drop what is written to file descriptor 2 inside the block.
+def decoding() -> AbstractContextManager[None]:
+    """Context for one call of a decoder that may print about damaged input."""
+    return _around()
 
-    Decoders (libpng, OpenEXR, FFmpeg) print about damaged input; mifit says the same in one line of its own. The
-    descriptor belongs to the whole process, so keep the block around one decoder call.
-    """
-    try:
-        saved = os.dup(2)
-    except OSError:  # no standard error at all
-        yield
-        return
-    sink = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(sink, 2)
-        yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(sink)
+
+def set_decoding_context(around: Callable[[], AbstractContextManager[None]]) -> None:
+    """Say what surrounds every decoder call; for programs that own their standard error."""
+    global _around
+    _around = around

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.files import read_text
+from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 
 MEDIAPIPE_TO_IBUG68 = np.array(
@@ -39,8 +41,10 @@ IBUG_MIRROR = np.array(
 def read_landmark_file(path: Path) -> NDArray[np.int64]:
     """Read a JSON list of 68 vertex indices, 0-based, in iBUG order."""
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        values = json.loads(read_text(path, MAX_SETTINGS_BYTES, "landmark file"))
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not readable as JSON: {error}") from None
     if not isinstance(values, list) or len(values) != 68 or not all(type(v) is int for v in values):
         raise InputError(f"{path}: expected a list of 68 vertex indices in iBUG order")

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import h5py
 
+from mifit.core.files import check_file
+from mifit.core.limits import MAX_MODEL_BYTES
+from mifit.core.npz import npz_keys
 from mifit.errors import InputError
 from mifit.morphable.builtin import builtin_model
 from mifit.morphable.formats import bfm2009, deep3d, threeddfa
-from mifit.morphable.formats.archive import npz_keys
 from mifit.morphable.formats.bfm_h5 import load_bfm_h5
 from mifit.morphable.formats.eos import load_eos, looks_like_eos
 from mifit.morphable.formats.flame import KEYS as FLAME_KEYS
@@ -72,6 +74,7 @@ def recognise(path: Path) -> str:
         if is_ict_folder(path):
             return "ict-folder"
         raise InputError(f"{path}: a folder without generic_neutral_mesh.obj and vertex_indices.json")
+    check_file(path, MAX_MODEL_BYTES, "model file")
     keys = npz_keys(path)
     if keys is not None:
         for kind, fits in (

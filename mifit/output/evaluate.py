@@ -16,6 +16,7 @@ from mifit.core.camera import Camera
 from mifit.core.flip import flip
 from mifit.core.image import to_8_bit
 from mifit.core.metrics import mean_squared_error, psnr_from_rmse, ssim
+from mifit.core.npz import read_npz
 from mifit.errors import InputError
 from mifit.output.baseline import image_based
 from mifit.output.deferred import shade_methods, trace_mesh, visible_surface
@@ -240,21 +241,22 @@ def _truth(capture: Capture, reconstruction: Result, timestep: int) -> tuple[NDA
     folder = Path(capture.path) / "truth"
     path = folder / f"{timestep:04d}.npz"
     try:
-        with np.load(path, allow_pickle=False) as data:
-            vertices = data["vertices"]
-    except FileNotFoundError:
-        raise InputError(
-            f"{path}: missing; --region truth needs the capture's ground truth, or use --region model"
-        ) from None
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: not a readable ground-truth file with an array 'vertices' ({error})") from None
+        if not path.exists():
+            raise InputError(f"{path}: missing; --region truth needs the capture's ground truth, or use --region model")
+        vertices = read_npz(path, ("vertices",))["vertices"]
+    except KeyError:
+        raise InputError(f"{path}: not a ground-truth file: has no array 'vertices'") from None
     mesh = folder / "mesh.npz"
     if mesh.exists():
-        with np.load(mesh, allow_pickle=False) as data:
-            if "faces" not in data:
-                raise InputError(f"{mesh}: has no array 'faces'")
-            faces = data["faces"]
-            mask = data["face_mask"].astype(bool) if "face_mask" in data else np.ones(len(faces), dtype=bool)
+        data = read_npz(mesh, ("faces", "face_mask"))
+        if "faces" not in data:
+            raise InputError(f"{mesh}: has no array 'faces'")
+        faces = data["faces"]
+        if faces.ndim != 2 or faces.shape[1] != 3 or faces.min() < 0 or faces.max() >= len(vertices):
+            raise InputError(
+                f"{mesh}: faces has shape {faces.shape}, expected (F, 3) indices of {len(vertices)} vertices"
+            )
+        mask = data["face_mask"].astype(bool) if "face_mask" in data else np.ones(len(faces), dtype=bool)
         return vertices, faces, mask
     model = reconstruction.model
     if len(vertices) != len(model.mean):

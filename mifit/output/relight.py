@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.files import replacing, write_text
+from mifit.core.files import file_name, replacing, write_text
 from mifit.core.image import encode_png, read_image, to_8_bit, write_image
 from mifit.core.metrics import psnr, rmse
 from mifit.core.sh import LUMINANCE, SHLighting
@@ -109,11 +109,12 @@ def write_relit(
         progress("Relighting", 2 * k + 1, total)
         path = lit.render(camera, timestep, integrator="path", samples=samples, seed=seed)
         progress("Relighting", 2 * k + 2, total)
-        write_image(folder / f"{camera.name}_fast.png", fast)
-        write_image(folder / f"{camera.name}_path.png", path)
+        name = file_name(camera.name)
+        write_image(folder / f"{name}_fast.png", fast)
+        write_image(folder / f"{name}_path.png", path)
         covered = (fast[..., 3] == 1) & (path[..., 3] > 0.99)
         a, b = to_8_bit(fast[..., :3]), to_8_bit(path[..., :3])
-        with replacing(folder / f"{camera.name}_difference.png") as temporary:
+        with replacing(folder / f"{name}_difference.png") as temporary:
             temporary.write_bytes(encode_png(heat_map(b, a, covered)))
         rows.append([fast, path])
         pairs.append((a[covered], b[covered]))

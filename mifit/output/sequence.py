@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.files import replacing
+from mifit.core.files import file_name, replacing
 from mifit.core.image import to_8_bit
+from mifit.core.quiet import decoding
 from mifit.errors import InputError, MifitError
 from mifit.output.deferred import shade_methods, visible_surface
 from mifit.output.evaluate import as_photographed, rgba_8_bit
@@ -143,7 +144,7 @@ def write_moving_pictures(
     folder = Path(folder)
     names = [camera.name for camera in reconstruction.cameras] if cameras is None else cameras
     for name in names:
-        write_overlay(reconstruction, capture, name, folder / f"overlay_{name}.mp4", fps, progress)
+        write_overlay(reconstruction, capture, name, folder / f"overlay_{file_name(name)}.mp4", fps, progress)
     write_glb(reconstruction, folder / "sequence.glb", animate=sorted(reconstruction.timesteps), fps=fps)
 
 
@@ -167,7 +168,7 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
     if not 0 < fps < float("inf"):
         raise InputError(f"fps: found {fps}, expected a number of frames per second above 0")
     with replacing(path) as temporary:
-        writer, size = None, (0, 0)
+        writer, size, count = None, (0, 0), 0
         try:
             for frame in frames:
                 if writer is None:
@@ -180,8 +181,23 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
                     if writer is None:
                         raise MifitError(f"{path}: OpenCV can write none of {', '.join(CODECS)}; install its FFmpeg")
                 writer.write(np.ascontiguousarray(frame[: size[0], : size[1], ::-1]))
+                count += 1
         finally:
             if writer is not None:
                 writer.release()
         if writer is None:
             raise InputError(f"{path}: found no frame to write, expected one or more timesteps")
+        if not _is_playable(temporary, count):  # FFmpeg doesn't say when a disk is full
+            raise InputError(f"{path}: can't be written whole, is the disk full?; what was there is unchanged")
+
+
+def _is_playable(path: Path, count: int) -> bool:
+    """Whether a video holds ``count`` frames that can be read back."""
+    import cv2
+
+    with decoding():
+        reader = cv2.VideoCapture(str(path))
+        try:
+            return reader.isOpened() and all(reader.grab() for _ in range(count))
+        finally:
+            reader.release()

@@ -17,7 +17,7 @@ import sys
 from dataclasses import dataclass
 from importlib import metadata
 
-from mifit.errors import VariantError
+from mifit.errors import UnknownVariantError, VariantError
 
 LLVM_SUPPORTED = 19
 """From this major version on LLVM is used as found; an older one must survive a trial in a process of its own."""
@@ -157,8 +157,9 @@ def set_variant(name: str = "auto") -> str:
 
     if name == "auto":
         name = "cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"
-    if name not in mi.variants():
-        raise VariantError(f"variant: found {name!r}, expected auto or one of {', '.join(mi.variants())}")
+    usable = [v for v in mi.variants() if v.endswith("_ad_rgb")]
+    if name not in usable:
+        raise UnknownVariantError(f"variant: found {name!r}, expected auto or one of {', '.join(usable)}")
     if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
         raise VariantError(f"variant {name}: no working CUDA device or driver here; use llvm_ad_rgb")
     if name.startswith("llvm"):

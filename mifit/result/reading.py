@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from mifit.config import MeshConfig
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
+from mifit.core.files import read_text
 from mifit.core.image import read_image
+from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_PIXELS
 from mifit.core.ply import read_ply
 from mifit.core.split_mesh import SplitMesh, split_at_seams
 from mifit.core.subdivision import split_faces
@@ -67,13 +69,15 @@ def _read_document(folder: Path, path: Path) -> dict[str, Any]:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a result that `mifit fit` wrote")
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(
-            f"{path}: missing, so {folder} is no result or an unfinished one; "
-            "name a folder that `mifit fit` wrote, or finish it with --resume"
-        ) from None
-    except (OSError, ValueError, RecursionError) as error:
+        if not path.exists():
+            raise InputError(
+                f"{path}: missing, so {folder} is no result or an unfinished one; "
+                "name a folder that `mifit fit` wrote, or finish it with --resume"
+            )
+        document = json.loads(read_text(path, MAX_DOCUMENT_BYTES, "result"))
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not readable as JSON ({error}); fit again") from None
     version = document.get("format_version") if isinstance(document, dict) else None
     if version != FORMAT_VERSION:
@@ -99,7 +103,7 @@ def _load_model(entry: dict[str, Any], path: Path) -> MorphableModel:
 def _camera(entry: dict[str, Any]) -> Camera:
     """A camera from the keys of `_camera_document`, all of its numbers finite and its sizes positive."""
     size, focal = (_array([entry[k] for k in keys], (2,), "camera") for keys in (("width", "height"), ("fx", "fy")))
-    if not (size.min() >= 1 and focal.min() > 0):
+    if not (size.min() >= 1 and size.prod() <= MAX_PIXELS and focal.min() > 0):
         raise ValueError(f"camera: found size {size.tolist()}, focal lengths {focal.tolist()}, expected positive ones")
     centre = _array([entry["cx"], entry["cy"]], (2,), "camera")
     pose = _array(entry["world_to_camera"], (4, 4), "world_to_camera")

@@ -17,6 +17,14 @@ from mifit.capture.transforms import MIN_SIDE, Shot, View, write_transforms
 from mifit.core.camera import Camera
 from mifit.core.files import replacing, write_text
 from mifit.core.image import read_image, write_image
+from mifit.core.limits import (
+    MAX_RENDERED_PIXELS,
+    MAX_RUNS,
+    MAX_SAMPLES,
+    MAX_SEED,
+    MAX_TIMESTEPS,
+    check_range,
+)
 from mifit.core.mesh import vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
@@ -88,16 +96,16 @@ def synthesize(
         A size, count or file that can't be used.
     """
     out = Path(out)
-    for name, value, low in (
-        ("subjects", subjects, 1),
-        ("timesteps", timesteps, 1),
-        ("width", width, MIN_SIDE),
-        ("height", height, MIN_SIDE),
-        ("spp", spp, 1),
-        ("seed", seed, 0),
+    for name, value, low, high in (
+        ("subjects", subjects, 1, MAX_RUNS),
+        ("timesteps", timesteps, 1, MAX_TIMESTEPS),
+        ("width", width, MIN_SIDE, MAX_RENDERED_PIXELS // MIN_SIDE),
+        ("height", height, MIN_SIDE, MAX_RENDERED_PIXELS // MIN_SIDE),
+        ("width x height", width * height, MIN_SIDE**2, MAX_RENDERED_PIXELS),
+        ("spp", spp, 1, MAX_SAMPLES),
+        ("seed", seed, 0, MAX_SEED),
     ):
-        if value < low:
-            raise InputError(f"{name}: found {value}, expected at least {low}")
+        check_range(name, value, low, high)
     if tone is not None and not 0 <= tone <= 1:
         raise InputError(f"tone: found {tone}, expected 0 (fair) to 1 (deep)")
     shape = MorphableModel.load(model)
@@ -214,7 +222,9 @@ def _write_capture(
     advance(1)
     for t, pose in enumerate(subject.poses):
         world = _world_vertices(subject, pose)
-        images = tracer.render(_surfaces(subject, pose, world), cameras, spp, seed=subject.seed * 100_003 + t)
+        images = tracer.render(
+            _surfaces(subject, pose, world), cameras, spp, seed=(subject.seed * 100_003 + t) % (MAX_SEED + 1)
+        )
         visibility.update(world)
         for c, (camera, image) in enumerate(zip(cameras, images, strict=True)):
             rng = np.random.default_rng([subject.seed, t, c, 21])

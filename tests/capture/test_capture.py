@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -138,7 +140,8 @@ def test_grey_images_are_taken(folder: Path) -> None:
 
 
 def test_invisible_landmarks_stay_finite(folder: Path) -> None:
-    (folder / "landmarks/left/0000.json").write_text('{"points": [null' + ", [NaN, 3]" + ", [4, 5]" * 66 + "]}")
+    points = [[4 + i, 5] for i in range(66)]
+    (folder / "landmarks/left/0000.json").write_text(json.dumps({"points": [None, [math.nan, 3], *points]}))
     frame = Capture.load(folder).frame("left", 0)
     assert frame.landmarks is not None
     assert np.isfinite(frame.landmarks).all()

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.files import opened, read_text
+from mifit.core.limits import MAX_MODEL_BYTES, MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 from mifit.morphable.assemble import complete, interleaved, single, srgb_albedo
 from mifit.morphable.formats.mat5 import read_mat
@@ -57,8 +59,7 @@ def _facewarehouse(folder: Path, n: int) -> tuple[NDArray, NDArray]:
     trim = read_mat(index_file, ("trimIndex",))["trimIndex"].ravel().astype(np.int64) - 1
     if trim.size == 0 or trim.min() < 0 or trim.max() >= n:
         raise InputError(f"{index_file}: trimIndex spans {trim.min() + 1}..{trim.max() + 1}, expected 1..{n}")
-    size = basis_file.stat().st_size
-    with basis_file.open("rb") as f:
+    with opened(basis_file, MAX_MODEL_BYTES) as (f, size):
         head = f.read(4)
         count = int(np.frombuffer(head, "<i4")[0]) if len(head) == 4 else -1
         expected = 4 + 4 * 3 * len(trim) * (count + 1)
@@ -68,7 +69,7 @@ def _facewarehouse(folder: Path, n: int) -> tuple[NDArray, NDArray]:
             )
         values = np.frombuffer(f.read(), "<f4").reshape(count + 1, len(trim), 3)
     try:
-        sigma = np.array(deviation_file.read_text(encoding="ascii").split(), dtype=np.float32)
+        sigma = np.array(read_text(deviation_file, MAX_SETTINGS_BYTES).split(), dtype=np.float32)
     except ValueError as error:
         raise InputError(f"{deviation_file}: {error}; expected {count} numbers") from None
     if sigma.shape != (count,):

@@ -64,7 +64,7 @@ def _already_scaled(h5: Reader) -> bool:
     """Whether the file is of version 0.8, whose basis is premultiplied by the deviations."""
     if not (h5.has("version/majorVersion") and h5.has("version/minorVersion")):
         return False
-    major, minor = (int(h5.dataset(f"version/{k}")[()]) for k in ("majorVersion", "minorVersion"))
+    major, minor = (h5.whole(f"version/{k}") for k in ("majorVersion", "minorVersion"))
     return (major, minor) < (0, 9)
 
 

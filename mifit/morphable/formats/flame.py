@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.npz import read_npz
 from mifit.core.uv import sample_map
 from mifit.errors import InputError
 from mifit.morphable.assemble import complete, single, srgb_albedo
-from mifit.morphable.formats.archive import read_npz
 from mifit.morphable.formats.pickles import plain_array, read_pickle
 from mifit.morphable.model import MorphableModel
 

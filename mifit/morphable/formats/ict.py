@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.files import read_bytes, read_text
+from mifit.core.limits import MAX_SETTINGS_BYTES, MAX_TEXT_MODEL_BYTES
+from mifit.core.npz import read_npz
 from mifit.errors import InputError
 from mifit.morphable.assemble import N_ALBEDO, check_mesh, fingerprint
-from mifit.morphable.formats.archive import read_npz
 from mifit.morphable.model import MorphableModel
 from mifit.morphable.pigment import skin_model
 from mifit.morphable.topology import mirror_map, opening_faces
@@ -21,7 +23,6 @@ EXPRESSION_SIGMA = 0.3
 _SKIN_VERTICES, _FACE_VERTICES = 11248, 9409
 """Vertices of face, head and neck skin, and of the face alone, come first in the original files."""
 
-_MAX_OBJ_BYTES = 256 << 20
 _KEYS = ("mean", "faces", "uv", "faces_uv", "identity", "expression", "expression_names", "landmarks_ibug68")
 
 
@@ -66,7 +67,7 @@ def load_ict_folder(path: Path) -> MorphableModel:
     Only the skin of face, head and neck is kept; quads are split along their first diagonal.
     """
     try:
-        index = json.loads((path / "vertex_indices.json").read_text(encoding="utf-8"))
+        index = json.loads(read_text(path / "vertex_indices.json", MAX_SETTINGS_BYTES))
         landmarks = np.array(index["idx_to_landmark_verts"])
         known = [str(name) for name in index["expressions"]]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
@@ -105,10 +106,7 @@ def load_ict_folder(path: Path) -> MorphableModel:
 
 
 def _obj_lines(path: Path) -> list[bytes]:
-    size = path.stat().st_size
-    if size > _MAX_OBJ_BYTES:
-        raise InputError(f"{path}: {size} bytes, expected at most {_MAX_OBJ_BYTES}")
-    return path.read_bytes().splitlines()
+    return read_bytes(path, MAX_TEXT_MODEL_BYTES, "mesh").splitlines()
 
 
 def _obj_vertices(path: Path, lines: list[bytes], keyword: bytes = b"v ", columns: int = 3) -> NDArray[np.float64]:

@@ -1,4 +1,8 @@
-"""A bounded reader of numeric arrays in MATLAB version-5 files: no size is believed before it is checked."""
+"""A bounded reader of numeric arrays in MATLAB version-5 files: no size is believed before it is checked.
+
+SciPy's own reader looks up data types without a check of bounds and ends the process on damaged files (a type of 19, 20
+or 1000, SciPy 1.17), so it can't be used on files from elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.files import opened
+from mifit.core.limits import MAX_MODEL_BYTES, MAX_UNPACKING, UNPACKING_SLACK
 from mifit.errors import InputError
-from mifit.morphable.formats.archive import MAX_BYTES
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
 _COMPRESSED, _MATRIX = 15, 14
-_MAX_RATIO, _SLACK = 100, 16 << 20
 
 
 def is_mat5(path: Path) -> bool:
@@ -60,9 +64,8 @@ def _matrices(
     path: Path, wanted: tuple[str, ...] = (), names_only: bool = False
 ) -> Iterator[tuple[str, NDArray | None]]:
     """Yield (name, array) of each numeric matrix; the array is None when it isn't wanted."""
-    size = path.stat().st_size
-    budget = min(MAX_BYTES, _MAX_RATIO * size + _SLACK)
-    with path.open("rb") as f:
+    with opened(path, MAX_MODEL_BYTES, "MATLAB file") as (f, size):
+        budget = min(MAX_MODEL_BYTES, MAX_UNPACKING * size + UNPACKING_SLACK)
         head = f.read(128)
         if head[126:128] != b"IM":
             raise InputError(f"{path}: big-endian MATLAB file, expected little-endian")

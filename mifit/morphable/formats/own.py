@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from mifit.core.files import replacing
+from mifit.core.npz import read_npz
 from mifit.errors import InputError
-from mifit.morphable.formats.archive import read_npz
 from mifit.morphable.model import MorphableModel, provides
 
 FORMAT_KEY = "mifit_model"

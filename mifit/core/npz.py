@@ -1,4 +1,4 @@
-"""Guarded reading of ``.npz`` archives: every size is checked before anything is allocated."""
+"""Guarded reading of NumPy's files: every size is checked before anything is allocated, objects are refused."""
 
 from __future__ import annotations
 
@@ -14,16 +14,19 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from mifit.core.files import check_file, opened
+from mifit.core.limits import MAX_MODEL_BYTES, MAX_UNPACKING, UNPACKING_SLACK
 from mifit.errors import InputError
 
-MAX_BYTES = 4 << 30
-"""No model that exists is larger when unpacked."""
-
-_MAX_RATIO, _SLACK = 100, 16 << 20  # real arrays of floats compress far less
+_DAMAGE = (
+    zipfile.BadZipFile, zlib.error, OSError, ValueError, EOFError, KeyError, struct.error,
+    NotImplementedError, RuntimeError, SyntaxError, TypeError, MemoryError, tokenize.TokenError,
+)  # fmt: skip
 
 
 def npz_keys(path: Path) -> list[str] | None:
     """Names of the arrays in an ``.npz`` file, or None when the file is not a zip archive."""
+    check_file(path, MAX_MODEL_BYTES)
     if not zipfile.is_zipfile(path):
         return None
     try:
@@ -52,12 +55,13 @@ def read_npz(path: str | Path, keys: Iterable[str] | None = None) -> dict[str, N
     path = Path(path)
     wanted = None if keys is None else set(keys)
     out: dict[str, NDArray] = {}
+    size = check_file(path, MAX_MODEL_BYTES)
     try:
         with zipfile.ZipFile(path) as archive:
             members = {i.filename[:-4]: i for i in archive.infolist() if i.filename.endswith(".npy")}
             members = {k: i for k, i in members.items() if wanted is None or k in wanted}
             total = sum(i.file_size for i in members.values())
-            limit = min(MAX_BYTES, _MAX_RATIO * path.stat().st_size + _SLACK)
+            limit = min(MAX_MODEL_BYTES, MAX_UNPACKING * size + UNPACKING_SLACK)
             if total > limit:
                 raise InputError(
                     f"{path}: claims {total} bytes when unpacked, expected at most {limit} for a file of this size"
@@ -67,14 +71,20 @@ def read_npz(path: str | Path, keys: Iterable[str] | None = None) -> dict[str, N
                     out[key] = _read_npy(stream, info.file_size, f"{path}: {key}")
     except InputError:
         raise
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (
-        zipfile.BadZipFile, zlib.error, OSError, ValueError, EOFError, KeyError, struct.error,
-        NotImplementedError, RuntimeError, SyntaxError, TypeError, MemoryError, tokenize.TokenError,
-    ) as error:  # fmt: skip
+    except _DAMAGE as error:
         raise InputError(f"{path}: damaged .npz file: {error}") from None
     return out
+
+
+def read_npy(path: str | Path, limit: int, what: str = "file") -> NDArray:
+    """Read one array from an ``.npy`` file of at most ``limit`` bytes; InputError as `read_npz` raises it."""
+    with opened(path, limit, what) as (stream, size):
+        try:
+            return _read_npy(stream, size, f"{path}: not a readable {what}")
+        except InputError:
+            raise
+        except _DAMAGE as error:
+            raise InputError(f"{path}: not a readable {what}: {' '.join(str(error).split())[:100]}") from None
 
 
 def _read_npy(stream, size: int, where: str) -> NDArray:
@@ -86,8 +96,9 @@ def _read_npy(stream, size: int, where: str) -> NDArray:
         shape, fortran, dtype = npy.read_array_header_2_0(stream)
     else:
         raise InputError(f"{where}: .npy version {version}, expected (1, 0) or (2, 0)")
-    if dtype.hasobject:
-        raise InputError(f"{where}: holds Python objects, which are refused; expected numbers or text")
+    if dtype.hasobject or dtype.kind not in "biufSU":
+        kind = "Python objects" if dtype.hasobject else str(dtype)
+        raise InputError(f"{where}: holds {kind}, which are refused; expected numbers or text")
     count = math.prod(shape)
     if any(n < 0 for n in shape) or count * dtype.itemsize > size:
         raise InputError(f"{where}: header claims shape {shape} of {dtype}, but the member has {size} bytes")
