@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import typing
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -28,7 +27,7 @@ from benchmarks.measure import conditions, measured
 from benchmarks.record import RESULTS, SHARED, record
 from benchmarks.third_view import Error, ThirdView, pooled_psnr
 from mifit import Capture, MorphableModel, Reconstruction
-from mifit.config import FitConfig, GeometryConfig, NormalsConfig, ReflectanceConfig
+from mifit.config import SHADINGS, FitConfig, GeometryConfig, NormalsConfig, ReflectanceConfig
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
 from mifit.core.files import write_text
 from mifit.errors import ConvergenceError, InputError
@@ -42,26 +41,25 @@ MODEL = SHARED / "models" / "ict_facekit" / "ict_facekit_head.npz"
 CAMERAS = ("left", "right")
 TIMESTEPS = (0, 1, 2, 3)
 GEOMETRY = GeometryConfig()
-SHADINGS = typing.get_args(typing.get_type_hints(ReflectanceConfig)["shading"])
 
 
 class Diffuse(Forward):
     """A shading model without its specular reflection."""
 
-    def transfers(self, seen: Observations, radiance: Any) -> tuple[Any, Any]:
-        diffuse, specular = super().transfers(seen, radiance)
+    def transfers(self, seen: Observations, light: Any) -> tuple[Any, Any]:
+        diffuse, specular = super().transfers(seen, light)
         return diffuse, np.zeros_like(specular)
 
-    def shade(self, seen: Observations, radiance: Any) -> tuple[Any, Any]:
-        shade, glint = super().shade(seen, radiance)
+    def shade(self, seen: Observations, light: Any) -> tuple[Any, Any]:
+        shade, glint = super().shade(seen, light)
         return shade, np.zeros_like(glint)
 
 
 def choose_diffuse_lighting(
-    surface: Surface, faces: Any, seen: Observations, albedo: Any, config: ReflectanceConfig, progress: Progress
+    surface: Surface, seen: Observations, albedo: Any, config: ReflectanceConfig, progress: Progress
 ) -> tuple[Forward, LightingSolution, dict]:
     """The model that stage 2 chooses, and the lighting that explains the images best without its specular part."""
-    forward, _, choice = choose_lighting(surface, faces, seen, albedo, config, progress)
+    forward, _, choice = choose_lighting(surface, seen, albedo, config, progress)
     diffuse = Diffuse(**{f.name: getattr(forward, f.name) for f in fields(forward)})
     return diffuse, fit_lighting(seen, diffuse, albedo, config, config.max_iterations, 0.0), choice
 
@@ -152,7 +150,7 @@ class Table:
             "over_base_db": round(third - pooled_psnr(self.base[t] for t in errors), 3),
             "timesteps_compared": list(errors),
             "shading": reflectance.report.details["shading"]["chosen"],
-            "exponent": reflectance.exponent,
+            "exponent": reflectance.lobe.typical,
             "outcome": reflectance.report.outcome,
             **cost,
         }

@@ -203,7 +203,7 @@ def is_finite(result: Reconstruction) -> bool:
     arrays = [result.geometry.vertices, result.geometry.vertex_albedo, result.geometry.shading]
     if result.reflectance is not None:
         found = result.reflectance
-        arrays += [found.diffuse, found.specular, found.confidence, found.radiance]
+        arrays += [found.diffuse, found.specular, found.confidence, found.illumination.unknowns]
     if result.normals is not None:
         arrays.append(result.normals.normal_object)
     return all(np.isfinite(array).all() for array in arrays)

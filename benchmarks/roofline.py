@@ -35,6 +35,8 @@ from benchmarks.record import RESULTS, SHARED, record
 from benchmarks.shading_speed import Cached
 from benchmarks.truth import true_geometry
 from mifit import Capture, MorphableModel
+from mifit.appearance import models
+from mifit.appearance.lobe import Lobe
 from mifit.config import GeometryConfig, NormalsConfig, ReflectanceConfig
 from mifit.core.files import write_text
 from mifit.core.mesh import vertex_normals
@@ -48,7 +50,7 @@ from mifit.stages.geometry.visibility import Visibility, spread_points
 from mifit.stages.observations import Surface
 from mifit.stages.refine_normals import frame_problem
 from mifit.stages.reflectance.als import LIGHTING_TEXELS
-from mifit.stages.reflectance.choice import FRESNEL, lighting_problem
+from mifit.stages.reflectance.choice import lighting_problem
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import solve_lighting
 from mifit.stages.reflectance.maps import Smoothness, TexelSystems, solve_maps
@@ -189,8 +191,8 @@ def kernels(quick: bool) -> dict[str, Kernel]:
 
 def rendering(capture: Capture, model: MorphableModel, truth: Any, size: int) -> dict[str, Kernel]:
     """G-buffer, transfer tracing, and shading with its gradients."""
+    from mifit.appearance.occlusion import trace_transfer
     from mifit.render.gbuffer import SurfaceScene
-    from mifit.render.transfer import trace_transfer
 
     camera = capture.camera("third")
     vertices = truth.vertices[0]
@@ -201,9 +203,7 @@ def rendering(capture: Capture, model: MorphableModel, truth: Any, size: int) ->
     buffer = replace(buffer, bytes=pixels * (12 + 20) + vertices.size * 4 + model.faces.size * 4)
     smooth = vertex_normals(vertices, model.faces)
     samples, count = 64, len(vertices)
-    transfer = of_history(
-        lambda: trace_transfer(vertices, model.faces, vertices, smooth, 10, samples), count * samples, float(samples)
-    )
+    transfer = of_history(lambda: trace_transfer(scene, vertices, smooth, 10, samples), count * samples, float(samples))
     transfer = replace(transfer, bytes=count * (24 + 400.0) + model.faces.size * 4)
     light = 0.1 * np.random.default_rng(0).normal(size=(9, 3))
     light[0] = 3.0
@@ -269,7 +269,8 @@ def stage2(capture: Capture, model: MorphableModel, truth: Any, size: int) -> di
     rng = np.random.default_rng(0)
     subset = surface.sample(LIGHTING_TEXELS, rng)
     seen = surface.observe(subset)
-    forward = Forward("prefiltered", 10, 100.0, FRESNEL)
+    plain = models.get("prefiltered")
+    forward = Forward.of(plain, 10, Lobe(100.0, plain.fresnel))
     albedo = np.full((len(subset), 3), 0.3, np.float32)
     problem = lighting_problem(seen, forward, np.zeros((100, 3)), albedo, True)
 

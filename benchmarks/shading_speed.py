@@ -70,14 +70,14 @@ class Cached:
     def __init__(self, views: list[Camera], mesh: tuple, size: int, light: np.ndarray) -> None:
         import mitsuba as mi
 
+        from mifit.appearance.occlusion import trace_transfer
         from mifit.render.gbuffer import SurfaceScene
         from mifit.render.mapped import MapSampler
-        from mifit.render.transfer import trace_transfer
 
         vertices, faces, uv, faces_uv = mesh
         scene = SurfaceScene(vertices, faces)
         smooth = vertex_normals(vertices, faces)
-        traced = trace_transfer(vertices, faces, vertices, smooth, ORDER)
+        traced = trace_transfer(scene, vertices, smooth, ORDER)
         points: dict[str, list] = {"uv": [], "normal": [], "view": [], "traced": []}
         for camera in views:
             g = scene.gbuffer(camera)
@@ -110,17 +110,20 @@ class Cached:
         import drjit as dr
         import mitsuba as mi
 
-        from mifit.render import shading
+        from mifit.appearance import kernels, models
+        from mifit.appearance.image import assemble
+        from mifit.appearance.lobe import Lobe
 
         parameters = [*self.maps, self.light]
         dr.enable_grad(parameters)
         look_up = self.sampler.look_up if scattered else self.sampler
         red, green, blue, gloss, a, b = look_up(self.maps)
         n = dr.normalize(self.normal + a * self.tangent + b * self.bitangent)
-        coefficients = shading.colours(self.light, ORDER, self.count)
-        exponent = EXPONENT if model == "paper" else shading.lobe(EXPONENT, ORDER)
-        white, specular = shading.shade(n, self.view, coefficients, exponent, model, traced=self.traced)
-        residual = mi.Color3f(red, green, blue) * white + gloss * specular - self.target
+        coefficients = kernels.colours(self.light, ORDER, self.count)
+        chosen = models.get(model)
+        lobe = kernels.prepare(Lobe(EXPONENT, normalized=chosen.normalized), ORDER)
+        white, specular = chosen.shade(n, self.view, lobe, coefficients, self.traced)
+        residual = assemble(0.0, mi.Color3f(red, green, blue), white, gloss, specular) - self.target
         # The loss beside its gradient in one kernel, instead of a kernel for the sum and one that shades again.
         loss = dr.zeros(mi.Float, 1)
         value = dr.squared_norm(dr.detach(mi.Vector3f(residual))) / (3 * self.count)

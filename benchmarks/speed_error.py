@@ -37,7 +37,7 @@ from benchmarks.record import RESULTS, SHARED, record
 from benchmarks.third_view import ThirdView, pooled_psnr
 from benchmarks.truth import true_geometry
 from mifit import Capture, MorphableModel, Reconstruction
-from mifit.config import GeometryConfig, NormalsConfig, ReflectanceConfig
+from mifit.config import SHADINGS, GeometryConfig, NormalsConfig, ReflectanceConfig
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate
 from mifit.core.files import write_text
@@ -148,7 +148,7 @@ def reflectance() -> Row:
     """Stage 2 with the true geometry: held-out error over time for every solver and shading model."""
     d = data()
     configs = []
-    for shading in choices(ReflectanceConfig, "shading"):
+    for shading in SHADINGS:
         if shading != "auto":
             for limit in (1, 3, 8, 30):
                 configs.append(ReflectanceConfig(texture_size=SIZE, shading=shading, max_iterations=limit))  # type: ignore
@@ -256,8 +256,8 @@ def growth() -> Row:
     """Steady cost of the kernels and of stage 1 as pixels, vertices and surface points grow."""
     import trimesh
 
+    from mifit.appearance.occlusion import trace_transfer
     from mifit.render.gbuffer import SurfaceScene
-    from mifit.render.transfer import trace_transfer
 
     d = data()
     camera = d.capture.camera("third")
@@ -281,7 +281,7 @@ def growth() -> Row:
         size = {"vertices": len(mesh)}
         buffers.append({**size, **best(lambda m=mesh, t=triangles: SurfaceScene(m, t).gbuffer(camera)).figures()})
         smooth = vertex_normals(mesh, triangles)
-        cost = best(lambda m=mesh, t=triangles, n=smooth: trace_transfer(m, t, m, n, 10), 1)
+        cost = best(lambda m=mesh, t=triangles, n=smooth: trace_transfer(SurfaceScene(m, t), m, n, 10), 1)
         transfers.append(note("growth", {**size, **cost.figures()}))
     out["mesh set-up and G-buffer over vertices"] = grown(buffers, "vertices")
     out["shadowed transfer over vertices"] = grown(transfers, "vertices")

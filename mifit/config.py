@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import pydantic
 
 from mifit.schema import choice, flag, from_mapping, number, part, read_toml, settings
 
@@ -61,6 +64,18 @@ class ShapeConfig:
     )
 
 
+SHADINGS = ["auto", "paper", "prefiltered", "shadowed", "keyed"]
+"""What ``shading`` may be; registering a shading model (``appearance.models``) adds its name."""
+
+
+def _known_shading(name: str) -> str:
+    if name not in SHADINGS:
+        near = difflib.get_close_matches(name, SHADINGS, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"found {name!r}, expected one of {', '.join(map(repr, SHADINGS))}{hint}")
+    return name
+
+
 @settings
 class ReflectanceConfig:
     """Stage 2, reflectance inference (paper, section 5)."""
@@ -69,8 +84,10 @@ class ReflectanceConfig:
     solver: Literal["als", "adam"] = choice(
         "als", "als: lighting with the texels eliminated, then the maps by ADMM; adam: the paper's gradient descent"
     )
-    shading: Literal["auto", "paper", "prefiltered", "shadowed", "keyed"] = choice(
-        "auto", "image-formation model; auto takes the cheapest that explains the images"
+    shading: Annotated[str, pydantic.AfterValidator(_known_shading)] = choice(
+        "auto",
+        "image-formation model: paper, prefiltered, shadowed, keyed (shadowed with a compact light), or another that "
+        "is registered; auto takes the cheapest of the four that explains the images",
     )
     bands: int = number(10, "bands of the lighting of prefiltered and shadowed; paper has 3", least=3, most=10)
     exponent: float | None = number(

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.keylight import KeyLight
+if TYPE_CHECKING:
+    from mifit.appearance.illumination import Illumination
+    from mifit.appearance.lobe import Lobe
 
 
 @dataclass(frozen=True)
@@ -114,40 +117,21 @@ class ReflectanceEstimate:
         Specular albedo C_s, 0..1.
     confidence : (S, S) float32
         0 where never seen, 1 where seen often and well.
-    radiance : (B*B, 3) float64
-        SH coefficients of the incident radiance, world axes, convention of ``core.sh``.
-    ambient : float
-    exponent : float
-        Blinn-Phong exponent.
+    illumination : Illumination
+        What lights the face: smooth radiance, compact lights, ambient.
+    lobe : Lobe
+        Exponent, Fresnel factor and normalisation of the specular lobe.
     shading_model : str
-        ``"paper"``, ``"prefiltered"`` or ``"shadowed"``: how maps and lighting make an image.
-    fresnel : float or None
-        Rise of the specular lobe towards grazing views, see ``render.shading.Lobe``; None for plain Blinn-Phong.
-    key_direction, key_irradiance : (3,) float64 or None
-        A compact light beside ``radiance``, see ``core.keylight``; None where there is none.
-    key_radius : float
-        Its angular radius in radians.
+        How maps and lighting make an image: a name of ``appearance.models``.
     """
 
     diffuse: NDArray
     specular: NDArray
     confidence: NDArray
-    radiance: NDArray
-    ambient: float
-    exponent: float
+    illumination: Illumination
+    lobe: Lobe
     shading_model: str
     report: Report
-    fresnel: float | None = None
-    key_direction: NDArray | None = None
-    key_irradiance: NDArray | None = None
-    key_radius: float = 0.0
-
-    @property
-    def key(self) -> KeyLight | None:
-        """The compact light, where there is one."""
-        if self.key_direction is None or self.key_irradiance is None:
-            return None
-        return KeyLight(self.key_direction, self.key_radius, self.key_irradiance)
 
 
 @dataclass(frozen=True)

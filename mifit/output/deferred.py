@@ -1,6 +1,6 @@
 """Local rendering of a reconstruction: visible surface once, then the shading that the fit used.
 
-Nothing here knows how a surface reflects light: colours come from ``render.local``, which the plugins and the
+Nothing here knows how a surface reflects light: colours come from ``appearance``, which the plugins and the
 optimisers share.
 """
 
@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.image import Appearance, assemble
+from mifit.appearance.occlusion import OccludingMesh, SurfacePoints
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.sh import basis
@@ -19,6 +21,7 @@ from mifit.core.uv import sample_map
 from mifit.output.surface import surface_maps
 
 if TYPE_CHECKING:
+    from mifit.morphable import MorphableModel
     from mifit.result import Method, Result
 
 
@@ -157,35 +160,28 @@ def shade_methods(
         out["pca"] = surface.image(_shade_stage_1(reconstruction, surface, timestep))
     finer = [m for m in methods if m != "pca"]
     if finer:
-        from mifit.render.bent import shade_bent
         from mifit.render.gbuffer import SurfaceScene
 
         reflectance = reconstruction.reflectance
         assert reflectance is not None
+        model, vertices = reconstruction.model, reconstruction.geometry.vertices[reconstruction.index(timestep)]
         material = surface_material(reconstruction, surface, timestep)
         base = _mesh_normals(reconstruction, surface, timestep)
-        traced = _traced(reconstruction, surface, timestep) if reflectance.shading_model == "shadowed" else None
-        lit = None
-        if reflectance.key is not None:
-            vertices = reconstruction.geometry.vertices[reconstruction.index(timestep)]
-            scene = SurfaceScene(vertices, reconstruction.model.faces)
-            lit = scene.open_towards(surface.points, base, reflectance.key.samples())
+        appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: _look_up(model, surface, m)))
+        points = SurfacePoints(surface.points, base, surface.face, surface.weights)
+        occlusion = appearance.trace(OccludingMesh(SurfaceScene(vertices, model.faces)), points)
+        shaded = appearance.shade_bent(material.normal, base, surface.view, occlusion, surface.points)
+        ambient = np.float32(reflectance.illumination.ambient)
         for method in finer:
-            specular = material.specular if method == "full" else np.zeros_like(material.specular)
-            out[method] = surface.image(
-                shade_bent(material.normal, base, surface.view, material.diffuse, specular, reflectance, traced, lit)
-            )
+            specular = material.specular[:, None] if method == "full" else np.float32(0.0)
+            out[method] = surface.image(assemble(ambient, material.diffuse, shaded[0], specular, shaded[1]))
     return {m: out[m] for m in methods}
 
 
-def _traced(reconstruction: Result, surface: VisibleSurface, timestep: int) -> NDArray:
-    """(N, B*B) shadowed transfer at the mesh's normals."""
-    from mifit.render.transfer import trace_transfer
-
-    vertices, faces = reconstruction.geometry.vertices[reconstruction.index(timestep)], reconstruction.model.faces
-    order = reconstruction.lighting.order
-    at_vertices = trace_transfer(vertices, faces, vertices, vertex_normals(vertices, faces), order)
-    return interpolate(at_vertices, faces, surface.face, surface.weights)
+def _look_up(model: MorphableModel, surface: VisibleSurface, image: NDArray) -> NDArray:
+    """A map at the samples; where the model has no maps any of its values will do."""
+    uv = interpolate(model.uv, model.faces_uv, surface.face, surface.weights)
+    return sample_map(image, np.clip(uv, 0.0, 1.0))
 
 
 def _mesh_normals(reconstruction: Result, surface: VisibleSurface, timestep: int) -> NDArray:

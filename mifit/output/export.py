@@ -109,14 +109,12 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int) -> None:
     write_image(path.with_name(f"{stem}_specular.png"), maps.specular)
     with replacing(path.with_name(f"{stem}_normal.png")) as temporary:
         temporary.write_bytes(encode_png(np.round(127.5 * (bent + 1)).astype(np.uint8)))
-    reflectance = reconstruction.reflectance
-    exponent = reflectance.exponent if reflectance else 1.0
     rest = part_of(mesh, ~model.face_mask) if not model.face_mask.all() else None
     grey = reconstruction.geometry.vertex_albedo[rest.origin].mean(0) if rest else np.full(3, 0.5)
     colour = " ".join(f"{c:.5f}" for c in linear_to_srgb(np.clip(grey, 0, 1)))
     write_text(
         path.with_suffix(".mtl"),
-        f"newmtl skin\nillum 2\nKd 1 1 1\nKs 1 1 1\nNs {exponent:.6g}\n"
+        f"newmtl skin\nillum 2\nKd 1 1 1\nKs 1 1 1\nNs {reconstruction.lobe.typical:.6g}\n"
         f"map_Kd {stem}_diffuse.png\nmap_Ks {stem}_specular.png\nnorm {stem}_normal.png\n\n"
         f"newmtl rest\nillum 1\nKd {colour}\nKs 0 0 0\n",
     )

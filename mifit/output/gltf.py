@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import mifit
-from mifit.core.blinn_phong import normalization
 from mifit.core.files import replacing
 from mifit.core.image import encode_png, to_8_bit
 from mifit.core.mesh import vertex_normals
@@ -208,14 +207,9 @@ def _skin(
         maps.normal, vertices[mesh.origin], normals[mesh.origin], mesh, reconstruction.model.face_mask
     )
     peak = max(float(maps.specular.max()), 1e-6)
-    reflectance = reconstruction.reflectance
-    exponent = reflectance.exponent if reflectance else 1.0
-    # The paper's lobe is not normalised: as energy its albedo is smaller by the ratio of the lobes' factors.
-    energy = 1.0
-    if reflectance and reflectance.shading_model == "paper":
-        energy = normalization(exponent, False) / normalization(exponent)
-    # Plain Blinn-Phong reflects alike at all angles; a fitted Fresnel rise has Schlick's form, as glTF's has.
-    rise = 1.0 + (reflectance.fresnel or 0.0 if reflectance else 0.0)
+    lobe = reconstruction.lobe
+    # Plain Blinn-Phong reflects alike at all angles; a fitted Fresnel factor has Schlick's form, as glTF's has.
+    grazing = lobe.grazing
     planes = {
         "baseColor": to_8_bit(maps.diffuse),
         "normal": np.round(127.5 * (bent + 1)).astype(np.uint8),
@@ -229,7 +223,7 @@ def _skin(
         for name, codes in planes.items()
     ]
     textures = [{"sampler": 0, "source": k} for k in range(3)]
-    alpha = math.sqrt(2.0 / (exponent + 2.0))
+    alpha = lobe.roughness
     skin = {
         "name": "skin",
         "pbrMetallicRoughness": {
@@ -241,9 +235,9 @@ def _skin(
         "extensions": {
             "KHR_materials_specular": {
                 # Reflectance is specularFactor at grazing angles, and that times 0.04 colours along the normal.
-                "specularFactor": min(energy * peak * rise, 1.0),
+                "specularFactor": min(lobe.factor() * peak * grazing, 1.0),
                 "specularTexture": {"index": 2},
-                "specularColorFactor": [1.0 / (DIELECTRIC_F0 * rise)] * 3,
+                "specularColorFactor": [1.0 / (DIELECTRIC_F0 * grazing)] * 3,
             }
         },
     }

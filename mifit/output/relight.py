@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.illumination import Illumination
 from mifit.core.files import file_name, replacing, write_text
 from mifit.core.image import encode_png, read_image, to_8_bit, write_image
 from mifit.core.metrics import psnr, rmse
@@ -60,8 +61,8 @@ def relit(
     if not (np.isfinite(exposure) and exposure > 0):
         raise InputError(f"exposure: found {exposure!r}, expected a positive number")
     # The ambient term stands for light that the model leaves out, such as interreflection: it grows with the light.
-    ambient = reflectance.ambient * exposure * after / before
-    changed = replace(reflectance, radiance=exposure * lighting.coefficients, ambient=ambient, key_direction=None)
+    ambient = reflectance.illumination.ambient * exposure * after / before
+    changed = replace(reflectance, illumination=Illumination(exposure * lighting.coefficients, ambient=ambient))
     return replace(reconstruction, reflectance=changed, environment=exposure * _turned(image, angle))
 
 
@@ -119,7 +120,7 @@ def write_relit(
         rows.append([fast, path])
         pairs.append((a[covered], b[covered]))
     fast_codes, path_codes = (np.concatenate([p[j] for p in pairs])[None] for j in (0, 1))
-    used = float(lit.reflectance.radiance[0] @ LUMINANCE) if lit.reflectance else 0.0
+    used = float(lit.illumination.radiance[0] @ LUMINANCE)
     figures = {
         "psnr": psnr(fast_codes, path_codes),
         "rmse": rmse(fast_codes, path_codes),

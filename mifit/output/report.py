@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import json
-import math
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -296,20 +295,13 @@ def _lighting(result: Result) -> str:
     matt, mirror = lighting_balls(lighting)
     panorama = np.maximum(lighting.to_latlong(), 0)
     codes = to_8_bit(panorama / max(float(panorama.max()), 1e-12))
-    ambient = result.geometry.ambient if result.reflectance is None else result.reflectance.ambient
-    light = None if result.reflectance is None else result.reflectance.key
-    key = ""
-    if light is not None:
-        x, y, z = light.direction
-        key = (
-            f"; the sharp light towards ({x:.2f}, {y:.2f}, {z:.2f}), with an angular radius of "
-            f"{math.degrees(light.radius):.1f} degrees, was found apart from them"
-        )
+    lights = result.illumination.lights
+    compact = "".join(f"; the sharp light {light.describe()}, was found apart from them" for light in lights)
     return f"""<div class="balls">{_figure(png_uri(matt), "White matt ball", "lighting on a matt ball")}
 {_figure(png_uri(mirror), "Mirror ball", "lighting in a mirror ball")}
 {_figure(jpeg_uri(codes), "All directions, latitude by longitude", "lighting panorama")}</div>
-<p class="soft">Recovered as spherical harmonics of {lighting.order} bands, so only broad light shows{key}.
-Ambient term {ambient:.4f}.</p>"""
+<p class="soft">Recovered as spherical harmonics of {lighting.order} bands, so only broad light shows{compact}.
+Ambient term {result.illumination.ambient:.4f}.</p>"""
 
 
 def _convergence(result: Result) -> str:

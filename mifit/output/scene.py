@@ -5,7 +5,6 @@ The path integrator of ``mifit render`` reads the same file that a user gets, so
 
 from __future__ import annotations
 
-import math
 import re
 import tempfile
 from collections.abc import Sequence
@@ -21,6 +20,7 @@ from mifit.core.files import write_text
 from mifit.core.image import write_image
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.ply import write_ply
+from mifit.core.sh import SHLighting
 from mifit.core.split_mesh import SplitMesh, part_of, split_at_seams
 from mifit.core.uv import rasterize_uv
 from mifit.output.deferred import visible_surface
@@ -136,7 +136,7 @@ def _write_files(reconstruction: Result, files: Path, timestep: int, method: Met
     write_image(files / "diffuse_stock.exr", np.clip(base, 0, 1))
     environment = reconstruction.environment
     if environment is None:
-        environment = np.maximum(_without_key(reconstruction).lighting.to_latlong(128, 256), 0.0)
+        environment = np.maximum(SHLighting(reconstruction.illumination.radiance).to_latlong(128, 256), 0.0)
     write_image(files / "environment.exr", environment)
 
 
@@ -177,8 +177,8 @@ def scene_description(
 ) -> dict[str, Any]:
     """The scene of `write_scene` as a plain dictionary (`render.description`), its files in the folder ``files``.
 
-    Ids are ours, not the user's: ``skin`` and ``light`` (maps and lighting), ``key`` (the compact light), ``face`` and
-    ``rest`` (shapes), and ``camera_NAME`` (see `sensor_ids`).
+    Ids are ours, not the user's: ``skin`` and ``light`` (maps and lighting), ``light_1`` ... (compact lights),
+    ``face`` and ``rest`` (shapes), and ``camera_NAME`` (see `sensor_ids`).
     """
     if method == "pca":
         reconstruction = replace(reconstruction, reflectance=None, normals=None)
@@ -195,16 +195,11 @@ def scene_description(
     if stock or reconstruction.environment is not None:
         scene["light"] = {"type": "envmap", "filename": f"{files}/environment.exr"}
     else:
-        rows = _without_key(reconstruction).lighting.coefficients
+        rows = reconstruction.illumination.radiance
         text = ",  ".join(" ".join(f"{x:.9g}" for x in row) for row in rows)
         scene["light"] = {"type": "shenv", "coefficients": text}
-    key = None if reconstruction.reflectance is None else reconstruction.reflectance.key
-    if key is not None:  # a point at infinity, whatever its radius
-        scene["key"] = {
-            "type": "directional",
-            "direction": [-float(x) for x in key.direction],
-            "irradiance": {"type": "rgb", "value": [float(x) for x in key.irradiance]},
-        }
+    for number, light in enumerate(reconstruction.illumination.lights, 1):
+        scene[f"light_{number}"] = light.emitter()
     return scene
 
 
@@ -225,29 +220,23 @@ def _texture(file: str, raw: bool = True) -> dict[str, Any]:
 
 
 def _skin(reconstruction: Result, files: str, stock: bool) -> dict[str, Any]:
-    reflectance = reconstruction.reflectance
-    exponent = float(reflectance.exponent) if reflectance else 1.0
     if stock:
         mirror = {
             "type": "roughconductor",
             "material": "none",
             "distribution": "beckmann",
-            "alpha": math.sqrt(2.0 / (exponent + 2.0)),
+            "alpha": reconstruction.lobe.roughness,
         }
         base = {"type": "diffuse", "reflectance": _texture(f"{files}/diffuse_stock.exr", False)}
         blend = {"type": "blendbsdf", "weight": _texture(f"{files}/specular.exr"), "base": base, "lobe": mirror}
         return {"type": "normalmap", "normalmap": _texture(f"{files}/normal.exr"), "nested": blend}
-    skin = {
+    return {
         "type": "blinnphong",
         "diffuse_reflectance": _texture(f"{files}/diffuse.exr", False),
         "specular_reflectance": _texture(f"{files}/specular.exr"),
         "normal_correction": _texture(f"{files}/slopes.exr"),
-        "exponent": exponent,
-        "normalized": reflectance is None or reflectance.shading_model != "paper",
+        **reconstruction.lobe.parameters(),
     }
-    if reflectance is not None and reflectance.fresnel is not None:
-        skin["fresnel"] = float(reflectance.fresnel)
-    return skin
 
 
 def _vertex_albedo(stock: bool) -> dict[str, Any]:
@@ -260,9 +249,3 @@ def _vertex_albedo(stock: bool) -> dict[str, Any]:
 
 def _shape(file: str, bsdf: dict[str, Any]) -> dict[str, Any]:
     return {"type": "ply", "filename": file, "flip_tex_coords": True, "bsdf": bsdf}
-
-
-def _without_key(reconstruction: Result) -> Result:
-    if reconstruction.reflectance is None:
-        return reconstruction
-    return replace(reconstruction, reflectance=replace(reconstruction.reflectance, key_direction=None))

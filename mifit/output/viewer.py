@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.blinn_phong import lobe_table, normalization
 from mifit.core.image import to_8_bit
 from mifit.core.mesh import vertex_normals
 from mifit.core.sh import SHLighting, bands, cosine_coefficients
@@ -77,30 +76,19 @@ def _lighting(reconstruction: Result) -> dict[str, Any]:
     it at a middling angle; the lobe's albedo and tilt follow the angle by polynomials in the cosine.
     """
     irradiance = reconstruction.lighting.truncate(3).coefficients * (cosine_coefficients(3)[bands(3)] / np.pi)[:, None]
-    reflectance, order = reconstruction.reflectance, reconstruction.lighting.order
-    exponent = reflectance.exponent if reflectance else 1.0
+    order = reconstruction.lighting.order
     cosines = np.linspace(0.05, 1.0, 40)
-    moments = lobe_table(order)(cosines, exponent)
-    albedo, tilt = moments[0], moments[1]
-    middling = np.searchsorted(cosines, 0.7)
-    if reflectance and reflectance.fresnel is not None:
-        # The lobe of a view along the normal about the mirror direction, rising towards grazing views.
-        albedo, tilt = albedo[-1] * (1 + reflectance.fresnel * (1 - cosines) ** 5), np.zeros_like(tilt)
-        middling = -1
-    factors = np.concatenate([[1.0], moments[2:, middling]])
+    albedo, tilt, factors = reconstruction.lobe.zonal(order, cosines)
     blurred = SHLighting(factors[bands(order), None] * reconstruction.lighting.coefficients).to_latlong(64, 128)
     peak = max(float(blurred.max()), 1e-6)
-    scale = 1.0
-    if reflectance and reflectance.shading_model == "paper":
-        scale = float(normalization(exponent, False) / normalization(exponent))
     return {
         "irradiance": irradiance.ravel().tolist(),
         "glossy": png_uri(np.round(255 * np.sqrt(np.clip(blurred / peak, 0, 1))).astype(np.uint8)),
-        "glossy_scale": peak * scale,
+        "glossy_scale": peak,
         "lobe_albedo": np.polynomial.polynomial.polyfit(cosines, albedo, 5).tolist(),
         "lobe_tilt": np.polynomial.polynomial.polyfit(cosines, tilt, 5).tolist(),
-        "ambient": float(reflectance.ambient if reflectance else reconstruction.geometry.ambient),
-        "exponent": float(exponent),
+        "ambient": float(reconstruction.illumination.ambient),
+        "exponent": reconstruction.lobe.typical,
     }
 
 

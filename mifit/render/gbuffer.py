@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.arrays import aligned, vector
 from mifit.core.camera import Camera
 from mifit.errors import InputError
-from mifit.render.arrays import aligned
 
 MESH_POSITIONS = "vertex_positions"
 MESH_FACES = "faces"
@@ -106,6 +106,13 @@ class SurfaceScene:
     faces : (F, 3) int
         Corner indices.
 
+    Attributes
+    ----------
+    vertices, faces
+        The mesh as it is now.
+    rays : mi.Scene
+        What rays are sent at.
+
     Raises
     ------
     InputError
@@ -116,21 +123,22 @@ class SurfaceScene:
         import mitsuba as mi
 
         self._mesh = make_mesh(vertices, faces)
-        self._scene = mi.load_dict({"type": "scene", "mesh": self._mesh})
-        self._parameters = mi.traverse(self._scene)
+        self.vertices, self.faces = np.asarray(vertices), np.asarray(faces)
+        self.rays = mi.load_dict({"type": "scene", "mesh": self._mesh})
+        self._parameters = mi.traverse(self.rays)
         self._key = next(k for k in self._parameters.keys() if k.endswith(MESH_POSITIONS))
-        self._vertex_count = len(vertices)
         self._diagonal = _diagonal(vertices)
 
     def update(self, vertices: NDArray) -> None:
         """Move the mesh to new positions (V, 3) and rebuild what rays are traced against."""
         vertices = np.asarray(vertices)
-        if vertices.shape != (self._vertex_count, 3):
-            raise InputError(f"vertices: found shape {vertices.shape}, expected ({self._vertex_count}, 3)")
+        if vertices.shape != (len(self.vertices), 3):
+            raise InputError(f"vertices: found shape {vertices.shape}, expected ({len(self.vertices)}, 3)")
         if not np.isfinite(vertices).all():
             raise InputError("vertices: found values that are not finite")
         self._parameters[self._key] = np.ascontiguousarray(vertices, dtype=np.float32).ravel()
         self._parameters.update()
+        self.vertices = vertices
         self._diagonal = _diagonal(vertices)
 
     def gbuffer(self, camera: Camera) -> GBuffer:
@@ -147,8 +155,8 @@ class SurfaceScene:
         if any(camera.distortion):
             raise InputError(f"camera {camera.name}: found lens distortion, expected an undistorted camera")
         directions = camera.pixel_rays(camera.pixel_centres()).reshape(-1, 3)
-        ray = mi.Ray3f(mi.Point3f(camera.position), _vector(directions))
-        hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
+        ray = mi.Ray3f(mi.Point3f(camera.position), vector(mi.Vector3f, directions))
+        hit = self.rays.ray_intersect_preliminary(ray, coherent=True)
         dr.eval(hit.t, hit.prim_uv, hit.prim_index)  # one kernel: each array read would trace the rays again
         valid = np.array(hit.is_valid()).astype(bool)
         face = np.where(valid, np.array(hit.prim_index).astype(np.int32), -1)
@@ -188,9 +196,9 @@ class SurfaceScene:
         distance = np.linalg.norm(direction, axis=1)
         direction /= np.maximum(distance, 1e-30)[:, None]
         reach = np.maximum(distance - SHADOW_EPSILON * self._diagonal, 0.0)
-        ray = mi.Ray3f(mi.Point3f(np.asarray(origin, dtype=np.float64)), _vector(direction))
+        ray = mi.Ray3f(mi.Point3f(np.asarray(origin, dtype=np.float64)), vector(mi.Vector3f, direction))
         ray.maxt = mi.Float(reach.astype(np.float32))
-        hit = self._scene.ray_test(ray)
+        hit = self.rays.ray_test(ray)
         return ~np.array(hit).astype(bool)
 
     def open_towards(self, points: NDArray, normals: NDArray, directions: NDArray) -> NDArray[np.uint32]:
@@ -218,26 +226,19 @@ class SurfaceScene:
             raise InputError(f"directions: found {len(directions)}, expected at most 32")
         if not len(points):
             return np.zeros(0, np.uint32)
-        n = _vector(normals)
-        origin = _vector(points) + SHADOW_EPSILON * self._diagonal * n
+        n = vector(mi.Vector3f, normals)
+        origin = vector(mi.Vector3f, points) + SHADOW_EPSILON * self._diagonal * n
         toward = mi.Float(aligned(directions).ravel())
 
         def body(i: Any, bits: Any) -> tuple[Any, Any]:
             d = mi.Vector3f(*(dr.gather(mi.Float, toward, 3 * i + k) for k in range(3)))
             above = dr.dot(n, d) > 0.0
-            seen = above & ~self._scene.ray_test(mi.Ray3f(mi.Point3f(origin), d), active=above)
+            seen = above & ~self.rays.ray_test(mi.Ray3f(mi.Point3f(origin), d), active=above)
             return i + 1, bits | dr.select(seen, mi.UInt(1) << i, mi.UInt(0))
 
         start = (mi.UInt(0), dr.zeros(mi.UInt, len(points)))
         _, bits = dr.while_loop(state=start, cond=lambda i, bits: i < dr.opaque(mi.UInt, len(directions)), body=body)
         return np.array(bits, dtype=np.uint32)
-
-
-def _vector(values: NDArray) -> Any:
-    """(N, 3) array -> mi.Vector3f."""
-    import mitsuba as mi
-
-    return mi.Vector3f(*map(aligned, values.T))
 
 
 def _diagonal(vertices: NDArray) -> float:

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.sh import order_of
+from mifit.appearance.arrays import aligned
+from mifit.appearance.illumination import Illumination
+from mifit.appearance.image import Appearance, assemble
+from mifit.appearance.kernels import prepare
 from mifit.errors import InputError
-from mifit.render import shading
-from mifit.render.arrays import aligned
 
 HISTORY = ("data", "difference", "smoothness")
 
@@ -85,7 +86,7 @@ class Samples:
     albedo : (N, 3) float32
         Diffuse albedo C_d of the morphable model.
     traced : (M, K) float32 or None
-        Shadowed transfer vectors, for ``shadowed``.
+        Shadowed transfer vectors, for models that need them.
     """
 
     normal: NDArray[np.float32]
@@ -103,10 +104,9 @@ class Samples:
 
 @dataclass(frozen=True)
 class AdamResult:
-    """Where Adam ended: radiance (K, 3), ambient, diffuse (N, 3), specular (N,), and the energies on the way."""
+    """Where Adam ended: illumination, diffuse (N, 3), specular (N,), and the energies on the way."""
 
-    radiance: NDArray[np.float64]
-    ambient: float
+    illumination: Illumination
     diffuse: NDArray[np.float32]
     specular: NDArray[np.float32]
     history: dict[str, list[float]] = field(default_factory=dict)
@@ -114,17 +114,12 @@ class AdamResult:
 
 def fit_adam(
     samples: Samples,
-    radiance: NDArray,
-    ambient: float,
-    model: str,
-    exponent: float,
+    appearance: Appearance,
     difference_weight: float,
     smoothness: tuple[float, float],
     iterations: int,
     specular: NDArray | None = None,
     rates: tuple[float, float, float] = (0.01, 0.005, 0.005),
-    with_ambient: bool = True,
-    fresnel: float | None = None,
     on_iteration: Callable[[int], None] | None = None,
 ) -> AdamResult:
     """Minimise E_O + lambda_S E_S + lambda_H E_H (paper, section 5) from zero specular albedo.
@@ -132,11 +127,8 @@ def fit_adam(
     Parameters
     ----------
     samples : Samples
-    radiance : (B*B, 3)
-        Lighting to start from.
-    ambient : float
-    model, exponent
-        See ``render.shading``.
+    appearance : Appearance
+        Model and lobe, and the smooth illumination to start from.
     difference_weight : float
         lambda_S.
     smoothness : (float, float)
@@ -146,10 +138,6 @@ def fit_adam(
         Specular map to start from; zero by default, as in the paper.
     rates : (float, float, float)
         Step lengths of lighting (relative to its largest coefficient), specular map and diffuse offset.
-    with_ambient : bool
-        Whether I_a is an unknown.
-    fresnel : float, optional
-        See ``render.shading.Lobe``.
     on_iteration : callable, optional
         Called with the number of iterations done.
 
@@ -163,15 +151,16 @@ def fit_adam(
 
     if not len(samples.colour):
         raise InputError("found 0 observations, expected some: no image shows the face")
-    problem = _Objective(samples, model, exponent, difference_weight, smoothness, fresnel)
-    k = order_of(radiance) ** 2
+    problem = _Objective(samples, appearance, difference_weight, smoothness)
+    radiance, ambient = appearance.illumination.radiance, appearance.illumination.ambient
+    k = len(radiance)
     scale = max(float(np.abs(radiance).max()), 1e-6)
     start = np.concatenate([np.asarray(radiance, dtype=np.float64).ravel() / scale, [ambient / scale]])
     # One vector for lighting and ambient, relative to the lighting's size, so that one step length fits any exposure.
     lower = np.full(3 * k + 1, -np.inf)
     lower[-1] = 0.0
     upper = np.full(3 * k + 1, np.inf)
-    if not with_ambient:
+    if not appearance.model.has_ambient:
         upper[-1] = 0.0
     n = len(samples.albedo)
     light = Variable(mi.Float(aligned(start)), rates[0], mi.Float(aligned(lower)), mi.Float(aligned(upper)))
@@ -197,9 +186,8 @@ def fit_adam(
             on_iteration(iteration + 1)
     final = np.array(light.value, dtype=np.float64) * scale
     diffuse = np.array(base + offset.value, dtype=np.float32).reshape(n, 3)
-    return AdamResult(
-        final[:-1].reshape(k, 3), float(final[-1]), diffuse, np.array(gloss.value, dtype=np.float32), history
-    )
+    illumination = Illumination(final[:-1].reshape(k, 3), ambient=float(final[-1]))
+    return AdamResult(illumination, diffuse, np.array(gloss.value, dtype=np.float32), history)
 
 
 class _Objective:
@@ -208,16 +196,13 @@ class _Objective:
     def __init__(
         self,
         samples: Samples,
-        model: str,
-        exponent: float,
+        appearance: Appearance,
         difference: float,
         smoothness: tuple[float, float],
-        fresnel: float | None,
     ) -> None:
         import mitsuba as mi
 
-        shading.check_model(model)
-        self.model, self.exponent, self.fresnel = model, float(exponent), fresnel
+        self.model, self.lobe = appearance.model, prepare(appearance.lobe, appearance.order)
         self.difference, self.smoothness = difference, smoothness
         self.normal, self.view = _vector(samples.normal), _vector(samples.view)
         self.colour, self.weight = _colour(samples.colour), _colour(samples.weight)
@@ -234,10 +219,7 @@ class _Objective:
 
         if not dr.grad_enabled(coefficients):
             dr.make_opaque(coefficients)
-        lobe: Any = self.exponent
-        if self.model != "paper":
-            lobe = shading.lobe(self.exponent, round(len(coefficients) ** 0.5), fresnel=self.fresnel)
-        d, s = shading.shade(self.normal, self.view, coefficients, lobe, self.model, True, self.traced)
+        d, s = self.model.shade(self.normal, self.view, self.lobe, coefficients, self.traced)
         return d, s, ambient
 
     def terms(self, shaded: tuple[Any, Any, Any], gloss: Any, base: Any, offset: Any) -> tuple[Any, Any, Any]:
@@ -248,7 +230,7 @@ class _Objective:
         d, s, ambient = shaded
         y = dr.gather(mi.Float, gloss, self.texel)
         x = mi.Color3f(*(dr.gather(mi.Float, base + offset, 3 * self.texel + c) for c in range(3)))
-        residual = self.colour - x * d - y * s - ambient
+        residual = self.colour - assemble(ambient, x, d, y, s)
         data = dr.sum(_total(self.weight * dr.square(residual)))
         pair = mi.Float(0.0)
         if self.difference > 0 and len(self.first):

@@ -2,29 +2,84 @@
 
     E(x) = sum_images sum_texels w rho(|I - L(n(x))|) + w1 |Laplacian (n(x) - n0)|_1 + w2 |n(x) - n0 - aim|^2
 
-over the tangent-plane offsets x of `core.bend`, by Gauss-Newton or by Adam. Shading is that of `render.shading`;
+over the tangent-plane offsets x of `core.bend`, by Gauss-Newton or by Adam. Shading is that of `appearance`;
 derivatives are Dr.Jit's: forward mode for the two unknowns of a texel, reverse mode for Adam. All arrays stay with
 Dr.Jit between iterations; the host reads one number per iteration, the energy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.arrays import aligned, vector
+from mifit.appearance.image import Appearance, assemble
+from mifit.appearance.occlusion import Occlusion
 from mifit.progress import Progress, silent
-from mifit.render.arrays import aligned
-from mifit.render.bent import NormalView, Shade, vector
 from mifit.render.pairs import bend, bend_jacobian, conjugate_gradients, solve_blocks
 
 L1_FLOOR = 1e-4
 """Radians below which the L1 norm is rounded off: sqrt(c^2 + floor^2); its reweighting stays finite."""
 FACING = 0.05
 """Smallest cosine between a refined normal and the direction to a camera that measures it."""
+
+
+TexelShade = Callable[[Any, Any, int], Any]
+"""Normals, view directions (Dr.Jit vectors), number of the view -> radiance (Color3f) of the texels."""
+
+
+@dataclass(frozen=True)
+class NormalView:
+    """What one image says about N texels.
+
+    Attributes
+    ----------
+    colour : (N, 3)
+        Linear image colour.
+    weight : (N,)
+        Weight of the squared residual; 0 where the image doesn't measure the texel.
+    direction : (N, 3)
+        Unit vectors towards the camera.
+    normal : (N, 3), tangents : (N, 2, 3)
+        Base normals and tangents when the image was taken, world space.
+    """
+
+    colour: NDArray
+    weight: NDArray
+    direction: NDArray
+    normal: NDArray
+    tangents: NDArray
+
+
+def texel_shade(
+    appearance: Appearance,
+    diffuse: NDArray,
+    specular: NDArray,
+    views: Sequence[NormalView],
+    occlusion: Occlusion,
+    points: NDArray,
+) -> TexelShade:
+    """Shading of texels with albedos (N, 3) and (N,) by the model that stage 2 estimated them with.
+
+    ``occlusion`` and ``points`` (N, 3) are those of the base normals, the same for all views.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    albedo, specular_albedo = vector(mi.Color3f, diffuse), mi.Float(aligned(specular))
+    ambient = mi.Float(float(appearance.illumination.ambient))
+    dr.make_opaque(ambient)
+    shaders = [appearance.shader(view.normal, view.direction, occlusion, points) for view in views]
+
+    def shade(n: Any, v: Any, view: int) -> Any:
+        d, s = shaders[view](n, v)
+        return assemble(ambient, albedo, d, specular_albedo, s)
+
+    return shade
 
 
 @dataclass(frozen=True)
@@ -67,7 +122,7 @@ class NormalProblem:
         tangents: NDArray,
         neighbours: NDArray,
         views: Sequence[NormalView],
-        shade: Shade,
+        shade: TexelShade,
         laplacian_weight: float,
         magnitude_weight: float,
         huber: float = float("inf"),
@@ -360,7 +415,7 @@ class NormalProblem:
         return tuple(mi.Float(aligned(offsets[:, i])) for i in range(2))  # type: ignore[return-value]
 
 
-def residual_scale(views: Sequence[NormalView], shade: Shade) -> float:
+def residual_scale(views: Sequence[NormalView], shade: TexelShade) -> float:
     """Robust standard deviation of the residual's length at the base normals: 1.48 times the median."""
     import mitsuba as mi
 

@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance import models
+from mifit.appearance.illumination import Illumination, light_from
+from mifit.appearance.lobe import Lobe
 from mifit.config import MeshConfig
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
@@ -192,21 +195,25 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
         return None
     lighting = document["lighting"]
     order = int(lighting["order"])
-    key = lighting.get("key")
+    # Results of older versions have one light or none, and a lobe whose kind follows from the model.
+    lights = lighting["lights"] if "lights" in lighting else [lighting["key"]] if lighting.get("key") else []
+    model = models.get(str(lighting["shading_model"]))
+    fresnel = lighting.get("fresnel")
+    lobe = Lobe(
+        float(lighting["exponent"]),
+        None if fresnel is None else float(fresnel),
+        bool(lighting.get("normalized", model.normalized)),
+    )
+    radiance = _array(lighting["radiance"], (order * order, 3), "radiance")
     diffuse = _read_map(folder / "maps" / "diffuse.exr", 3)
     return ReflectanceEstimate(
         diffuse=diffuse,
         specular=_read_map(folder / "maps" / "specular.exr", 1, len(diffuse)),
         confidence=_read_map(folder / "maps" / "confidence.exr", 1, len(diffuse)),
-        radiance=_array(lighting["radiance"], (order * order, 3), "radiance"),
-        ambient=float(lighting["ambient"]),
-        exponent=float(lighting["exponent"]),
-        shading_model=str(lighting["shading_model"]),
+        illumination=Illumination(radiance, tuple(light_from(x) for x in lights), float(lighting["ambient"])),
+        lobe=lobe,
+        shading_model=model.name,
         report=_report(document, "reflectance"),
-        fresnel=None if lighting.get("fresnel") is None else float(lighting["fresnel"]),
-        key_direction=None if key is None else _array(key["direction"], (3,), "key direction"),
-        key_irradiance=None if key is None else _array(key["irradiance"], (3,), "key irradiance"),
-        key_radius=0.0 if key is None else float(key["radius"]),
     )
 
 

@@ -9,9 +9,11 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.illumination import Illumination
+from mifit.appearance.lobe import Lobe
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
-from mifit.core.sh import SHLighting, bands, cosine_coefficients, order_of
+from mifit.core.sh import SHLighting, bands, cosine_coefficients
 from mifit.core.subdivision import split_faces
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
@@ -103,10 +105,20 @@ class Result:
 
         A compact light is in it as far as the bands can show one.
         """
+        return self.illumination.smooth()
+
+    @property
+    def illumination(self) -> Illumination:
+        """What lights the face; without stage 2, the radiance whose irradiance gives stage 1's shading."""
         if self.reflectance is not None:
-            radiance, key = self.reflectance.radiance, self.reflectance.key
-            return SHLighting(radiance if key is None else radiance + key.coefficients(order_of(radiance)))
-        return SHLighting(self.geometry.shading * (math.pi / cosine_coefficients(3)[bands(3)])[:, None])
+            return self.reflectance.illumination
+        radiance = self.geometry.shading * (math.pi / cosine_coefficients(3)[bands(3)])[:, None]
+        return Illumination(radiance, ambient=self.geometry.ambient)
+
+    @property
+    def lobe(self) -> Lobe:
+        """The specular lobe; without stage 2 there is no specular albedo, and any will do."""
+        return Lobe(1.0) if self.reflectance is None else self.reflectance.lobe
 
     def index(self, timestep: int) -> int:
         """Position of a timestep in the per-timestep arrays; InputError when it was not fitted."""

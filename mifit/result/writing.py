@@ -17,7 +17,6 @@ from mifit.core.camera import Camera
 from mifit.core.estimate import Report
 from mifit.core.files import replacing, write_text
 from mifit.core.image import encode_png, write_image
-from mifit.core.keylight import KeyLight
 from mifit.core.mesh import vertex_normals
 from mifit.core.ply import write_ply
 from mifit.core.split_mesh import SplitMesh, split_at_seams, tangent_space_map
@@ -126,13 +125,12 @@ def _document(result: Result) -> dict[str, Any]:
     }
     if reflectance is not None:
         lighting |= {
-            "order": math.isqrt(len(reflectance.radiance)),
-            "radiance": reflectance.radiance.tolist(),
-            "ambient": float(reflectance.ambient),
-            "exponent": float(reflectance.exponent),
+            "order": reflectance.illumination.order,
+            "radiance": reflectance.illumination.radiance.tolist(),
+            "lights": [light.document() for light in reflectance.illumination.lights],
+            "ambient": float(reflectance.illumination.ambient),
             "shading_model": reflectance.shading_model,
-            "fresnel": reflectance.fresnel,
-            "key": _key_document(reflectance.key),
+            **reflectance.lobe.parameters(),
         }
     return _finite(
         {
@@ -182,12 +180,6 @@ def _source(source: str) -> str:
 def _camera_document(camera: Camera) -> dict[str, Any]:
     keys = ("name", "width", "height", "fx", "fy", "cx", "cy")
     return {k: getattr(camera, k) for k in keys} | {"world_to_camera": camera.world_to_camera.tolist()}
-
-
-def _key_document(key: KeyLight | None) -> dict[str, Any] | None:
-    if key is None:
-        return None
-    return {"direction": key.direction.tolist(), "radius": key.radius, "irradiance": key.irradiance.tolist()}
 
 
 def _report_document(report: Report) -> dict[str, Any]:

@@ -15,12 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance import models
+from mifit.appearance.image import assemble
+from mifit.appearance.lobe import Lobe
 from mifit.config import ReflectanceConfig
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate
 from mifit.progress import Progress, silent
 from mifit.stages.observations import Observations, Surface
-from mifit.stages.reflectance.choice import FRESNEL, lighting_problem
+from mifit.stages.reflectance.choice import lighting_problem
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingProblem, LightingSolution, solve_lighting
 
@@ -148,7 +151,8 @@ def _from_lighting(
     seen: Observations, albedo: NDArray, log_gain: NDArray, known: list[int], progress: Progress
 ) -> NDArray[np.float64]:
     """(C, 3) log gains with which lighting, gloss and albedo explain all cameras alike."""
-    forward = Forward("prefiltered", BANDS, EXPONENT, FRESNEL)
+    model = models.get("prefiltered")
+    forward = Forward.of(model, BANDS, Lobe(EXPONENT, model.fresnel))
     problem = lighting_problem(seen, forward, np.zeros((BANDS**2, 3)), albedo, ReflectanceConfig().robust)
     found: LightingSolution | None = None
     tried: list[NDArray] = []
@@ -156,7 +160,7 @@ def _from_lighting(
     for number in range(ROUNDS):
         progress("Camera gains", number, ROUNDS)
         corrected = replace(problem, colour=seen.colour / np.exp(log_gain)[seen.camera].astype(np.float32))
-        start = None if found is None else found.radiance
+        start = None if found is None else found.light
         found = solve_lighting(corrected, start, iterations=ITERATIONS, tolerance=TOLERANCE)
         left = _unexplained(seen, corrected, found, len(log_gain), known)
         tried.append(log_gain)
@@ -184,9 +188,9 @@ def _unexplained(
     seen: Observations, problem: LightingProblem, found: LightingSolution, cameras: int, known: list[int]
 ) -> NDArray[np.float64]:
     """(C, 3) robust mean log ratio of each camera's colours to the fitted ones, less the first camera's."""
-    light = found.radiance.astype(np.float32)
-    fitted = found.diffuse[:, None] * np.einsum("njk,kc->njc", problem.diffuse, light)
-    fitted += found.specular[:, None, None] * np.einsum("njk,kc->njc", problem.specular, light)
+    light = found.light.astype(np.float32)
+    diffuse, specular = (np.einsum("njk,kc->njc", t, light) for t in (problem.diffuse, problem.specular))
+    fitted = assemble(0.0, found.diffuse[:, None], diffuse, found.specular[:, None, None], specular)
     usable = _usable(seen) & (fitted.min(axis=2) > DARKEST)
     ratio = np.log(np.maximum(problem.colour, DARKEST)) - np.log(np.maximum(fitted, DARKEST))
     out = np.zeros((cameras, 3))

@@ -11,19 +11,18 @@ import numpy as np
 from mifit.config import ReflectanceConfig
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
 from mifit.core.mesh import interpolate
-from mifit.errors import ConvergenceError, InputError
+from mifit.errors import ConvergenceError
 from mifit.progress import Progress, silent
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.als import fit_als
 from mifit.stages.reflectance.descent import fit_adam
 from mifit.stages.reflectance.fill import blend_unseen, mirrored_coordinates
+from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.objective import energies
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
-
-TEXTURE_SIZES = (16, 4096)
 
 
 def infer_reflectance(
@@ -69,14 +68,14 @@ def infer_reflectance(
     """
     started = time.perf_counter()
     config = config or ReflectanceConfig()
-    _check(config)
     surface = Surface(capture, model, geometry, cameras, config.texture_size, trust=config.robust)
     mirrored = mirrored_coordinates(model, surface.texels) if config.symmetric_fill else None
     albedo = interpolate(geometry.vertex_albedo, model.faces, surface.texels.face, surface.texels.weights)
     albedo = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float32)
     solve = fit_adam if config.solver == "adam" else fit_als
-    fitted, choice, warnings = solve(surface, model.faces, albedo, config, seed, progress)
-    if not (np.isfinite(fitted.maps).all() and np.isfinite(fitted.radiance).all()):
+    fitted, choice, warnings = solve(surface, albedo, config, seed, progress)
+    illumination = fitted.appearance.illumination
+    if not (np.isfinite(fitted.maps).all() and np.isfinite(illumination.unknowns).all()):
         raise ConvergenceError("stage 2 (reflectance): the maps or the lighting are not finite; see the images' range")
     quality = surface.quality()
     diffuse, specular, confidence = blend_unseen(surface.texels, albedo, fitted.maps, quality, mirrored)
@@ -91,43 +90,17 @@ def infer_reflectance(
         "images": surface.image_count,
     }
     if config.solver == "adam" or not config.robust:
-        terms = energies(surface, fitted.forward, fitted.radiance, fitted.ambient, fitted.maps, albedo, config)
+        forward = Forward(fitted.appearance, surface.meshes)
+        light = illumination.unknowns, illumination.ambient
+        terms = energies(surface, forward, *light, fitted.maps, albedo, config)
         details["objective"] = {**terms, "total": sum(terms.values())}
-    key = fitted.forward.key
     outcome = "converged" if fitted.converged else "max_iterations"
     return ReflectanceEstimate(
         diffuse=diffuse,
         specular=specular,
         confidence=confidence,
-        radiance=fitted.radiance[: fitted.forward.order**2],
-        ambient=float(fitted.ambient),
-        exponent=float(fitted.forward.exponent),
-        shading_model=fitted.forward.model,
-        fresnel=fitted.forward.fresnel,
+        illumination=illumination,
+        lobe=fitted.appearance.lobe,
+        shading_model=fitted.appearance.model.name,
         report=Report(outcome, fitted.energies, time.perf_counter() - started, warnings, details),
-        key_direction=key.direction if key else None,
-        key_irradiance=fitted.radiance[-1] if key else None,
-        key_radius=float(key.radius) if key else 0.0,
     )
-
-
-def _check(config: ReflectanceConfig) -> None:
-    """Refuse settings out of range, by name."""
-    low, high = TEXTURE_SIZES
-    if not low <= config.texture_size <= high:
-        raise InputError(f"reflectance.texture_size: found {config.texture_size}, expected {low} to {high} texels")
-    if not 3 <= config.bands <= 10:
-        raise InputError(f"reflectance.bands: found {config.bands}, expected 3 to 10")
-    if config.exponent is not None and not 1.0 <= config.exponent <= 10000.0:
-        raise InputError(f"reflectance.exponent: found {config.exponent}, expected 1 to 10000, or none to estimate it")
-    if config.max_iterations < 1:
-        raise InputError(f"reflectance.max_iterations: found {config.max_iterations}, expected 1 or more")
-    if config.solver == "adam" and config.shading == "keyed":
-        raise InputError(
-            "reflectance.shading: found 'keyed' with solver 'adam', which has no search for the light's direction; "
-            "use solver 'als', or shading 'shadowed'"
-        )
-    for name in ("specular_difference_weight", "smoothness_weight", "specular_smoothness"):
-        value = getattr(config, name)
-        if not (np.isfinite(value) and value >= 0):
-            raise InputError(f"reflectance.{name}: found {value}, expected a number not below 0")

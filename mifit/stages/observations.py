@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.occlusion import OccludingMesh
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
@@ -167,6 +168,7 @@ class Surface:
         self.vertices = [np.asarray(v, dtype=np.float64) for v in geometry.vertices]
         self.normals = [vertex_normals(v, model.faces) for v in self.vertices]
         self.scenes = [SurfaceScene(v, model.faces) for v in self.vertices]
+        self.meshes = tuple(OccludingMesh(scene) for scene in self.scenes)
         texel_area = _texel_area(model.uv, model.faces_uv, size)
         self._kept: Observations | None = None
         self._images: list[_Image] = []
@@ -243,14 +245,6 @@ class Surface:
             good = np.where(seen.measured > 0, np.clip(cosine, 0.0, 1.0) * seen.right, 0.0)
             out[part] = np.minimum(good.sum(1) / max(1.0, 0.35 * self.image_count), 1.0)
         return out
-
-    def trace(self, order: int) -> tuple[NDArray[np.float32], ...]:
-        """(V, B*B) shadowed transfer vectors at the vertices, per timestep."""
-        from mifit.render.transfer import trace_transfer
-
-        return tuple(
-            trace_transfer(v, self.faces, v, n, order) for v, n in zip(self.vertices, self.normals, strict=True)
-        )
 
     def observe(self, texel: NDArray[np.int64]) -> Observations:
         """Read all images at some of the texels (positions in the `TexelMap`).

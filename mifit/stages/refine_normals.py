@@ -18,10 +18,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.image import Appearance
+from mifit.appearance.occlusion import SurfacePoints
 from mifit.config import NormalsConfig
 from mifit.core.bend import bend, tangent_plane, texel_neighbours
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
-from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.mesh import normalize
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
@@ -190,13 +192,11 @@ def frame_problem(
 
     Without a measured texel there is no optimisation: None.
     """
-    from mifit.render.bent import NormalView, material_shade
-    from mifit.render.gbuffer import SurfaceScene
-    from mifit.render.refine import NormalProblem, residual_scale
-    from mifit.render.transfer import trace_transfer
+    from mifit.render.refine import NormalProblem, NormalView, residual_scale, texel_shade
 
     rotation = geometry.rotation[0]
-    seen = Surface(capture, model, geometry, cameras, texels.size).observe(np.arange(len(texels.index)))
+    surface = Surface(capture, model, geometry, cameras, texels.size)
+    seen = surface.observe(np.arange(len(texels.index)))
     base = seen.normal[:, 0].astype(np.float64)
     rows = np.flatnonzero((seen.measured > 0).any(1))
     if not len(rows):
@@ -209,21 +209,11 @@ def frame_problem(
         NormalView(part.colour[:, j], part.measured[:, j], part.view[:, j], base[rows], tangents)
         for j in range(len(part.step))
     ]
-    traced = None
-    if reflectance.shading_model == "shadowed":
-        order = round(len(reflectance.radiance) ** 0.5)
-        vertices = geometry.vertices[0]
-        at_vertices = trace_transfer(
-            vertices, model.faces, vertices, vertex_normals(vertices, model.faces), order, seed=seed
-        )
-        at_texels = interpolate(at_vertices, model.faces, texels.face[rows], texels.weights[rows])
-        traced = [at_texels] * len(views)
     diffuse, specular = (texels.from_map(m)[rows] for m in (reflectance.diffuse, reflectance.specular))
-    lit = None
-    if reflectance.key is not None:
-        scene = SurfaceScene(geometry.vertices[0], model.faces)
-        lit = [scene.open_towards(part.point[:, 0], base[rows], reflectance.key.samples())] * len(views)
-    shade = material_shade(reflectance, diffuse, specular, views, traced, lit)
+    appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: texels.from_map(m)[rows]))
+    points = SurfacePoints(part.point[:, 0], base[rows], part.face, part.barycentric)
+    occlusion = appearance.trace(surface.meshes[0], points, seed)
+    shade = texel_shade(appearance, diffuse, specular, views, occlusion, points.position)
     patch = TexelMap(texels.size, texels.index[rows], texels.face[rows], texels.weights[rows])
     drawn = None
     if aim is not None:

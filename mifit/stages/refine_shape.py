@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.image import Appearance, assemble
+from mifit.appearance.occlusion import SurfacePoints
 from mifit.config import GeometryConfig, ShapeConfig
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
-from mifit.core.mesh import interpolate
 from mifit.errors import ConvergenceError
 from mifit.progress import Progress, silent
 from mifit.solve import minimize
@@ -144,29 +145,20 @@ def refine_shape(
 
 def _shade(surface: Surface, seen: Observations, reflectance: ReflectanceEstimate, specular: NDArray) -> Shade:
     """Shading of the points by stage 2's model; shadows are those of the normals at the start."""
-    from mifit.render.bent import shade_bent
-
-    traced = None
-    if reflectance.shading_model == "shadowed":
-        at_vertices = surface.trace(round(len(reflectance.radiance) ** 0.5))
-        traced = [interpolate(v, surface.faces, seen.face, seen.barycentric) for v in at_vertices]
-    lit = None
-    if reflectance.key is not None:
-        directions = reflectance.key.samples()
-        lit = [
-            scene.open_towards(seen.point[:, k], seen.normal[:, k], directions)
-            for k, scene in enumerate(surface.scenes)
-        ]
-    count = len(seen.texel)
-    white, black, nothing = np.ones((count, 3)), np.zeros((count, 3)), np.zeros(count)
+    appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: surface.texels.from_map(m)[seen.texel]))
+    ambient = reflectance.illumination.ambient
+    shadows = [
+        appearance.trace(mesh, SurfacePoints(seen.point[:, k], seen.normal[:, k], seen.face, seen.barycentric))
+        for k, mesh in enumerate(surface.meshes)
+    ]
 
     def shade(normals: NDArray, image: int) -> tuple[NDArray, NDArray]:
         step = seen.step[image]
-        shared = seen.normal[:, step], seen.view[:, image]
-        passed = None if traced is None else traced[step], None if lit is None else lit[step]
-        body = shade_bent(normals, *shared, white, nothing, reflectance, *passed).astype(np.float64)
-        rest = shade_bent(normals, *shared, black, specular, reflectance, *passed).astype(np.float64)
-        return body - reflectance.ambient, rest
+        diffuse, glossy = appearance.shade_bent(
+            normals, seen.normal[:, step], seen.view[:, image], shadows[step], seen.point[:, step]
+        )
+        rest = assemble(ambient, 0.0, diffuse, specular[:, None], glossy)
+        return diffuse.astype(np.float64), rest.astype(np.float64)
 
     return shade
 

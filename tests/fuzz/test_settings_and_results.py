@@ -156,7 +156,7 @@ def use(folder: Path, model: MorphableModel) -> None:
     for camera in found.cameras:
         assert camera.width >= 1 and np.isfinite(camera.world_to_camera).all()
     if found.reflectance is not None:
-        assert np.isfinite(found.reflectance.radiance).all() and np.isfinite(found.reflectance.diffuse).all()
+        assert np.isfinite(found.illumination.radiance).all() and np.isfinite(found.reflectance.diffuse).all()
 
 
 @bounded(150)

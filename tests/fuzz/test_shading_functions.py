@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mifit.render import shading
+from mifit.appearance import kernels, models
 from tests.fuzz.conftest import bounded
 
 AXES = np.array([[0, 0, 1], [0, 0, -1], [0, 1, 0], [0, -1, 0], [1, 0, 0], [-1, 0, 0]], dtype=np.float64)
@@ -32,7 +32,7 @@ values = st.one_of(st.sampled_from([0.0, 1.0, -1.0, 1e-30, 1e6, -1e6, 1e-6]), st
 @pytest.mark.slow
 @bounded(24, deadline=None)  # the first of a kind compiles its kernels
 @given(
-    model=st.sampled_from(shading.MODELS),
+    model=st.sampled_from(models.names()),
     order=st.sampled_from([1, 3]),
     exponent=st.sampled_from([1.0, 1.5, 5.0, 200.0, 1e4]),
     fresnel=st.sampled_from([None, 0.0, 8.0]),
@@ -65,7 +65,9 @@ def test_shade(
         traced = [mi.Float(rng.choice([0.0, 0.3, -0.1], len(i)).astype(np.float32)) for _ in range(order * order)]
     inputs = [n, v, m, *coefficients, *(traced or [])]
     dr.enable_grad(inputs)
-    diffuse, specular = shading.shade(n, v, coefficients, m, model, traced=traced, fresnel=fresnel)
+    chosen = models.get(model)
+    lobe = kernels.prepare_exponent(m, order, chosen.normalized, fresnel if chosen.normalized else None)
+    diffuse, specular = chosen.shade(n, v, lobe, coefficients, traced)
     for part in (diffuse, specular):
         assert np.isfinite(np.array(part)).all()
     dr.backward(dr.sum(diffuse + specular, axis=None))
@@ -86,7 +88,7 @@ def test_dominant_direction(variant: str, order: int, lighting: list[float], see
     numbers = np.random.default_rng(seed).choice(np.array(lighting), (order * order, 3)).astype(np.float32)
     coefficients = [mi.Color3f(*(dr.opaque(mi.Float, float(x)) for x in row)) for row in numbers]
     dr.enable_grad(coefficients)
-    d = shading.dominant_direction(coefficients)
+    d = kernels.dominant_direction(coefficients)
     assert abs(np.linalg.norm(np.array(d)) - 1) < 1e-3
     if order > 1:  # with one band the direction depends on nothing
         dr.backward(d.x + 2.0 * d.y + 3.0 * d.z)

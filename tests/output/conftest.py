@@ -7,6 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mifit.appearance import models
+from mifit.appearance.illumination import Illumination
+from mifit.appearance.lobe import Lobe
 from mifit.config import MeshConfig
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
@@ -98,7 +101,13 @@ def ball_result(size: int = 32, shading_model: str = "prefiltered") -> Reconstru
     specular = texels.to_map(np.full(len(texels.index), 0.15, np.float32))
     confidence = texels.to_map(np.ones(len(texels.index), np.float32))
     reflectance = ReflectanceEstimate(
-        diffuse, specular, confidence, radiance, 0.02, 12.0, shading_model, Report("max_iterations", curve, 2.0)
+        diffuse,
+        specular,
+        confidence,
+        Illumination(radiance, ambient=0.02),
+        Lobe(12.0, normalized=models.get(shading_model).normalized),
+        shading_model,
+        Report("max_iterations", curve, 2.0),
     )
     normals = []
     for v, r in zip(vertices, rotation, strict=True):

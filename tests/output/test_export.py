@@ -98,7 +98,8 @@ def test_gltf_material_holds_the_maps(ball, glb):
 
 def test_gltf_takes_the_fresnel_rise_over(ball, tmp_path):
     """Schlick's form in both: C_s along the normal, C_s (1 + fresnel) at grazing angles."""
-    export(replace(ball, reflectance=replace(ball.reflectance, fresnel=4.0)), "glb", tmp_path / "a.glb")
+    reflectance = replace(ball.reflectance, lobe=replace(ball.lobe, fresnel=4.0))
+    export(replace(ball, reflectance=reflectance), "glb", tmp_path / "a.glb")
     specular = read_glb(tmp_path / "a.glb")[0]["materials"][0]["extensions"]["KHR_materials_specular"]
     assert specular["specularFactor"] == pytest.approx(0.15 * 5)
     assert specular["specularFactor"] * 0.04 * specular["specularColorFactor"][0] == pytest.approx(0.15)

@@ -30,7 +30,9 @@ def same(a, b):
     """Two records are equal, arrays to the last bit."""
     for field in dataclasses.fields(a):
         x, y = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(x, np.ndarray):
+        if dataclasses.is_dataclass(x):
+            same(x, y)
+        elif isinstance(x, np.ndarray):
             np.testing.assert_array_equal(x, y, err_msg=field.name)
         else:
             assert x == y, field.name

@@ -11,6 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import mifit
+from mifit.appearance.illumination import Illumination
+from mifit.appearance.lobe import Lobe
 from mifit.core.camera import Camera
 from mifit.core.estimate import NormalsEstimate
 from mifit.core.image import to_8_bit, write_image
@@ -29,7 +31,7 @@ from tests.output.test_views import smooth_environment
 @pytest.fixture(scope="module")
 def flat(ball):
     """The ball without ambient term, which path tracing doesn't have."""
-    return replace(ball, reflectance=replace(ball.reflectance, ambient=0.0))
+    return replace(ball, reflectance=replace(ball.reflectance, illumination=replace(ball.illumination, ambient=0.0)))
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +60,7 @@ def test_path_tracing_a_convex_diffuse_ball_is_local_shading(flat):
     tilt = Rotation.from_euler("y", -10, degrees=True).as_matrix().astype(np.float32)
     radiance = np.zeros((9, 3))
     radiance[0], radiance[3] = 3.0, -1.7  # Y_1,1 = -k x
-    flat = replace(flat, reflectance=replace(flat.reflectance, radiance=radiance), normals=None)
+    flat = replace(flat, reflectance=replace(flat.reflectance, illumination=Illumination(radiance)), normals=None)
     base = np.stack([surface_maps(flat, t).normal for t in flat.timesteps])
     tilted = replace(flat, normals=NormalsEstimate(flat.timesteps, base @ tilt, flat.geometry.report))
     local = tilted.render(camera, 0, method="diffuse")
@@ -75,7 +77,7 @@ def test_path_tracing_a_convex_diffuse_ball_is_local_shading(flat):
 
 @pytest.mark.parametrize(("exponent", "fresnel"), [(12.0, None), (150.0, 8.0)])
 def test_specular_light_of_both_integrators_is_alike(flat, exponent, fresnel):
-    flat = replace(flat, reflectance=replace(flat.reflectance, exponent=exponent, fresnel=fresnel))
+    flat = replace(flat, reflectance=replace(flat.reflectance, lobe=Lobe(exponent, fresnel)))
     camera = ball_camera(angle=10)
     glint = {}
     for integrator, samples in (("local", 2), ("path", 512)):

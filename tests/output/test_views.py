@@ -59,7 +59,7 @@ def test_relighting_projects_the_environment_and_keeps_the_mean(ball):
     np.testing.assert_allclose(ratio, ratio[0, 0], rtol=1e-3)
     luminance = np.array([0.2126, 0.7152, 0.0722])
     assert lit.lighting.coefficients[0] @ luminance == pytest.approx(ball.lighting.coefficients[0] @ luminance)
-    assert lit.reflectance.ambient == pytest.approx(ball.reflectance.ambient)
+    assert lit.illumination.ambient == pytest.approx(ball.illumination.ambient)
     plain = ball.relight(environment, exposure=1.0)
     np.testing.assert_allclose(plain.lighting.coefficients, expected, rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(plain.environment, environment)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import mifit
-from mifit.core import blinn_phong, sh
+from mifit.appearance import reference
+from mifit.core import sh
 
 EXPONENTS = (1.0, 5.0, 50.0, 1000.0)
 ANGLES = (0.0, 45.0, 80.0)
@@ -96,7 +97,7 @@ def test_eval_is_the_float64_form(exponent: float, normalized: bool) -> None:
     wi, wo = hemisphere(500), hemisphere(500, 1)
     plugin = bsdf(diffuse_reflectance=0.3, specular_reflectance=0.6, exponent=exponent, normalized=normalized)
     value = plugin.eval(mi.BSDFContext(), interaction(wi, 500), mi.Vector3f(wo.T.astype(np.float32)))
-    lobe = blinn_phong.specular_brdf(wo, wi, np.array([0.0, 0, 1]), exponent, normalized)
+    lobe = reference.specular_brdf(wo, wi, np.array([0.0, 0, 1]), exponent, normalized)
     expected = (0.3 / np.pi + 0.6 * lobe) * wo[:, 2]
     assert np.abs(np.array(value)[0] - expected).max() < 3e-4 * expected.max()
 
@@ -113,7 +114,7 @@ def test_the_carried_lobe_is_the_float64_form(exponent: float, normalized: bool)
         diffuse_reflectance=0.3, specular_reflectance=0.05, exponent=exponent, normalized=normalized, fresnel=8.0
     )
     value = plugin.eval(mi.BSDFContext(), interaction(wi, 500), mi.Vector3f(wo.T.astype(np.float32)))
-    lobe = blinn_phong.carried_brdf(wo, wi, np.array([0.0, 0, 1]), exponent, 8.0, normalized)
+    lobe = reference.carried_brdf(wo, wi, np.array([0.0, 0, 1]), exponent, 8.0, normalized)
     expected = (0.3 / np.pi + 0.05 * lobe) * wo[:, 2]  # 9 * 0.05 + 0.3 < 1: the rise is never stopped
     assert np.abs(np.array(value)[0] - expected).max() < 1e-3 * expected.max()
 
@@ -123,10 +124,10 @@ def test_the_carried_lobe_rises_as_fitted() -> None:
     d, w = sh.quadrature(256)
     for angle in (0.0, 30.0, 50.0, 60.0):
         cosine = np.cos(np.radians(angle))
-        lobe = blinn_phong.carried_brdf(d, np.array(direction(angle)), np.array([0.0, 0, 1]), 150.0, 8.0)
+        lobe = reference.carried_brdf(d, np.array(direction(angle)), np.array([0.0, 0, 1]), 150.0, 8.0)
         albedo = float((w * lobe * np.maximum(d[:, 2], 0)).sum())
         assert albedo == pytest.approx(1 + 8 * (1 - cosine) ** 5, rel=0.05)
-        plain = blinn_phong.specular_brdf(d, np.array(direction(angle)), np.array([0.0, 0, 1]), 150.0)
+        plain = reference.specular_brdf(d, np.array(direction(angle)), np.array([0.0, 0, 1]), 150.0)
         if angle >= 50:
             assert albedo > 1.8 * float((w * plain * np.maximum(d[:, 2], 0)).sum())
 
@@ -252,7 +253,7 @@ def test_the_correction_tilts_the_normal() -> None:
     wi, wo = hemisphere(200), hemisphere(200, 1)
     plugin = bsdf(diffuse_reflectance=0.5, specular_reflectance=0.3, exponent=9.0, normal_correction=raw(*slopes, 0))
     value = plugin.eval(mi.BSDFContext(), interaction(wi, 200), mi.Vector3f(wo.T.astype(np.float32)))
-    lobe = blinn_phong.specular_brdf(wo, wi, n, 9.0)
+    lobe = reference.specular_brdf(wo, wi, n, 9.0)
     # The lobe is zero where either side is below the corrected normal; the base only where the light is.
     expected = np.where(wo @ n > 0, (0.5 / np.pi + 0.3 * lobe) * (wo @ n), 0.0)
     assert ((wi @ n <= 0) & (wo @ n > 0)).any()

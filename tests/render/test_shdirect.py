@@ -105,8 +105,8 @@ def test_the_prefiltered_lobe_is_the_path_traced_one(lobe: dict, tolerance: floa
 
 
 def test_the_rise_is_that_of_local_shading() -> None:
-    """One pixel after the other, `shdirect` and ``render.local`` agree on the carried lobe."""
-    from mifit.render.local import shade_points
+    """One pixel after the other, `shdirect` and local shading agree on the carried lobe."""
+    from tests.shaded import shade_points
 
     bsdf = {
         "type": "blinnphong",
@@ -351,7 +351,7 @@ def test_a_head_with_shadows_is_three_times_closer(ict_path, shared) -> None:
 def test_transfer_vectors_are_traced_once_per_geometry(monkeypatch: pytest.MonkeyPatch) -> None:
     import mitsuba as mi
 
-    from mifit.render import transfer
+    from mifit.appearance import occlusion as transfer
 
     scene = make_scene(ball(), {"type": "blinnphong"}, LIGHTS["positive"], model="shadowed", samples=4)
     calls = []

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mifit.appearance.illumination import Illumination
+from mifit.appearance.lobe import Lobe
 from mifit.capture.capture import Frame
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
@@ -13,7 +15,7 @@ from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import rasterize_uv, sample_map
 from mifit.morphable import MorphableModel
 from mifit.render.gbuffer import SurfaceScene
-from mifit.render.local import shade_points
+from tests.shaded import shade_points
 
 SIZE = 96
 DONE = Report("converged")
@@ -97,7 +99,13 @@ def build(model_name: str = "prefiltered", noise: float = 0.0, timesteps: int = 
     diffuse *= (1 + 0.2 * np.sin(9 * row + 4 * column))[..., None].astype(np.float32)
     specular = np.full((SIZE, SIZE), 0.1, np.float32)
     reflectance = ReflectanceEstimate(
-        diffuse, specular, texels.mask.astype(np.float32), radiance, 0.01, 8.0, model_name, DONE
+        diffuse,
+        specular,
+        texels.mask.astype(np.float32),
+        Illumination(radiance, ambient=0.01),
+        Lobe(8.0),
+        model_name,
+        DONE,
     )
     geometry = GeometryEstimate(
         tuple(range(timesteps)),

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from stages.normal_scene import camera, dome_model
 
+from mifit.appearance.occlusion import trace_transfer
 from mifit.capture.capture import Frame
 from mifit.core.estimate import GeometryEstimate, Report
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import sample_map
 from mifit.render.gbuffer import SurfaceScene
-from mifit.render.local import shade_points
-from mifit.render.transfer import trace_transfer
+from tests.shaded import shade_points
 
 SIZE = 48
 EXPONENT = 60.0
@@ -117,7 +117,7 @@ def render(scene, name, t, diffuse, specular, radiance, exponent, shading, fresn
     traced = None
     if shading == "shadowed":
         smooth = vertex_normals(vertices, model.faces)
-        traced = trace_transfer(vertices, model.faces, vertices, smooth, round(len(radiance) ** 0.5))
+        traced = trace_transfer(SurfaceScene(vertices, model.faces), vertices, smooth, round(len(radiance) ** 0.5))
         traced = interpolate(traced, model.faces, face, weights)
     d, s = shade_points(normal, toward, x, y, radiance, ambient, exponent, shading, traced, fresnel=fresnel)
     image = np.zeros((*mask.shape, 3), np.float32)

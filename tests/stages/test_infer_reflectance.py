@@ -52,11 +52,11 @@ def held_out(scene, estimate):
             t,
             estimate.diffuse,
             estimate.specular,
-            estimate.radiance,
-            estimate.exponent,
+            estimate.illumination.radiance,
+            estimate.lobe.exponent,
             estimate.shading_model,
-            estimate.fresnel,
-            estimate.ambient,
+            estimate.lobe.fresnel,
+            estimate.illumination.ambient,
         )
         true = scene.frame("third", t).image
         total.append(((image - true)[mask]) ** 2)
@@ -74,7 +74,7 @@ def test_maps_are_finite_in_the_box_and_confident_where_seen(found):
     for image in (found.diffuse, found.specular, found.confidence):
         assert image.dtype == np.float32 and np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
     assert found.diffuse.shape == (SIZE, SIZE, 3) and found.specular.shape == (SIZE, SIZE)
-    assert found.radiance.shape == (16, 3)
+    assert found.illumination.radiance.shape == (16, 3)
 
 
 def test_the_gauge_is_the_models_mean_albedo(dome, found):
@@ -83,7 +83,7 @@ def test_the_gauge_is_the_models_mean_albedo(dome, found):
     other = infer(dome, vertex_albedo=dome.geometry.vertex_albedo * np.float32(0.7))
     ratio = other.diffuse[found.confidence > 0.9].mean() / found.diffuse[found.confidence > 0.9].mean()
     assert abs(ratio / 0.7 - 1) < 0.03
-    np.testing.assert_allclose(other.radiance[0] * 0.7, found.radiance[0], rtol=0.05)
+    np.testing.assert_allclose(other.illumination.radiance[0] * 0.7, found.illumination.radiance[0], rtol=0.05)
 
 
 @pytest.mark.slow
@@ -92,7 +92,7 @@ def test_exposure_goes_into_the_lighting(dome, exposure):
     scaled = dome.changed(lambda f: replace(f, image=f.image * np.float32(exposure)))
     config = replace(CONFIG, texture_size=24, robust=False, smoothness_weight=0.0)
     other, plain = infer(scaled, config), infer(dome, config)
-    np.testing.assert_allclose(other.radiance[0] / exposure, plain.radiance[0], rtol=0.02)
+    np.testing.assert_allclose(other.illumination.radiance[0] / exposure, plain.illumination.radiance[0], rtol=0.02)
     good = plain.confidence > 0.9
     np.testing.assert_allclose(other.diffuse[good].mean(), plain.diffuse[good].mean(), rtol=0.02)
 
@@ -121,13 +121,13 @@ def test_bad_pixels_change_little(dome, found):
 
 def test_two_equal_views_still_end(dome):
     twin = infer(dome, cameras=("left", "left"))
-    assert np.isfinite(twin.diffuse).all() and np.isfinite(twin.radiance).all()
+    assert np.isfinite(twin.diffuse).all() and np.isfinite(twin.illumination.radiance).all()
 
 
 def test_the_same_seed_gives_the_same_result(dome, found):
     again = infer(dome)
     np.testing.assert_array_equal(again.diffuse, found.diffuse)
-    np.testing.assert_array_equal(again.radiance, found.radiance)
+    np.testing.assert_array_equal(again.illumination.radiance, found.illumination.radiance)
 
 
 def test_auto_says_what_it_chose_and_why(dome):

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from stages.reflectance_scene import EXPONENT, SIZE, TurningDome, turning_dome
 
+from mifit.appearance.illumination import DistantLight, disc
+from mifit.appearance.occlusion import trace_transfer
+from mifit.appearance.reference import specular_brdf
 from mifit.config import ReflectanceConfig
-from mifit.core.blinn_phong import specular_brdf
-from mifit.core.keylight import KeyLight, disc
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import sample_map
 from mifit.errors import InputError
 from mifit.render.gbuffer import SurfaceScene
-from mifit.render.local import key_columns, shade_points
-from mifit.render.transfer import trace_transfer
 from mifit.stages.infer_reflectance import infer_reflectance
+from tests.shaded import light_columns, shade_points
 
 CONFIG = ReflectanceConfig(texture_size=SIZE, shading="keyed", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
-KEY = KeyLight(normalize(np.array([0.75, 0.2, 0.6])), 0.02, np.array([4.0, 3.6, 3.0]))
+KEY = DistantLight(normalize(np.array([0.75, 0.2, 0.6])), 0.02, np.array([4.0, 3.6, 3.0]))
 
 
 def test_disc_is_even_and_centred():
@@ -56,9 +56,10 @@ def test_columns_are_cosine_and_lobe_at_the_lights_directions(variant):
     n = normalize(rng.normal(size=(200, 3)))
     v = normalize(n + 0.6 * rng.normal(size=(200, 3)))
     v = np.where((n * v).sum(1, keepdims=True) > 0, v, -v)
-    directions = disc(KEY.direction, 0.1)
+    light = replace(KEY, radius=0.1)
+    directions = light.samples()
     seen = rng.integers(0, 1 << 16, 200).astype(np.uint32)
-    matt, glossy = key_columns(n, v, seen, directions, EXPONENT)
+    matt, glossy = light_columns(n, v, seen, light, EXPONENT)
     open_sky = (seen[:, None] >> np.arange(16)) & 1
     cosine = np.maximum(n @ directions.T, 0.0)
     brdf = np.stack([specular_brdf(np.broadcast_to(d, n.shape), v, n, EXPONENT) for d in directions], axis=1)
@@ -69,13 +70,13 @@ def test_columns_are_cosine_and_lobe_at_the_lights_directions(variant):
 @pytest.mark.parametrize("fresnel", [None, 8.0])
 def test_the_lobe_agrees_with_the_prefiltered_one(variant, fresnel):
     """A wide dim disc is the same light as its spherical harmonics, seen through a lobe that is as smooth."""
-    light = KeyLight(KEY.direction, 0.6, np.ones(3))
+    light = DistantLight(KEY.direction, 0.6, np.ones(3))
     rng = np.random.default_rng(1)
     n = normalize(light.direction + 0.4 * rng.normal(size=(300, 3)))
     v = normalize(n + 0.3 * rng.normal(size=(300, 3)))
     ones = np.ones((300, 3))
     _, smooth = shade_points(n, v, ones, ones[:, 0], light.coefficients(10), 0.0, 12.0, "prefiltered", fresnel=fresnel)
-    _, sharp = key_columns(n, v, np.full(300, 0xFFFF, np.uint32), light.samples(), 12.0, fresnel)
+    _, sharp = light_columns(n, v, np.full(300, 0xFFFF, np.uint32), light, 12.0, fresnel)
     assert np.abs(sharp - smooth[:, 0]).max() < 0.06 * sharp.max()
 
 
@@ -112,15 +113,15 @@ def walled_dome() -> TurningDome:
         normal = normalize(interpolate(vertex_normals(v, faces), faces, face, weights))
         toward = normalize(view.position - point)
         open_sky = scene.open_towards(point, normal, KEY.samples())
-        matt, glossy = key_columns(normal, toward, open_sky, KEY.samples(), EXPONENT, dome.fresnel)
+        matt, glossy = light_columns(normal, toward, open_sky, KEY, EXPONENT, dome.fresnel)
         uv = interpolate(model.uv, model.faces_uv, face, weights)
         x, y = sample_map(dome.diffuse, uv), sample_map(dome.specular, uv)
-        traced = interpolate(trace_transfer(v, faces, v, vertex_normals(v, faces), 4), faces, face, weights)
+        traced = interpolate(trace_transfer(scene, v, vertex_normals(v, faces), 4), faces, face, weights)
         body, glint = shade_points(
             normal, toward, x, y, dome.radiance, 0.0, EXPONENT, "shadowed", traced, fresnel=dome.fresnel
         )
         image = np.full_like(frame.image, 0.1)
-        sharp = (x * matt[:, None] + y[:, None] * glossy[:, None]) * KEY.irradiance.astype(np.float32)
+        sharp = (x * matt[:, None] + y[:, None] * glossy[:, None]) * KEY.colour.astype(np.float32)
         image[hit] = body + glint + sharp
         dome.frames[name, t] = replace(frame, image=image)
     return dome
@@ -138,11 +139,11 @@ def found(walled):
 
 def test_a_compact_light_is_found(walled, found):
     assert found.report.details["shading"]["chosen"] == "keyed" and found.shading_model == "shadowed"
-    key = found.key
+    (key,) = found.illumination.lights
     assert np.degrees(np.arccos(key.direction @ KEY.direction)) < 1.0
     good = found.confidence > 0.9
     gauge = walled.diffuse[good].mean() / found.diffuse[good].mean()
-    np.testing.assert_allclose(key.irradiance / gauge, KEY.irradiance, rtol=0.1)
+    np.testing.assert_allclose(key.colour / gauge, KEY.colour, rtol=0.1)
     residuals = found.report.details["shading"]["residuals"]
     assert residuals["keyed"] < 0.3 * residuals["shadowed"]
 
@@ -156,11 +157,10 @@ def test_auto_takes_it_where_it_explains_the_images(walled):
 def test_without_a_compact_light_none_is_made_up(variant):
     dome = turning_dome(steps=2)
     estimate = infer_reflectance(dome, dome.model, dome.geometry, ("left", "right"), replace(CONFIG, texture_size=24))
-    assert estimate.key is None
+    assert estimate.illumination.lights == ()
     assert estimate.report.details["shading"]["why"] == "no compact light explains enough"
 
 
 def test_adam_refuses_it(walled):
-    config = replace(CONFIG, solver="adam")
     with pytest.raises(InputError, match="use solver 'als'"):
-        infer_reflectance(walled, walled.model, walled.geometry, ("left",), config)
+        replace(CONFIG, solver="adam")

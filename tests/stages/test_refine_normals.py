@@ -66,9 +66,8 @@ def sphere_problem(w1=1e-3 * 127.5 / 255**2, w2=1e-3, huber=float("inf"), size=9
     import drjit as dr
     import mitsuba as mi
 
-    from mifit.render import shading
-    from mifit.render.bent import NormalView
-    from mifit.render.refine import NormalProblem
+    from mifit.appearance import kernels
+    from mifit.render.refine import NormalProblem, NormalView
 
     texels, base, true = bumpy_sphere(size)
     radiance = 0.4 * np.random.default_rng(seed).normal(size=(9, 3))
@@ -79,7 +78,7 @@ def sphere_problem(w1=1e-3 * 127.5 / 255**2, w2=1e-3, huber=float("inf"), size=9
     dr.make_opaque(coefficients)
 
     def shade(n, v, view):
-        return shading.radiance(shading.diffuse_transfer(n, 3), coefficients)
+        return kernels.radiance(kernels.diffuse_transfer(n, 3), coefficients)
 
     tangents = tangent_plane(base)
     view = NormalView(colour, np.ones(len(base)), base, base, tangents)

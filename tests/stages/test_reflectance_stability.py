@@ -10,13 +10,15 @@ import pytest
 from stages.reflectance_scene import EXPONENT, turning_dome
 from stages.reflectance_scene import SIZE as FINE
 
+from mifit.appearance import models
+from mifit.appearance.illumination import Illumination
+from mifit.appearance.lobe import Lobe, lobe_table
+from mifit.appearance.models.paper import GUARD
 from mifit.config import ReflectanceConfig
-from mifit.core import blinn_phong, sh
+from mifit.core import sh
 from mifit.core.mesh import interpolate
 from mifit.core.uv import sample_map
 from mifit.errors import InputError
-from mifit.render.local import shade_points
-from mifit.render.shading import GUARD
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance import choice
@@ -24,6 +26,7 @@ from mifit.stages.reflectance.choice import fit_lighting, lighting_problem
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingPriors, solve_lighting
 from mifit.stages.reflectance.maps import Smoothness, TexelSystems, laplacian, solve_maps
+from tests.shaded import shade_points
 
 SIZE = 24
 CONFIG = ReflectanceConfig(texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
@@ -53,7 +56,9 @@ def errors(scene, estimate, exposure=1.0, least_seen=0.3):
     good = estimate.confidence > 0.9
     assert good.mean() > least_seen
     scale = diffuse[good].mean() / estimate.diffuse[good].mean()
-    light = np.linalg.norm(estimate.radiance / (scale * exposure) - scene.radiance) / np.linalg.norm(scene.radiance)
+    light = np.linalg.norm(estimate.illumination.radiance / (scale * exposure) - scene.radiance) / np.linalg.norm(
+        scene.radiance
+    )
     return rms(scale * estimate.diffuse - diffuse, good), rms(scale * estimate.specular - specular, good), light
 
 
@@ -66,7 +71,8 @@ def problem_of(scene, shading="prefiltered", bands=4, exponent=EXPONENT, fresnel
     surface = Surface(scene, scene.model, scene.geometry, ("left", "right"), size)
     seen = surface.observe(surface.sample(10**6, np.random.default_rng(0)))
     albedo = interpolate(scene.geometry.vertex_albedo, scene.model.faces, seen.face, seen.barycentric)
-    return surface, seen, Forward(shading, bands, exponent, fresnel), albedo
+    model = models.get(shading)
+    return surface, seen, Forward.of(model, bands, Lobe(exponent, fresnel, model.normalized), surface.meshes), albedo
 
 
 @pytest.mark.slow
@@ -78,7 +84,7 @@ def test_lighting_has_one_minimum_whatever_the_specular_start(dome):
     ends = [solve_lighting(problem, specular=s, iterations=100, tolerance=1e-5) for s in (0.05, 0.0, 1.0, random)]
     for end in ends[1:]:
         assert abs(end.unexplained / ends[0].unexplained - 1) < 0.05
-        assert np.linalg.norm(end.radiance - ends[0].radiance) < 0.02 * np.linalg.norm(ends[0].radiance)
+        assert np.linalg.norm(end.light - ends[0].light) < 0.02 * np.linalg.norm(ends[0].light)
         assert rms(end.specular - ends[0].specular) < 0.01 and rms(end.diffuse - ends[0].diffuse) < 0.01
 
 
@@ -116,7 +122,11 @@ def test_exposure_changes_the_lighting_alone(dome, exposure):
     one, other = infer(dome, plain), infer(scaled, plain)
     good = one.confidence > 0.9
     assert rms(one.diffuse - other.diffuse, good) < 2e-3 and rms(one.specular - other.specular, good) < 5e-3
-    np.testing.assert_allclose(other.radiance / exposure, one.radiance, atol=0.02 * np.abs(one.radiance).max())
+    np.testing.assert_allclose(
+        other.illumination.radiance / exposure,
+        one.illumination.radiance,
+        atol=0.02 * np.abs(one.illumination.radiance).max(),
+    )
 
 
 def test_pixels_that_are_not_numbers_lend_their_neighbours_nothing(dome, found):
@@ -138,13 +148,15 @@ def test_an_image_that_is_not_a_number_counts_for_nothing(dome):
         frame = spoiled.frames[key]
         spoiled.frames[key] = replace(frame, image=np.full_like(frame.image, np.nan))
     estimate = infer(spoiled)
-    assert np.isfinite(estimate.radiance).all()
+    assert np.isfinite(estimate.illumination.radiance).all()
     assert errors(dome, estimate)[0] < 0.02
 
 
 def test_two_equal_views_are_worth_one(dome):
     twins, one = infer(dome, cameras=("left", "left")), infer(dome, cameras=("left",))
-    np.testing.assert_allclose(twins.radiance, one.radiance, atol=0.02 * np.abs(one.radiance).max())
+    np.testing.assert_allclose(
+        twins.illumination.radiance, one.illumination.radiance, atol=0.02 * np.abs(one.illumination.radiance).max()
+    )
     good = one.confidence > 0.9
     assert rms(twins.diffuse - one.diffuse, good) < 0.005 and rms(twins.specular - one.specular, good) < 0.01
 
@@ -179,7 +191,7 @@ def test_saturated_images(dome, level):
     estimate = infer(clipped)
     for image in (estimate.diffuse, estimate.specular):
         assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
-    assert np.isfinite(estimate.radiance).all()
+    assert np.isfinite(estimate.illumination.radiance).all()
     if level == 0.6:
         assert errors(dome, estimate, least_seen=0.2)[0] < 0.02
 
@@ -203,7 +215,7 @@ def test_prefiltered_shading_in_float32_is_that_in_float64(variant, order, expon
     radiance = np.random.default_rng(1).normal(size=(order**2, 3)) / (1 + sh.bands(order)[:, None])
     cosine = (n * v).sum(1)
     mirror = 2 * cosine[:, None] * n - v
-    moments = blinn_phong.lobe_table(order)(cosine if fresnel is None else np.ones_like(cosine), exponent)
+    moments = lobe_table(order)(cosine if fresnel is None else np.ones_like(cosine), exponent)
     if fresnel is None:
         axis = mirror + moments[1][:, None] * (n - mirror)
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
@@ -249,7 +261,7 @@ def recover(scene, shading, bands, exponent, fresnel, monkeypatch):
         forward = replace(forward, traced=surface.trace(bands), faces=scene.model.faces)
     config = replace(CONFIG, shading=shading, bands=bands, exponent=exponent)
     light = fit_lighting(seen, forward, albedo, config, 100)
-    shade, glint = forward.shade(seen, light.radiance)
+    shade, glint = forward.shade(seen, light.light)
     weight = seen.measured[..., None] * np.ones(3, np.float32)
     colour = seen.colour - np.float32(light.ambient)
     systems = TexelSystems.accumulate(colour, weight, shade, glint, surface.pairs, 0.1)
@@ -279,7 +291,7 @@ def test_own_shading_is_recovered(variant, shading, monkeypatch):
     scene = turning_dome(shading, fresnel, exponent=exponent, depth=2.0)  # a shallow one shows too few normals
     light, maps, confidence = recover(scene, shading, bands, exponent, fresnel, monkeypatch)
     estimate = SimpleNamespace(
-        diffuse=maps[..., :3], specular=maps[..., 3], confidence=confidence, radiance=light.radiance
+        diffuse=maps[..., :3], specular=maps[..., 3], confidence=confidence, illumination=Illumination(light.light)
     )
     for value, limit in zip(errors(scene, estimate), RECOVERED, strict=True):
         assert value < limit

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mifit.core.blinn_phong import EXPONENT_MAX, EXPONENT_MIN
+from mifit.appearance.lobe import EXPONENT_MAX, EXPONENT_MIN
 
 
 def make() -> type:
@@ -12,7 +12,7 @@ def make() -> type:
     import drjit as dr
     import mitsuba as mi
 
-    from mifit.render.shading import carried_lobe, fresnel_rise, normalization
+    from mifit.appearance.kernels import carried_lobe, fresnel_factor, normalization
 
     class BlinnPhong(mi.BSDF):
         r"""
@@ -94,7 +94,7 @@ def make() -> type:
             self._set_flags()
 
         def parameters(self, si: mi.SurfaceInteraction3f, active: Any = True) -> tuple[Any, Any, Any, Any, Any]:
-            """Diffuse and specular albedo, exponent, rise (or None) and corrected local normal at a surface point."""
+            """Both albedos, exponent, Fresnel factor (or None) and corrected local normal at a surface point."""
             diffuse = self.diffuse.eval(si, active)
             specular = self.specular.eval(si, active)
             if self.normalized:
@@ -108,11 +108,11 @@ def make() -> type:
             n = mi.Normal3f(dr.normalize(mi.Vector3f(slopes.x, slopes.y, 1.0)))
             return diffuse, specular, exponent, fresnel, n
 
-        def risen(self, diffuse: Any, specular: Any, fresnel: Any, cosine: Any) -> Any:
-            """Specular albedo with its rise at a cosine, stopped where it would gain energy."""
+        def at_angle(self, diffuse: Any, specular: Any, fresnel: Any, cosine: Any) -> Any:
+            """Specular albedo with its Fresnel factor at a cosine, stopped where it would gain energy."""
             if fresnel is None:
                 return specular
-            value = specular * fresnel_rise(cosine, fresnel)
+            value = specular * fresnel_factor(cosine, fresnel)
             return dr.minimum(value, dr.maximum(1.0 - diffuse, 0.0)) if self.normalized else value
 
         def _half(self, wi: Any, wo: Any) -> Any:
@@ -140,7 +140,7 @@ def make() -> type:
                 return mi.Float(0.0)
             diffuse, specular, _, fresnel, n = dr.detach(parameters)
             cosine = dr.dot(wi, n)
-            s, d = dr.mean(self.risen(diffuse, specular, fresnel, cosine)), dr.mean(diffuse)
+            s, d = dr.mean(self.at_angle(diffuse, specular, fresnel, cosine)), dr.mean(diffuse)
             return dr.select(cosine > 0.0, dr.select(s + d > 0.0, s / dr.maximum(s + d, 1e-12), 0.5), 0.0)
 
         def _reflects(self, wi: Any, wo: Any, n: Any) -> tuple[Any, Any, Any]:
@@ -155,7 +155,7 @@ def make() -> type:
             value = mi.Spectrum(0.0)
             if ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
                 factor = normalization(exponent) if self.normalized else dr.inv_pi
-                albedo = self.risen(diffuse, specular, fresnel, dr.dot(wi, self._half(wi, wo)))
+                albedo = self.at_angle(diffuse, specular, fresnel, dr.dot(wi, self._half(wi, wo)))
                 lobe, _ = self._lobe(wi, wo, n, exponent, fresnel)
                 value += dr.select(shines, albedo * (factor * lobe), 0.0)
             if ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1):

@@ -16,9 +16,10 @@ def make() -> type:
     import mitsuba as mi
     from mitsuba.python.ad.integrators.common import ADIntegrator
 
-    from mifit.render import shading
-    from mifit.render.gbuffer import MESH_FACES, MESH_POSITIONS
-    from mifit.render.transfer import trace_transfer
+    from mifit.appearance import kernels, models
+    from mifit.appearance.image import assemble
+    from mifit.appearance.occlusion import trace_transfer
+    from mifit.render.gbuffer import MESH_FACES, MESH_POSITIONS, SurfaceScene
 
     class Nested(mi.TraversalCallback):
         """Collects what an object exposes: parameters and objects inside it."""
@@ -37,7 +38,8 @@ def make() -> type:
 
         Shades the first hit of `blinnphong` surfaces under one `shenv` in closed form, without sampling noise.
 
-        - `model` (`paper`, `prefiltered` or `shadowed`, default `prefiltered`): how light becomes radiance, see below
+        - `model` (`paper`, `prefiltered`, `shadowed` or the name of another registered shading model, default
+          `prefiltered`): how light becomes radiance, see below
         - `ambient` (float, default 0): $I_a$, added to every shaded point, linear radiance
         - `samples` (int, default 256): rays per vertex with which `shadowed` traces its transfer vectors
         - `bounce_albedo` (float, default 0): `shadowed` adds one diffuse interreflection with this albedo
@@ -47,7 +49,7 @@ def make() -> type:
 
         - `paper`: $I_a + C_d \frac{E(n)}{\pi} + C_s \frac{E(n)}{\pi\,(n \cdot d)} (n \cdot h)^m$ with the dominant
           direction $d$ of the lighting (Sloan 2008) and $h$ between $v$ and $d$. The quotient is guarded, see
-          `mifit.render.shading`. Always the plain lobe.
+          `mifit.appearance.models.paper`. Always the plain lobe.
         - `prefiltered`: $I_a + C_d \frac{E(n)}{\pi} + C_s \sum_{lm} a\, c_l\, L_{lm} Y_{lm}(\bar r)$, the lobe
           convolved with the lighting about its mean direction $\bar r$; $a$ is its directional albedo and $c_l$ its
           Legendre factors for this angle and exponent. With `fresnel` those of the view along the normal, about the
@@ -64,8 +66,7 @@ def make() -> type:
 
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
-            self.model = props.get("model", "prefiltered")
-            shading.check_model(self.model)
+            self.model = models.get(props.get("model", "prefiltered"))
             self.ambient = mi.Float(props.get("ambient", 0.0))
             self.samples = int(props.get("samples", 256))
             self.bounce_albedo = float(props.get("bounce_albedo", 0.0))
@@ -103,14 +104,14 @@ def make() -> type:
             emitter = self._emitter(scene)
             flat = emitter.project()
             order = round((dr.width(flat) // 3) ** 0.5)
-            coefficients = shading.colours(flat, order, dr.width(ray))
+            coefficients = kernels.colours(flat, order, dr.width(ray))
             si = scene.ray_intersect(ray, active)
             hit = active & si.is_valid()
             radiance = mi.Color3f(0.0)
             if not self.hide:
                 radiance = dr.select(hit, 0.0, emitter.radiance(ray.d))
             pointers = si.bsdf(ray)
-            traced = self._transfer(scene, si, hit, order) if self.model == "shadowed" else None
+            traced = self._transfer(scene, si, hit, order) if self.model.needs_shadows else None
             for bsdf, pointer, two_sided in self._bsdfs(scene):
                 own = hit & (pointers == pointer)
                 local = mi.SurfaceInteraction3f(si)
@@ -119,22 +120,18 @@ def make() -> type:
                 diffuse, specular, exponent, fresnel, n = bsdf.parameters(local, own)
                 front, cosine = own & (local.wi.z > 0.0), dr.dot(local.wi, n)
                 specular = dr.select(cosine > 0.0, specular, 0.0)
-                if fresnel is not None and self.model != "paper":
-                    # The shading below brings the rise; here is only where it stops.
-                    rise = shading.fresnel_rise(cosine, fresnel)
-                    specular = bsdf.risen(diffuse, specular, fresnel, cosine) / rise
+                if not self.model.normalized:
+                    fresnel = None
+                lobe = kernels.prepare_exponent(exponent, order, self.model.normalized and bsdf.normalized, fresnel)
+                if fresnel is not None:
+                    # The shading below brings the Fresnel factor; here is only where it stops.
+                    factor = kernels.fresnel_factor(cosine, fresnel)
+                    specular = bsdf.at_angle(diffuse, specular, fresnel, cosine) / factor
                 n.z = dr.select(flipped, -n.z, n.z)
-                white, glossy = shading.shade(
-                    mi.Vector3f(si.sh_frame.to_world(n)),
-                    -ray.d,
-                    coefficients,
-                    exponent,
-                    self.model,
-                    bsdf.normalized,
-                    traced,
-                    fresnel,
-                )
-                radiance = dr.select(front, self.ambient + diffuse * white + specular * glossy, radiance)
+                normal = mi.Vector3f(si.sh_frame.to_world(n))
+                shaded = self.model.shade(normal, -ray.d, lobe, coefficients, traced)
+                image = assemble(self.ambient, diffuse, shaded[0], specular, shaded[1])
+                radiance = dr.select(front, image, radiance)
             return radiance, si.is_valid() | (not self.hide), [], None
 
         def _emitter(self, scene: Any) -> Any:
@@ -206,8 +203,7 @@ def make() -> type:
                 everything = np.concatenate([f + s for f, s in zip(faces, starts[:-1], strict=True)])
                 points = np.concatenate(vertices)
                 traced = trace_transfer(
-                    points,
-                    everything,
+                    SurfaceScene(points, everything),
                     points,
                     np.concatenate(normals),
                     order,
@@ -221,6 +217,6 @@ def make() -> type:
             return self._traced["tables"]
 
         def to_string(self) -> str:
-            return f"SHDirect[model = {self.model}, ambient = {self.ambient}]"
+            return f"SHDirect[model = {self.model.name}, ambient = {self.ambient}]"
 
     return SHDirect

@@ -46,7 +46,7 @@ def make() -> type:
     import drjit as dr
     import mitsuba as mi
 
-    from mifit.render.shading import sh_basis
+    from mifit.appearance.kernels import sh_basis
 
     class SHEnvironment(mi.Emitter):
         r"""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.image import Appearance, assemble
 from mifit.config import ReflectanceConfig
 from mifit.core.sh import LUMINANCE
 from mifit.progress import Progress
@@ -31,9 +32,8 @@ class Fitted:
 
     Attributes
     ----------
-    forward : Forward
-    radiance : (K, 3) float64
-    ambient : float
+    appearance : Appearance
+        Model, illumination and lobe.
     maps : (S, S, 4) float32
         Diffuse and specular albedo.
     sigma : float
@@ -42,9 +42,7 @@ class Fitted:
     converged : bool
     """
 
-    forward: Forward
-    radiance: NDArray[np.float64]
-    ambient: float
+    appearance: Appearance
     maps: NDArray[np.float32]
     sigma: float
     energies: dict[str, list[float]]
@@ -76,7 +74,7 @@ def fit_maps(
             progress("Reflectance maps", number * len(chunks) + done, passes * len(chunks))
             if kept is None:
                 seen = surface.observe(chunk)
-                shade, glint = forward.shade(seen, found.radiance)
+                shade, glint = forward.shade(seen, found.light)
             else:
                 seen, shade, glint = kept
             if len(chunks) == 1:
@@ -87,7 +85,7 @@ def fit_maps(
                 weight = np.where(seen.clipped[..., None], np.float32(0.0), weight)
             else:
                 texel = maps.reshape(-1, 4)[index[chunk]]
-                residual = target - texel[:, None, :3] * shade - texel[:, 3, None, None] * glint
+                residual = target - assemble(0.0, texel[:, None, :3], shade, texel[:, 3, None, None], glint)
                 weight, spread = active_weight(weight, seen.clipped, residual, config.robust)
                 data += float((weight * residual**2).sum())
                 sigmas.append(spread)
@@ -106,7 +104,6 @@ def fit_maps(
 
 def fit_als(
     surface: Surface,
-    faces: NDArray,
     albedo: NDArray,
     config: ReflectanceConfig,
     seed: int,
@@ -120,7 +117,7 @@ def fit_als(
     """
     subset = surface.sample(LIGHTING_TEXELS, np.random.default_rng(seed))
     seen = surface.observe(subset)
-    forward, found, choice = choose_lighting(surface, faces, seen, albedo[subset], config, progress)
+    forward, found, choice = choose_lighting(surface, seen, albedo[subset], config, progress)
     prior = np.zeros((surface.texels.size**2, 4), dtype=np.float32)
     prior[surface.texels.index, :3] = albedo
     prior[:, 3] = expected_specular(found.specular, seen.weight > 0)
@@ -129,7 +126,7 @@ def fit_als(
     if not config.robust:
         found, maps, energy = alternate(surface, forward, found, maps, prior, albedo, config, progress)
     energy = {"lighting": found.energy} if config.robust else energy
-    return Fitted(forward, found.radiance, found.ambient, maps, sigma, energy, found.converged), choice, ()
+    return Fitted(forward.lit(found.light, found.ambient), maps, sigma, energy, found.converged), choice, ()
 
 
 def alternate(
@@ -144,18 +141,18 @@ def alternate(
 ) -> tuple[LightingSolution, NDArray[np.float32], dict[str, list[float]]]:
     """Minimise the paper's objective as it stands: exact lighting for the maps, maps for the lighting, and again.
 
-    Under the paper's model, whose specular light turns with the lighting, a step can be too long: it is shortened
+    Under a model that turns with the lighting a step can be too long: it is shortened
     until it lowers the objective.
     """
-    terms = energies(surface, forward, found.radiance, found.ambient, maps, albedo, config)
+    terms = energies(surface, forward, found.light, found.ambient, maps, albedo, config)
     history = {name: [value] for name, value in terms.items()}
     converged = False
     for _ in range(ROUNDS):
-        radiance, ambient = exact_lighting(surface, forward, found, maps, config)
+        light, ambient = exact_lighting(surface, forward, found, maps, config)
         before = sum(terms.values())
         for length in (3.0, 1.0, 0.3, 0.1):  # alternation creeps: the longer step is right more often than not
-            mixed = found.radiance + length * (radiance - found.radiance)
-            trial = replace(found, radiance=mixed, ambient=found.ambient + length * (ambient - found.ambient))
+            mixed = found.light + length * (light - found.light)
+            trial = replace(found, light=mixed, ambient=found.ambient + length * (ambient - found.ambient))
             trial_maps, _, _ = fit_maps(surface, forward, trial, prior, config, progress, start=maps)
             trial_terms = energies(surface, forward, mixed, trial.ambient, trial_maps, albedo, config)
             if sum(trial_terms.values()) < before:
@@ -175,18 +172,18 @@ def alternate(
 def exact_lighting(
     surface: Surface, forward: Forward, found: LightingSolution, maps: NDArray, config: ReflectanceConfig
 ) -> tuple[NDArray[np.float64], float]:
-    """Lighting, and for the paper's model ambient, that minimise data and difference terms for the maps given.
+    """Lighting, and for models that have it ambient, that minimise data and difference terms for the maps given.
 
-    The paper's specular light turns with the lighting: there this is a Gauss-Newton step, whose length is to be tried.
+    Where the model turns with the lighting this is a Gauss-Newton step, whose length is to be tried.
     """
-    if forward.model == "paper":
+    if forward.model.turns:
         return _turning_step(surface, forward, found, maps, config)
-    k = forward.lights
+    k = forward.unknowns
     system, right = np.zeros((3, k, k)), np.zeros((3, k))
     values = maps.reshape(-1, 4)[surface.texels.index]
     for chunk in surface.chunks(8 * k):
         seen = surface.observe(chunk)
-        diffuse, specular = forward.transfers(seen, found.radiance)
+        diffuse, specular = forward.transfers(seen, found.light)
         glint = values[chunk, 3][:, None, None] * specular
         for c in range(3):
             rows = values[chunk, c][:, None, None] * diffuse + glint
@@ -203,21 +200,21 @@ def _turning_step(
     The factor that makes specular of diffuse shading depends on the direction of the linear band's luminance. It is
     differentiated by differences; being the same for the lighting at any scale, it leaves the right-hand side as it is.
     """
-    k = forward.lights
+    k = forward.unknowns
     system, right = np.zeros((3 * k + 1, 3 * k + 1)), np.zeros(3 * k + 1)
     values = maps.reshape(-1, 4)[surface.texels.index]
-    light = found.radiance.astype(np.float32)
-    reach = 1e-2 * float(np.linalg.norm(found.radiance[1:4] @ LUMINANCE))
-    turned = [np.zeros_like(found.radiance) for _ in range(3)]
+    light = found.light.astype(np.float32)
+    reach = 1e-2 * float(np.linalg.norm(found.light[1:4] @ LUMINANCE))
+    turned = [np.zeros_like(found.light) for _ in range(3)]
     for band, change in enumerate(turned):
         change[band + 1] = reach
     for chunk in surface.chunks(32 * k):
         seen = surface.observe(chunk)
-        diffuse, specular = forward.transfers(seen, found.radiance)
+        diffuse, specular = forward.transfers(seen, found.light)
         y = values[chunk, 3][:, None, None]
         turning = []
         for change in turned:
-            ahead, behind = (forward.transfers(seen, found.radiance + s * change)[1] for s in (1.0, -1.0))
+            ahead, behind = (forward.transfers(seen, found.light + s * change)[1] for s in (1.0, -1.0))
             turning.append(y * ((ahead - behind) @ light) * np.float32(0.5 / reach))
         for c in range(3):
             glint = np.zeros((*diffuse.shape[:2], 3 * k + 1), np.float32)

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance import models
+from mifit.appearance.lobe import Lobe
 from mifit.config import ReflectanceConfig
 from mifit.progress import Progress
 from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.als import Fitted
-from mifit.stages.reflectance.choice import FRESNEL, PAPER_EXPONENT, fit_lighting, noise_weight
+from mifit.stages.reflectance.choice import candidate, fit_lighting, noise_weight, plain_forward
 from mifit.stages.reflectance.forward import Forward
 
+PAPER_EXPONENT = 5.0
+"""Exponent where none is given, as in the paper, whatever the model."""
 STEPS_PER_ITERATION = 10
 """Gradient steps that stand for one of ``max_iterations``: a Gauss-Newton step costs and does as much."""
 
 
 def fit_adam(
     surface: Surface,
-    faces: NDArray,
     albedo: NDArray,
     config: ReflectanceConfig,
     seed: int,
@@ -32,28 +37,21 @@ def fit_adam(
     from mifit.render import optimize
 
     name = "paper" if config.shading == "auto" else config.shading
-    order = 3 if name == "paper" else config.bands
-    traced = surface.trace(order) if name == "shadowed" else ()
-    fresnel = None if name == "paper" else FRESNEL
-    forward = Forward(name, order, config.exponent or PAPER_EXPONENT, fresnel, traced, faces)
+    model = models.get(candidate(name).model)
+    forward = plain_forward(model, config.exponent or PAPER_EXPONENT, config, surface)
     seen = surface.observe(np.arange(len(surface)))
     subset = surface.sample(2000, np.random.default_rng(seed))
-    lambert = Forward("prefiltered", 3, PAPER_EXPONENT)
+    lambert = Forward.of(models.get("prefiltered"), 3, Lobe(PAPER_EXPONENT))
     start = fit_lighting(seen.take(subset), lambert, albedo[subset], config, 1, specular=0.0)
-    radiance = np.zeros((order * order, 3))
-    radiance[:9] = start.radiance
+    radiance = np.zeros((forward.unknowns, 3))
+    radiance[:9] = start.light
     steps = config.max_iterations * STEPS_PER_ITERATION
     result = optimize.fit_adam(
         gather_samples(surface, seen, forward, albedo, config),
-        radiance,
-        0.0,
-        name,
-        forward.exponent,
+        forward.lit(radiance),
         config.specular_difference_weight,
         (config.smoothness_weight, config.smoothness_weight * config.specular_smoothness),
         steps,
-        with_ambient=name == "paper",
-        fresnel=fresnel,
         on_iteration=lambda done: progress("Reflectance by Adam", done, steps),
     )
     maps = np.zeros((surface.texels.size**2, 4), dtype=np.float32)
@@ -63,16 +61,14 @@ def fit_adam(
     converged = bool(abs(tail[0] - tail[-1]) < 1e-2 * abs(tail[-1]))
     sigma = float(np.sqrt(result.history["data"][-1] / max(3.0 * float(seen.measured.sum()), 1e-12)))
     fitted = Fitted(
-        forward,
-        result.radiance,
-        result.ambient,
+        replace(forward.appearance, illumination=result.illumination),
         maps.reshape(surface.texels.size, surface.texels.size, 4),
         sigma,
         result.history,
         converged,
     )
     why = "as configured" if config.shading != "auto" else "the paper's model: it is the paper's solver"
-    return fitted, {"chosen": name, "why": why, "exponent": forward.exponent}, ()
+    return fitted, {"chosen": name, "why": why, "exponent": forward.lobe.typical}, ()
 
 
 def gather_samples(surface: Surface, seen: Observations, forward: Forward, albedo: NDArray, config: ReflectanceConfig):
@@ -88,7 +84,7 @@ def gather_samples(surface: Surface, seen: Observations, forward: Forward, albed
         both = (row[:, a] >= 0) & (row[:, b] >= 0)
         first.append(row[both, a])
         second.append(row[both, b])
-    traced = forward.traced_at(seen)
+    traced = forward.occlusion(seen).transfer
     colour = seen.colour[texel, image]
     return Samples(
         seen.normal[texel, seen.step[image]],
@@ -101,5 +97,5 @@ def gather_samples(surface: Surface, seen: Observations, forward: Forward, albed
         surface.texels.index,
         surface.texels.size,
         albedo,
-        None if traced is None else traced[texel, seen.step[image]],
+        None if traced is None else traced[texel * len(seen.step) + image],
     )

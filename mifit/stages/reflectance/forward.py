@@ -1,19 +1,18 @@
-"""The image-formation model of stage 2 at observed surface points: what maps and lighting make of a texel."""
+"""Image formation at observed surface points: what maps and lighting make of a texel."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.keylight import KeyLight
-from mifit.core.mesh import interpolate
+from mifit.appearance.illumination import Illumination, Light
+from mifit.appearance.image import Appearance
+from mifit.appearance.lobe import Lobe
+from mifit.appearance.models import ShadingModel
+from mifit.appearance.occlusion import OccludingMesh, Occlusion, SurfacePoints
 from mifit.stages.observations import Observations
-
-if TYPE_CHECKING:
-    from mifit.render.gbuffer import SurfaceScene
 
 CHUNK = 1 << 19
 """Points shaded at a time: bounds the memory of the basis functions."""
@@ -21,138 +20,128 @@ CHUNK = 1 << 19
 
 @dataclass(frozen=True)
 class Forward:
-    """A shading model with its settings; the shading itself is `render.shading`.
+    """An appearance on the meshes of the timesteps.
 
     Attributes
     ----------
-    model : str
-        ``"paper"``, ``"prefiltered"`` or ``"shadowed"``.
-    order : int
-        Bands of the lighting.
-    exponent : float
-        Blinn-Phong exponent.
-    fresnel : float or None
-        Rise of the lobe towards grazing views; None for plain Blinn-Phong.
-    traced : tuple of (V, B*B) float32
-        Shadowed diffuse transfer per timestep, at the vertices; empty unless ``shadowed``.
-    faces : (F, 3) int
-    key : KeyLight, optional
-        A compact light; its irradiance is the last row of the lighting, not what it holds itself.
-    scenes : tuple of SurfaceScene
-        Meshes of the timesteps, for the key light's shadows.
+    appearance : Appearance
+        Model and lobe; its illumination says how many bands and which compact lights there are, not how bright.
+    meshes : tuple of OccludingMesh
+        One per timestep.
     """
 
-    model: str
-    order: int
-    exponent: float
-    fresnel: float | None = None
-    traced: tuple[NDArray[np.float32], ...] = field(default=(), repr=False)
-    faces: NDArray[np.int32] | None = field(default=None, repr=False)
-    key: KeyLight | None = None
-    scenes: tuple[SurfaceScene, ...] = field(default=(), repr=False)
+    appearance: Appearance
+    meshes: tuple[OccludingMesh, ...] = field(default=(), repr=False)
+
+    @classmethod
+    def of(cls, model: ShadingModel, order: int, lobe: Lobe, meshes: tuple[OccludingMesh, ...] = ()) -> Forward:
+        """A model under smooth light of some bands."""
+        return cls(Appearance(model, Illumination.dark(order), lobe), meshes)
 
     @property
-    def lights(self) -> int:
-        """Number K of lighting unknowns per channel: coefficients, and the key light's irradiance."""
-        return self.order**2 + (self.key is not None)
+    def model(self) -> ShadingModel:
+        """The shading model."""
+        return self.appearance.model
 
-    def transfers(self, seen: Observations, radiance: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    @property
+    def order(self) -> int:
+        """Bands of the smooth light."""
+        return self.appearance.order
+
+    @property
+    def lobe(self) -> Lobe:
+        """The specular lobe."""
+        return self.appearance.lobe
+
+    @property
+    def lights(self) -> tuple[Light, ...]:
+        """The compact lights."""
+        return self.appearance.illumination.lights
+
+    @property
+    def unknowns(self) -> int:
+        """Number K of lighting unknowns per channel: coefficients, and a colour per compact light."""
+        return self.order**2 + len(self.lights)
+
+    def lit(self, light: NDArray, ambient: float = 0.0) -> Appearance:
+        """The appearance under lighting unknowns (K, 3)."""
+        illumination = self.appearance.illumination.with_unknowns(light, ambient)
+        return replace(self.appearance, illumination=illumination)
+
+    def with_lobe(self, lobe: Lobe) -> Forward:
+        """The same with another lobe."""
+        return replace(self, appearance=replace(self.appearance, lobe=lobe))
+
+    def with_lights(self, lights: tuple[Light, ...]) -> Forward:
+        """The same with other compact lights."""
+        return replace(self, appearance=replace(self.appearance, illumination=Illumination.dark(self.order, lights)))
+
+    def transfers(self, seen: Observations, light: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Diffuse (N, J, K) and specular (N, J, K) transfer vectors of observations at unit albedo.
 
-        With a key light its transfer is the last of the K.
-
-        ``radiance`` matters to the paper's model alone: its dominant direction is held fixed.
+        ``light`` (K, 3) matters to models that turn with the lighting alone.
         """
-        from mifit.render.local import diffuse_matrix, specular_matrix
-
         n, j = seen.weight.shape
-        steps = seen.normal.shape[1]
-        traced = self.traced_at(seen)
-        if traced is None:
-            diffuse = diffuse_matrix(seen.normal.reshape(-1, 3), self.order).reshape(n, steps, -1)
-        else:
-            diffuse = traced
-        diffuse = diffuse[:, seen.step]
-        rows = diffuse.reshape(n * j, -1) if traced is not None else None
-        specular = specular_matrix(
-            seen.image_normal.reshape(-1, 3),
-            seen.view.reshape(-1, 3),
-            radiance[: self.order**2],
-            self.exponent,
-            self.model,
-            rows,
-            fresnel=self.fresnel,
-        )
-        specular = specular.reshape(n, j, -1)
-        if self.key is None:
-            return diffuse, specular
-        matt, glossy = self.key_columns(seen)
-        return np.append(diffuse, matt[..., None], axis=2), np.append(specular, glossy[..., None], axis=2)
+        found = self.lit(light).transfers(*_flat(seen), self.occlusion(seen), _points(seen))
+        return found[0].reshape(n, j, -1), found[1].reshape(n, j, -1)
 
-    def shade(self, seen: Observations, radiance: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Diffuse and specular reflection (N, J, 3) at unit albedo, without ambient."""
-        from mifit.render.local import shade_points
-
+    def shade(self, seen: Observations, light: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Diffuse and specular radiance (N, J, 3) at unit albedo, without ambient."""
         n, j = seen.weight.shape
-        shade, glint = np.empty((n, j, 3), np.float32), np.empty((n, j, 3), np.float32)
-        step = max(1, CHUNK // j)
+        diffuse, specular = np.empty((n, j, 3), np.float32), np.empty((n, j, 3), np.float32)
+        appearance, step = self.lit(light), max(1, CHUNK // j)
         for start in range(0, n, step):
-            part = seen.take(slice(start, start + step))
-            normal, view = part.image_normal.reshape(-1, 3), part.view.reshape(-1, 3)
-            traced = self.traced_at(part)
-            ones = np.ones((len(normal), 3), np.float32)
-            d, s = shade_points(
-                normal,
-                view,
-                ones,
-                ones[:, 0],
-                radiance[: self.order**2],
-                0.0,
-                self.exponent,
-                self.model,
-                None if traced is None else traced[:, part.step].reshape(len(normal), -1),
-                fresnel=self.fresnel,
-            )
-            d, s = d.reshape(-1, j, 3), s.reshape(-1, j, 3)
-            if self.key is not None:
-                matt, glossy = self.key_columns(part)
-                irradiance = radiance[-1].astype(np.float32)
-                d, s = d + matt[..., None] * irradiance, s + glossy[..., None] * irradiance
-            shade[start : start + step], glint[start : start + step] = d, s
-        return shade, glint
+            rows = slice(start, start + step)
+            part = seen.take(rows)
+            d, s = appearance.shade(*_flat(part), self.occlusion(part), _points(part))
+            diffuse[rows], specular[rows] = d.reshape(-1, j, 3), s.reshape(-1, j, 3)
+        return diffuse, specular
+
+    def occlusion(self, seen: Observations) -> Occlusion:
+        """Shadows at the N * J observations, image after image of each texel."""
+        if not (self.model.needs_shadows or self.lights):
+            return Occlusion()
+        steps = [self.appearance.trace(mesh, _surface_points(seen, t)) for t, mesh in enumerate(self.meshes)]
+        transfer = None
+        if self.model.needs_shadows:
+            transfer = np.stack([s.transfer for s in steps], axis=1)[:, seen.step]
+            transfer = transfer.reshape(-1, transfer.shape[-1])
+        visible = tuple(
+            np.stack(bits, axis=1)[:, seen.step].ravel() for bits in zip(*(s.visible for s in steps), strict=True)
+        )
+        return Occlusion(transfer, visible)
 
     def open_towards(self, seen: Observations, directions: NDArray) -> NDArray[np.uint32]:
         """(N, T) which of some directions the texels see, a bit each."""
-        steps = [s.open_towards(seen.point[:, t], seen.normal[:, t], directions) for t, s in enumerate(self.scenes)]
+        steps = [
+            m.scene.open_towards(seen.point[:, t], seen.normal[:, t], directions) for t, m in enumerate(self.meshes)
+        ]
         return np.stack(steps, axis=1)
 
-    def key_columns(
-        self, seen: Observations, open_sky: NDArray[np.uint32] | None = None
+    def light_columns(
+        self, seen: Observations, light: Light, visible: NDArray[np.uint32] | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Diffuse and specular reflection (N, J) at unit albedo per unit of the key light's irradiance.
+        """Diffuse and specular radiance (N, J) at unit albedo per unit of a compact light's colour.
 
-        Shadows are traced unless (N, T) bits tell which of the light's directions the texels see.
+        Shadows are traced unless (N, T) bits tell which of the light's samples the texels see.
         """
-        from mifit.render.local import key_columns
+        if visible is None:
+            steps = [light.visible(m.scene, seen.point[:, t], seen.normal[:, t]) for t, m in enumerate(self.meshes)]
+            visible = np.stack(steps, axis=1)
+        found = self.appearance.light_transfer(light, *_flat(seen), visible[:, seen.step].ravel(), _points(seen))
+        return found[0].reshape(seen.weight.shape), found[1].reshape(seen.weight.shape)
 
-        assert self.key is not None
-        directions = self.key.samples()
-        if open_sky is None:
-            open_sky = self.open_towards(seen, directions)
-        n, j = seen.weight.shape
-        matt, glossy = key_columns(
-            seen.image_normal.reshape(-1, 3),
-            seen.view.reshape(-1, 3),
-            open_sky[:, seen.step].ravel(),
-            directions,
-            self.exponent,
-            self.fresnel,
-        )
-        return matt.reshape(n, j), glossy.reshape(n, j)
 
-    def traced_at(self, seen: Observations) -> NDArray[np.float32] | None:
-        """(N, T, K) traced transfer vectors at the texels, or None."""
-        if self.model != "shadowed":
-            return None
-        assert self.faces is not None
-        return np.stack([interpolate(t, self.faces, seen.face, seen.barycentric) for t in self.traced], axis=1)
+def _flat(seen: Observations) -> tuple[NDArray, NDArray]:
+    """Normals and views (N * J, 3)."""
+    return seen.image_normal.reshape(-1, 3), seen.view.reshape(-1, 3)
+
+
+def _points(seen: Observations) -> NDArray:
+    """World positions (N * J, 3)."""
+    return seen.point[:, seen.step].reshape(-1, 3)
+
+
+def _surface_points(seen: Observations, step: int) -> SurfacePoints:
+    """The texels on the mesh of one timestep."""
+    return SurfacePoints(seen.point[:, step], seen.normal[:, step], seen.face, seen.barycentric)

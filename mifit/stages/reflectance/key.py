@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.keylight import KeyLight
+from mifit.appearance.illumination import DistantLight
+from mifit.appearance.image import assemble
 from mifit.stages.observations import Observations
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import (
@@ -78,19 +79,19 @@ class Candidates:
     ) -> Candidates:
         """Linearise about a solution, whose own compact light, if any, is taken away: candidates are to replace it."""
         k = forward.order**2
-        light = found.radiance.astype(np.float32)
+        light = found.light.astype(np.float32)
         x, y = found.diffuse[:, None], found.specular[:, None, None]
-        residual = problem.colour - x * (problem.diffuse @ light) - y * (problem.specular @ light)
+        residual = problem.colour - assemble(0.0, x, problem.diffuse @ light, y, problem.specular @ light)
         weight = bounded_weight(problem, residual)
         plain = replace(problem, diffuse=problem.diffuse[..., :k], specular=problem.specular[..., :k])
         shade, glint = plain.diffuse @ light[:k], plain.specular @ light[:k]
-        residual = problem.colour - x * shade - y * glint
-        normal = linearize(plain, found.radiance[:k], found.diffuse, found.specular, shade, glint, residual, weight)
+        residual = problem.colour - assemble(0.0, x, shade, y, glint)
+        normal = linearize(plain, found.light[:k], found.diffuse, found.specular, shade, glint, residual, weight)
         inverse, reduced, right = normal.eliminate(3 * k, 1e-4)
         rows = [(x[..., c : c + 1] * plain.diffuse + y * plain.specular).reshape(-1, k) for c in range(3)]
         return cls(
             seen,
-            replace(forward, key=None),
+            forward.with_lights(()),
             rows,
             weight,
             residual,
@@ -110,13 +111,13 @@ class Candidates:
 
         Its shadows are traced, unless bits tell which directions of its disc the texels (n, T) see.
         """
-        key = KeyLight(direction, radius, np.zeros(3))
-        matt, glossy = replace(self.forward, key=key).key_columns(self.seen, open_sky)
+        light = DistantLight(direction, radius, np.zeros(3))
+        by_diffuse, by_specular = self.forward.light_columns(self.seen, light, open_sky)
         k = self.rows[0].shape[1]
-        own = np.zeros((len(matt), 4, 3), np.float32)
+        own = np.zeros((len(by_diffuse), 4, 3), np.float32)
         system, right, across = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3 * k))
         for c in range(3):
-            column = self.diffuse[:, None, c] * matt + self.gloss[:, None] * glossy
+            column = self.diffuse[:, None, c] * by_diffuse + self.gloss[:, None] * by_specular
             weighted = self.weight[..., c] * column
             system[c, c] = (weighted * column).sum()
             right[c] = (weighted * self.residual[..., c]).sum()
@@ -153,13 +154,13 @@ def scan(candidates: Candidates) -> tuple[NDArray[np.float64], float]:
     return best, most
 
 
-def find_key(candidates: Candidates, start: KeyLight | None = None) -> KeyLight | None:
+def find_light(candidates: Candidates, start: DistantLight | None = None) -> DistantLight | None:
     """Search for the compact light that explains most of what is left; None where none is worth a trial.
 
     Parameters
     ----------
     candidates : Candidates
-    start : KeyLight, optional
+    start : DistantLight, optional
         Search around this one only.
     """
     if start is None:
@@ -181,7 +182,7 @@ def find_key(candidates: Candidates, start: KeyLight | None = None) -> KeyLight 
             (direction, radius), gain = around[best], gains[best]
         else:
             step, widen = 0.5 * step, np.sqrt(widen)
-    return KeyLight(direction, float(radius), np.zeros(3)) if radius < RADII[1] else None
+    return DistantLight(direction, float(radius), np.zeros(3)) if radius < RADII[1] else None
 
 
 def _ring(direction: NDArray, angle: float, count: int = 6) -> NDArray[np.float64]:

@@ -8,12 +8,12 @@ determine a few hundred coefficients, so a random subset is enough; the maps are
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.image import assemble
 from mifit.core.sh import bands, basis
 
 NEGATIVE_DIRECTIONS = 400
@@ -53,6 +53,8 @@ class LightingProblem:
         Transfer vectors of the specular reflection at unit albedo.
     albedo : (n, 3)
         Diffuse albedo expected by the morphable model.
+    order : int
+        Bands B of the smooth light: the first B*B of the K; the others are the compact lights.
     """
 
     colour: NDArray[np.float32]
@@ -61,6 +63,7 @@ class LightingProblem:
     diffuse: NDArray[np.float32]
     specular: NDArray[np.float32]
     albedo: NDArray[np.float32]
+    order: int
 
 
 def specular_pull(expected: float, sigma: float) -> float:
@@ -106,7 +109,8 @@ class LightingSolution:
 
     Attributes
     ----------
-    radiance : (K, 3) float64
+    light : (K, 3) float64
+        The lighting unknowns, `Illumination.unknowns`.
     ambient : float
         The paper's I_a; 0 unless asked for.
     diffuse : (n, 3), specular : (n,)
@@ -120,7 +124,7 @@ class LightingSolution:
     converged : bool
     """
 
-    radiance: NDArray[np.float64]
+    light: NDArray[np.float64]
     ambient: float
     diffuse: NDArray[np.float32]
     specular: NDArray[np.float32]
@@ -132,7 +136,7 @@ class LightingSolution:
 
 def solve_lighting(
     problem: LightingProblem,
-    radiance: NDArray | None = None,
+    start: NDArray | None = None,
     specular: float = 0.05,
     priors: LightingPriors = LightingPriors(),
     robust: bool = True,
@@ -145,8 +149,8 @@ def solve_lighting(
     Parameters
     ----------
     problem : LightingProblem
-    radiance : (K, 3), optional
-        Start; by default the best one for the model's albedo and the given specular albedo.
+    start : (K, 3), optional
+        Lighting to start from; by default the best one for the model's albedo and the given specular albedo.
     specular : float
         Specular albedo to start from. Zero is a stationary point of the bands that only the specular lobe sees.
     priors : LightingPriors
@@ -161,7 +165,7 @@ def solve_lighting(
     n = len(problem.specular)
     diffuse = problem.albedo.astype(np.float32).copy()
     gloss = np.full(n, specular, dtype=np.float32)
-    light = _initial(problem, diffuse, gloss) if radiance is None else np.array(radiance, dtype=np.float64)
+    light = _initial(problem, diffuse, gloss) if start is None else np.array(start, dtype=np.float64)
     energy: list[float] = []
     ambient, sigma, unexplained, converged, damping = 0.0, 0.0, np.inf, False, 1e-3
     state = light, ambient, diffuse, gloss
@@ -170,7 +174,8 @@ def solve_lighting(
         light, ambient, diffuse, gloss = state
         shade = np.einsum("njk,kc->njc", problem.diffuse, light.astype(np.float32))
         glint = np.einsum("njk,kc->njc", problem.specular, light.astype(np.float32))
-        residual = problem.colour - diffuse[:, None] * shade - gloss[:, None, None] * glint - np.float32(ambient)
+        shown = assemble(np.float32(ambient), diffuse[:, None], shade, gloss[:, None, None], glint)
+        residual = problem.colour - shown
         weight, spread = active_weight(problem.weight, problem.clipped, residual, robust)
         current = float((weight * residual**2).sum())
         if energy and not current < SLACK * energy[-1]:
@@ -213,20 +218,18 @@ def linearize(
     sigma: float = 0.0,
 ) -> _Normal:
     """Normal equations about a state, with priors beside residuals of standard deviation `sigma`."""
-    k = problem.specular.shape[-1]
-    order = math.isqrt(k)
+    k, order = problem.specular.shape[-1], problem.order
     system = _Normal.accumulate(problem, diffuse, gloss, shade, glint, residual, weight)
-    extra = k - order * order  # lights that are no coefficients are kept from negative values one by one
+    extra = k - order * order  # compact lights are kept from negative values one by one
     directions = np.pad(basis(fibonacci_sphere(NEGATIVE_DIRECTIONS), order), ((0, extra), (0, extra)))
     directions[NEGATIVE_DIRECTIONS:, order * order :] = np.eye(extra)
     expected = expected_specular(gloss, (problem.weight > 0).any(axis=2))
-    system.add_priors(priors, light, diffuse, gloss, problem.albedo, _stiffness(k), directions, sigma, expected)
+    system.add_priors(priors, light, diffuse, gloss, problem.albedo, _stiffness(order, k), directions, sigma, expected)
     return system
 
 
-def _stiffness(count: int) -> NDArray[np.float64]:
-    """(l (l + 1))^2 of each coefficient; 0 for lights beyond them, about which nothing is smooth."""
-    order = math.isqrt(count)
+def _stiffness(order: int, count: int) -> NDArray[np.float64]:
+    """(l (l + 1))^2 of each coefficient; 0 for the compact lights after them, about which nothing is smooth."""
     band = bands(order).astype(np.float64)
     return np.pad((band * (band + 1.0)) ** 2, (0, count - order * order))
 
@@ -261,7 +264,7 @@ def bounded_weight(problem: LightingProblem, residual: NDArray) -> NDArray[np.fl
 def _initial(problem: LightingProblem, diffuse: NDArray, gloss: NDArray) -> NDArray[np.float64]:
     """Linear least squares for the lighting with fixed maps."""
     k = problem.specular.shape[-1]
-    stiffness = _stiffness(k)
+    stiffness = _stiffness(problem.order, k)
     light = np.zeros((k, 3))
     for c in range(3):
         rows = (diffuse[:, None, None, c] * problem.diffuse + gloss[:, None, None] * problem.specular).reshape(-1, k)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.image import assemble
 from mifit.config import ReflectanceConfig
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.forward import Forward
@@ -14,7 +15,7 @@ from mifit.stages.reflectance.maps import laplacian
 def energies(
     surface: Surface,
     forward: Forward,
-    radiance: NDArray,
+    light: NDArray,
     ambient: float,
     maps: NDArray,
     albedo: NDArray,
@@ -28,7 +29,8 @@ def energies(
     ----------
     surface : Surface
     forward : Forward
-    radiance : (K, 3)
+    light : (K, 3)
+        The lighting unknowns.
     ambient : float
     maps : (S, S, 4)
         Diffuse and specular albedo.
@@ -41,10 +43,10 @@ def energies(
     data = difference = 0.0
     for chunk in surface.chunks():
         seen = surface.observe(chunk)
-        shade, glint = forward.shade(seen, radiance)
+        shade, glint = forward.shade(seen, light)
         weight = seen.measured[..., None]
         x, y = values[chunk, None, :3], values[chunk, 3, None, None]
-        data += float((weight * (seen.colour - x * shade - y * glint - np.float32(ambient)) ** 2).sum())
+        data += float((weight * (seen.colour - assemble(np.float32(ambient), x, shade, y, glint)) ** 2).sum())
         for a, b in surface.pairs:
             both = np.minimum(weight[:, a], weight[:, b])
             shown = y[:, 0] * (glint[:, a] - glint[:, b])

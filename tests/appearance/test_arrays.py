@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mifit.render.arrays import ALIGNMENT, aligned
+from mifit.appearance.arrays import ALIGNMENT, aligned
 
 
 def shifted(count: int, offset: int) -> np.ndarray:
@@ -32,7 +32,7 @@ def test_empty_arrays_stay_empty():
 def test_shading_takes_one_kernel_for_all_addresses(variant):
     import drjit as dr
 
-    from mifit.render.local import shade_points
+    from tests.shaded import shade_points
 
     normal = np.array([[0.0, 0.0, 1.0], [0.0, 0.6, 0.8], [0.6, 0.0, 0.8]], dtype=np.float32)
     radiance = np.linspace(0.1, 1.0, 27).reshape(9, 3)

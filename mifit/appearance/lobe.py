@@ -1,4 +1,4 @@
-"""The Blinn-Phong reflection model in float64: the plain form that every fast one is tested against.
+"""The specular lobe: its record, its normalisation, and the moments by which it is prefiltered (NumPy).
 
 The BRDF is ``f = C_d / pi + C_s N(m) (n . h)^m`` with the half vector h of view and light. ``N(m)`` is either
 
@@ -9,14 +9,14 @@ The BRDF is ``f = C_d / pi + C_s N(m) (n . h)^m`` with the half vector h of view
 Carried lobe
 ------------
 Microfacet surfaces reflect about the mirror direction r(v) at every angle and more so at grazing ones, where the half
-vector's lobe fades and leans towards the normal. With a Fresnel rise the lobe that a view along the normal has is
+vector's lobe fades and leans towards the normal. With a Fresnel term the lobe that a view along the normal has is
 therefore carried about r:
 ``f = C_s (1 + fresnel (1 - h.v)^5) N(m) ((1 + c) / 2)^(m/2) c * 2 / (n.l + n.v)`` with ``c = max(r.l, 0)``.
 ``r.l = 2 (n.v)(n.l) - v.l`` and ``h.v`` don't change when l and v change places, so f is reciprocal; at the mirror
-direction h is n, so the rise is that of ``1 + fresnel (1 - n.v)^5``. The last factor turns c, which is wanted of the
-outgoing light ``f n.l``, into a reciprocal f: ``1 / n.l`` isn't symmetric, ``1 / max(n.l, n.v)`` loses 40 % at grazing
-angles, and ``1 / sqrt(n.l n.v)`` has no bound there. With this one the lobe's albedo is at most 1 for every exponent
-and angle, and for exponents of 50 and more at least 0.8.
+direction h is n, so the Fresnel factor is that of ``1 + fresnel (1 - n.v)^5``. The last factor turns c, which is wanted
+of the outgoing light ``f n.l``, into a reciprocal f: ``1 / n.l`` isn't symmetric, ``1 / max(n.l, n.v)`` loses 40 % at
+grazing angles, and ``1 / sqrt(n.l n.v)`` has no bound there. With this one the lobe's albedo is at most 1 for every
+exponent and angle, and for exponents of 50 and more at least 0.8.
 
 Prefiltered form
 ----------------
@@ -31,7 +31,8 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,43 +46,81 @@ EXPONENT_MIN, EXPONENT_MAX = 1.0, 1e4
 _DEGREE_COSINE, _DEGREE_EXPONENT = 7, 11
 
 
+@dataclass(frozen=True)
+class Lobe:
+    """The Blinn-Phong lobe of a surface, or of one that varies over it.
+
+    Attributes
+    ----------
+    exponent : float, (N,) or (S, S) array
+        1 to 10000: one number, one per point, or a map.
+    fresnel : float or None
+        Strength of the lobe at grazing views over that of a view along the normal, less 1; None for plain Blinn-Phong,
+        a number for the lobe carried about the mirror direction.
+    normalized : bool
+        Which N(m), see above.
+    """
+
+    exponent: float | Array
+    fresnel: float | None = None
+    normalized: bool = True
+
+    @property
+    def typical(self) -> float:
+        """One exponent that stands for all: the median."""
+        return float(np.median(self.exponent))
+
+    def at(self, look_up: Callable[[Array], Array]) -> Lobe:
+        """The lobe at points of a map: ``look_up`` turns a map (S, S) into values (N,); one exponent stays one."""
+        if np.ndim(self.exponent) == 0:
+            return self
+        return replace(self, exponent=look_up(np.asarray(self.exponent)))
+
+    @property
+    def roughness(self) -> float:
+        """Beckmann's alpha, and GGX's, of the microfacet lobe that is about as wide."""
+        return math.sqrt(2.0 / (self.typical + 2.0))
+
+    @property
+    def grazing(self) -> float:
+        """Strength of the lobe at grazing views over that of a view along the normal."""
+        return 1.0 + (self.fresnel or 0.0)
+
+    def parameters(self) -> dict[str, float | bool]:
+        """The lobe as parameters of the ``blinnphong`` plugin and as ``result.json`` has it."""
+        fresnel = {} if self.fresnel is None else {"fresnel": float(self.fresnel)}
+        return {"exponent": self.typical, "normalized": self.normalized, **fresnel}
+
+    def zonal(self, order: int, cosines: Array) -> tuple[Array, Array, Array]:
+        """The lobe as few numbers, for a viewer.
+
+        Returns
+        -------
+        albedo, tilt : like ``cosines``
+            Of views at these cosines from the normal, ascending to 1; see `lobe_moments`.
+        factors : (B,)
+            Legendre factors of the bands, those of a middling view.
+        """
+        moments = lobe_table(order)(cosines, self.typical)
+        albedo, tilt = moments[0], moments[1]
+        middling = int(np.searchsorted(cosines, 0.7))
+        if self.fresnel is not None:
+            # The lobe of a view along the normal about the mirror direction, stronger towards grazing views.
+            albedo, tilt = albedo[-1] * (1 + self.fresnel * (1 - cosines) ** 5), np.zeros_like(tilt)
+            middling = -1
+        return self.factor() * albedo, tilt, np.concatenate([[1.0], moments[2:, middling]])
+
+    def factor(self) -> float:
+        """Albedo of the lobe relative to that of the normalised one, at the typical exponent."""
+        return float(normalization(self.typical, self.normalized) / normalization(self.typical))
+
+
 def normalization(exponent: ArrayLike, normalized: bool = True) -> Array:
     """The lobe's factor N(m), for both kinds."""
     m = np.asarray(exponent, dtype=np.float64)
     if not normalized:
         return np.full_like(m, 1.0 / np.pi)
     return (m + 2.0) * (m + 4.0) / (8.0 * np.pi * (m + np.exp2(-0.5 * m)))
-
-
-def specular_brdf(
-    light: ArrayLike, view: ArrayLike, normal: ArrayLike, exponent: ArrayLike, normalized: bool = True
-) -> Array:
-    """``N(m) (n . h)^m`` for unit vectors (..., 3) away from the surface; zero below the horizon."""
-    li, v, n = (np.asarray(x, dtype=np.float64) for x in (light, view, normal))
-    h = li + v
-    h = h / np.maximum(np.linalg.norm(h, axis=-1, keepdims=True), 1e-300)
-    above = ((li * n).sum(-1) > 0) & ((v * n).sum(-1) > 0)
-    lobe = np.maximum((h * n).sum(-1), 0.0) ** np.asarray(exponent, dtype=np.float64)
-    return np.where(above, normalization(exponent, normalized) * lobe, 0.0)
-
-
-def carried_brdf(
-    light: ArrayLike,
-    view: ArrayLike,
-    normal: ArrayLike,
-    exponent: ArrayLike,
-    fresnel: ArrayLike,
-    normalized: bool = True,
-) -> Array:
-    """The lobe carried about the mirror direction with its rise, for unit vectors (..., 3); zero below the horizon."""
-    li, v, n = (np.asarray(x, dtype=np.float64) for x in (light, view, normal))
-    nl, nv, lv = (li * n).sum(-1), (v * n).sum(-1), (li * v).sum(-1)
-    c = np.clip(2.0 * nl * nv - lv, 0.0, 1.0)
-    half = np.sqrt(np.maximum(0.5 * (1.0 + lv), 0.0))  # h.v
-    rise = 1.0 + np.asarray(fresnel) * (1.0 - half) ** 5
-    lobe = (0.5 * (1.0 + c)) ** (0.5 * np.asarray(exponent, dtype=np.float64)) * c
-    value = normalization(exponent, normalized) * rise * lobe * 2.0 / np.maximum(nl + nv, 1e-300)
-    return np.where((nl > 0) & (nv > 0), value, 0.0)
 
 
 def lobe_samples(cosine: float, exponent: float, count: int = 48) -> tuple[Array, Array]:

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from mifit.appearance.image import diffuse_matrix
+from mifit.appearance.occlusion import trace_transfer
 from mifit.core import sh
 from mifit.errors import InputError
-from mifit.render.local import diffuse_matrix
-from mifit.render.transfer import trace_transfer
+from mifit.render.gbuffer import SurfaceScene
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +23,7 @@ UP = np.array([[0.0, 0.0, 1.0]])
 
 
 def test_half_the_sky_is_the_integral_over_half_the_sky(variant: str, wall) -> None:
-    traced = trace_transfer(*wall, POINT, UP, order=3, samples=4096)[0]
+    traced = trace_transfer(SurfaceScene(*wall), POINT, UP, order=3, samples=4096)[0]
     d, w = sh.quadrature(200)
     visible = np.maximum(d[:, 2], 0) * (d[:, 0] > 0) / np.pi
     assert np.abs(traced - (w * visible) @ sh.basis(d, 3)).max() < 4e-3
@@ -31,7 +32,7 @@ def test_half_the_sky_is_the_integral_over_half_the_sky(variant: str, wall) -> N
 def test_a_convex_body_casts_no_shadow_on_itself(variant: str) -> None:
     ball = trimesh.creation.icosphere(3)
     n = np.array(ball.vertices)
-    assert np.array_equal(trace_transfer(n, ball.faces, n, n, 4), diffuse_matrix(n, 4))
+    assert np.array_equal(trace_transfer(SurfaceScene(n, ball.faces), n, n, 4), diffuse_matrix(n, 4))
 
 
 def test_a_wall_sends_light_back(variant: str, wall) -> None:
@@ -41,20 +42,20 @@ def test_a_wall_sends_light_back(variant: str, wall) -> None:
     both = np.concatenate([vertices - np.array([1.0, 0.0, 0.0]), floor])
     indices = np.concatenate([faces, [[4, 5, 6], [4, 6, 7]]])
     white = np.sqrt(4 * np.pi)  # constant radiance 1
-    dark = trace_transfer(both, indices, POINT, UP, 1, 4096)[0, 0] * white
-    lit = trace_transfer(both, indices, POINT, UP, 1, 4096, bounce_albedo=0.5)[0, 0] * white
+    dark = trace_transfer(SurfaceScene(both, indices), POINT, UP, 1, 4096)[0, 0] * white
+    lit = trace_transfer(SurfaceScene(both, indices), POINT, UP, 1, 4096, bounce_albedo=0.5)[0, 0] * white
     assert dark == pytest.approx(0.5, abs=0.01)
     assert 0.5 * 0.5 * 0.4 < lit - dark < 0.5 * 0.5  # the wall's lower end sees less than the whole sky
 
 
 def test_seeds(variant: str, wall) -> None:
-    a, b, c = (trace_transfer(*wall, POINT, UP, 2, 16, seed=seed) for seed in (1, 1, 2))
+    a, b, c = (trace_transfer(SurfaceScene(*wall), POINT, UP, 2, 16, seed=seed) for seed in (1, 1, 2))
     assert np.array_equal(a, b) and not np.array_equal(a, c)
 
 
 def test_bad_input_is_named(variant: str, wall) -> None:
     with pytest.raises(InputError, match="points and normals"):
-        trace_transfer(*wall, POINT, UP[:0], 3)
+        trace_transfer(SurfaceScene(*wall), POINT, UP[:0], 3)
     with pytest.raises(InputError, match="samples: found 0"):
-        trace_transfer(*wall, POINT, UP, 3, samples=0)
-    assert trace_transfer(*wall, POINT[:0], UP[:0], 3).shape == (0, 9)
+        trace_transfer(SurfaceScene(*wall), POINT, UP, 3, samples=0)
+    assert trace_transfer(SurfaceScene(*wall), POINT[:0], UP[:0], 3).shape == (0, 9)

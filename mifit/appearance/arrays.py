@@ -1,0 +1,53 @@
+"""NumPy arrays in the form in which Dr.Jit's kernels stay the same from call to call."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from mifit.errors import InputError
+
+ALIGNMENT = 64
+
+
+def aligned(values: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray[Any]:
+    """Copy values into contiguous memory that starts at a multiple of `ALIGNMENT` bytes.
+
+    Dr.Jit reads NumPy's memory where it lies, and its LLVM backend writes the memory's alignment into the kernel. NumPy
+    aligns to 16 bytes only: the same kernel would be compiled anew for each pattern of its inputs' addresses.
+    """
+    source = np.asarray(values)
+    out_type = np.dtype(dtype)
+    size = source.size * out_type.itemsize
+    block = np.empty(size + ALIGNMENT, dtype=np.uint8)
+    start = -block.ctypes.data % ALIGNMENT
+    out = block[start : start + size].view(out_type).reshape(source.shape)
+    out[...] = source
+    return out
+
+
+def vector(kind: Any, values: NDArray) -> Any:
+    """(N, 3) array -> Dr.Jit vector of a kind, such as ``mi.Vector3f``."""
+    return kind(*map(aligned, np.asarray(values).T))
+
+
+def stored(values: list[Any], count: int) -> NDArray[np.float32]:
+    """Floats, of width N or 1, computed in one kernel -> (N, number of values)."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if not count:
+        return np.zeros((0, len(values)), np.float32)
+    floats = [mi.Float(value) for value in values]
+    dr.eval(floats)
+    return np.stack([np.broadcast_to(np.array(f, dtype=np.float32), (count,)) for f in floats], axis=1)
+
+
+def expect(values: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float32]:
+    """The values as float32; InputError names the shape found and the one expected."""
+    array = np.asarray(values, dtype=np.float32)
+    if array.shape != shape:
+        raise InputError(f"{name}: found shape {array.shape}, expected {shape}")
+    return array

@@ -1,0 +1,245 @@
+"""What lights a face: smooth distant light, compact lights beside it, and an ambient term.
+
+NumPy only: a record that stages fit, results keep and shading reads.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mifit.core.sh import SHLighting, basis, order_of
+from mifit.errors import InputError
+
+if TYPE_CHECKING:
+    from mifit.render.gbuffer import SurfaceScene
+
+RAYS = 16
+"""Directions or points that stand for the extent of a compact light."""
+
+
+class Light(Protocol):
+    """A light that is too compact for spherical harmonics; its colour is what images are linear in.
+
+    A surface point that sees the light from a unit direction w reflects ``colour * strength * f(w, v) * (n . w)``,
+    averaged over the samples of the light's extent that it sees.
+
+    Attributes
+    ----------
+    colour : (3,)
+        Linear Rec. 709. Of a distant light the irradiance of a surface that faces it.
+    """
+
+    @property
+    def colour(self) -> NDArray[np.float64]:
+        """(3,) linear Rec. 709."""
+        ...
+
+    def with_colour(self, colour: ArrayLike) -> Light:
+        """The same light in another colour."""
+        ...
+
+    def rotated(self, rotation: ArrayLike) -> Light:
+        """The light turned by a rotation (3, 3) about the origin of world space."""
+        ...
+
+    def coefficients(self, order: int) -> NDArray[np.float64]:
+        """(B*B, 3) SH coefficients of its radiance: what B bands can show of it."""
+        ...
+
+    def document(self) -> dict[str, Any]:
+        """JSON values from which `light_from` makes it again."""
+        ...
+
+    def emitter(self) -> dict[str, Any]:
+        """The stock Mitsuba emitter that is nearest to it."""
+        ...
+
+    def describe(self) -> str:
+        """A few words for a report."""
+        ...
+
+    def visible(self, scene: SurfaceScene, points: NDArray, normals: NDArray) -> NDArray[np.uint32]:
+        """(N,) which samples the points (N, 3) of a mesh see, a bit each."""
+        ...
+
+    def incident(self, points: Any) -> tuple[list[Any], Any]:
+        """Unit directions (Vector3f) from points (Point3f) towards the samples, and the strength of the light there.
+
+        Dr.Jit; a distant light doesn't look at the points, and they may be None.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class DistantLight:
+    """A disc of even radiance, far away, such as the sun or a bare lamp.
+
+    Attributes
+    ----------
+    direction : (3,) float64
+        Unit vector towards its centre, world axes.
+    radius : float
+        Angular radius in radians; 0 for a point.
+    colour : (3,) float64
+        Irradiance of a surface that faces it, linear Rec. 709: a white Lambertian point reflects 1 / pi of it.
+    """
+
+    direction: NDArray[np.float64]
+    radius: float
+    colour: NDArray[np.float64]
+
+    def samples(self, count: int = RAYS) -> NDArray[np.float64]:
+        """(count, 3) directions that cover the disc evenly."""
+        return disc(self.direction, self.radius, count)
+
+    def with_colour(self, colour: ArrayLike) -> DistantLight:
+        """The same light in another colour."""
+        return replace(self, colour=np.asarray(colour, dtype=np.float64))
+
+    def rotated(self, rotation: ArrayLike) -> DistantLight:
+        """The light turned by a rotation R (3, 3): what came from d comes from R d."""
+        return replace(self, direction=np.asarray(rotation, dtype=np.float64) @ self.direction)
+
+    def coefficients(self, order: int) -> NDArray[np.float64]:
+        """(B*B, 3) SH coefficients of its radiance: what B bands can show of it."""
+        return np.outer(basis(self.samples(), order).mean(0), self.colour)
+
+    def document(self) -> dict[str, Any]:
+        """JSON values from which `light_from` makes it again."""
+        return {"direction": self.direction.tolist(), "radius": self.radius, "irradiance": self.colour.tolist()}
+
+    def emitter(self) -> dict[str, Any]:
+        """A point at infinity, whatever its radius."""
+        return {
+            "type": "directional",
+            "direction": [-float(x) for x in self.direction],
+            "irradiance": {"type": "rgb", "value": [float(x) for x in self.colour]},
+        }
+
+    def describe(self) -> str:
+        """Where it is and how large it looks."""
+        x, y, z = self.direction
+        return f"towards ({x:.2f}, {y:.2f}, {z:.2f}), with an angular radius of {math.degrees(self.radius):.1f} degrees"
+
+    def visible(self, scene: SurfaceScene, points: NDArray, normals: NDArray) -> NDArray[np.uint32]:
+        """(N,) which samples of the disc the points (N, 3) of a mesh see, a bit each."""
+        return scene.open_towards(points, normals, self.samples())
+
+    def incident(self, points: Any = None) -> tuple[list[Any], Any]:
+        """Directions towards the samples of the disc, the same for all points, and the strength 1."""
+        import drjit as dr
+        import mitsuba as mi
+
+        directions = [mi.Vector3f(*map(float, d)) for d in self.samples()]
+        dr.make_opaque(directions)
+        return directions, 1.0
+
+
+def light_from(document: dict[str, Any]) -> Light:
+    """The light of `Light.document`.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        A value is missing, of the wrong kind or shape, or not finite.
+    """
+    direction, colour = (np.array(document[name], dtype=np.float64) for name in ("direction", "irradiance"))
+    radius = float(document["radius"])
+    if direction.shape != (3,) or colour.shape != (3,) or not np.isfinite([*direction, *colour, radius]).all():
+        raise ValueError(f"compact light: found {document}, expected three finite numbers for direction and irradiance")
+    return DistantLight(direction, radius, colour)
+
+
+def disc(direction: ArrayLike, radius: float, count: int = RAYS) -> NDArray[np.float64]:
+    """Directions (count, 3) that cover a disc of an angular radius evenly, on a sunflower's pattern."""
+    centre = np.asarray(direction, dtype=np.float64)
+    frame = np.linalg.svd(centre[None])[2]  # the centre up to its sign, and two directions across
+    i = np.arange(count) + 0.5
+    # Even in solid angle: the cap between centre and angle a has the area 2 pi (1 - cos a).
+    cosine = 1.0 - (1.0 - math.cos(radius)) * i / count
+    angle = i * math.pi * (3.0 - math.sqrt(5.0))
+    across = np.cos(angle)[:, None] * frame[1] + np.sin(angle)[:, None] * frame[2]
+    return cosine[:, None] * centre + np.sqrt(np.maximum(1.0 - cosine**2, 0.0))[:, None] * across
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """Everything that lights a face, world axes, linear Rec. 709.
+
+    Attributes
+    ----------
+    radiance : (B*B, 3) float64
+        SH coefficients of the smooth incident radiance, conventions of ``core.sh``; compact lights are not in it.
+    lights : tuple of Light
+        Compact lights beside it.
+    ambient : float
+        The paper's I_a, added to every point: light that the model leaves out.
+
+    Raises
+    ------
+    InputError
+        Radiance of another shape than (B*B, 3).
+    """
+
+    radiance: NDArray[np.float64]
+    lights: tuple[Light, ...] = field(default=())
+    ambient: float = 0.0
+
+    def __post_init__(self) -> None:
+        radiance = np.asarray(self.radiance, dtype=np.float64)
+        if radiance.ndim != 2 or radiance.shape[1] != 3:
+            raise InputError(f"radiance: found shape {radiance.shape}, expected (B*B, 3)")
+        order_of(radiance)
+        object.__setattr__(self, "radiance", radiance)
+        object.__setattr__(self, "lights", tuple(self.lights))
+
+    @classmethod
+    def dark(cls, order: int, lights: Sequence[Light] = ()) -> Illumination:
+        """No light from B bands, and compact lights of no colour: the shape of what is to be fitted."""
+        return cls(np.zeros((order * order, 3)), tuple(light.with_colour(np.zeros(3)) for light in lights))
+
+    @property
+    def order(self) -> int:
+        """Number of bands B."""
+        return order_of(self.radiance)
+
+    @property
+    def unknowns(self) -> NDArray[np.float64]:
+        """(K, 3) all that images are linear in, but for ambient: coefficients, then a colour per compact light."""
+        return np.concatenate([self.radiance, *(light.colour[None] for light in self.lights)])
+
+    def with_unknowns(self, values: NDArray, ambient: float | None = None) -> Illumination:
+        """The same lights with other coefficients and colours (K, 3); inverse of `unknowns`."""
+        count = len(self.radiance)
+        if np.shape(values) != (count + len(self.lights), 3):
+            raise InputError(f"lighting: found shape {np.shape(values)}, expected {(count + len(self.lights), 3)}")
+        lights = tuple(light.with_colour(colour) for light, colour in zip(self.lights, values[count:], strict=True))
+        return Illumination(values[:count], lights, self.ambient if ambient is None else ambient)
+
+    def rotated(self, rotation: ArrayLike) -> Illumination:
+        """Turned by a rotation R (3, 3): what came from d comes from R d."""
+        turned = SHLighting(self.radiance).rotate(rotation).coefficients
+        return replace(self, radiance=turned, lights=tuple(light.rotated(rotation) for light in self.lights))
+
+    def scaled(self, factor: float) -> Illumination:
+        """Everything brighter by a factor."""
+        lights = tuple(light.with_colour(factor * light.colour) for light in self.lights)
+        return Illumination(factor * self.radiance, lights, factor * self.ambient)
+
+    def without_lights(self) -> Illumination:
+        """The smooth part alone."""
+        return replace(self, lights=())
+
+    def without_light(self, number: int) -> Illumination:
+        """All but one of the compact lights."""
+        return replace(self, lights=self.lights[:number] + self.lights[number + 1 :])
+
+    def smooth(self) -> SHLighting:
+        """All of it, without ambient, as far as the bands can show compact lights."""
+        return SHLighting(self.radiance + sum((light.coefficients(self.order) for light in self.lights), np.zeros(1)))

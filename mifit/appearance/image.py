@@ -1,0 +1,243 @@
+"""How an image is formed: a shading model, what lights the surface, its lobe, and what stands in the light's way.
+
+The image of a point is ``ambient + albedo * diffuse + specular_albedo * specular``, with diffuse and specular radiance
+at unit albedo from smooth and from compact lights. `assemble` is the only place that says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mifit.appearance import models
+from mifit.appearance.arrays import aligned, expect, stored, vector
+from mifit.appearance.illumination import Illumination, Light
+from mifit.appearance.kernels import PreparedLobe, diffuse_transfer, prepare
+from mifit.appearance.lobe import Lobe
+from mifit.appearance.models import ShadingModel
+from mifit.appearance.models.base import Shade
+from mifit.appearance.occlusion import OccludingMesh, Occlusion, SurfacePoints
+from mifit.errors import InputError
+
+OPEN = Occlusion()
+
+
+def assemble(ambient: Any, albedo: Any, diffuse: Any, specular_albedo: Any, specular: Any) -> Any:
+    """The image of points, from diffuse and specular radiance at unit albedo; NumPy or Dr.Jit, shapes broadcast."""
+    return ambient + albedo * diffuse + specular_albedo * specular
+
+
+class Reflectance(Protocol):
+    """What `Appearance.of` reads of stage 2's estimate."""
+
+    illumination: Illumination
+    lobe: Lobe
+    shading_model: str
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """An image-formation model with all of its parameters but albedos.
+
+    Attributes
+    ----------
+    model : ShadingModel
+    illumination : Illumination
+    lobe : Lobe
+        One exponent, or one for each of the points that are shaded.
+    """
+
+    model: ShadingModel
+    illumination: Illumination
+    lobe: Lobe
+
+    @classmethod
+    def of(cls, reflectance: Reflectance, lobe: Lobe | None = None) -> Appearance:
+        """That of an estimate; ``lobe`` stands for its own, e.g. looked up at the points."""
+        return cls(models.get(reflectance.shading_model), reflectance.illumination, lobe or reflectance.lobe)
+
+    @property
+    def order(self) -> int:
+        """Number of bands of the smooth light."""
+        return self.illumination.order
+
+    def trace(self, mesh: OccludingMesh, points: SurfacePoints, seed: int = 0) -> Occlusion:
+        """What of the mesh stands between points on it and the light, as far as this appearance asks."""
+        return Occlusion.trace(mesh, points, self.illumination, seed, self.model.needs_shadows)
+
+    def shade(
+        self, normals: ArrayLike, view: ArrayLike, occlusion: Occlusion = OPEN, points: ArrayLike | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Diffuse and specular radiance (N, 3) of points at unit albedo, without ambient.
+
+        Parameters
+        ----------
+        normals, view : (N, 3)
+            Unit normals and unit directions towards the camera, world axes.
+        occlusion : Occlusion
+            Shadows at the points; models that need none and illumination without compact lights may do without.
+        points : (N, 3), optional
+            World positions, for lights that are near.
+
+        Raises
+        ------
+        InputError
+            Arrays of unequal lengths or wrong shapes, or shadows that are missing.
+        """
+        scene = _Scene(self, normals, view, occlusion, points)
+        if not scene.count:
+            return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
+        return scene.store(scene.with_lights(self._smooth(scene))(scene.n, scene.v))
+
+    def shade_bent(
+        self,
+        normals: ArrayLike,
+        base: ArrayLike,
+        view: ArrayLike,
+        occlusion: Occlusion = OPEN,
+        points: ArrayLike | None = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """As `shade`, for normals that are bent away from those of the mesh (``base``), where shadows were traced."""
+        scene = _Scene(self, base, view, occlusion, points)
+        if not scene.count:
+            return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
+        return scene.store(scene.shader()(vector(type(scene.n), expect(normals, (scene.count, 3), "normals")), scene.v))
+
+    def shader(
+        self, base: ArrayLike, view: ArrayLike, occlusion: Occlusion = OPEN, points: ArrayLike | None = None
+    ) -> Shade:
+        """Shading as a Dr.Jit function of the normal, differentiable; parameters as in `shade_bent`."""
+        return _Scene(self, base, view, occlusion, points).shader()
+
+    def transfers(
+        self, normals: ArrayLike, view: ArrayLike, occlusion: Occlusion = OPEN, points: ArrayLike | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Diffuse and specular transfer (N, K): radiance at unit albedo = matrix @ ``illumination.unknowns``.
+
+        The first B*B columns belong to the SH coefficients, the others to the compact lights' colours. For models that
+        turn with the lighting they are those of this illumination.
+        """
+        scene = _Scene(self, normals, view, occlusion, points)
+        if not scene.count:
+            empty = np.zeros((0, len(self.illumination.unknowns)), np.float32)
+            return empty, empty
+        found = self.model.transfer(scene.n, scene.v, scene.lobe, scene.coefficients, scene.shadowed)
+        diffuse, specular = list(found.diffuse), [found.gain * t for t in found.specular]
+        for light, visible in zip(self.illumination.lights, scene.visible, strict=True):
+            d, s = scene.light(light, visible)(scene.n, scene.v)
+            diffuse.append(d)
+            specular.append(s)
+        both = stored([*diffuse, *specular], scene.count)
+        return both[:, : len(diffuse)], both[:, len(diffuse) :]
+
+    def light_transfer(
+        self, light: Light, normals: ArrayLike, view: ArrayLike, visible: NDArray, points: ArrayLike | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Diffuse and specular radiance (N,) at unit albedo per unit of a compact light's colour.
+
+        ``visible`` (N,) uint32 tells which of the light's samples each point sees (``Light.visible``).
+        """
+        import mitsuba as mi
+
+        scene = _Scene(
+            Appearance(self.model, Illumination.dark(1), self.lobe), normals, view, Occlusion(), points, shadows=False
+        )
+        if not scene.count:
+            return np.zeros(0, np.float32), np.zeros(0, np.float32)
+        both = stored(list(scene.light(light, mi.UInt(visible))(scene.n, scene.v)), scene.count)
+        return both[:, 0], both[:, 1]
+
+    def _smooth(self, scene: _Scene) -> Shade:
+        return lambda n, v: self.model.shade(n, v, scene.lobe, scene.coefficients, scene.shadowed)
+
+
+class _Scene:
+    """Points and an appearance on the device."""
+
+    def __init__(
+        self,
+        appearance: Appearance,
+        normals: ArrayLike,
+        view: ArrayLike,
+        occlusion: Occlusion,
+        points: ArrayLike | None,
+        shadows: bool = True,
+    ) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        self.appearance, self.model = appearance, appearance.model
+        illumination, order = appearance.illumination, appearance.order
+        self.count = len(np.asarray(normals))
+        shape = (self.count, 3)
+        self.n, self.v = (
+            vector(mi.Vector3f, expect(x, shape, name)) for x, name in ((normals, "normals"), (view, "view"))
+        )
+        self.points = None if points is None else vector(mi.Point3f, expect(points, shape, "points"))
+        self.shadowed = None
+        if shadows and self.model.needs_shadows:
+            if occlusion.transfer is None:
+                raise InputError(
+                    f"shading model {self.model.name!r}: found no transfer vectors, expected those of trace_transfer"
+                )
+            rows = expect(occlusion.transfer, (self.count, order * order), "shadowed transfer")
+            self.shadowed = [mi.Float(aligned(column)) for column in rows.T]
+        if len(occlusion.visible) != len(illumination.lights):
+            raise InputError(
+                f"compact lights: found visibility of {len(occlusion.visible)}, expected it of "
+                f"{len(illumination.lights)}; trace it with Occlusion.trace"
+            )
+        self.visible = [mi.UInt(np.asarray(bits, dtype=np.uint32)) for bits in occlusion.visible]
+        # Inputs of the kernel instead of constants in it, so that it is compiled once.
+        self.coefficients = [mi.Color3f(*map(float, row)) for row in illumination.radiance]
+        dr.make_opaque(self.coefficients)
+        self.lobe: PreparedLobe = prepare(appearance.lobe, order)
+
+    def shader(self) -> Shade:
+        """Shading of bent normals, compact lights included."""
+        return self.with_lights(self.model.about(self.n, self.v, self.lobe, self.coefficients, self.shadowed))
+
+    def light(self, light: Light, visible: Any) -> Shade:
+        """Radiance at unit albedo per unit of a light's colour, as a function of normal and view."""
+        directions, strength = light.incident(self.points)
+        return lambda n, v: self.model.light(n, v, self.lobe, directions, strength, visible)
+
+    def with_lights(self, smooth: Shade) -> Shade:
+        """Add the compact lights to the shading by smooth light."""
+        import drjit as dr
+        import mitsuba as mi
+
+        lights = self.appearance.illumination.lights
+        if not lights:
+            return smooth
+        parts = [self.light(*pair) for pair in zip(lights, self.visible, strict=True)]
+        colours = [mi.Color3f(*map(float, light.colour)) for light in lights]
+        dr.make_opaque(colours)
+
+        def shade(n: Any, v: Any) -> tuple[Any, Any]:
+            diffuse, specular = smooth(n, v)
+            for part, colour in zip(parts, colours, strict=True):
+                d, s = part(n, v)
+                diffuse, specular = diffuse + d * colour, specular + s * colour
+            return diffuse, specular
+
+        return shade
+
+    def store(self, shaded: tuple[Any, Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Two colours -> two arrays (N, 3)."""
+        import mitsuba as mi
+
+        d, s = (mi.Color3f(part) for part in shaded)
+        both = stored([d.x, d.y, d.z, s.x, s.y, s.z], self.count)
+        return both[:, :3], both[:, 3:]
+
+
+def diffuse_matrix(normals: ArrayLike, order: int) -> NDArray[np.float32]:
+    """(N, B*B) unshadowed transfer: radiance of a white Lambertian point = matrix @ coefficients."""
+    import mitsuba as mi
+
+    n = expect(normals, (len(np.asarray(normals)), 3), "normals")
+    return stored(diffuse_transfer(vector(mi.Vector3f, n), order), len(n))

@@ -1,0 +1,235 @@
+"""What of a mesh stands between points on it and the light: paid for once per geometry.
+
+Smooth light has traced transfer vectors, found at the mesh's vertices and interpolated; compact lights have the part of
+their extent that a point sees, found at the points themselves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mifit.appearance.arrays import aligned, stored, vector
+from mifit.appearance.illumination import Illumination
+from mifit.appearance.kernels import diffuse_transfer, sh_basis
+from mifit.core.mesh import interpolate, vertex_normals
+from mifit.core.sh import check_order
+from mifit.errors import InputError
+
+if TYPE_CHECKING:
+    from mifit.render.gbuffer import SurfaceScene
+
+OFFSET = 1e-3
+"""Distance by which rays start off the surface, relative to the mesh's diagonal: facets don't shadow themselves."""
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """N points on a mesh.
+
+    Attributes
+    ----------
+    position, normal : (N, 3)
+        World space; the mesh's own unit normals.
+    face : (N,) int, barycentric : (N, 3)
+        Where on the mesh they lie.
+    """
+
+    position: NDArray
+    normal: NDArray
+    face: NDArray
+    barycentric: NDArray
+
+
+class OccludingMesh:
+    """A mesh that shadows itself; what is traced at its vertices is kept.
+
+    Parameters
+    ----------
+    scene : SurfaceScene
+        The mesh as rays meet it.
+    """
+
+    def __init__(self, scene: SurfaceScene) -> None:
+        self.scene = scene
+        self._transfer: dict[tuple[int, int], NDArray[np.float32]] = {}
+
+    def transfer(self, order: int, seed: int = 0) -> NDArray[np.float32]:
+        """(V, B*B) shadowed diffuse transfer at the vertices."""
+        if (order, seed) not in self._transfer:
+            vertices = np.asarray(self.scene.vertices, dtype=np.float64)
+            normals = vertex_normals(vertices, self.scene.faces)
+            self._transfer[order, seed] = trace_transfer(self.scene, vertices, normals, order, seed=seed)
+        return self._transfer[order, seed]
+
+
+@dataclass(frozen=True)
+class Occlusion:
+    """Shadows of a mesh on N points of it; the default is none.
+
+    Attributes
+    ----------
+    transfer : (N, B*B) float32 or None
+        Shadowed diffuse transfer, for models that need it.
+    visible : tuple of (N,) uint32
+        Per compact light, which of its samples each point sees.
+    """
+
+    transfer: NDArray[np.float32] | None = None
+    visible: tuple[NDArray[np.uint32], ...] = ()
+
+    @classmethod
+    def trace(
+        cls,
+        mesh: OccludingMesh,
+        points: SurfacePoints,
+        illumination: Illumination,
+        seed: int = 0,
+        smooth: bool = True,
+    ) -> Occlusion:
+        """Trace what points of a mesh see of an illumination.
+
+        Parameters
+        ----------
+        mesh : OccludingMesh
+        points : SurfacePoints
+        illumination : Illumination
+            Its number of bands, and its compact lights.
+        seed : int
+            The same seed gives the same shadows.
+        smooth : bool
+            Whether smooth light is wanted: models without shadows do without.
+        """
+        transfer = None
+        if smooth:
+            at_vertices = mesh.transfer(illumination.order, seed)
+            transfer = interpolate(at_vertices, mesh.scene.faces, points.face, points.barycentric)
+        lights = illumination.lights
+        return cls(transfer, tuple(light.visible(mesh.scene, points.position, points.normal) for light in lights))
+
+    def take(self, rows: NDArray | slice) -> Occlusion:
+        """Those of some of the points."""
+        transfer = None if self.transfer is None else self.transfer[rows]
+        return Occlusion(transfer, tuple(bits[rows] for bits in self.visible))
+
+
+def trace_transfer(
+    scene: SurfaceScene,
+    points: ArrayLike,
+    normals: ArrayLike,
+    order: int,
+    samples: int = 64,
+    seed: int = 0,
+    bounce_albedo: float | None = None,
+) -> NDArray[np.float32]:
+    """Trace the shadowed diffuse transfer vectors of surface points.
+
+    ``albedo * (transfer @ coefficients)`` is the radiance that a Lambertian point reflects under SH lighting, with the
+    mesh's own shadows. The unshadowed part is the closed form and rays only estimate what is taken away, so points
+    that see the whole sky carry no noise.
+
+    Parameters
+    ----------
+    scene : SurfaceScene
+        The mesh that casts shadows.
+    points, normals : (N, 3)
+        Points on it and their unit normals.
+    order : int
+        Number of bands B.
+    samples : int
+        Rays per point.
+    seed : int
+        The same seed gives the same result.
+    bounce_albedo : float, optional
+        Adds the light that reaches the points after one diffuse reflection off the mesh, with this albedo.
+
+    Returns
+    -------
+    (N, B*B) float32
+
+    Raises
+    ------
+    InputError
+        Points and normals of unequal shapes, no sample, or no band.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    check_order(order)
+    vertices, faces = np.asarray(scene.vertices, dtype=np.float64), np.asarray(scene.faces)
+    p, n = np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
+    if p.ndim != 2 or p.shape[1] != 3 or p.shape != n.shape:
+        raise InputError(f"points and normals: found shapes {p.shape} and {n.shape}, expected (N, 3) each")
+    if samples < 1:
+        raise InputError(f"samples: found {samples}, expected 1 or more")
+    offset = OFFSET * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    at_vertices = None
+    if bounce_albedo:
+        vertex_n = vertex_normals(vertices, faces)
+        first = _trace(scene.rays, offset, vertices, vertex_n, order, samples, seed, None, None, 0.0)
+        at_vertices = mi.Float(aligned(first).ravel())
+    indices = mi.UInt(aligned(faces, np.uint32).ravel())
+    result = _trace(scene.rays, offset, p, n, order, samples, seed + 1, at_vertices, indices, bounce_albedo or 0.0)
+    dr.flush_malloc_cache()
+    return result
+
+
+def _trace(
+    scene: Any,
+    offset: float,
+    points: NDArray,
+    normals: NDArray,
+    order: int,
+    samples: int,
+    seed: int,
+    at_vertices: Any,
+    indices: Any,
+    albedo: float,
+) -> NDArray[np.float32]:
+    """One kernel: a thread per point, a loop over its rays, B*B sums in registers."""
+    import drjit as dr
+    import mitsuba as mi
+
+    count, size = len(points), order * order
+    if not count:
+        return np.zeros((0, size), np.float32)
+    n = vector(mi.Vector3f, np.asarray(normals, dtype=np.float32))
+    origin = vector(mi.Vector3f, np.asarray(points + offset * normals, dtype=np.float32))
+    frame = mi.Frame3f(n)
+    shift = mi.PCG32(size=count, initstate=seed)
+    shift_u, shift_v = shift.next_float32(), shift.next_float32()
+
+    def body(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+        # A rank-1 lattice, shifted at random per point: far less noise than independent rays.
+        u = dr.fma(mi.Float(i), 0.7548776662466927, shift_u)
+        v = dr.fma(mi.Float(i), 0.5698402909980532, shift_v)
+        sample = mi.Point2f(u - dr.floor(u), v - dr.floor(v))
+        w = frame.to_world(mi.warp.square_to_cosine_hemisphere(sample))
+        ray = mi.Ray3f(mi.Point3f(origin), w)
+        y = sh_basis(w, order)
+        if at_vertices is None:
+            blocked = scene.ray_test(ray)
+            return i + 1, [s - dr.select(blocked, yk, 0.0) for s, yk in zip(sums, y, strict=True)]
+        hit = scene.ray_intersect_preliminary(ray)
+        blocked = hit.is_valid()
+        weights = (1.0 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
+        corners = [dr.gather(mi.UInt, indices, hit.prim_index * 3 + k, blocked) for k in range(3)]
+        out = []
+        for k, (s, yk) in enumerate(zip(sums, y, strict=True)):
+            lit = sum(
+                wc * dr.gather(mi.Float, at_vertices, c * size + k, blocked)
+                for wc, c in zip(weights, corners, strict=True)
+            )
+            out.append(s + dr.select(blocked, albedo * lit - yk, 0.0))
+        return i + 1, out
+
+    _, sums = dr.while_loop(
+        state=(mi.UInt(0), [dr.zeros(mi.Float, count) for _ in range(size)]),
+        cond=lambda i, sums: i < samples,
+        body=body,
+    )
+    unshadowed = diffuse_transfer(n, order)
+    return stored([t + s / samples for t, s in zip(unshadowed, sums, strict=True)], count)
