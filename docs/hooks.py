@@ -23,11 +23,11 @@ def settings_tables(text: str) -> str:
 def settings_table(cls: type, prefix: str, skip: bool = False) -> str:
     """A Markdown table of all settings below a class; ``skip``: without those of the stages."""
     from mifit.config import FitConfig
-    from mifit.schema import describe
+    from mifit.schema import list_settings
 
-    stages = {f"fit.{key}" for key, *_ in describe(FitConfig)} if skip else set()
+    stages = {f"fit.{key}" for key, *_ in list_settings(FitConfig)} if skip else set()
     lines = ["| key | default | expected | meaning |", "| --- | --- | --- | --- |"]
-    for key, default, expected, meaning in describe(cls, prefix):
+    for key, default, expected, meaning in list_settings(cls, prefix):
         if key not in stages:
             shown = "" if default is None else f"`{_toml(default)}`"
             lines.append(f"| `{key}` | {shown} | {expected} | {meaning} |")

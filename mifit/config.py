@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import pydantic
 
-from mifit.schema import choice, flag, from_mapping, number, part, read_toml, settings
+from mifit.schema import flag, from_mapping, number, one_of, part, read_toml, settings
 
 WEIGHT = 1e9  # above any weight that makes sense, below what overflows in float32
 
@@ -21,7 +21,7 @@ class GeometryConfig:
     ``"paper"`` is the paper's objective, whose weights are for colours of 0..255 and for pixels.
     """
 
-    objective: Literal["consistency", "paper"] = choice("consistency", "what is minimised")
+    objective: Literal["consistency", "paper"] = one_of("consistency", "what is minimised")
     rounds: int = number(2, "outer steps: visibility is found anew in each", least=0, most=100)
     landmark_noise: float = number(
         1.0, "least standard deviation of a landmark coordinate; residuals may raise it", "pixels", above=0, most=1000
@@ -81,10 +81,10 @@ class ReflectanceConfig:
     """Stage 2, reflectance inference (paper, section 5)."""
 
     texture_size: int = number(512, "side of the maps", "texels", least=16, most=4096)
-    solver: Literal["als", "adam"] = choice(
+    solver: Literal["als", "adam"] = one_of(
         "als", "als: lighting with the texels eliminated, then the maps by ADMM; adam: the paper's gradient descent"
     )
-    shading: Annotated[str, pydantic.AfterValidator(_known_shading)] = choice(
+    shading: Annotated[str, pydantic.AfterValidator(_known_shading)] = one_of(
         "auto",
         "image-formation model: paper, prefiltered, shadowed, keyed (shadowed with a compact light), or another that "
         "is registered; auto takes the cheapest of the four that explains the images",
@@ -128,7 +128,7 @@ class NormalsConfig:
     The paper has w2 = 0.3; with ten times that, path-traced captures keep the accuracy of the model's normals.
     """
 
-    solver: Literal["gauss_newton", "adam"] = choice(
+    solver: Literal["gauss_newton", "adam"] = one_of(
         "gauss_newton", "adam is the paper's; both minimise the same energy"
     )
     laplacian_weight: float = number(

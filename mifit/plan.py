@@ -21,10 +21,10 @@ from mifit.errors import InputError
 from mifit.schema import (
     Index,
     Name,
-    choice,
     flag,
     from_mapping,
     number,
+    one_of,
     parse_toml,
     part,
     part_or_none,
@@ -65,7 +65,7 @@ class FitRun:
     model: str = text("builtin", "morphable model: a path or builtin")
     cameras: tuple[Name, ...] = several(("left", "right"), "cameras to use")
     timesteps: tuple[Index, ...] | None = several(None, "timesteps to use; none: the first four")
-    until: Literal["geometry", "reflectance", "normals"] = choice("normals", "last stage")
+    until: Literal["geometry", "reflectance", "normals"] = one_of("normals", "last stage")
     seed: int = number(0, "seed of everything random", least=0, most=SEEDS)
     geometry: GeometryConfig = part(GeometryConfig)
     reflectance: ReflectanceConfig = part(ReflectanceConfig)
@@ -79,7 +79,7 @@ class EvaluateRun:
     """Judge the fit on a view; the settings of ``mifit evaluate``."""
 
     camera: str = text(..., "camera that is not fitted")
-    region: Literal["model", "truth"] = choice("model", "whose face area counts")
+    region: Literal["model", "truth"] = one_of("model", "whose face area counts")
     timesteps: tuple[Index, ...] | None = several(None, "timesteps to judge; none: all of the fit")
 
 

@@ -41,7 +41,7 @@ def number(
     return pydantic.Field(default, description=meaning, **{k: v for k, v in field.items() if v is not None})
 
 
-def choice(default: Any, meaning: str) -> Any:
+def one_of(default: Any, meaning: str) -> Any:
     """A field with one of the values that its ``Literal`` lists."""
     return pydantic.Field(default, description=meaning)
 
@@ -137,12 +137,12 @@ def parse_toml(text: str) -> dict[str, Any]:
     return tomllib.loads(text)
 
 
-def describe(cls: type, prefix: str = "") -> Iterator[tuple[str, Any, str, str]]:
+def list_settings(cls: type, prefix: str = "") -> Iterator[tuple[str, Any, str, str]]:
     """Every setting below a class: dotted key, default, what is expected, meaning."""
     for name, field in _fields(cls).items():
         inner = _settings_in(field.annotation)
         if inner is not None:
-            yield from describe(inner, f"{prefix}{name}.")
+            yield from list_settings(inner, f"{prefix}{name}.")
         else:
             default = None if field.is_required() else field.get_default(call_default_factory=True)
             yield prefix + name, default, expectation(field), field.description or ""

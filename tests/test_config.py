@@ -19,7 +19,7 @@ from mifit.plan import (
     SynthRun,
     load_plan,
 )
-from mifit.schema import describe, from_mapping
+from mifit.schema import from_mapping, list_settings
 
 
 def test_defaults_are_the_papers():
@@ -89,7 +89,7 @@ def test_settings_made_in_python_are_checked_alike_and_stay_as_they_are():
 def bounded_settings() -> Iterator:
     """Every number of a fit and of an experiment that has a bound, with a value beyond it."""
     for cls, start in ((FitConfig, {}), (Experiment, {"name": "x"})):
-        for key, _, expected, _ in describe(cls):
+        for key, _, expected, _ in list_settings(cls):
             bounds = re.search(r"(?:from (\S+) to (\S+))|(?:above (\S+), at most (\S+))", expected)
             if bounds is None:
                 continue
@@ -113,7 +113,7 @@ def test_every_number_has_bounds_that_hold(cls, start, key, value):
 
 
 def test_every_setting_is_within_its_bounds_and_explained():
-    found = [*describe(FitConfig), *describe(Experiment)]
+    found = [*list_settings(FitConfig), *list_settings(Experiment)]
     assert all(meaning for *_, meaning in found)
     numbers = [key for key, default, expected, _ in found if "number" in expected and "list" not in expected]
     bounded = {parameter.values[2] for parameter in bounded_settings()}
@@ -169,7 +169,7 @@ def test_a_sweep_that_has_no_end_is_refused(tmp_path):
     path = tmp_path / "sweep.toml"
     axes = "\n".join(f'"fit.synth.{key}" = {list(range(16, 1016))}' for key in ("seed", "width", "height", "spp"))
     path.write_text(f"[fit]\nsynth = {{}}\n[sweep.grid]\n{axes}\n")
-    with pytest.raises(InputError, match=r"sweep.grid: found 1000000000000 runs, expected at most 10000"):
+    with pytest.raises(InputError, match=r"sweep: found 1000000000000 runs, expected at most 10000"):
         load_plan(path)
 
 

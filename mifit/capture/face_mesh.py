@@ -20,6 +20,7 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.files import cache_folder
 from mifit.errors import MifitError
 
 REQUIREMENTS = ("mediapipe==0.10.21", "numpy<2")
@@ -29,13 +30,6 @@ of three captures. Their median error is 1.5 per cent, but neighbours share it a
 that a sum over all points must weigh less than if they were independent."""
 PYTHONS = ((3, 9), (3, 12))
 """First and last Python that the wheel of REQUIREMENTS exists for."""
-
-
-def cache_folder() -> Path:
-    """Where mifit keeps what it makes once: ``MIFIT_CACHE``, else ``mifit`` in the user's cache folder."""
-    if "MIFIT_CACHE" in os.environ:
-        return Path(os.environ["MIFIT_CACHE"])
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mifit"
 
 
 def environment_python() -> Path:

@@ -185,6 +185,17 @@ def _room(path: Path, temporary: Path) -> Iterator[None]:
         raise
 
 
+def cache_folder() -> Path:
+    """Where mifit keeps what it makes once: ``MIFIT_CACHE``, else ``mifit`` in the user's cache folder."""
+    if os.environ.get("MIFIT_CACHE"):
+        return Path(os.environ["MIFIT_CACHE"])
+    base = os.environ.get("XDG_CACHE_HOME")
+    try:
+        return Path(base) / "mifit" if base else Path.home() / ".cache" / "mifit"
+    except RuntimeError:  # no home folder
+        return Path(os.devnull) / "mifit"
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write a UTF-8 text file whole or not at all."""
     write_bytes(path, text.encode("utf-8"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,14 @@ class TexturedMesh(Protocol):
     def uv(self) -> NDArray:
         """(T, 2) texture coordinates."""
         ...
+
+
+class MeshPart(NamedTuple):
+    """Some faces with their texture coordinates: what `split_at_seams` takes, where there is no model."""
+
+    faces: NDArray
+    faces_uv: NDArray
+    uv: NDArray
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def complete(
         landmarks = transfer_landmarks(mean.astype(np.float64) * unit_mm, faces)
         check_mesh(name, mean, faces, landmarks)
     if face_mask is None:
-        face_mask = face_area(mean.astype(np.float64), faces, landmarks)
+        face_mask = find_face_mask(mean.astype(np.float64), faces, landmarks)
     if not np.any(face_mask):
         raise InputError(f"{name}: no face lies in the face area that the landmarks span; expected a face mesh")
     if albedo is None:
@@ -140,7 +140,7 @@ def transfer_landmarks(vertices: NDArray, faces: NDArray) -> NDArray[np.int64]:
     return near[np.arange(68), best]
 
 
-def face_area(mean: NDArray, faces: NDArray, landmarks: NDArray) -> NDArray[np.bool_]:
+def find_face_mask(mean: NDArray, faces: NDArray, landmarks: NDArray) -> NDArray[np.bool_]:
     """(F,) faces of the skin between ears, hairline and throat, of the piece that has the nose, openings left out."""
     p = mean[landmarks]
     height = p[17:27, 1].max() - p[8, 1]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mifit.errors import InputError
-from mifit.morphable.assemble import check_mesh, complete, face_area, transfer_landmarks
+from mifit.morphable.assemble import check_mesh, complete, find_face_mask, transfer_landmarks
 from mifit.morphable.builtin.identity import deformation_modes
 from mifit.morphable.model import MorphableModel, provides
 
@@ -32,7 +32,7 @@ def model_of_template(
     vertex = transfer_landmarks(points, faces) if landmarks is None else np.asarray(landmarks)
     check_mesh(name, points, faces, vertex)
     where = np.zeros(len(points), dtype=bool)
-    where[np.unique(faces[face_area(points, faces, vertex)])] = True
+    where[np.unique(faces[find_face_mask(points, faces, vertex)])] = True
     if not where.any():
         raise InputError(f"{name}: no face lies in the face area that the landmarks span; expected a face mesh")
     options = {} if kernels is None else {"symmetric": kernels}

@@ -26,6 +26,7 @@ from mifit.core.limits import (
     check_range,
 )
 from mifit.core.mesh import vertex_normals
+from mifit.core.split_mesh import MeshPart, SplitMesh, split_at_seams
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
@@ -164,10 +165,10 @@ class _Subject:
     model: MorphableModel
     seed: int
     neutral: NDArray[np.float64]
-    poses: list[head.Pose]
+    poses: list[head.HeadPose]
     scale: float
     skin: dict[str, SkinMaps]
-    parts: dict[str, head.SplitMesh]
+    parts: dict[str, SplitMesh]
     eyes: list[NDArray[np.float64]]
 
 
@@ -177,7 +178,7 @@ def _draw_subject(model: MorphableModel, style: SkinStyle, timesteps: int, map_s
     mean_mm = model.mean.astype(np.float64) * model.unit_mm
     normals = vertex_normals(mean_mm, model.faces)
     skin: dict[str, SkinMaps] = {}
-    parts: dict[str, head.SplitMesh] = {}
+    parts: dict[str, SplitMesh] = {}
     rest = ~model.face_mask
     for i, ball in enumerate(head.own_eyeballs(model)):
         parts[f"eye{i}"] = head.split_eyeball(model, ball)
@@ -189,7 +190,7 @@ def _draw_subject(model: MorphableModel, style: SkinStyle, timesteps: int, map_s
         if name == "rest":  # its tiles may overlap or lie outside the unit square
             uv, faces_uv = head.wrap_uv(uv, faces_uv)
         skin[name] = paint(rasterize_uv(uv, faces_uv, map_size), mean_mm, normals, faces, model.landmarks, style)
-        parts[name] = head.split_at_seams(faces, uv, faces_uv)
+        parts[name] = split_at_seams(MeshPart(faces, faces_uv, uv))
     neutral = head.neutral_shape(model, seed)
     centre = neutral[model.landmarks[27:48]].mean(axis=0) - np.array([0.0, 0.0, 55.0 / model.unit_mm])
     eyes = (
@@ -254,7 +255,7 @@ def _write_capture(
     write_transforms(folder / "transforms.json", [View.of(camera) for camera in cameras], shots, "cm")
 
 
-def _world_vertices(subject: _Subject, pose: head.Pose) -> NDArray[np.float64]:
+def _world_vertices(subject: _Subject, pose: head.HeadPose) -> NDArray[np.float64]:
     moved = (subject.model.expression_jacobian @ pose.expression).reshape(-1, 3)
     return subject.scale * (subject.neutral + moved) @ pose.rotation.T + pose.translation
 
@@ -270,10 +271,10 @@ def _materials(subject: _Subject) -> dict[str, Material]:
     return materials
 
 
-def _surfaces(subject: _Subject, pose: head.Pose, world: NDArray) -> list[Surface]:
+def _surfaces(subject: _Subject, pose: head.HeadPose, world: NDArray) -> list[Surface]:
     normals = vertex_normals(world, subject.model.faces)
     surfaces = [
-        Surface(world[part.source], normals[part.source], part.uv, part.faces, name.rstrip("01"))
+        Surface(world[part.origin], normals[part.origin], part.uv, part.faces, name.rstrip("01"))
         for name, part in subject.parts.items()
     ]
     unit, uv, faces = head.sphere()

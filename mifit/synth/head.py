@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from mifit.core.mesh import edges, vertex_normals
+from mifit.core.split_mesh import SplitMesh
 from mifit.morphable import MorphableModel
 from mifit.synth.noise import smooth_noise
 
@@ -21,7 +22,7 @@ IRIS_COLOURS = np.array([[0.10, 0.045, 0.02], [0.16, 0.10, 0.04], [0.14, 0.20, 0
 
 
 @dataclass(frozen=True)
-class Pose:
+class HeadPose:
     """Head pose and expression at one timestep: world = scale * rotation @ object + translation."""
 
     expression: NDArray[np.float32]
@@ -42,7 +43,7 @@ def neutral_shape(model: MorphableModel, seed: int) -> NDArray[np.float64]:
     return shape + (0.5 / model.unit_mm) * noise[:, None] * vertex_normals(shape, model.faces)
 
 
-def draw_motion(model: MorphableModel, timesteps: int, seed: int, scale: float, centre: NDArray) -> list[Pose]:
+def draw_motion(model: MorphableModel, timesteps: int, seed: int, scale: float, centre: NDArray) -> list[HeadPose]:
     """A pose and an expression per timestep, smooth in time.
 
     Parameters
@@ -71,33 +72,8 @@ def draw_motion(model: MorphableModel, timesteps: int, seed: int, scale: float, 
         expression[active] = strength * (wave if t else 0.0 * wave)  # the first timestep is neutral
         expression = np.clip(expression, bounds[:, 0], bounds[:, 1])
         translation = np.array(shift) - scale * rotation @ centre
-        poses.append(Pose(expression.astype(np.float32), rotation, translation))
+        poses.append(HeadPose(expression.astype(np.float32), rotation, translation))
     return poses
-
-
-@dataclass(frozen=True)
-class SplitMesh:
-    """Part of a mesh with one UV pair per vertex.
-
-    Attributes
-    ----------
-    source : (W,) int
-        Vertex of the whole mesh that each split vertex copies.
-    uv : (W, 2) float32
-        Wrapped into [0, 1).
-    faces : (F, 3) int32
-    """
-
-    source: NDArray[np.int64]
-    uv: NDArray[np.float32]
-    faces: NDArray[np.int32]
-
-
-def split_at_seams(faces: NDArray, uv: NDArray, faces_uv: NDArray) -> SplitMesh:
-    """Copy vertices so that each has one UV pair."""
-    pairs = np.stack([faces.ravel(), faces_uv.ravel()], axis=1)
-    unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
-    return SplitMesh(unique[:, 0], uv[unique[:, 1]].astype(np.float32), inverse.reshape(-1, 3).astype(np.int32))
 
 
 def wrap_uv(uv: NDArray, faces_uv: NDArray) -> tuple[NDArray[np.float32], NDArray[np.int32]]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mifit.config import FitConfig
 from mifit.plan import Experiment
-from mifit.schema import describe
+from mifit.schema import list_settings
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -21,7 +21,7 @@ def hooks():
 
 def test_every_setting_is_on_its_page():
     page = hooks().on_page_markdown((DOCS / "settings.md").read_text())
-    keys = [key for key, *_ in describe(FitConfig)] + [key for key, *_ in describe(Experiment)]
-    fit = {f"fit.{key}" for key, *_ in describe(FitConfig)}
+    keys = [key for key, *_ in list_settings(FitConfig)] + [key for key, *_ in list_settings(Experiment)]
+    fit = {f"fit.{key}" for key, *_ in list_settings(FitConfig)}
     assert all(f"| `{key}` |" in page for key in keys if key not in fit) and "<!--" not in page
     assert "| `reflectance.bands` | `10` | a whole number from 3 to 10 |" in page

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from mifit.capture import Capture
+from mifit.core.split_mesh import MeshPart, split_at_seams
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.synth.compose import FULL_WELL, READ_NOISE, expose, place_cameras
-from mifit.synth.head import split_at_seams, wrap_uv
+from mifit.synth.head import wrap_uv
 from mifit.synth.noise import smooth_noise
 from mifit.synth.skin import SkinStyle
 from mifit.synth.studio import studio_environment
@@ -107,9 +108,9 @@ def test_a_given_tone_changes_nothing_else_of_a_subject() -> None:
 def test_seams_are_split_and_tiles_wrapped() -> None:
     faces, faces_uv = np.array([[0, 1, 2], [2, 1, 3]]), np.array([[0, 1, 2], [4, 3, 5]])
     uv = np.array([[0, 0], [1, 0], [0, 1], [1.2, 0.1], [1.1, 0.9], [1.9, 0.9]], dtype=np.float32)
-    mesh = split_at_seams(faces, uv, faces_uv)
-    assert len(mesh.source) == 6
-    np.testing.assert_array_equal(mesh.source[mesh.faces], faces)
+    mesh = split_at_seams(MeshPart(faces, faces_uv, uv))
+    assert len(mesh.origin) == 6
+    np.testing.assert_array_equal(mesh.origin[mesh.faces], faces)
     np.testing.assert_array_equal(mesh.uv[mesh.faces], uv[faces_uv])
     wrapped, index = wrap_uv(uv, faces_uv)
     centres = wrapped[index].mean(axis=1)
@@ -119,8 +120,8 @@ def test_seams_are_split_and_tiles_wrapped() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"timesteps": 0}, "timesteps: found 0, expected at least 1"),
-        ({"width": 8}, "width: found 8, expected at least 16"),
+        ({"timesteps": 0}, "timesteps: found 0, expected 1 to"),
+        ({"width": 8}, "width: found 8, expected 16 to"),
         ({"spp": 0}, "spp: found 0"),
         ({"tone": 1.5}, "tone: found 1.5, expected 0"),
         ({"env": "none.hdr", "model": "builtin:coarse"}, "none.hdr: no such image file"),

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+from mifit.core.files import cache_folder
 from mifit.errors import InputError
 from mifit.morphable.builtin.head import make_head
 from mifit.morphable.formats.own import load_own, save_model
@@ -47,15 +48,6 @@ def builtin_model(coarse: bool = False) -> MorphableModel:
     except (OSError, InputError):
         pass  # a cache that can't be written only costs time
     return model
-
-
-def cache_folder() -> Path:
-    """``$XDG_CACHE_HOME/mifit``, or ``~/.cache/mifit``."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    try:
-        return Path(base) / "mifit" if base else Path.home() / ".cache" / "mifit"
-    except RuntimeError:  # no home folder
-        return Path(os.devnull) / "mifit"
 
 
 def _source_digest() -> str:

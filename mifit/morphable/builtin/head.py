@@ -21,7 +21,7 @@ def make_head(coarse: bool = False) -> MorphableModel:
     """Compute the built-in model: about 31 000 vertices, or 8 000 when ``coarse``; takes seconds."""
     t = make_template(2 if coarse else 1)
     landmarks = landmark_vertices(t)
-    mask = face_area(t)
+    mask = template_face_mask(t)
     identity = identity_modes(t, N_IDENTITY)
     expression, names, bounds = expression_modes(t)
     mean_albedo, albedo_modes = skin_model(t.vertices, t.faces[mask], landmarks, 1.0, N_ALBEDO, t.part == SKIN)
@@ -49,7 +49,7 @@ def make_head(coarse: bool = False) -> MorphableModel:
     )
 
 
-def face_area(t: Template) -> NDArray[np.bool_]:
+def template_face_mask(t: Template) -> NDArray[np.bool_]:
     """(F,) faces from the hairline to under the jaw and to the ears, without the insides of lids and lips."""
     v = t.vertices
     inside = (v[:, 1] < 76.0) & (v[:, 1] > -120.0) & (v[:, 2] > 8.0 - 0.25 * np.maximum(v[:, 1], 0.0))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mifit.errors import InputError
-from mifit.morphable.assemble import complete, face_area, interleaved, single, srgb_albedo
+from mifit.morphable.assemble import complete, find_face_mask, interleaved, single, srgb_albedo
 from mifit.morphable.formats.bfm2009 import check_modes, triangles, vector
 from mifit.morphable.formats.mat5 import read_mat
 from mifit.morphable.model import MorphableModel
@@ -27,7 +27,7 @@ def load_deep3d(path: Path) -> MorphableModel:
     keypoints = data["keypoints"].ravel().astype(np.int64) - 1
     if keypoints.size != 68 or keypoints.min() < 0 or keypoints.max() >= n3 // 3:
         raise InputError(f"{path}: keypoints has shape {data['keypoints'].shape}, expected 68 1-based vertices")
-    mask = face_area(mean, faces, keypoints)
+    mask = find_face_mask(mean, faces, keypoints)
     if "skinmask" in data:
         skin = vector(path, data["skinmask"], "skinmask", n3 // 3) > 0.5
         mask &= skin[faces].all(1)
