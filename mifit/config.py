@@ -77,6 +77,21 @@ def _known_shading(name: str) -> str:
 
 
 @settings
+class SurfaceConfig:
+    """The surface beyond the model's span (``stages.find_surface``); needs two views or more."""
+
+    enabled: bool = flag(True, "move the surface to where all views agree; false: it stays in the model's span")
+    reach: float = number(4.0, "distance from the model's surface that is searched", "millimetres", above=0, most=100)
+    stiffness: float = number(
+        8.0,
+        "resistance of the displacements to bending; a wave's height is free in proportion to its length",
+        above=0,
+        most=WEIGHT,
+    )
+    finest: int = number(0, "times that the images are halved at the finest level", least=0, most=6)
+
+
+@settings
 class ReflectanceConfig:
     """Stage 2, reflectance inference (paper, section 5)."""
 
@@ -162,6 +177,7 @@ class FitConfig:
     """All settings of ``mifit.fit``."""
 
     geometry: GeometryConfig = part(GeometryConfig)
+    surface: SurfaceConfig = part(SurfaceConfig)
     reflectance: ReflectanceConfig = part(ReflectanceConfig)
     normals: NormalsConfig = part(NormalsConfig)
     mesh: MeshConfig = part(MeshConfig)

@@ -18,7 +18,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import mifit
 from mifit import checkpoint
-from mifit.config import FitConfig, GeometryConfig, MeshConfig, NormalsConfig, ReflectanceConfig, ShapeConfig
+from mifit.config import (
+    FitConfig,
+    GeometryConfig,
+    MeshConfig,
+    NormalsConfig,
+    ReflectanceConfig,
+    ShapeConfig,
+    SurfaceConfig,
+)
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate
 from mifit.progress import Progress
 
@@ -105,6 +113,8 @@ class Step:
 def steps(config: FitConfig, until: Stage = "normals") -> list[Step]:
     """The steps of a fit with these settings, in order."""
     found = [Step("geometry", "geometry", (), (config.geometry,), _fit_geometry)]
+    if config.surface.enabled:
+        found.append(Step("surface", "geometry", ("geometry",), (config.surface,), _find_surface))
     if until == "geometry":
         return found
     found.append(Step("reflectance", "reflectance", ("geometry",), (config.reflectance,), _infer_reflectance))
@@ -177,6 +187,14 @@ def _fit_geometry(source: Source, inputs: Inputs, progress: Progress, config: Ge
     found = fit_geometry(
         source.capture, source.model, source.cameras, source.timesteps, config, seed=source.seed, progress=progress
     )
+    return behind_lids(source.model, found)
+
+
+def _find_surface(source: Source, inputs: Inputs, progress: Progress, config: SurfaceConfig) -> Any:
+    from mifit.stages.eyes import behind_lids
+    from mifit.stages.find_surface import find_surface
+
+    found = find_surface(source.capture, source.model, inputs["geometry"], source.cameras, config, progress)
     return behind_lids(source.model, found)
 
 

@@ -43,8 +43,8 @@ def test_views_from_one_place_bring_a_warning():
     assert one_place(capture, ["a", "b", "c"], geometry) == ()
 
 
-ORDER = ("geometry", "reflectance", "geometry_1", "reflectance_1", "normals", "mesh")
-FIRST = {"geometry": 0, "reflectance": 1, "shape": 2, "normals": 4, "mesh": 5}
+ORDER = ("geometry", "surface", "reflectance", "geometry_1", "reflectance_1", "normals", "mesh")
+FIRST = {"geometry": 0, "surface": 1, "reflectance": 2, "shape": 3, "normals": 5, "mesh": 6}
 """Section of the settings -> the first step that reads it; all later ones depend on that one's estimate."""
 
 
@@ -83,7 +83,7 @@ class Stages:
         self.ran = []
         result = ball_result()
         for name, part in (
-            ("fit_geometry", "geometry"), ("infer_reflectance", "reflectance"), ("refine_shape", "geometry"),
+            ("fit_geometry", "geometry"), ("find_surface", "geometry"), ("infer_reflectance", "reflectance"), ("refine_shape", "geometry"),
             ("refine_normals", "normals"), ("refine_mesh", "mesh"),
         ):  # fmt: skip
             monkeypatch.setattr(f"mifit.stages.{name}.{name}", self.stand_in(name, getattr(result, part)))
@@ -117,7 +117,15 @@ def fitted(monkeypatch):
     return run
 
 
-RUNS = ("fit_geometry", "infer_reflectance", "refine_shape", "infer_reflectance", "refine_normals", "refine_mesh")
+RUNS = (
+    "fit_geometry",
+    "find_surface",
+    "infer_reflectance",
+    "refine_shape",
+    "infer_reflectance",
+    "refine_normals",
+    "refine_mesh",
+)
 
 
 @pytest.mark.parametrize(("section", "name"), SETTINGS, ids=".".join)
@@ -128,6 +136,8 @@ def test_a_changed_setting_reruns_the_steps_that_depend_on_it(fitted, tmp_path, 
     if (section, name) == ("shape", "rounds"):
         # One round more: those that were done serve, the new one and what comes after it run.
         assert ran == ["refine_shape", "infer_reflectance", "refine_normals", "refine_mesh"]
+    elif (section, name) == ("surface", "enabled"):
+        assert ran == list(RUNS[2:])
     else:
         assert ran == list(RUNS[FIRST[section] :])
 
@@ -146,8 +156,8 @@ def test_a_changed_source_reruns_everything(change):
 
 
 def test_stages_that_a_shorter_fit_ran_serve_a_longer_one(fitted, tmp_path):
-    assert fitted(BASE, tmp_path, until="geometry") == ["fit_geometry"]
-    assert fitted(BASE, tmp_path, until="reflectance") == list(RUNS[1:4])
+    assert fitted(BASE, tmp_path, until="geometry") == list(RUNS[:2])
+    assert fitted(BASE, tmp_path, until="reflectance") == list(RUNS[2:5])
     assert fitted(BASE, tmp_path) == ["refine_normals", "refine_mesh"]
 
 

@@ -66,6 +66,9 @@ class GeometryEstimate:
     gains : dict of camera name to (r, g, b)
         Each camera's linear image over the first one's, where asked for; images are divided by it when they are
         observed. A camera that isn't named has gain 1.
+    displacement : (V, 3) float32 or None
+        Neutral surface beyond the model's span, object space: ``model.mean`` plus this is what coefficients add to
+        (`displaced`). None where the surface is the model's.
     """
 
     timesteps: tuple[int, ...]
@@ -81,6 +84,7 @@ class GeometryEstimate:
     ambient: float
     report: Report
     gains: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    displacement: NDArray | None = None
 
     def gain(self, camera: str) -> NDArray:
         """(3,) float32 gain of a camera; 1 where none is known."""

@@ -51,7 +51,7 @@ class MeshUpdater:
         self._corner_weight = _cotangents(rest, self.faces)
         area = np.linalg.norm(face_cross(rest, self.faces), axis=1) / 6.0
         self._anchor = position_weight * np.bincount(self.faces.ravel(), np.repeat(area, 3), minlength=self._count)
-        laplacian = self._stiffness()
+        laplacian = _stiffness(self.faces, self._corner_weight, self._count)
         matrix = (laplacian + sp.diags(self._anchor)).tocsr()[self.free]
         self._fixed_part = matrix[:, ~self.free]
         self._factor = spl.splu(matrix[:, self.free].tocsc()) if self.free.any() else None
@@ -73,17 +73,6 @@ class MeshUpdater:
             right = self._divergence(p, wanted, own, silent) + self._anchor[:, None] * trusted
             p[self.free] = self._factor.solve(right[self.free] - self._fixed_part @ trusted[~self.free])
         return self._unfold(trusted, p, own)
-
-    def _stiffness(self) -> sp.csr_matrix:
-        """Cotangent Laplacian from the corner weights."""
-        f, w = self.faces, self._corner_weight
-        i = np.concatenate([f[:, (k + 1) % 3] for k in range(3)])
-        j = np.concatenate([f[:, (k + 2) % 3] for k in range(3)])
-        weight = w.T.ravel()
-        n = self._count
-        off = sp.csr_matrix((weight, (i, j)), shape=(n, n))
-        off = off + off.T
-        return (sp.diags(np.asarray(off.sum(1)).ravel()) - off).tocsr()
 
     def _divergence(self, p: NDArray, wanted: NDArray, own: NDArray, silent: NDArray) -> NDArray:
         """Right-hand side: weighted sums of every face's edges, projected to the wanted plane."""
@@ -110,6 +99,21 @@ class MeshUpdater:
                 break
             shift[np.unique(self.faces[folded])] *= 0.5 if attempt < 8 else 0.0
         return trusted + shift
+
+
+def cotangent_laplacian(vertices: NDArray, faces: NDArray) -> sp.csr_matrix:
+    """(V, V) positive semidefinite cotangent Laplacian, constants in its null space; small cotangents are raised."""
+    faces = np.asarray(faces, dtype=np.int64)
+    return _stiffness(faces, _cotangents(np.asarray(vertices, dtype=np.float64), faces), len(vertices))
+
+
+def _stiffness(faces: NDArray, corner_weight: NDArray, count: int) -> sp.csr_matrix:
+    """Laplacian from the corner weights (F, 3) of the edges opposite."""
+    i = np.concatenate([faces[:, (k + 1) % 3] for k in range(3)])
+    j = np.concatenate([faces[:, (k + 2) % 3] for k in range(3)])
+    off = sp.csr_matrix((corner_weight.T.ravel(), (i, j)), shape=(count, count))
+    off = off + off.T
+    return (sp.diags(np.asarray(off.sum(1)).ravel()) - off).tocsr()
 
 
 def _cotangents(vertices: NDArray, faces: NDArray) -> NDArray:

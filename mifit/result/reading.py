@@ -136,6 +136,7 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
     mesh = split_at_seams(model)
     vertices = np.empty((n, len(model.mean), 3), dtype=np.float32)
     vertex_albedo = model.albedo(albedo).astype(np.float32)
+    displacement = np.zeros((len(model.mean), 3))
     for i, step in enumerate(steps):
         # Vertices that no face uses are in no mesh file: they follow from the coefficients.
         rotation, translation = np.array(step["rotation"]), np.array(step["translation"])
@@ -144,6 +145,7 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
         stored = _read_mesh(folder / "geometry" / f"{step['timestep']:04d}.ply", mesh)
         vertices[i, mesh.origin] = stored["vertices"]
         vertex_albedo[mesh.origin] = stored["albedo"]
+        displacement += ((vertices[i] - translation) @ rotation / entry["scale"] - shape) / n
     return GeometryEstimate(
         timesteps=tuple(int(s["timestep"]) for s in steps),
         identity=identity,
@@ -161,6 +163,7 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
             name: tuple(_array(gain, (3,), f"gain of {name}").tolist())
             for name, gain in document["capture"].get("gains", {}).items()
         },
+        displacement=displacement.astype(np.float32) if entry.get("displaced") else None,
     )
 
 

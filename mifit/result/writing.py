@@ -151,6 +151,7 @@ def _document(result: Result) -> dict[str, Any]:
                 "identity": geometry.identity.tolist(),
                 "albedo": geometry.albedo.tolist(),
                 "scale": float(geometry.scale),
+                "displaced": geometry.displacement is not None,
             },
             "lighting": lighting,
             "timesteps": [

@@ -17,6 +17,7 @@ from mifit.progress import Progress, silent
 from mifit.solve import Solution
 from mifit.stages.gains import estimate_gains
 from mifit.stages.geometry.appearance import fit_appearance, gather
+from mifit.stages.geometry.displaced import displaced
 from mifit.stages.geometry.landmarks import LandmarkView
 from mifit.stages.geometry.parameters import Frames, Layout
 from mifit.stages.geometry.refine import Reference, priors_of, refine_by_rendering, refine_by_texture, texture_reference
@@ -140,7 +141,7 @@ def fit_pose_expression(
     if not cameras:
         raise InputError("fit_pose_expression: found no camera, expected at least one")
     journal = Journal("track geometry", 2 + config.rounds, progress)
-    baked = bake_identity(model, geometry.identity)
+    baked = bake_identity(displaced(model, geometry), geometry.identity)
     warm = _state_of(geometry, geometry.timesteps[-1])
     config = replace(config, landmark_noise=_landmark_noise(capture, cameras, (timestep,), config))
     views = landmark_views(capture, baked, cameras, (timestep,), config.landmark_noise, fewest=0)
@@ -152,9 +153,10 @@ def fit_pose_expression(
     else:
         state = warm
         journal.warn(f"timestep {timestep}: too few landmarks; started from timestep {geometry.timesteps[-1]} alone")
-    return _refine_and_pack(
+    found = _refine_and_pack(
         capture, baked, cameras, (timestep,), config, seed, journal, state, views, reference, geometry, geometry.gains
     )
+    return replace(found, displacement=geometry.displacement)
 
 
 def _landmark_noise(

@@ -17,6 +17,7 @@ from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
 from mifit.errors import ConvergenceError
 from mifit.progress import Progress, silent
 from mifit.solve import minimize
+from mifit.stages.geometry.displaced import displaced
 from mifit.stages.geometry.refine import ENERGY_TOLERANCE, joint_state, texture_problem
 from mifit.stages.geometry.shading import Shade, ShadedTextureProblem, ShadingTerm
 from mifit.stages.geometry.start import bounds, landmark_views
@@ -79,6 +80,7 @@ def refine_shape(
     geometry_config = geometry_config or GeometryConfig()
     noise = float(geometry.report.details.get("landmark_noise_pixels", geometry_config.landmark_noise))
     geometry_config = replace(geometry_config, landmark_noise=noise)
+    model = displaced(model, geometry)
     state = joint_state(model, geometry)
     visibility = Visibility(capture, model, tuple(cameras), geometry.timesteps, geometry.gains)
     views = landmark_views(capture, model, tuple(cameras), geometry.timesteps, noise, fewest=0)

@@ -14,6 +14,7 @@ from mifit.core.estimate import GeometryEstimate
 from mifit.morphable import MorphableModel
 from mifit.solve import Solution, minimize
 from mifit.stages.geometry.consistency import ConsistencyProblem
+from mifit.stages.geometry.displaced import displaced
 from mifit.stages.geometry.landmarks import LandmarkTerm, LandmarkView
 from mifit.stages.geometry.parameters import Frames, Layout
 from mifit.stages.geometry.points import PointBasis
@@ -72,6 +73,7 @@ def texture_reference(
     geometry : GeometryEstimate
         Its result.
     """
+    model = displaced(model, geometry)
     state = joint_state(model, geometry)
     points = spread_points(model, config.surface_points, seed)
     visibility = Visibility(capture, model, cameras, geometry.timesteps)

@@ -1,0 +1,73 @@
+"""Images as matching sees them: the logarithm between two scales, highlights and shadows' edges held in check."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.camera import Camera
+
+DARKEST = 4e-3
+"""Added before the logarithm, in linear image units: below it the noise of 8-bit images outweighs the signal."""
+WINDOW = 3.0
+"""Wide blur of the band, pixels of the level."""
+LARGEST = 0.3
+"""Contrast in the logarithm above which a feature stops growing: highlights, hair, the edges of cast shadows."""
+
+
+@dataclass(frozen=True)
+class FeatureImage:
+    """One image at one level of the pyramid.
+
+    Attributes
+    ----------
+    camera : Camera
+        Of the full image.
+    factor : float
+        Pixels of the level per pixel of the image, at most 1.
+    values : (h, w, 2) float32
+        Feature, and 1 where it is measured.
+    """
+
+    camera: Camera
+    factor: float
+    values: NDArray[np.float32]
+
+    def sample(self, points: NDArray) -> NDArray[np.float32]:
+        """(N, 2) feature and validity at world points (N, 3); 0 outside the image."""
+        pixels = self.camera.project(points) * self.factor - 0.5
+        pixels = np.nan_to_num(pixels, nan=-10.0).astype(np.float32)
+        return _remap(self.values, pixels)
+
+
+def feature_image(camera: Camera, image: NDArray, valid: NDArray[np.bool_], factor: float) -> FeatureImage:
+    """Band-passed logarithm of a linear image (H, W, 3) at a level of the pyramid.
+
+    ``valid`` leaves out what isn't the surface: the band never mixes the face with what lies behind it.
+    """
+    size = (max(round(camera.width * factor), 8), max(round(camera.height * factor), 8))
+    weight = valid.astype(np.float32)
+    luminance = np.where(valid, image @ np.array([0.3, 0.5, 0.2], np.float32), np.float32(0))
+    if factor < 1.0:
+        weight = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+        luminance = cv2.resize(luminance, size, interpolation=cv2.INTER_AREA) / np.maximum(weight, 1e-3)
+    usable = (weight > 0.9).astype(np.float32)
+    log = np.log(np.maximum(luminance, 0.0) + DARKEST) * usable
+    wide, fine = (
+        cv2.GaussianBlur(log, (0, 0), s) / np.maximum(cv2.GaussianBlur(usable, (0, 0), s), 1e-3) for s in (WINDOW, 0.6)
+    )
+    band = LARGEST * np.tanh((fine - wide) / LARGEST)
+    return FeatureImage(camera, factor, np.stack([band * usable, usable], axis=-1).astype(np.float32))
+
+
+def _remap(values: NDArray, pixels: NDArray, columns: int = 4096) -> NDArray[np.float32]:
+    """Bilinear look-up at integer-centred (N, 2) positions; OpenCV wants them as an image of limited width."""
+    count = len(pixels)
+    padded = np.full((-(-max(count, 1) // columns) * columns, 2), -10.0, np.float32)
+    padded[:count] = pixels
+    grid = padded.reshape(-1, columns, 2)
+    out = cv2.remap(values, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    return out.reshape(-1, values.shape[-1])[:count]

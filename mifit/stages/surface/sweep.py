@@ -1,0 +1,143 @@
+"""Where the surface lies along its own normals: a sweep of offsets, each judged by how well the views then agree.
+
+Every texel of the surface is moved by a few offsets along its normal; each view is sampled there, and windows of
+texels are compared between views. Windows live on the surface, so that they are foreshortened in every image as the
+surface is, and one score per texel and offset sums all pairs of views of all timesteps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.uv import TexelMap
+from mifit.stages.surface.band import FeatureImage
+
+NOISE = 0.012
+"""Standard deviation of a feature that is noise: windows with less contrast say nothing."""
+FLOOR = 0.05
+"""Disagreement (1 - correlation) that remains at best."""
+FAR = 0.1
+UNIQUE = 0.2
+POWER = 1.5
+LEAST_SCORE = 0.4
+"""Correlation below which a texel counts as not matched."""
+
+
+@dataclass(frozen=True)
+class Posed:
+    """The texels of one timestep and the views of it.
+
+    Attributes
+    ----------
+    position, normal : (N, 3)
+        World space.
+    images : sequence of FeatureImage
+    seen : (views, N) float32
+        Cosine of the angle of view; 0 where hidden or grazing.
+    """
+
+    position: NDArray
+    normal: NDArray
+    images: Sequence[FeatureImage]
+    seen: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Found:
+    """Offsets along the normals.
+
+    Attributes
+    ----------
+    offset : (N,) float64
+        World units.
+    precision : (N,) float64
+        Inverse variance, 0 where nothing was found.
+    score : (N,) float32
+        Mean correlation at the offset.
+    """
+
+    offset: NDArray[np.float64]
+    precision: NDArray[np.float64]
+    score: NDArray[np.float32]
+
+
+def sweep(texels: TexelMap, steps: Sequence[Posed], offsets: NDArray, window: int, pairs: Sequence) -> Found:
+    """Find each texel's offset.
+
+    Parameters
+    ----------
+    texels : TexelMap
+    steps : sequence of Posed
+    offsets : (K,)
+        Evenly spaced, ascending, world units.
+    window : int
+        Texels along a side, odd.
+    pairs : sequence of (int, int)
+        Views to compare.
+    """
+    count, layers = len(texels.index), len(offsets)
+    total = np.zeros((layers, count), np.float32)
+    weight = np.zeros(count, np.float32)
+    for step in steps:
+        at = {}
+        for i in {i for pair in pairs for i in pair}:
+            at[i] = np.stack(
+                [step.images[i].sample(step.position + offset * step.normal) for offset in offsets]
+            )  # (K, N, 2)
+        for a, b in pairs:
+            trust = np.sqrt(step.seen[a] * step.seen[b])
+            if not (trust > 0).any():
+                continue
+            valid = (at[a][..., 1] > 0.99).all(0) & (at[b][..., 1] > 0.99).all(0) & (trust > 0)
+            mask = texels.to_map(valid.astype(np.float32))
+            inside = cv2.blur(mask, (window, window))
+            enough = texels.from_map(inside) > 0.5
+            use = np.where(valid & enough, trust, np.float32(0))
+            for k in range(layers):
+                total[k] += use * texels.from_map(
+                    _correlate(texels, mask, inside, at[a][k, :, 0], at[b][k, :, 0], window)
+                )
+            weight += use
+    score = total / np.maximum(weight, 1e-6)
+    return _peak(score, weight, offsets)
+
+
+def _correlate(
+    texels: TexelMap, mask: NDArray, inside: NDArray, a: NDArray, b: NDArray, window: int
+) -> NDArray[np.float32]:
+    """Correlation of two textures in windows, towards 0 where the contrast is noise."""
+    x, y = texels.to_map(a) * mask, texels.to_map(b) * mask
+    stack = np.stack([x, y, x * x, y * y], axis=-1)
+    size = (window, window)
+    sums = cv2.blur(stack, size)
+    xy = cv2.blur(x * y, size)
+    n = np.maximum(inside, 1e-6)
+    mx, my = sums[..., 0] / n, sums[..., 1] / n
+    vx, vy = sums[..., 2] / n - mx * mx, sums[..., 3] / n - my * my
+    return (xy / n - mx * my) / np.sqrt((np.maximum(vx, 0) + NOISE**2) * (np.maximum(vy, 0) + NOISE**2))
+
+
+def _peak(score: NDArray, weight: NDArray, offsets: NDArray) -> Found:
+    """Best offset by a parabola through the best layer and its neighbours."""
+    layers, count = score.shape
+    score = score - (FAR * (np.linspace(-1.0, 1.0, layers) ** 2)).astype(np.float32)[:, None]
+    best = score.argmax(0)
+    inner = np.clip(best, 1, layers - 2)
+    column = np.arange(count)
+    low, mid, high = score[inner - 1, column], score[inner, column], score[inner + 1, column]
+    step = float(offsets[1] - offsets[0])
+    curvature = np.maximum(2 * mid - low - high, 1e-6)
+    shift = np.clip(0.5 * (high - low) / curvature, -1.0, 1.0)
+    offset = offsets[inner] + step * shift
+    top = mid + 0.25 * (high - low) * shift
+    other = np.where(np.abs(np.arange(layers)[:, None] - best) > 2, score, -1.0).max(0)
+    unique = np.clip((top - other) / UNIQUE, 0.0, 1.0)
+    usable = (best == inner) & (weight > 0) & (top > LEAST_SCORE)
+    sharpness = unique * np.maximum(curvature, 0.0) / np.maximum(1.0 - top + FLOOR, FLOOR)
+    precision = np.where(usable, weight * sharpness**POWER / step**2, 0.0)
+    return Found(offset.astype(np.float64), precision.astype(np.float64), top)

@@ -1,0 +1,104 @@
+"""What each view sees of the texels of the current surface, at one level of the image pyramid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.camera import Camera
+from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
+from mifit.core.uv import TexelMap
+from mifit.render.gbuffer import SurfaceScene
+from mifit.stages.surface.band import feature_image
+from mifit.stages.surface.sweep import Posed
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+
+GRAZING_COSINE = 0.2  # beyond about 78 degrees a pixel covers too much surface to compare it
+OUTLINE_SCALE = 0.25  # outlines are found in images of this scale
+OUTLINE_SLOPE = 12.0  # depth step between neighbouring pixels, in pixel lengths, that is an outline
+
+
+def pose_texels(
+    capture: Capture,
+    scene: SurfaceScene,
+    vertices: NDArray,
+    faces: NDArray,
+    texels: TexelMap,
+    cameras: Sequence[str],
+    timestep: int,
+    factor: float,
+) -> Posed:
+    """Texels of the surface with these world-space vertices (V, 3), which ``scene`` holds, and the views of them.
+
+    ``factor`` is the level's pixels per pixel of the image.
+    """
+    position = interpolate(vertices, faces, texels.face, texels.weights)
+    normal = normalize(interpolate(vertex_normals(vertices, faces), faces, texels.face, texels.weights))
+    images, seen = [], np.zeros((len(cameras), len(position)), np.float32)
+    for row, name in enumerate(cameras):
+        camera, frame = capture.camera(name), capture.frame(name, timestep)
+        valid = frame.valid & ~frame.clipped & shows_surface(scene, camera)
+        images.append(feature_image(camera, frame.image, valid, factor))
+        cosine = (normalize(camera.position - position) * normal).sum(1)
+        towards = np.flatnonzero(cosine > GRAZING_COSINE)
+        towards = towards[scene.visible_from(position[towards], camera.position)]
+        seen[row, towards] = cosine[towards]
+    return Posed(position, normal, tuple(images), seen)
+
+
+def shows_surface(scene: SurfaceScene, camera: Camera) -> NDArray[np.bool_]:
+    """(H, W) pixels that show the surface, away from its outlines against the background and against itself."""
+    width, height = (max(round(n * OUTLINE_SCALE), 1) for n in (camera.width, camera.height))
+    x, y = width / camera.width, height / camera.height
+    small = replace(
+        camera, width=width, height=height, fx=camera.fx * x, cx=camera.cx * x, fy=camera.fy * y, cy=camera.cy * y
+    )
+    buffer = scene.gbuffer(small)
+    depth = np.where(buffer.mask, buffer.depth, np.float32(0))
+    around = np.ones((3, 3), np.uint8)
+    outline = cv2.dilate(depth, around) - cv2.erode(depth, around) > OUTLINE_SLOPE * depth / small.fx
+    shown = (buffer.mask & ~outline).astype(np.uint8)
+    return cv2.resize(shown, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST) > 0
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """How finely the views see the face.
+
+    Attributes
+    ----------
+    pixel : float
+        Mean world length of a pixel at the face.
+    parallax : float
+        Mean shift between two views, in world lengths across the line of sight, per unit of depth.
+    """
+
+    pixel: float
+    parallax: float
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera], centre: NDArray, pairs: Sequence[tuple[int, int]]) -> Resolution:
+        """Of cameras that look at a point."""
+        pixels = [
+            float(np.linalg.norm(centre - camera.position)) / np.sqrt(camera.fx * camera.fy) for camera in cameras
+        ]
+        towards = normalize(np.array([camera.position - centre for camera in cameras]))
+        angles = [np.arccos(np.clip(towards[a] @ towards[b], -1.0, 1.0)) for a, b in pairs]
+        return cls(float(np.mean(pixels)), float(np.mean(2.0 * np.sin(np.array(angles) / 2.0))))
+
+
+def texture_size(model: MorphableModel, vertices: NDArray, length: float, largest: int) -> int:
+    """Side of the map whose texels are about as large as ``length`` on a surface with these vertices (V, 3)."""
+    area = np.linalg.norm(face_cross(vertices, model.faces[model.face_mask]), axis=1).sum()
+    a, b, c = (model.uv[model.faces_uv[model.face_mask, k]].astype(np.float64) for k in range(3))
+    u, v = b - a, c - a
+    covered = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum()
+    return int(np.clip(np.sqrt(area / max(covered, 1e-12)) / length, 64, largest))

@@ -1,0 +1,158 @@
+"""Stage 1b: a surface beyond the model's span is found; where nothing asks for it the surface stays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from memory_capture import make_capture
+
+from mifit.config import GeometryConfig
+from mifit.core.mesh import vertex_normals
+from mifit.morphable import MorphableModel
+from mifit.stages.eyes import eyeballs
+from mifit.stages.find_surface import find_surface
+from mifit.stages.fit_geometry import fit_geometry, fit_pose_expression
+from mifit.stages.geometry.displaced import displaced
+from mifit.stages.surface.displace import Plate, solve_displacement
+from tests.morphable.intersections import intersections
+
+QUICK = GeometryConfig(rounds=1, surface_points=800, pixels=400, max_iterations=15)
+BOTH = ("left", "right")
+STEPS = (0, 1)
+
+
+@pytest.fixture(scope="module")
+def model(variant):
+    return MorphableModel.load("builtin:coarse").subset(identity=30, expression=20, albedo=10)
+
+
+def bumps(model):
+    """Displacements of 2 mm along the normals of cheeks, brow and chin, model units: too narrow for its modes."""
+    mean, marks = model.mean, model.mean[model.landmarks]
+    normal = vertex_normals(mean, model.faces)
+    out = np.zeros_like(mean)
+    centres = (marks[[36, 48, 2]].mean(0), marks[[45, 54, 14]].mean(0), marks[[21, 22]].mean(0), marks[[8, 57]].mean(0))
+    for centre, height in zip(centres, (0.2, -0.2, 0.15, 0.15), strict=True):
+        near = np.linalg.norm((mean - centre)[:, :2], axis=1)
+        out += np.where(mean[:, 2:] > 0, height * np.exp(-((near / 1.1) ** 2))[:, None] * normal, 0.0)
+    return out.astype(np.float32)
+
+
+def captured(model, displacement, **options):
+    """A capture of the displaced model."""
+    return make_capture(replace(model, mean=model.mean + displacement), [(0, 0, 0), (-6, 10, 3)], **options)
+
+
+def fitted_to(model, capture, cameras=BOTH):
+    return fit_geometry(capture, model, cameras, STEPS, QUICK)
+
+
+def seen_vertices(model, capture):
+    """Vertices of the face area that face both cameras at the first timestep."""
+    vertices = capture.vertices[0]
+    normal = vertex_normals(vertices, model.faces)
+    facial = np.zeros(len(vertices), bool)
+    facial[model.faces[model.face_mask]] = True
+    for name in BOTH:
+        towards = capture.camera(name).position - vertices
+        facial &= (towards * normal).sum(1) > 0.5 * np.linalg.norm(towards, axis=1)
+    return np.flatnonzero(facial)
+
+
+def off_mm(model, capture, estimate):
+    """Distance of the estimate along the true normals at the seen vertices, first timestep, in mm."""
+    normal = vertex_normals(capture.vertices[0], model.faces)
+    rows = seen_vertices(model, capture)
+    return 10.0 * np.abs(((estimate.vertices[0] - capture.vertices[0]) * normal).sum(1))[rows]
+
+
+@pytest.fixture(scope="module")
+def bumpy(model):
+    return captured(model, bumps(model), width=510, height=360)
+
+
+@pytest.fixture(scope="module")
+def start(model, bumpy):
+    return fitted_to(model, bumpy)
+
+
+@pytest.fixture(scope="module")
+def found(model, bumpy, start):
+    return find_surface(bumpy, model, start, BOTH)
+
+
+def test_a_surface_beyond_the_span_is_found(model, bumpy, start, found):
+    before, after = off_mm(model, bumpy, start), off_mm(model, bumpy, found)
+    assert after.mean() < 0.6 * before.mean()
+    assert np.median(after) < 0.3
+
+
+def test_the_estimate_is_consistent_in_itself(model, found):
+    carried = displaced(model, found)
+    for k in range(len(STEPS)):
+        shape = carried.shape(found.identity, found.expression[k])
+        expected = found.scale * shape @ found.rotation[k].T + found.translation[k]
+        np.testing.assert_allclose(found.vertices[k], expected, atol=1e-4)
+
+
+def test_the_skin_does_not_intersect_itself(model, start, found):
+    eyes = np.concatenate(eyeballs(model))
+    skin = model.faces[~np.isin(model.faces, eyes).any(1)]
+    before, after = (intersections(10.0 * g.vertices[0], skin) for g in (start, found))
+    assert len(after) <= len(before)
+
+
+def test_a_head_that_the_model_spans_stays_right(model):
+    capture = captured(model, np.zeros_like(model.mean), width=510, height=360)
+    start = fitted_to(model, capture)
+    found = find_surface(capture, model, start, BOTH)
+    assert off_mm(model, capture, found).mean() < max(off_mm(model, capture, start).mean(), 0.15)
+
+
+def test_where_nothing_is_seen_the_surface_stays(model, bumpy, start):
+    blank = bumpy.changed(lambda name, t, frame: replace(frame, image=np.full_like(frame.image, 0.3)))
+    found = find_surface(blank, model, start, BOTH)
+    np.testing.assert_allclose(found.vertices, start.vertices, atol=1e-3)
+
+
+def test_one_view_says_so(model, bumpy, start):
+    found = find_surface(bumpy, model, start, ("left",))
+    assert found.displacement is None and any("one view" in w for w in found.report.warnings)
+    np.testing.assert_array_equal(found.vertices, start.vertices)
+
+
+def test_tracking_moves_the_displaced_surface(model, bumpy, found):
+    first = found.at((0,))
+    tracked = fit_pose_expression(bumpy, model, first, BOTH, 1, QUICK)
+    np.testing.assert_array_equal(tracked.displacement, found.displacement)
+    shape = displaced(model, tracked).shape(tracked.identity, tracked.expression[0])
+    expected = tracked.scale * shape @ tracked.rotation[0].T + tracked.translation[0]
+    np.testing.assert_allclose(tracked.vertices[0], expected, atol=1e-4)
+
+
+def test_the_solution_is_the_minimum(model):
+    """Conjugate gradients on the coupled system against a dense solution of the same energy."""
+    rng = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0), indexing="ij"), axis=-1).reshape(-1, 2)
+    vertices = np.column_stack([grid, 0.2 * rng.normal(size=36)])
+    quads = [(6 * i + j, 6 * i + j + 6, 6 * i + j + 7, 6 * i + j + 1) for i in range(5) for j in range(5)]
+    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    plate = Plate.of(vertices, faces)
+    points = sp.csr_matrix(rng.dirichlet(np.ones(36), size=80))
+    normals = rng.normal(size=(80, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    offsets, precision = rng.normal(size=80), rng.uniform(0.5, 2.0, 80)
+    got = solve_displacement(
+        plate, points, normals, offsets, precision, np.zeros((36, 3)), 0.5, 0.1, robust=1e9, slide=0.02
+    )
+    rows = np.einsum("nv,nc->nvc", points.toarray(), normals).reshape(80, -1)
+    full = np.kron(points.toarray(), np.eye(3))
+    weights = np.repeat(precision, 3)
+    prior = np.kron((0.5 * plate.matrix + 0.1 * sp.diags(plate.area)).toarray(), np.eye(3))
+    normal_part = rows.T @ (precision[:, None] * rows)
+    matrix = prior + 0.98 * normal_part + 0.02 * full.T @ (weights[:, None] * full)
+    expected = np.linalg.solve(matrix, rows.T @ (precision * offsets)).reshape(-1, 3)
+    np.testing.assert_allclose(got, expected, atol=2e-3 * np.abs(expected).max())
