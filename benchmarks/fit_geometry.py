@@ -217,7 +217,7 @@ def speed() -> dict[str, Any]:
     print("LM", first, solution.energy, whole, newton, steps_to_goal, solution.iterations, flush=True)
     attempts = {}
     for rate in (0.01, 0.03):
-        seconds, steps, energy = adam(problem, start, low, high, rate, goal, limit=32.0 * newton)
+        seconds, steps, energy = adam_steps(problem, start, low, high, rate, goal, limit=32.0 * newton)
         attempts[str(rate)] = {"seconds": seconds, "steps": steps, "energy": energy, "reached": energy <= goal}
         print("Adam", rate, attempts[str(rate)], flush=True)
     reached = [a["seconds"] for a in attempts.values() if a["reached"]]
@@ -242,7 +242,7 @@ def speed() -> dict[str, Any]:
     }
 
 
-def adam(
+def adam_steps(
     problem: Any, start: np.ndarray, low: np.ndarray, high: np.ndarray, rate: float, goal: float, limit: float
 ) -> tuple[float, int, float]:
     """Adam (Kingma and Ba 2015) with each group in its natural unit, until the goal or the time limit."""

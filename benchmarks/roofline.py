@@ -47,8 +47,9 @@ from mifit.stages.geometry.parameters import Layout
 from mifit.stages.geometry.refine import priors_of
 from mifit.stages.geometry.start import OUTLIER_PIXELS, initial_state, landmark_views
 from mifit.stages.geometry.visibility import Visibility, spread_points
+from mifit.stages.normals.normal_refinement import frame_problem
+from mifit.stages.normals.solvers import adam_steps, gauss_newton
 from mifit.stages.observations import Surface
-from mifit.stages.refine_normals import frame_problem
 from mifit.stages.reflectance.als import LIGHTING_TEXELS
 from mifit.stages.reflectance.choice import lighting_problem
 from mifit.stages.reflectance.forward import Forward
@@ -319,10 +320,10 @@ def stage3(capture: Capture, model: MorphableModel, truth: Any, size: int) -> di
     problem, _, _ = frame_problem(capture, model, truth.at(truth.timesteps[:1]), maps, CAMERAS, NormalsConfig(), texels)
     assert problem is not None
     one, two = (
-        of_history(lambda: problem.gauss_newton(1, tolerance=0.0)),
-        of_history(lambda: problem.gauss_newton(2, tolerance=0.0)),
+        of_history(lambda: gauss_newton(problem, 1, tolerance=0.0)),
+        of_history(lambda: gauss_newton(problem, 2, tolerance=0.0)),
     )
-    step = of_history(lambda: problem.adam(4))
+    step = of_history(lambda: adam_steps(problem, 4))
     return {
         "stage 3: Gauss-Newton, one iteration": Kernel(
             two.seconds - one.seconds,

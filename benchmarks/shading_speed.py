@@ -70,9 +70,9 @@ class Cached:
     def __init__(self, views: list[Camera], mesh: tuple, size: int, light: np.ndarray) -> None:
         import mitsuba as mi
 
+        from benchmarks.mapped import MapSampler
         from mifit.appearance.occlusion import trace_transfer
         from mifit.render.gbuffer import SurfaceScene
-        from mifit.render.mapped import MapSampler
 
         vertices, faces, uv, faces_uv = mesh
         scene = SurfaceScene(vertices, faces)

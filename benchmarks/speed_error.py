@@ -44,7 +44,8 @@ from mifit.core.files import write_text
 from mifit.core.mesh import vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.stages.fit_geometry import fit_geometry
-from mifit.stages.refine_normals import frame_problem, refine_normals
+from mifit.stages.normals.normal_refinement import frame_problem, refine_normals
+from mifit.stages.normals.solvers import adam_steps, gauss_newton
 
 CAPTURE, CAMERAS = "gloss", ("left", "right")
 TIMESTEPS = (0, 1, 2, 3)
@@ -184,13 +185,13 @@ def normals() -> Row:
         d.capture, d.model, d.truth.at(d.truth.timesteps[:1]), maps_of(SIZE), CAMERAS, NormalsConfig(), texels
     )
     assert problem is not None
-    problem.adam(2)
-    problem.gauss_newton(2)
+    adam_steps(problem, 2)
+    gauss_newton(problem, 2)
     out = []
     for solver, limits in (("gauss_newton", (1, 2, 3, 5, 8)), ("adam", (5, 10, 20, 50, 100))):
         for limit in limits:
             with measured() as cost:
-                found = problem.adam(limit) if solver == "adam" else problem.gauss_newton(limit, tolerance=0.0)
+                found = adam_steps(problem, limit) if solver == "adam" else gauss_newton(problem, limit, tolerance=0.0)
             row = {"solver": solver, "iterations": limit, "energy": found.energy, **cost.figures()}
             out.append(note("normals", row))
     start = sum(problem.energies(np.zeros((len(rows), 2))).values())

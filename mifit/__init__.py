@@ -34,8 +34,8 @@ _EXPORTS = {
     "fit_geometry": "mifit.stages.fit_geometry",
     "find_surface": "mifit.stages.find_surface",
     "infer_reflectance": "mifit.stages.infer_reflectance",
-    "refine_normals": "mifit.stages.refine_normals",
-    "refine_mesh": "mifit.stages.refine_mesh",
+    "refine_normals": "mifit.stages.normals.normal_refinement",
+    "refine_mesh": "mifit.stages.normals.mesh_refinement",
     "refine_shape": "mifit.stages.refine_shape",
     "Reconstruction": "mifit.reconstruction",
 }

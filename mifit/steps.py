@@ -233,7 +233,7 @@ def _refine_shape(
 
 
 def _refine_normals(source: Source, inputs: Inputs, progress: Progress, config: NormalsConfig) -> Any:
-    from mifit.stages.refine_normals import refine_normals
+    from mifit.stages.normals.normal_refinement import refine_normals
 
     return refine_normals(
         source.capture,
@@ -248,6 +248,6 @@ def _refine_normals(source: Source, inputs: Inputs, progress: Progress, config: 
 
 
 def _refine_mesh(source: Source, inputs: Inputs, progress: Progress, config: MeshConfig) -> Any:
-    from mifit.stages.refine_mesh import refine_mesh
+    from mifit.stages.normals.mesh_refinement import refine_mesh
 
     return refine_mesh(source.model, inputs["geometry"], inputs["normals"], config, progress)

@@ -15,7 +15,7 @@ from mifit.errors import InputError
 from mifit.progress import Progress, silent
 from mifit.result.record import R
 from mifit.result.writing import add_timestep
-from mifit.stages.refine_mesh import MeshRefiner
+from mifit.stages.normals.mesh_refinement import MeshRefiner
 from mifit.stages.track import TrackedFrame, track
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def extend(result: R, frame: TrackedFrame, refiner: MeshRefiner | None = None) -
     )
     mesh = result.mesh
     if mesh is not None and refiner is not None:
-        vertices, height = refiner.refine(frame.geometry, frame.timestep, frame.normal_object)
+        vertices, height, _ = refiner.refine(frame.geometry, frame.timestep, frame.normal_object)
         mesh = replace(
             mesh,
             timesteps=(*mesh.timesteps, frame.timestep),

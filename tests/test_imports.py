@@ -43,7 +43,9 @@ MAY_IMPORT = {
 TOP = {"commands", "cli", "__main__", "__init__"}  # may import everything
 KERNELS = {"render", "appearance"}
 """Parts whose functions may import Mitsuba and Dr.Jit."""
-KERNEL_FILES: set[str] = set()
+KERNEL_FILES = {
+    f"stages/{name}.py" for name in ("normals/chart", "normals/problem", "normals/solvers", "reflectance/adam")
+}
 """Further files that may, relative to the package: solvers of stages."""
 
 FILES = {str(path.relative_to(PACKAGE)): path for path in sorted(PACKAGE.rglob("*.py"))}

@@ -57,22 +57,51 @@ class MeshUpdater:
         self._factor = spl.splu(matrix[:, self.free].tocsc()) if self.free.any() else None
 
     def update(self, vertices: NDArray, normals: NDArray, iterations: int = 4) -> NDArray[np.float64]:
-        """New positions (V, 3) of a mesh with trusted positions (V, 3) and wanted unit face normals (F, 3).
+        """New positions (V, 3) after some iterations, see `settle`."""
+        return self.settle(vertices, normals, iterations, 0.0)[0]
+
+    def settle(
+        self, vertices: NDArray, normals: NDArray, iterations: int, tolerance: float
+    ) -> tuple[NDArray[np.float64], float]:
+        """Iterate until the positions stand.
 
         Faces whose wanted normal is zero keep their own. No face turns by more than a right angle from where it was:
         displacements that would do so are halved around it.
+
+        Parameters
+        ----------
+        vertices : (V, 3)
+            Trusted positions.
+        normals : (F, 3)
+            Wanted unit face normals.
+        iterations : int
+            At the most.
+        tolerance : float
+            Stop when an iteration moves the vertices by no more than this part of their displacement, both as root of
+            mean squares.
+
+        Returns
+        -------
+        vertices : (V, 3)
+        change : float
+            That part in the last iteration.
         """
         trusted = np.asarray(vertices, dtype=np.float64)
         if self._factor is None:
-            return trusted.copy()
+            return trusted.copy(), 0.0
         own = normalize(face_cross(trusted, self.faces))
         silent = ~(np.linalg.norm(normals, axis=1) > 0.5)
         wanted = np.where(silent[:, None], own, normals)
-        p = trusted.copy()
+        p, change = trusted.copy(), np.inf
         for _ in range(iterations):
+            before = p.copy()
             right = self._divergence(p, wanted, own, silent) + self._anchor[:, None] * trusted
             p[self.free] = self._factor.solve(right[self.free] - self._fixed_part @ trusted[~self.free])
-        return self._unfold(trusted, p, own)
+            displaced = float(np.linalg.norm(p - trusted))
+            change = float(np.linalg.norm(p - before)) / displaced if displaced > 0 else 0.0
+            if change <= tolerance:
+                break
+        return self._unfold(trusted, p, own), change
 
     def _divergence(self, p: NDArray, wanted: NDArray, own: NDArray, silent: NDArray) -> NDArray:
         """Right-hand side: weighted sums of every face's edges, projected to the wanted plane."""

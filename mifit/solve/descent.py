@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,10 @@ class Descent(Protocol):
     """``descent(system, size, frozen, gradient)`` gives a step.
 
     ``size`` shrinks after rejections; ``gradient`` replaces the system's own when parameters are moved by hand.
+    ``regularizes`` tells whether a smaller size can make a step of a system that is singular.
     """
+
+    regularizes: ClassVar[bool]
 
     def __call__(
         self, system: System, size: float, frozen: NDArray[np.bool_], gradient: NDArray | None = None
@@ -28,6 +31,8 @@ class Descent(Protocol):
 class GaussNewton:
     """The minimiser of the linear model, shortened by ``size`` (1 = the full step)."""
 
+    regularizes: ClassVar[bool] = False
+
     def __call__(
         self, system: System, size: float, frozen: NDArray[np.bool_], gradient: NDArray | None = None
     ) -> NDArray[np.float64]:
@@ -38,6 +43,8 @@ class GaussNewton:
 @dataclass(frozen=True)
 class LevenbergMarquardt:
     """The minimiser of the linear model plus ``1 / size`` times Marquardt's diagonal."""
+
+    regularizes: ClassVar[bool] = True
 
     def __call__(
         self, system: System, size: float, frozen: NDArray[np.bool_], gradient: NDArray | None = None

@@ -93,7 +93,7 @@ def minimize(
             step = _bounded_step(descent, system, size, frozen, low - x, high - x)
             if step is None:
                 size /= 10.0
-                if size < SMALLEST_SIZE or not isinstance(descent, LevenbergMarquardt):
+                if size < SMALLEST_SIZE or not descent.regularizes:
                     outcome, done = Outcome.SINGULAR, True
                     break
                 continue

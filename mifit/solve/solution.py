@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
+import numpy as np
 from numpy.typing import NDArray
 
 from mifit.solve.systems import System
+
+FEWEST_ITERATIONS = 10
+"""Iterations over which a first-order descent is judged, at the least."""
 
 
 class Outcome(Enum):
@@ -18,6 +23,29 @@ class Outcome(Enum):
     MAX_ITERATIONS = "max_iterations"
     SINGULAR = "singular"  # the linear system has no finite solution at any damping
     DIVERGED = "diverged"  # energy or derivatives are not finite at the start
+
+    @classmethod
+    def worst(cls, outcomes: Iterable[Outcome]) -> Outcome:
+        """The least satisfactory of several outcomes; ``CONVERGED`` where there is none."""
+        return max(outcomes, key=list(cls).index, default=cls.CONVERGED)
+
+    @classmethod
+    def of_history(cls, energies: Sequence[float], window: float = 0.1, tolerance: float = 1e-2) -> Outcome:
+        """How a descent without a model of its steps, such as Adam's, ended, read off its energies.
+
+        Converged when the energy fell by less than ``tolerance``, relative, over the last ``window`` of the iterations,
+        which must be ten or more.
+        """
+        if not np.isfinite(energies).all():
+            return cls.DIVERGED
+        last = round(window * len(energies))
+        if last < FEWEST_ITERATIONS:
+            return cls.MAX_ITERATIONS
+        return (
+            cls.CONVERGED
+            if abs(energies[-1 - last] - energies[-1]) < tolerance * abs(energies[-1])
+            else cls.MAX_ITERATIONS
+        )
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
 from mifit.core.mesh import interpolate
 from mifit.errors import ConvergenceError
 from mifit.progress import Progress, silent
+from mifit.solve import Outcome
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.als import fit_als
 from mifit.stages.reflectance.descent import fit_adam
@@ -79,7 +80,7 @@ def infer_reflectance(
         raise ConvergenceError("stage 2 (reflectance): the maps or the lighting are not finite; see the images' range")
     quality = surface.quality()
     diffuse, specular, confidence = blend_unseen(surface.texels, albedo, fitted.maps, quality, mirrored)
-    if not fitted.converged:
+    if fitted.outcome is Outcome.MAX_ITERATIONS:
         warnings = (*warnings, "the lighting had not converged when the iterations ran out; raise max_iterations")
     details: dict = {
         "shading": choice,
@@ -94,7 +95,6 @@ def infer_reflectance(
         light = illumination.unknowns, illumination.ambient
         terms = energies(surface, forward, *light, fitted.maps, albedo, config)
         details["objective"] = {**terms, "total": sum(terms.values())}
-    outcome = "converged" if fitted.converged else "max_iterations"
     return ReflectanceEstimate(
         diffuse=diffuse,
         specular=specular,
@@ -102,5 +102,5 @@ def infer_reflectance(
         illumination=illumination,
         lobe=fitted.appearance.lobe,
         shading_model=fitted.appearance.model.name,
-        report=Report(outcome, fitted.energies, time.perf_counter() - started, warnings, details),
+        report=Report(fitted.outcome.value, fitted.energies, time.perf_counter() - started, warnings, details),
     )

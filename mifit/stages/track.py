@@ -24,7 +24,7 @@ from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
 from mifit.stages.fit_geometry import fit_pose_expression
 from mifit.stages.geometry.refine import texture_reference
-from mifit.stages.refine_normals import check_maps, refine_frame
+from mifit.stages.normals.normal_refinement import check_maps, refine_frame
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -135,7 +135,7 @@ def track(
             warnings.append(f"timestep {timestep}: lost the face and found it again by its landmarks")
         aim = memory.offsets(found)
         frame = refine_frame(capture, model, found, reflectance, cameras, config, texels, aim, seed)
-        if frame.seen == 0.0:
+        if frame.measured == 0.0:
             warnings.append(f"timestep {timestep}: no camera measures the face; normals are those of the frames before")
         memory.add(found, frame.normal_object)
         last = found

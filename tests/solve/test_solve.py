@@ -216,3 +216,22 @@ def test_outliers_do_not_pull_a_robust_mean():
     solution = minimize(Mean(), np.array([np.median(data)]))
     assert solution.usable and abs(solution.value[0] - data[:90].mean()) < 0.1
     assert abs(data.mean()) > 4.0
+
+
+def test_the_worst_of_several_outcomes_counts():
+    assert Outcome.worst([]) is Outcome.CONVERGED
+    assert Outcome.worst([Outcome.CONVERGED, Outcome.MAX_ITERATIONS, Outcome.STALLED]) is Outcome.MAX_ITERATIONS
+    assert Outcome.worst([Outcome.DIVERGED, Outcome.CONVERGED]) is Outcome.DIVERGED
+
+
+@pytest.mark.parametrize(
+    ("energies", "outcome"),
+    [
+        (2.0 ** -np.arange(200.0) + 1.0, Outcome.CONVERGED),
+        (np.linspace(2.0, 1.0, 200), Outcome.MAX_ITERATIONS),  # still falling by 10 per cent
+        (np.ones(50), Outcome.MAX_ITERATIONS),  # too few to tell
+        (np.full(200, np.nan), Outcome.DIVERGED),
+    ],
+)
+def test_first_order_descents_are_judged_by_their_history(energies, outcome):
+    assert Outcome.of_history(energies) is outcome

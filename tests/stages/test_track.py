@@ -169,7 +169,7 @@ def test_landmark_error_is_in_pixels(scene):
 def saved(scene, tmp_path):
     """A result with timestep 0 in a folder, and its reload."""
     from mifit.reconstruction import Reconstruction
-    from mifit.stages.refine_mesh import refine_mesh
+    from mifit.stages.normals.mesh_refinement import refine_mesh
 
     scene.model.save(tmp_path / "dome.npz")
     mask = np.linalg.norm(scene.normal_map, axis=-1) > 0
@@ -216,7 +216,7 @@ def test_each_frame_is_on_disk_when_it_is_done(scene, fit_truth, saved, monkeypa
 
 
 def test_meshes_of_tracked_frames_are_refined_as_those_of_the_fit(scene, fit_truth, saved):
-    from mifit.stages.refine_mesh import refine_mesh
+    from mifit.stages.normals.mesh_refinement import refine_mesh
     from mifit.tracking import track_into
 
     found = track_into(saved, reload(saved), scene, (1,), CONFIG)

@@ -11,6 +11,7 @@ from mifit.appearance.image import Appearance, assemble
 from mifit.config import ReflectanceConfig
 from mifit.core.sh import LUMINANCE
 from mifit.progress import Progress
+from mifit.solve import Outcome
 from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.choice import choose_lighting, noise_weight
 from mifit.stages.reflectance.forward import Forward
@@ -39,14 +40,14 @@ class Fitted:
     sigma : float
         Robust standard deviation of the residuals in linear colour.
     energies : dict of str to list of float
-    converged : bool
+    outcome : Outcome
     """
 
     appearance: Appearance
     maps: NDArray[np.float32]
     sigma: float
     energies: dict[str, list[float]]
-    converged: bool
+    outcome: Outcome
 
 
 def fit_maps(
@@ -126,7 +127,7 @@ def fit_als(
     if not config.robust:
         found, maps, energy = alternate(surface, forward, found, maps, prior, albedo, config, progress)
     energy = {"lighting": found.energy} if config.robust else energy
-    return Fitted(forward.lit(found.light, found.ambient), maps, sigma, energy, found.converged), choice, ()
+    return Fitted(forward.lit(found.light, found.ambient), maps, sigma, energy, found.outcome), choice, ()
 
 
 def alternate(
@@ -146,7 +147,7 @@ def alternate(
     """
     terms = energies(surface, forward, found.light, found.ambient, maps, albedo, config)
     history = {name: [value] for name, value in terms.items()}
-    converged = False
+    outcome = Outcome.MAX_ITERATIONS
     for _ in range(ROUNDS):
         light, ambient = exact_lighting(surface, forward, found, maps, config)
         before = sum(terms.values())
@@ -157,16 +158,16 @@ def alternate(
             trial_terms = energies(surface, forward, mixed, trial.ambient, trial_maps, albedo, config)
             if sum(trial_terms.values()) < before:
                 break
-        else:
-            converged = True
+        else:  # no step lowers the objective, however short
+            outcome = Outcome.STALLED
             break
         found, maps, terms = trial, trial_maps, trial_terms
         for name, value in terms.items():
             history[name].append(value)
         if before - sum(terms.values()) < 1e-3 * before:
-            converged = True
+            outcome = Outcome.CONVERGED
             break
-    return replace(found, converged=converged), maps, history
+    return replace(found, outcome=outcome), maps, history
 
 
 def exact_lighting(

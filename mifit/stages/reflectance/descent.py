@@ -11,7 +11,9 @@ from mifit.appearance import models
 from mifit.appearance.lobe import Lobe
 from mifit.config import ReflectanceConfig
 from mifit.progress import Progress
+from mifit.solve import Outcome
 from mifit.stages.observations import Observations, Surface
+from mifit.stages.reflectance.adam import HISTORY, Samples, minimize_by_adam
 from mifit.stages.reflectance.als import Fitted
 from mifit.stages.reflectance.choice import candidate, fit_lighting, noise_weight, plain_forward
 from mifit.stages.reflectance.forward import Forward
@@ -34,8 +36,6 @@ def fit_adam(
     Lighting starts from a Lambertian least-squares fit with the model's albedo, as stage 1 leaves it, and the
     specular map from zero.
     """
-    from mifit.render import optimize
-
     name = "paper" if config.shading == "auto" else config.shading
     model = models.get(candidate(name).model)
     forward = plain_forward(model, config.exponent or PAPER_EXPONENT, config, surface)
@@ -46,7 +46,7 @@ def fit_adam(
     radiance = np.zeros((forward.unknowns, 3))
     radiance[:9] = start.light
     steps = config.max_iterations * STEPS_PER_ITERATION
-    result = optimize.fit_adam(
+    result = minimize_by_adam(
         gather_samples(surface, seen, forward, albedo, config),
         forward.lit(radiance),
         config.specular_difference_weight,
@@ -56,25 +56,24 @@ def fit_adam(
     )
     maps = np.zeros((surface.texels.size**2, 4), dtype=np.float32)
     maps[surface.texels.index, :3], maps[surface.texels.index, 3] = result.diffuse, result.specular
-    total = np.sum([result.history[k] for k in optimize.HISTORY], axis=0)
-    tail = total[-max(2, len(total) // 20) :]
-    converged = bool(abs(tail[0] - tail[-1]) < 1e-2 * abs(tail[-1]))
+    total = np.sum([result.history[k] for k in HISTORY], axis=0)
+    outcome = Outcome.of_history(total)
     sigma = float(np.sqrt(result.history["data"][-1] / max(3.0 * float(seen.measured.sum()), 1e-12)))
     fitted = Fitted(
         replace(forward.appearance, illumination=result.illumination),
         maps.reshape(surface.texels.size, surface.texels.size, 4),
         sigma,
         result.history,
-        converged,
+        outcome,
     )
     why = "as configured" if config.shading != "auto" else "the paper's model: it is the paper's solver"
     return fitted, {"chosen": name, "why": why, "exponent": forward.lobe.typical}, ()
 
 
-def gather_samples(surface: Surface, seen: Observations, forward: Forward, albedo: NDArray, config: ReflectanceConfig):
+def gather_samples(
+    surface: Surface, seen: Observations, forward: Forward, albedo: NDArray, config: ReflectanceConfig
+) -> Samples:
     """Flatten the measured observations for Dr.Jit."""
-    from mifit.render.optimize import Samples
-
     weight = seen.measured
     texel, image = np.nonzero(weight > 0)
     row = np.full(weight.shape, -1, dtype=np.int64)

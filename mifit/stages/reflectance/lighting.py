@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mifit.appearance.image import assemble
 from mifit.core.sh import bands, basis
+from mifit.solve import Outcome
 
 NEGATIVE_DIRECTIONS = 400
 """Directions at which negative radiance is penalised."""
@@ -121,7 +122,7 @@ class LightingSolution:
         Root of the mean squared residual, each bounded by `GROSS`: comparable between shading models.
     energy : list of float
         Robust data energy per iteration.
-    converged : bool
+    outcome : Outcome
     """
 
     light: NDArray[np.float64]
@@ -131,7 +132,7 @@ class LightingSolution:
     sigma: float
     unexplained: float
     energy: list[float]
-    converged: bool
+    outcome: Outcome
 
 
 def solve_lighting(
@@ -167,7 +168,7 @@ def solve_lighting(
     gloss = np.full(n, specular, dtype=np.float32)
     light = _initial(problem, diffuse, gloss) if start is None else np.array(start, dtype=np.float64)
     energy: list[float] = []
-    ambient, sigma, unexplained, converged, damping = 0.0, 0.0, np.inf, False, 1e-3
+    ambient, sigma, unexplained, damping, outcome = 0.0, 0.0, np.inf, 1e-3, Outcome.MAX_ITERATIONS
     state = light, ambient, diffuse, gloss
     best = state
     for _ in range(iterations):
@@ -178,20 +179,24 @@ def solve_lighting(
         residual = problem.colour - shown
         weight, spread = active_weight(problem.weight, problem.clipped, residual, robust)
         current = float((weight * residual**2).sum())
+        if not energy and not np.isfinite(current):
+            outcome = Outcome.DIVERGED
+            break
         if energy and not current < SLACK * energy[-1]:
             damping *= 10.0  # the step made it worse: take a shorter one from where it started
             if damping > 1e3:
+                outcome = Outcome.STALLED
                 break
         else:
             if energy and abs(energy[-1] - current) < tolerance * energy[-1]:
-                converged = True
+                outcome = Outcome.CONVERGED
             energy.append(current)
             best, sigma = state, spread
             bounded = float((bounded_weight(problem, residual) * residual**2).sum())
             unexplained = float(np.sqrt(bounded / max(float(problem.weight.sum()), 1e-12)))
             damping = max(0.1 * damping, DAMPING)
             system = linearize(problem, light, diffuse, gloss, shade, glint, residual, weight, priors, spread)
-            if converged:
+            if outcome is Outcome.CONVERGED:
                 break
         step = system.solve(with_ambient, damping)
         light, ambient, diffuse, gloss = best
@@ -202,7 +207,7 @@ def solve_lighting(
         gain = gauge(diffuse, problem.albedo, problem.weight)
         state = light * gain, ambient, (diffuse / gain).astype(np.float32), (gloss / gain).astype(np.float32)
     light, ambient, diffuse, gloss = best
-    return LightingSolution(light, ambient, diffuse, gloss, sigma, unexplained, energy, converged)
+    return LightingSolution(light, ambient, diffuse, gloss, sigma, unexplained, energy, outcome)
 
 
 def linearize(

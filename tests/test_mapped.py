@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.mapped import MapSampler
 from mifit.core.uv import sample_map
-from mifit.render.mapped import MapSampler
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
-"""The paper's own optimisation of stage 2: Adam over bounded variables, by differentiating the shading functions.
+"""The paper's own optimisation of stage 2: Adam over bounded variables, by differentiating the shading models.
 
 One iteration updates, in the paper's order, lighting and ambient, then the specular map, then the diffuse offset,
-each by one Adam step along the gradient of the whole objective at the values of that moment.
+each by one step of Mitsuba's Adam along the gradient of the whole objective at the values of that moment.
 """
 
 from __future__ import annotations
@@ -13,59 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.arrays import aligned
+from mifit.appearance.arrays import aligned, vector
 from mifit.appearance.illumination import Illumination
 from mifit.appearance.image import Appearance, assemble
 from mifit.appearance.kernels import prepare
 from mifit.errors import InputError
 
 HISTORY = ("data", "difference", "smoothness")
-
-
-@dataclass
-class Variable:
-    """A differentiable array with bounds and Adam's moments.
-
-    Attributes
-    ----------
-    value : Float
-        Flat Dr.Jit array; the variable owns it.
-    rate : float
-        Step length.
-    lower, upper : Float or float
-        Box that each step ends in.
-    """
-
-    value: Any
-    rate: float
-    lower: Any = -np.inf
-    upper: Any = np.inf
-    _first: Any = None
-    _second: Any = None
-    _steps: int = 0
-
-    def step(self, energy: Callable[[Any], Any], beta: tuple[float, float] = (0.9, 0.999)) -> Any:
-        """Differentiate an energy at the current value, take one Adam step, and return the energy before it."""
-        import drjit as dr
-
-        x = type(self.value)(self.value)
-        dr.enable_grad(x)
-        value = energy(x)
-        dr.backward(value)
-        gradient = dr.detach(dr.grad(x))
-        if self._first is None:
-            self._first, self._second = dr.zeros(type(gradient), len(x)), dr.zeros(type(gradient), len(x))
-        self._steps += 1
-        self._first = beta[0] * self._first + (1.0 - beta[0]) * gradient
-        self._second = beta[1] * self._second + (1.0 - beta[1]) * dr.square(gradient)
-        # The bias correction is opaque, or every iteration would compile a kernel of its own.
-        scale = dr.opaque(
-            type(gradient), self.rate * np.sqrt(1.0 - beta[1] ** self._steps) / (1.0 - beta[0] ** self._steps)
-        )
-        moved = dr.detach(self.value) - scale * self._first / (dr.sqrt(self._second) + 1e-10)
-        self.value = dr.clip(moved, self.lower, self.upper)
-        dr.eval(self.value, self._first, self._second)
-        return dr.detach(value)
 
 
 @dataclass(frozen=True)
@@ -112,7 +66,7 @@ class AdamResult:
     history: dict[str, list[float]] = field(default_factory=dict)
 
 
-def fit_adam(
+def minimize_by_adam(
     samples: Samples,
     appearance: Appearance,
     difference_weight: float,
@@ -153,21 +107,20 @@ def fit_adam(
         raise InputError("found 0 observations, expected some: no image shows the face")
     problem = _Objective(samples, appearance, difference_weight, smoothness)
     radiance, ambient = appearance.illumination.radiance, appearance.illumination.ambient
-    k = len(radiance)
+    k, n = len(radiance), len(samples.albedo)
     scale = max(float(np.abs(radiance).max()), 1e-6)
-    start = np.concatenate([np.asarray(radiance, dtype=np.float64).ravel() / scale, [ambient / scale]])
     # One vector for lighting and ambient, relative to the lighting's size, so that one step length fits any exposure.
-    lower = np.full(3 * k + 1, -np.inf)
-    lower[-1] = 0.0
-    upper = np.full(3 * k + 1, np.inf)
+    start = np.concatenate([np.asarray(radiance, dtype=np.float64).ravel() / scale, [ambient / scale]])
+    low, high = np.full(3 * k + 1, -np.inf), np.full(3 * k + 1, np.inf)
+    low[-1] = 0.0
     if not appearance.model.has_ambient:
-        upper[-1] = 0.0
-    n = len(samples.albedo)
-    light = Variable(mi.Float(aligned(start)), rates[0], mi.Float(aligned(lower)), mi.Float(aligned(upper)))
-    begin = np.zeros(n, np.float32) if specular is None else np.asarray(specular, dtype=np.float32)
-    gloss = Variable(mi.Float(aligned(begin)), rates[1], 0.0, 1.0)
+        high[-1] = 0.0
     base = mi.Float(aligned(samples.albedo).ravel())
-    offset = Variable(dr.zeros(mi.Float, 3 * n), rates[2], -base, 1.0 - base)
+    begin = np.zeros(n, np.float32) if specular is None else np.asarray(specular, dtype=np.float32)
+    # Optimisers of their own: each variable steps at the values that the ones before it have just taken.
+    light = _Bounded(mi.Float(aligned(start)), rates[0], mi.Float(aligned(low)), mi.Float(aligned(high)))
+    gloss = _Bounded(mi.Float(aligned(begin)), rates[1], 0.0, 1.0)
+    offset = _Bounded(dr.zeros(mi.Float, 3 * n), rates[2], -base, 1.0 - base)
     history: dict[str, list[float]] = {name: [] for name in HISTORY}
 
     def unpack(x: Any) -> tuple[list[Any], Any]:
@@ -190,6 +143,32 @@ def fit_adam(
     return AdamResult(illumination, diffuse, np.array(gloss.value, dtype=np.float32), history)
 
 
+class _Bounded:
+    """A variable with a box that each of its Adam steps ends in."""
+
+    def __init__(self, value: Any, rate: float, low: Any, high: Any) -> None:
+        import mitsuba as mi
+
+        self._optimizer = mi.ad.Adam(lr=rate, params={"x": value})
+        self._low, self._high = low, high
+
+    @property
+    def value(self) -> Any:
+        """The variable, detached."""
+        import drjit as dr
+
+        return dr.detach(self._optimizer["x"])
+
+    def step(self, energy: Callable[[Any], Any]) -> None:
+        """Differentiate an energy at the current value and take one step."""
+        import drjit as dr
+
+        dr.backward(energy(self._optimizer["x"]))
+        self._optimizer.step()
+        self._optimizer["x"] = dr.clip(self.value, self._low, self._high)
+        dr.eval(self._optimizer["x"])
+
+
 class _Objective:
     """The paper's objective over one set of observations."""
 
@@ -204,8 +183,8 @@ class _Objective:
 
         self.model, self.lobe = appearance.model, prepare(appearance.lobe, appearance.order)
         self.difference, self.smoothness = difference, smoothness
-        self.normal, self.view = _vector(samples.normal), _vector(samples.view)
-        self.colour, self.weight = _colour(samples.colour), _colour(samples.weight)
+        self.normal, self.view = vector(mi.Vector3f, samples.normal), vector(mi.Vector3f, samples.view)
+        self.colour, self.weight = vector(mi.Color3f, samples.colour), vector(mi.Color3f, samples.weight)
         self.texel = mi.UInt(aligned(samples.texel, np.uint32))
         self.first, self.second = (mi.UInt(aligned(x, np.uint32)) for x in (samples.first, samples.second))
         self.traced = None
@@ -266,18 +245,6 @@ def _neighbours(index: NDArray, size: int) -> list[Any]:
         other = own[row + dy, column + dx]
         out.append(np.where(other < 0, np.arange(len(index)), other))
     return [mi.UInt(aligned(x, np.uint32)) for x in out]
-
-
-def _vector(values: NDArray) -> Any:
-    import mitsuba as mi
-
-    return mi.Vector3f(*map(aligned, values.T))
-
-
-def _colour(values: NDArray) -> Any:
-    import mitsuba as mi
-
-    return mi.Color3f(*map(aligned, values.T))
 
 
 def _at(colour: Any, index: Any) -> Any:

@@ -27,12 +27,14 @@ from mifit.core.mesh import normalize
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
+from mifit.solve import Outcome, Solution
+from mifit.stages.normals.solvers import adam_steps, gauss_newton
 from mifit.stages.observations import Surface
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
-    from mifit.render.refine import NormalProblem, Refined
+    from mifit.stages.normals.problem import NormalProblem
 
 IMAGE_STEPS = 255.0
 NORMAL_STEPS = 127.5
@@ -82,22 +84,21 @@ def refine_normals(
     size = check_maps(reflectance)
     texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
     normals, energies, warnings, seconds = [], {}, [], []
-    outcome = "converged"
+    outcomes = []
     for i, timestep in enumerate(geometry.timesteps):
         progress("refine normals", i, len(geometry.timesteps))
         frame = refine_frame(capture, model, geometry.at((timestep,)), reflectance, cameras, config, texels, seed=seed)
         normals.append(texels.to_map(frame.normal_object))
-        if frame.seen == 0.0:
+        if frame.measured == 0.0:
             warnings.append(f"timestep {timestep}: no camera measures the face; normals are the model's")
-        if not frame.solution_converged:
-            outcome = "max_iterations"
+        outcomes.append(frame.outcome)
         seconds.append(frame.seconds)
         for name, values in frame.energies.items():
             energies[f"{name} {timestep}"] = values
     progress("refine normals", len(geometry.timesteps), len(geometry.timesteps))
     longest = max((len(v) for v in energies.values()), default=0)
     report = Report(
-        outcome,
+        Outcome.worst(outcomes).value,
         {name: values + values[-1:] * (longest - len(values)) for name, values in energies.items()},
         time.perf_counter() - began,
         tuple(warnings),
@@ -116,9 +117,10 @@ class FrameNormals:
         Unit normals per covered texel, object space.
     base_object : (N, 3) float32
         The model's normals there.
-    seen : float
+    measured : float
         Part of the texels that some camera measures.
-    solution_converged : bool
+    outcome : Outcome
+        How the solver ended; converged where no texel is measured.
     energies : dict
         Per term, before and after each iteration.
     seconds : float
@@ -127,8 +129,8 @@ class FrameNormals:
 
     normal_object: NDArray[np.float32]
     base_object: NDArray[np.float32]
-    seen: float
-    solution_converged: bool
+    measured: float
+    outcome: Outcome
     energies: dict[str, list[float]]
     seconds: float
 
@@ -141,22 +143,22 @@ def refine_frame(
     cameras: Sequence[str],
     config: NormalsConfig,
     texels: TexelMap,
-    aim: NDArray | None = None,
+    prior: NDArray | None = None,
     seed: int = 0,
 ) -> FrameNormals:
     """Refine the normals of a geometry of one timestep; parameters as in `refine_normals`.
 
-    ``aim`` (N, 2) are offsets in the base normal's tangent plane (`core.bend`) that the correction is drawn to
-    instead of to zero, and from which it starts.
+    ``prior`` (N, 2) are offsets in the base normal's tangent plane (`core.bend`) that the correction is drawn
+    to instead of to zero, and from which it starts.
     """
-    problem, rows, base = frame_problem(capture, model, geometry, reflectance, cameras, config, texels, aim, seed)
+    problem, rows, base = frame_problem(capture, model, geometry, reflectance, cameras, config, texels, prior, seed)
     rotation = geometry.rotation[0]
-    offsets = np.zeros((len(base), 2)) if aim is None else aim.copy()
+    offsets = np.zeros((len(base), 2)) if prior is None else prior.copy()
     began = time.perf_counter()
     solution = None
     if problem is not None:
-        solution = solve(problem, config, None if aim is None else aim[rows])
-        offsets[rows] = solution.offsets
+        solution = solve(problem, config, None if prior is None else prior[rows])
+        offsets[rows] = solution.value
     elapsed = time.perf_counter() - began
     base_object = base @ rotation
     found = normalize(bend(base_object, tangent_plane(base_object), offsets))
@@ -164,17 +166,16 @@ def refine_frame(
         found.astype(np.float32),
         base_object.astype(np.float32),
         len(rows) / max(len(base), 1),
-        solution is None or solution.converged,
+        Outcome.CONVERGED if solution is None else solution.outcome,
         {} if solution is None else solution.energies,
         elapsed,
     )
 
 
-def solve(problem: NormalProblem, config: NormalsConfig, start: NDArray | None = None) -> Refined:
-    """Run the solver that the settings name."""
-    if config.solver == "adam":
-        return problem.adam(config.max_iterations, start=start)
-    return problem.gauss_newton(config.max_iterations, start=start)
+def solve(problem: NormalProblem, config: NormalsConfig, start: NDArray | None = None) -> Solution:
+    """Run the solver that the settings name; the solution's value are offsets (N, 2)."""
+    solver = adam_steps if config.solver == "adam" else gauss_newton
+    return solver(problem, config.max_iterations, start=start)
 
 
 def frame_problem(
@@ -185,14 +186,14 @@ def frame_problem(
     cameras: Sequence[str],
     config: NormalsConfig,
     texels: TexelMap,
-    aim: NDArray | None = None,
+    prior: NDArray | None = None,
     seed: int = 0,
 ) -> tuple[NormalProblem | None, NDArray, NDArray]:
     """The optimisation of one timestep, the texels (rows of ``texels``) that it solves for, and all base normals.
 
     Without a measured texel there is no optimisation: None.
     """
-    from mifit.render.refine import NormalProblem, NormalView, residual_scale, texel_shade
+    from mifit.stages.normals.problem import NormalProblem, NormalView, residual_scale, texel_shade
 
     rotation = geometry.rotation[0]
     surface = Surface(capture, model, geometry, cameras, texels.size)
@@ -215,9 +216,9 @@ def frame_problem(
     occlusion = appearance.trace(surface.meshes[0], points, seed)
     shade = texel_shade(appearance, diffuse, specular, views, occlusion, points.position)
     patch = TexelMap(texels.size, texels.index[rows], texels.face[rows], texels.weights[rows])
-    drawn = None
-    if aim is not None:
-        drawn = bend(object_normal, object_tangents, aim[rows]) - object_normal
+    prior_correction = None
+    if prior is not None:
+        prior_correction = bend(object_normal, object_tangents, prior[rows]) - object_normal
     problem = NormalProblem(
         object_normal,
         object_tangents,
@@ -227,7 +228,7 @@ def frame_problem(
         config.laplacian_weight * NORMAL_STEPS / IMAGE_STEPS**2,
         config.magnitude_weight * (NORMAL_STEPS / IMAGE_STEPS) ** 2,
         OUTLIER * max(residual_scale(views, shade), 1e-4),
-        drawn,
+        prior_correction,
     )
     return problem, rows, base
 

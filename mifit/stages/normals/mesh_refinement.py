@@ -15,9 +15,14 @@ from mifit.core.mesh_update import MeshUpdater, displacement, interior_vertices,
 from mifit.core.subdivision import split_faces
 from mifit.core.uv import rasterize_uv
 from mifit.progress import Progress, silent
+from mifit.solve import Outcome
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
+
+MAX_ITERATIONS = 30
+SETTLED = 0.01
+"""Part of the displacement by which the last iteration may still move the vertices."""
 
 
 def refine_mesh(
@@ -51,9 +56,11 @@ def refine_mesh(
     steps = normals.timesteps
     vertices = np.empty((len(steps), refiner.topology.n_vertices, 3), dtype=np.float32)
     heights = np.empty(normals.normal_object.shape[:3], dtype=np.float32)
+    outcomes = []
     for i, timestep in enumerate(steps):
         progress("refine mesh", i, len(steps))
-        vertices[i], heights[i] = refiner.refine(geometry, timestep, normals.normal_object[i])
+        vertices[i], heights[i], outcome = refiner.refine(geometry, timestep, normals.normal_object[i])
+        outcomes.append(outcome)
     progress("refine mesh", len(steps), len(steps))
     seconds = time.perf_counter() - factorised
     details = {
@@ -69,7 +76,7 @@ def refine_mesh(
         topology.faces_uv,
         topology.uv,
         heights,
-        Report("converged", seconds=time.perf_counter() - began, details=details),
+        Report(Outcome.worst(outcomes).value, seconds=time.perf_counter() - began, details=details),
     )
 
 
@@ -97,8 +104,11 @@ class MeshRefiner:
 
     def refine(
         self, geometry: GeometryEstimate, timestep: int, normal_object: NDArray
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """World-space vertices (V', 3) of a timestep and its displacement map (S, S), from its normals (S, S, 3)."""
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], Outcome]:
+        """World-space vertices (V', 3) of a timestep and its displacement map (S, S), from its normals (S, S, 3).
+
+        The outcome tells whether the vertices stood at the end.
+        """
         k, faces, texels = geometry.index(timestep), self.topology.faces, self._texels
         rotation, translation, scale = geometry.rotation[k], geometry.translation[k], geometry.scale
         world = geometry.vertices[k].astype(np.float64)
@@ -107,8 +117,10 @@ class MeshRefiner:
         refined = texels.from_map(normal_object).astype(np.float64)
         missing = np.linalg.norm(refined, axis=1) < 0.5
         refined[missing] = base[missing]
-        moved = self._updater.update(shape, wanted_face_normals(shape, faces, texels, base, refined))
+        wanted = wanted_face_normals(shape, faces, texels, base, refined)
+        moved, change = self._updater.settle(shape, wanted, MAX_ITERATIONS, SETTLED)
+        outcome = Outcome.CONVERGED if change <= SETTLED else Outcome.MAX_ITERATIONS
         height = displacement(texels, faces, shape, moved, base)
         # As a shift of the world's vertices, so that those that stay are the same to the last bit.
         vertices = self.topology.matrix @ world + scale * (moved - shape) @ rotation.T
-        return vertices.astype(np.float32), texels.to_map((scale * height).astype(np.float32))
+        return vertices.astype(np.float32), texels.to_map((scale * height).astype(np.float32)), outcome

@@ -1,16 +1,15 @@
-"""The optimisation of stage 3: normals per texel against images, tied to their neighbours.
+"""The energy of stage 3: normals per texel against images, tied to their neighbours.
 
-    E(x) = sum_images sum_texels w rho(|I - L(n(x))|) + w1 |Laplacian (n(x) - n0)|_1 + w2 |n(x) - n0 - aim|^2
+    E(x) = sum_images sum_texels w rho(|I - L(n(x))|) + w1 |Laplacian (n(x) - n0)|_1 + w2 |n(x) - n0 - prior|^2
 
-over the tangent-plane offsets x of `core.bend`, by Gauss-Newton or by Adam. Shading is that of `appearance`;
-derivatives are Dr.Jit's: forward mode for the two unknowns of a texel, reverse mode for Adam. All arrays stay with
-Dr.Jit between iterations; the host reads one number per iteration, the energy.
+over the tangent-plane offsets x of `core.bend`, with its linearisation. Shading is that of `appearance`; derivatives
+are Dr.Jit's: forward mode for the two unknowns of a texel, reverse mode for Adam. All arrays stay with Dr.Jit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,8 +18,7 @@ from numpy.typing import NDArray
 from mifit.appearance.arrays import aligned, vector
 from mifit.appearance.image import Appearance, assemble
 from mifit.appearance.occlusion import Occlusion
-from mifit.progress import Progress, silent
-from mifit.render.pairs import bend, bend_jacobian, conjugate_gradients, solve_blocks
+from mifit.stages.normals.chart import bend, bend_jacobian, conjugate_gradients, solve_blocks
 
 L1_FLOOR = 1e-4
 """Radians below which the L1 norm is rounded off: sqrt(c^2 + floor^2); its reweighting stays finite."""
@@ -82,20 +80,6 @@ def texel_shade(
     return shade
 
 
-@dataclass(frozen=True)
-class Refined:
-    """Offsets (N, 2), how the solver ended, and energies per term before and after each iteration."""
-
-    offsets: NDArray
-    converged: bool
-    energies: dict[str, list[float]] = field(default_factory=dict)
-
-    @property
-    def energy(self) -> float:
-        """Total at the end."""
-        return sum(values[-1] for values in self.energies.values())
-
-
 class NormalProblem:
     """Normal refinement of N texels.
 
@@ -112,7 +96,7 @@ class NormalProblem:
         w1, w2, for images in linear 0..1 and unit normals.
     huber : float
         Residual length from which the penalty grows linearly; infinite for plain least squares.
-    aim : (N, 3), optional
+    prior : (N, 3), optional
         Correction that the magnitude term pulls to; zero by default.
     """
 
@@ -126,7 +110,7 @@ class NormalProblem:
         laplacian_weight: float,
         magnitude_weight: float,
         huber: float = float("inf"),
-        aim: NDArray | None = None,
+        prior: NDArray | None = None,
     ) -> None:
         import drjit as dr
         import mitsuba as mi
@@ -135,7 +119,7 @@ class NormalProblem:
         self._base = _frame(normals, tangents)
         self._near = [mi.UInt32(aligned(neighbours[:, i], np.uint32)) for i in range(4)]
         self._degree = sum(dr.select(n != dr.arange(mi.UInt32, self._count), mi.Float(1), 0) for n in self._near)
-        self._views = [
+        self.views = [
             (
                 vector(mi.Color3f, v.colour),
                 mi.Float(aligned(v.weight)),
@@ -150,110 +134,35 @@ class NormalProblem:
         self._w1 = dr.opaque(mi.Float, float(laplacian_weight))
         self._w2 = dr.opaque(mi.Float, float(magnitude_weight))
         self._huber = dr.opaque(mi.Float, float(huber))
-        self._aim = vector(mi.Vector3f, np.zeros((self._count, 3)) if aim is None else aim)
-        dr.eval(self._degree, self._aim)
+        self._prior = vector(mi.Vector3f, np.zeros((self._count, 3)) if prior is None else prior)
+        dr.eval(self._degree, self._prior)
 
     def energies(self, offsets: NDArray) -> dict[str, float]:
         """Energy per term at offsets (N, 2)."""
-        return _totals(*self._terms(*self._load(offsets)))
+        return term_totals(*self.terms(*self.load(offsets)))
 
     def normals(self, offsets: NDArray, view: int) -> NDArray[np.float32]:
         """(N, 3) refined normals in the frame of one view, world space."""
-        return np.array(bend(self._views[view][3], *self._load(offsets))).T
-
-    def gauss_newton(
-        self,
-        max_iterations: int = 20,
-        tolerance: float = 1e-3,
-        start: NDArray | None = None,
-        progress: Progress = silent,
-    ) -> Refined:
-        """Minimise by Gauss-Newton with 2 x 2 blocks per texel.
-
-        The L1 norm is replaced by its quadratic majorant at the current point (iteratively reweighted least squares);
-        the joint system is solved by conjugate gradients with block-diagonal preconditioning. A step that raises the
-        energy is taken back and damped (Levenberg-Marquardt). Ends when the energy falls by less than ``tolerance``,
-        relative.
-        """
-        import drjit as dr
-
-        a, b = self._facing(*self._load(None), *self._load(start))
-        local, system = self._linearize(a, b)
-        rough = self._rough(a, b)
-        totals = _totals(local, rough)
-        history = {name: [value] for name, value in totals.items()}
-        damping, converged = self._zeros(), False
-        for iteration in range(max_iterations):
-            progress("normals", iteration, max_iterations)
-            x, y = self._facing(a, b, *self._step(a, b, system, damping))
-            found, new_system = self._linearize(x, y)
-            # Data and magnitude are separable: a texel whose own energy rises stays, and steps shorter next time.
-            worse = ~(sum(found.values()) <= 1.0001 * sum(local.values()) + 1e-9)  # also where it is NaN
-            x, y = dr.select(worse, a, x), dr.select(worse, b, y)
-            found = {name: dr.select(worse, local[name], value) for name, value in found.items()}
-            new_rough = self._rough(x, y)
-            after = _totals(found, new_rough)
-            before = sum(totals.values())
-            risen = sum(after.values()) > before
-            damping = dr.select(worse | risen, dr.maximum(8.0 * damping, 0.05), 0.25 * damping)
-            dr.eval(damping, x, y)
-            if risen:
-                continue
-            system = tuple(dr.select(worse, old, new) for old, new in zip(system, new_system, strict=True))
-            a, b, local, rough, totals = x, y, found, new_rough, after
-            dr.eval(system, local)
-            for name, value in totals.items():
-                history[name].append(value)
-            if before - sum(totals.values()) <= tolerance * before:
-                converged = True
-                break
-        progress("normals", max_iterations, max_iterations)
-        return Refined(_store(a, b), converged, history)
-
-    def adam(
-        self, iterations: int = 100, step: float = 0.01, start: NDArray | None = None, progress: Progress = silent
-    ) -> Refined:
-        """Minimise by Adam with learning rate ``step`` (radians): the paper's solver, on the same energy."""
-        import drjit as dr
-        import mitsuba as mi
-
-        a, b = self._load(start)
-        optimizer = mi.ad.Adam(lr=step, params={"a": a, "b": b})
-        totals = []
-        for iteration in range(iterations):
-            x = optimizer["a"], optimizer["b"]
-            total = dr.zeros(mi.Float, 1)
-            for k in range(len(self._views)):  # one kernel, compiled once for all views
-                total += _descend(self._data(*x, k))
-                dr.eval(total, *(dr.grad(v) for v in x))
-            total += _descend(self._magnitude(*x) + self._rough(*x))
-            totals.append(total)
-            optimizer.step()
-            dr.eval(total, optimizer["a"], optimizer["b"])
-            progress("normals (adam)", iteration + 1, iterations)
-        a, b = self._facing(*self._load(None), dr.detach(optimizer["a"]), dr.detach(optimizer["b"]))
-        found = _totals(*self._terms(a, b))
-        history = {"total": [float(t[0]) for t in totals] + [sum(found.values())]}
-        return Refined(_store(a, b), True, history)
+        return np.array(bend(self.views[view][3], *self.load(offsets))).T
 
     # Energy ---------------------------------------------------------------------------------------------------------
 
-    def _terms(self, a: Any, b: Any) -> tuple[dict[str, Any], Any]:
+    def terms(self, a: Any, b: Any) -> tuple[dict[str, Any], Any]:
         """Energy per texel: of the separable terms, and of the Laplacian's."""
         import drjit as dr
         import mitsuba as mi
 
         data = dr.zeros(mi.Float, self._count)
-        for k in range(len(self._views)):
-            data += self._data(a, b, k)
+        for k in range(len(self.views)):
+            data += self.data(a, b, k)
             dr.eval(data)
-        return {"data": data, "magnitude": self._magnitude(a, b)}, self._rough(a, b)
+        return {"data": data, "magnitude": self.magnitude(a, b)}, self.roughness(a, b)
 
-    def _data(self, a: Any, b: Any, view: int) -> Any:
+    def data(self, a: Any, b: Any, view: int) -> Any:
         """Energy of one view per texel."""
         import drjit as dr
 
-        colour, weight, direction, frame = self._views[view]
+        colour, weight, direction, frame = self.views[view]
         residual = colour - self._shade(bend(frame, a, b), direction, view)
         return self._penalty(weight, dr.squared_norm(residual))
 
@@ -266,12 +175,14 @@ class NormalProblem:
             square = dr.select(length <= self._huber, square, self._huber * (2 * length - self._huber))
         return dr.select(weight > 0, weight * square, 0)
 
-    def _magnitude(self, a: Any, b: Any) -> Any:
+    def magnitude(self, a: Any, b: Any) -> Any:
+        """Energy of the corrections' length per texel."""
         import drjit as dr
 
-        return self._w2 * dr.squared_norm(bend(self._base, a, b) - self._base[0] - self._aim)
+        return self._w2 * dr.squared_norm(bend(self._base, a, b) - self._base[0] - self._prior)
 
-    def _rough(self, a: Any, b: Any) -> Any:
+    def roughness(self, a: Any, b: Any) -> Any:
+        """Energy of the corrections' Laplacian per texel."""
         import drjit as dr
         import mitsuba as mi
 
@@ -292,13 +203,13 @@ class NormalProblem:
 
     # Gauss-Newton ---------------------------------------------------------------------------------------------------
 
-    def _linearize(self, a: Any, b: Any) -> tuple[dict[str, Any], tuple[Any, ...]]:
+    def linearize(self, a: Any, b: Any) -> tuple[dict[str, Any], tuple[Any, ...]]:
         """Separable energies, and gradient (2) and Gauss-Newton Hessian (aa, ab, bb) of the data, per texel."""
         import drjit as dr
         import mitsuba as mi
 
-        data, *out = (self._zeros() for _ in range(6))
-        for k, (colour, weight, direction, frame) in enumerate(self._views):
+        data, *out = (self.zeros() for _ in range(6))
+        for k, (colour, weight, direction, frame) in enumerate(self.views):
             columns = []
             for i in range(2):
                 x = [mi.Float(a), mi.Float(b)]
@@ -325,18 +236,18 @@ class NormalProblem:
             for i, value in enumerate(products):
                 out[i] += dr.select(seen, scale * value, 0)
             dr.eval(data, out)  # one kernel, compiled once for all views
-        local = {"data": data, "magnitude": self._magnitude(a, b)}
+        local = {"data": data, "magnitude": self.magnitude(a, b)}
         return local, tuple(out)
 
-    def _step(self, a: Any, b: Any, system: tuple[Any, ...], damping: Any) -> tuple[Any, Any]:
+    def step(self, a: Any, b: Any, system: tuple[Any, ...], damping: Any) -> tuple[Any, Any]:
         """Solve the linearised, majorised problem for a step of the offsets."""
         import drjit as dr
 
         ga, gb, haa, hab, hbb = system
         delta = bend(self._base, a, b) - self._base[0]
         ja, jb = bend_jacobian(self._base, a, b)
-        # d/dx of w2 |delta - aim|^2
-        pull = 2.0 * self._w2 * (delta - self._aim)
+        # d/dx of w2 |delta - prior|^2
+        pull = 2.0 * self._w2 * (delta - self._prior)
         irls = None
         if self._smooth:
             # w |c| <= w / 2 (c^2 / |c0| + |c0|): the majorant's Hessian is w / |c0|.
@@ -383,7 +294,7 @@ class NormalProblem:
 
         return conjugate_gradients(apply, (ra, rb), lambda r: solve_blocks(preconditioner, *r))
 
-    def _facing(self, a: Any, b: Any, da: Any, db: Any) -> tuple[Any, Any]:
+    def facing(self, a: Any, b: Any, da: Any, db: Any) -> tuple[Any, Any]:
         """Take steps from offsets that face every camera that measures the texel, halved until the ends do too."""
         import drjit as dr
 
@@ -392,13 +303,13 @@ class NormalProblem:
         for attempt in range(4):
             x, y = a + da, b + db
             good = x * x + y * y < 4.0  # a right angle
-            for _, weight, direction, frame in self._views:
+            for _, weight, direction, frame in self.views:
                 good &= (weight <= 0) | (dr.dot(bend(frame, x, y), direction) >= FACING)
             factor = dr.select(good, 1.0, 0.5 if attempt < 3 else 0.0)
             da, db = da * factor, db * factor
         return a + da, b + db
 
-    def _zeros(self) -> Any:
+    def zeros(self) -> Any:
         """Zeros in memory: a literal would be folded into the kernel and make it another one to compile."""
         import drjit as dr
         import mitsuba as mi
@@ -407,11 +318,12 @@ class NormalProblem:
         dr.make_opaque(zeros)
         return zeros
 
-    def _load(self, offsets: NDArray | None) -> tuple[Any, Any]:
+    def load(self, offsets: NDArray | None) -> tuple[Any, Any]:
+        """Offsets (N, 2), or zeros, on the device."""
         import mitsuba as mi
 
         if offsets is None:
-            return self._zeros(), self._zeros()
+            return self.zeros(), self.zeros()
         return tuple(mi.Float(aligned(offsets[:, i])) for i in range(2))  # type: ignore[return-value]
 
 
@@ -428,17 +340,8 @@ def residual_scale(views: Sequence[NormalView], shade: TexelShade) -> float:
     return 1.48 * float(np.median(every)) if len(every) else 0.0
 
 
-def _descend(energy: Any) -> Any:
-    """Sum an energy and add its gradient to that of the variables it depends on."""
-    import drjit as dr
-
-    total = dr.sum(energy)
-    dr.backward(total)
-    return dr.detach(total)
-
-
-def _totals(local: dict[str, Any], rough: Any) -> dict[str, float]:
-    """Sums in double precision: millions of small terms, compared to a relative 1e-3 and less."""
+def term_totals(local: dict[str, Any], rough: Any) -> dict[str, float]:
+    """Energy per term: sums in double precision: millions of small terms, compared to a relative 1e-3 and less."""
     import drjit as dr
 
     terms = {**local, "laplacian": rough}
@@ -452,5 +355,6 @@ def _frame(normals: NDArray, tangents: NDArray) -> tuple[Any, Any, Any]:
     return tuple(vector(mi.Vector3f, v) for v in (normals, tangents[:, 0], tangents[:, 1]))  # type: ignore[return-value]
 
 
-def _store(a: Any, b: Any) -> NDArray[np.float64]:
+def stored_offsets(a: Any, b: Any) -> NDArray[np.float64]:
+    """Offsets (N, 2) from the device."""
     return np.stack([np.array(a, dtype=np.float64), np.array(b, dtype=np.float64)], axis=1)

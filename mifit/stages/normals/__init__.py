@@ -1,0 +1,1 @@
+"""Stage 3: normals per timestep that explain the images, and meshes that carry them as shape."""
