@@ -58,7 +58,7 @@ def view(capture: Capture, name: str, timestep: int) -> View:
     low = np.maximum(np.floor(points.min(0)).astype(int) - MARGIN, 0)
     high = np.minimum(np.ceil(points.max(0)).astype(int) + MARGIN, (camera.width, camera.height))
     width, height = (high - low).tolist()
-    cut = replace(camera, width=width, height=height, cx=camera.cx - low[0], cy=camera.cy - low[1])
+    cut = replace(camera, width=width, height=height, cx=camera.cx - float(low[0]), cy=camera.cy - float(low[1]))
     box = slice(low[1], high[1]), slice(low[0], high[0])
     frame = capture.frame(name, timestep)
     regions = (

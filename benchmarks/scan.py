@@ -113,7 +113,8 @@ def read_scan(capture: Capture, timestep: int) -> Scan | None:
     source = SHARED / "models" / "lee_perry_smith" / "LeePerrySmith.glb"
     if uv is None and maps and source.exists():
         head = next(iter(trimesh.load(source, process=False).geometry.values()))
-        uv = head.visual.uv if len(head.vertices) == len(mesh.vertices) else None
+        # The file's v counts from the bottom, unlike glTF's, whose v is turned when it is read.
+        uv = head.visual.uv * (1, -1) + (0, 1) if len(head.vertices) == len(mesh.vertices) else None
     return Scan(np.asarray(mesh.vertices), np.asarray(mesh.faces), None if uv is None else np.asarray(uv), maps)
 
 
@@ -169,11 +170,11 @@ def relit_truths(capture: Capture) -> dict[str, tuple[Path, Path, float]]:
     if not (folder / "meta.json").exists():
         return {}
     meta: dict[str, Any] = json.loads((folder / "meta.json").read_text())
-    found = {}
+    found, own = {}, meta.get("relit_exposure", {})
     for view in sorted(folder.glob("relit_*.exr")):
         name = view.stem[len("relit_") :]
-        for place in (folder / f"environment_{name}.hdr", SHARED / "hdri" / f"{name}.hdr"):
+        for place in (folder / f"environment_{name}.exr", SHARED / "hdri" / f"{name}.hdr"):
             if place.exists():
-                found[name] = (view, place, float(meta.get("relit_exposure", meta["exposure"])))
+                found[name] = (view, place, float(own.get(name, meta["exposure"])))
                 break
     return found

@@ -130,7 +130,22 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--height", type=_whole(16, MAX_RENDERED_PIXELS // 16), default=480)
     p.add_argument("--spp", type=_whole(1, MAX_SAMPLES), default=64, help="samples per pixel (default: 64)")
     p.add_argument("--tone", type=_real, help="skin from 0, fair, to 1, deep; default: drawn for each subject")
-
+    p.add_argument(
+        "--motion", choices=["poses", "talk", "turn"], default="poses", help="talk and turn: 30 timesteps are a second"
+    )
+    p.add_argument(
+        "--head", type=_path, help="a scanned head with texture coordinates (.glb, .obj, .ply), moved rigidly"
+    )
+    p.add_argument(
+        "--maps",
+        nargs="+",
+        default=[],
+        metavar="NAME=FILE",
+        help="of --head: albedo, specular, roughness, displacement",
+    )
+    p.add_argument("--unit-mm", type=_real, default=10.0, help="of --head: millimetres of its unit (default: 10)")
+    p.add_argument("--flip-v", action="store_true", help="of --head: turn its maps upside down")
+    p.add_argument("--relit", type=_path, nargs="+", default=[], help="of --head: environments of relit true views")
     p.add_argument("--force", action="store_true", help="write into a folder that holds something already")
 
     p = add("import", "a capture from videos, image folders, COLMAP text models or nerfstudio transforms.json")
@@ -139,6 +154,7 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--calibration", type=_path, help="OpenCV stereo calibration, YAML or XML")
     p.add_argument("--colmap", type=_path, help="folder with cameras.txt and images.txt")
     p.add_argument("--transforms", type=_path, help="nerfstudio transforms.json")
+    p.add_argument("--digital-emily", type=_path, help="checkout of the public Digital Emily repository")
     p.add_argument("--units", default="cm", help="unit of length of the calibration: mm, cm or m (default: cm)")
     p.add_argument("--every", type=_at_least(1), default=1, help="keep every N-th frame")
     p.add_argument("--start", type=_at_least(0), default=0, help="first frame")

@@ -103,6 +103,11 @@ def synth(arguments: Namespace) -> None:
     out: Path = arguments.out
     if out.exists() and not arguments.force and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"--out {out}: is there already and not empty; --force writes into it, or name another folder")
+    if arguments.head is not None:
+        _synth_scan(arguments)
+        return
+    if arguments.maps or arguments.relit:
+        raise InputError("--maps and --relit belong to --head, which is missing")
     _use_variant(arguments)
     from mifit.synth import synthesize
 
@@ -117,13 +122,53 @@ def synth(arguments: Namespace) -> None:
         height=arguments.height,
         spp=arguments.spp,
         tone=arguments.tone,
+        motion=arguments.motion,
         progress=console_progress(arguments.quiet),
     )
     print(f"Capture: {arguments.out}")
 
 
+def _synth_scan(arguments: Namespace) -> None:
+    """A capture of a scanned head."""
+    for name, default in (("subjects", 1), ("motion", "poses"), ("tone", None)):
+        if getattr(arguments, name) != default:
+            raise InputError(f"--{name}: found with --head, whose shape and skin are the scan's; leave it out")
+    maps = {}
+    for text in arguments.maps:
+        name, separator, file = text.partition("=")
+        if not (separator and file):
+            raise InputError(f"--maps {text}: expected NAME=FILE, such as albedo=colour.jpg")
+        maps[name] = Path(file)
+    from mifit.synth.compose import place_cameras, read_environment
+    from mifit.synth.scanned import ScannedHead, synthesize_scan
+    from mifit.synth.studio import studio_environment
+
+    head = ScannedHead.load(arguments.head, maps, arguments.unit_mm, arguments.flip_v)
+    environment = read_environment(arguments.env) if arguments.env else studio_environment(arguments.seed)
+    relit = {path.stem: read_environment(path) for path in arguments.relit}
+    _use_variant(arguments)
+    synthesize_scan(
+        arguments.out,
+        head,
+        place_cameras(arguments.width, arguments.height),
+        environment,
+        relit,
+        timesteps=arguments.timesteps,
+        seed=arguments.seed,
+        spp=arguments.spp,
+        progress=console_progress(arguments.quiet),
+    )
+    print(f"Capture: {arguments.out}; it has no landmarks yet: mifit landmarks {arguments.out}")
+
+
 def import_(arguments: Namespace) -> None:
     """Make a capture from other files."""
+    if arguments.digital_emily is not None:
+        from mifit.capture.digital_emily import import_digital_emily
+
+        import_digital_emily(arguments.digital_emily, arguments.out)
+        print(f"Capture: {arguments.out}; it has no landmarks yet: mifit landmarks {arguments.out}")
+        return
     from mifit.capture import import_capture
 
     import_capture(

@@ -61,6 +61,27 @@ def test_image_based_rendering_shows_the_points_colours_where_a_view_sees_them(s
     assert len(columns) and columns.min() > 32  # what the left view doesn't see is on the right
 
 
+def test_what_hides_a_point_from_a_view_is_not_painted_onto_it(sphere):
+    faces, vertices = sphere
+    left, middle = ball_camera("left", -20), ball_camera("third", 0)
+    toward = left.position / np.linalg.norm(left.position)
+    plate = 0.2 * vertices + 1.8 * RADIUS * toward  # between the left camera and the ball
+    both = np.concatenate([vertices, plate]), np.concatenate([faces, faces + len(vertices)])
+    capture = photographs(None, lambda p: 0.5 + p / (3 * RADIUS))
+    free, blocked = (image_based(capture, [left], middle, 0, *mesh) for mesh in ((vertices, faces), both))
+    rays = middle.pixel_rays(middle.pixel_centres())
+    b = rays @ middle.position
+    root = b**2 - (middle.position @ middle.position - RADIUS**2)
+    point = middle.position + (-b - np.sqrt(np.maximum(root, 0)))[..., None] * rays
+    away = point - left.position
+    away /= np.linalg.norm(away, axis=-1, keepdims=True)
+    aside = np.linalg.norm(np.cross(away, 1.8 * RADIUS * toward - left.position), axis=-1)
+    ball = free.seen & blocked.hit & (np.abs(free.colour - blocked.colour).max(-1) < 1)
+    assert (free.seen & (aside < 0.15 * RADIUS)).sum() > 20
+    assert not blocked.seen[ball & (root > (0.3 * RADIUS) ** 2) & (aside < 0.15 * RADIUS)].any()
+    assert blocked.seen[free.seen & (aside > 0.3 * RADIUS) & (root > (0.5 * RADIUS) ** 2)].mean() > 0.9
+
+
 def test_a_gain_between_cameras_is_taken_out_of_the_colours(sphere):
     faces, vertices = sphere
     capture = photographs(None, lambda p: np.full(p.shape, 0.4))

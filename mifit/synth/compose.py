@@ -58,6 +58,7 @@ def synthesize(
     height: int = 480,
     spp: int = 64,
     tone: float | None = None,
+    motion: head.Motion = "poses",
     progress: Progress = silent,
 ) -> Path:
     """Render a capture of an unseen subject, with ground truth beside it.
@@ -84,6 +85,8 @@ def synthesize(
         Samples per pixel.
     tone : float, optional
         Skin from 0, fair, to 1, deep; drawn for each subject by default.
+    motion : {"poses", "talk", "turn"}
+        How the head moves, see `head.draw_motion`.
     progress : Progress
 
     Returns
@@ -110,13 +113,13 @@ def synthesize(
     if tone is not None and not 0 <= tone <= 1:
         raise InputError(f"tone: found {tone}, expected 0 (fair) to 1 (deep)")
     shape = MorphableModel.load(model)
-    radiance = None if env is None else _environment(env)
+    radiance = None if env is None else read_environment(env)
     total = subjects * (timesteps + 1)
     cameras = place_cameras(width, height)
     map_size = 1024 if min(width / 680, height / 480) > 0.6 else 512
     for i in range(subjects):
         folder = out if subjects == 1 else out / f"subject_{i:02d}"
-        subject = _draw_subject(shape, SkinStyle.draw(seed + i, tone), timesteps, map_size)
+        subject = _draw_subject(shape, SkinStyle.draw(seed + i, tone), timesteps, map_size, motion)
         light = studio_environment(seed + i) if radiance is None else radiance
         start = i * (timesteps + 1)
         _write_capture(
@@ -125,7 +128,8 @@ def synthesize(
     return out
 
 
-def _environment(path: str | Path) -> NDArray[np.float32]:
+def read_environment(path: str | Path) -> NDArray[np.float32]:
+    """A lat-long environment (H, 2 H, 3), finite and not black; InputError otherwise."""
     image = read_image(path)
     if image.shape[1] != 2 * image.shape[0]:
         raise InputError(
@@ -172,7 +176,9 @@ class _Subject:
     eyes: list[NDArray[np.float64]]
 
 
-def _draw_subject(model: MorphableModel, style: SkinStyle, timesteps: int, map_size: int) -> _Subject:
+def _draw_subject(
+    model: MorphableModel, style: SkinStyle, timesteps: int, map_size: int, motion: head.Motion
+) -> _Subject:
     seed = style.seed
     scale = model.unit_mm / 10.0  # the world is in centimetres
     mean_mm = model.mean.astype(np.float64) * model.unit_mm
@@ -201,7 +207,7 @@ def _draw_subject(model: MorphableModel, style: SkinStyle, timesteps: int, map_s
             for loop in head.eye_openings(neutral, model.faces, model.landmarks)
         ]
     )
-    poses = head.draw_motion(model, timesteps, seed, scale, centre)
+    poses = head.draw_motion(model, timesteps, seed, scale, centre, motion)
     return _Subject(model, seed, neutral, poses, scale, skin, parts, eyes)
 
 

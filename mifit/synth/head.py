@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +44,19 @@ def neutral_shape(model: MorphableModel, seed: int) -> NDArray[np.float64]:
     return shape + (0.5 / model.unit_mm) * noise[:, None] * vertex_normals(shape, model.faces)
 
 
-def draw_motion(model: MorphableModel, timesteps: int, seed: int, scale: float, centre: NDArray) -> list[HeadPose]:
+Motion = Literal["poses", "talk", "turn"]
+FRAMES_A_SECOND = 30.0
+TALKING_MODES = 6
+"""Expressions that speech is made of: those that move the mouth most and the rest of the face least."""
+
+
+def draw_motion(
+    model: MorphableModel, timesteps: int, seed: int, scale: float, centre: NDArray, motion: Motion = "poses"
+) -> list[HeadPose]:
     """A pose and an expression per timestep, smooth in time.
+
+    ``poses`` differ widely from timestep to timestep, as photographs do; ``talk`` and ``turn`` are sequences at 30
+    frames a second: syllables, four to five a second, with a head that sways, and a slow turn from side to side.
 
     Parameters
     ----------
@@ -56,6 +68,8 @@ def draw_motion(model: MorphableModel, timesteps: int, seed: int, scale: float, 
     centre : (3,)
         Object-space point that the head turns about and that stays near the world's origin.
     """
+    if motion != "poses":
+        return _sequence(model, timesteps, seed, scale, centre, motion)
     rng = np.random.default_rng([seed, 12])
     phase, speed = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.5, 1.1, 6)
     swing = np.array([9.0, 5.0, 3.0, 0.8, 0.5, 0.5])  # degrees of yaw, pitch, roll; centimetres
@@ -74,6 +88,44 @@ def draw_motion(model: MorphableModel, timesteps: int, seed: int, scale: float, 
         translation = np.array(shift) - scale * rotation @ centre
         poses.append(HeadPose(expression.astype(np.float32), rotation, translation))
     return poses
+
+
+def _sequence(
+    model: MorphableModel, timesteps: int, seed: int, scale: float, centre: NDArray, motion: Motion
+) -> list[HeadPose]:
+    """A head that talks or turns, frame by frame."""
+    rng = np.random.default_rng([seed, 14])
+    seconds = np.arange(timesteps) / FRAMES_A_SECOND
+    phase = rng.uniform(0, 2 * np.pi, (2, 6))
+    slow = np.sin(phase[0] + 2 * np.pi * np.outer(seconds, rng.uniform(0.15, 0.4, 6)))
+    swing = slow * (4.0, 2.5, 1.5, 0.3, 0.3, 0.2)
+    expression = np.zeros((timesteps, model.n_expression))
+    if motion == "turn":
+        swing[:, 0] = 35.0 * np.sin(2 * np.pi * seconds / 4.0)
+    else:
+        talking = talking_modes(model)
+        rate = rng.uniform(3.8, 5.0, len(talking)) * np.where(np.arange(len(talking)) % 2, 0.5, 1.0)
+        wave = 0.5 - 0.5 * np.cos(phase[1, : len(talking)] + 2 * np.pi * np.outer(seconds, rate))
+        breath = np.clip(1.5 * np.sin(2 * np.pi * seconds / 1.7 + phase[1, 0]) + 0.9, 0.0, 1.0)  # words and pauses
+        bounds = np.asarray(model.expression_bounds, dtype=np.float64)
+        free = ~np.isfinite(bounds).all(axis=1)[talking]
+        strength = np.where(free, rng.choice([-1.0, 1.0], len(talking)) * 0.9, rng.uniform(0.2, 0.5, len(talking)))
+        expression[:, talking] = strength * wave * breath[:, None]
+        expression = np.clip(expression, bounds[:, 0], bounds[:, 1])
+    poses = []
+    for (yaw, pitch, roll, *shift), weights in zip(swing, expression, strict=True):
+        rotation = Rotation.from_euler("yxz", [yaw, pitch, roll], degrees=True).as_matrix()
+        translation = np.array(shift) - scale * rotation @ centre
+        poses.append(HeadPose(weights.astype(np.float32), rotation, translation))
+    return poses
+
+
+def talking_modes(model: MorphableModel) -> NDArray[np.int64]:
+    """The expressions that move the mouth's landmarks most, relative to the brows' and eyes'."""
+    moved = np.linalg.norm(model.expression[model.landmarks].astype(np.float64), axis=1)  # (68, Ke)
+    mouth, rest = moved[48:68].mean(axis=0), moved[17:48].mean(axis=0)
+    score = mouth**2 / (mouth + 3.0 * rest + 1e-12)
+    return np.argsort(-score, kind="stable")[: min(TALKING_MODES, model.n_expression)]
 
 
 def wrap_uv(uv: NDArray, faces_uv: NDArray) -> tuple[NDArray[np.float32], NDArray[np.int32]]:

@@ -45,6 +45,15 @@ def test_ssim_orders_distortions_and_matches_the_formula_for_constants():
     assert ssim(np.full((32, 32), 100.0), np.full((32, 32), 120.0)) == pytest.approx(expected, rel=1e-9)
 
 
+def test_ssim_of_a_pattern_against_grey_is_its_second_constant_over_the_variance():
+    rows, columns = np.indices((64, 64))
+    image = 100.0 + 10.0 * np.where((rows + columns) % 2, 1.0, -1.0)
+    c2 = (0.03 * 255) ** 2
+    inner = np.zeros((64, 64), bool)
+    inner[16:48, 16:48] = True
+    assert ssim(image, np.full((64, 64), 100.0), inner) == pytest.approx(c2 / (10.0**2 + c2), rel=1e-3)
+
+
 def test_bad_input_is_named():
     with pytest.raises(InputError, match="expected two equal images"):
         rmse(np.zeros((2, 2, 3)), np.zeros((2, 3, 3)))

@@ -105,6 +105,14 @@ def test_projection_recovers_a_band_limited_environment() -> None:
     assert sh.latlong_solid_angles(64, 128).sum() * 128 == pytest.approx(4 * np.pi)
 
 
+def test_pixels_of_an_environment_look_along_the_stated_directions() -> None:
+    found = sh.latlong_directions(4, 8)
+    for row, column in ((0, 0), (1, 2), (3, 7)):
+        phi, theta = 2 * np.pi * (column + 0.5) / 8, np.pi * (row + 0.5) / 4
+        expected = (np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta))
+        assert found[row, column] == pytest.approx(expected)
+
+
 def test_the_lat_long_convention_is_that_of_mitsubas_envmap(variant: str) -> None:
     import drjit as dr
     import mitsuba as mi

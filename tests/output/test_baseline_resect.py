@@ -79,6 +79,22 @@ def test_a_camera_is_placed_from_its_landmarks_alone(ball, tmp_path, intrinsics)
     assert found.camera.fx == pytest.approx(THIRD.fx, rel=3e-3)
 
 
+def test_a_camera_of_another_size_gets_its_own_focal_length(ball, tmp_path):
+    capture = uncalibrated(tmp_path, ball)
+    zoomed = replace(THIRD, width=96, height=96, fx=1.3 * THIRD.fx, fy=1.3 * THIRD.fy, cx=48.0, cy=48.0)
+    document = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in document["frames"]:
+        if frame["camera_id"] == "third":
+            i = ball.timesteps.index(frame["timestep_index"])
+            points = zoomed.project(ball.geometry.vertices[i][ball.model.landmarks].astype(float))
+            (tmp_path / frame["landmark_path"]).write_text(json.dumps({"points": points.tolist()}))
+            frame |= {"w": 96, "h": 96}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    found = resect(ball, Capture.load(tmp_path), "third")
+    assert found.camera.fx == pytest.approx(zoomed.fx, rel=0.03) and found.landmark_pixels < 0.1
+    assert needs_resection(ball, capture, "third")
+
+
 def test_noise_of_landmarks_moves_the_camera_little(ball, tmp_path):
     found = resect(ball, uncalibrated(tmp_path, ball, noise=0.3), "third")
     assert 0.2 < found.landmark_pixels < 0.8

@@ -63,6 +63,10 @@ def test_relighting_projects_the_environment_and_keeps_the_mean(ball):
     plain = ball.relight(environment, exposure=1.0)
     np.testing.assert_allclose(plain.lighting.coefficients, expected, rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(plain.environment, environment)
+    # The ambient term goes with the mean radiance.
+    brighter = plain.lighting.coefficients[0] @ luminance / (ball.lighting.coefficients[0] @ luminance)
+    assert plain.illumination.ambient == pytest.approx(ball.illumination.ambient * brighter)
+    assert not 0.9 < brighter < 1.1
 
 
 @pytest.mark.parametrize("degrees", [30.0, -107.3])

@@ -61,6 +61,17 @@ def test_bumps_appear_in_positions_and_displacement(problem):
     assert np.corrcoef(shown, expected)[0, 1] > 0.95
 
 
+@pytest.mark.parametrize("times, low, high", [(0.25, 0.0, 0.2), (1.0, 0.3, 0.7), (4.0, 0.8, 1.1)])
+def test_waves_as_long_as_the_detail_are_half_from_the_normals(problem, times, low, high):
+    model, geometry, normals, true = problem
+    # The bumps' waves: 2 pi / 9 by 2 pi / 8 of object space, whose unit is 10 mm like the setting's, cross each other.
+    wave = 2 * np.pi / np.hypot(9, 8) * model.unit_mm / 10.0
+    refined = refine_mesh(model, geometry, normals, MeshConfig(detail=times * wave))
+    moved, wanted = refined.vertices[0] - geometry.vertices[0], true - geometry.vertices[0]
+    share = float((moved * wanted).sum() / (wanted * wanted).sum())
+    assert low < share < high
+
+
 def test_positions_hold_against_the_normals_of_large_shapes(problem):
     model, geometry, normals, _ = problem
     free = refine_mesh(model, geometry, normals, MeshConfig(detail=20.0))

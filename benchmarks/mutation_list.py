@@ -1,0 +1,121 @@
+# ruff: noqa: E501
+"""The changes of `benchmarks.mutations`: what each does, where, and which tests should notice."""
+
+from __future__ import annotations
+
+from benchmarks.mutations import Mutation as M
+
+CORE = "mifit/core/*.py"
+CAPTURE = "mifit/capture/*.py"
+STAGES = "mifit/stages/**/*.py"
+SOLVE = "mifit/solve/*.py"
+OUTPUT = "mifit/output/*.py"
+ANY = "mifit/**/*.py"
+
+CONVENTIONS = [
+    M("pixel centres at integers", CORE, r"return np\.stack\(\[x \+ 0\.5, y \+ 0\.5\]", "return np.stack([x, y]",
+      "tests/core/test_camera.py"),
+    M("camera axes of OpenGL not turned", CORE, r"OPENGL_FROM_OPENCV = np\.diag\(\[1\.0, -1\.0, -1\.0, 1\.0\]\)",
+      "OPENGL_FROM_OPENCV = np.diag([1.0, 1.0, 1.0, 1.0])", "tests/core/test_camera.py"),
+    M("a point behind the camera projects", CORE, r"np\.where\(p\[\.\.\., 2\] > 1e-12, p\[\.\.\., 2\], np\.nan\)",
+      "p[..., 2]", "tests/core/test_camera.py"),
+    M("maps read upside down", CORE, r"y = np\.clip\(\(1\.0 - uv\[:, 1\]\) \* size - 0\.5", "y = np.clip(uv[:, 1] * size - 0.5",
+      "tests/core/test_uv.py"),
+    M("texels half a texel off", CORE, r"px, py = x \+ 0\.5, y \+ 0\.5", "px, py = x, y", "tests/core/test_uv.py"),
+    M("OpenCV's principal point taken as ours", CAPTURE, r"matrix\[0, 2\] \+ 0\.5, matrix\[1, 2\] \+ 0\.5",
+      "matrix[0, 2], matrix[1, 2]", "tests/capture/test_importer.py tests/capture/test_conventions.py"),
+    M("lens distortion half a pixel off", CAPTURE, r"matrix\[:2, 2\] -= 0\.5", "matrix[:2, 2] -= 0.0",
+      "tests/capture/test_capture.py tests/capture/test_conventions.py"),
+    M("landmarks of .npy files taken as ours", CAPTURE, r'"\.npy": 0\.0', '".npy": 0.5',
+      "tests/capture/test_landmark_files.py"),
+    M("sRGB decoded with exponent 2.2", CORE, r"\*\* ?2\.4\b", "** 2.2", "tests/core/test_image.py"),
+    M("the weak landmark threshold of alpha ignored", CAPTURE, r"valid &= found\.alpha >= 0\.5", "pass",
+      "tests/capture/test_capture.py"),
+    M("clipped pixels count as measured", CAPTURE, r"clipped = found\.clipped\b", "clipped = found.clipped & False",
+      "tests/capture/test_capture.py"),
+]  # fmt: skip
+
+MEASURES = [
+    M("PSNR of powers", CORE, r"20\.0 \* math\.log10\(peak / error\)", "10.0 * math.log10(peak / error)",
+      "tests/core/test_metrics.py"),
+    M("SSIM's second constant ten times larger", CORE, r"\(0\.03 \* peak\) \*\* 2", "(0.3 * peak) ** 2",
+      "tests/core/test_metrics.py"),
+    M("FLIP without its feature exponent", CORE, r"COLOUR_EXPONENT, FEATURE_EXPONENT = 0\.7, 0\.5",
+      "COLOUR_EXPONENT, FEATURE_EXPONENT = 0.7, 1.0", "tests/core/test_flip.py"),
+    M("the evaluated region isn't eroded", OUTPUT, r"^EROSION = 2$", "EROSION = 0",
+      "tests/output/test_render_evaluate.py"),
+    M("the baseline takes views that are hidden", OUTPUT,
+      r"visible = inside & \(cosine > LEAST_COSINE\) & scene\.visible_from\(point, view\.position\)",
+      "visible = inside & (cosine > LEAST_COSINE)", "tests/test_foreign.py tests/output/test_baseline_resect.py"),
+    M("the baseline ignores gains", OUTPUT, r"colour = bilinear\(frame\.image, x, y\) / gain",
+      "colour = bilinear(frame.image, x, y)", "tests/test_foreign.py"),
+    M("a placed camera keeps a guessed focal length", OUTPUT,
+      r"focal = np\.exp\(x\[6\]\) if view\.intrinsics is None else 1\.0", "focal = 1.0",
+      "tests/output/test_baseline_resect.py"),
+    M("distances to vertices, not to faces", "benchmarks/scan.py", r"pick = distance\.argmin\(1\)",
+      "pick = distance.argmax(1)", "tests/test_foreign.py"),
+    M("relit views compared without their factors", "benchmarks/judge.py",
+      r"a = a \* \(a \* b\)\.sum\(0\) / np\.maximum\(\(a \* a\)\.sum\(0\), 1e-9\)", "a = a * 1.0",
+      "tests/test_foreign.py"),
+]  # fmt: skip
+
+LIGHT = [
+    M("irradiance without the cosine's factors", CORE, r"basis\(normals, self\.order\) @ \(factors\[:, None\] \* self",
+      "basis(normals, self.order) @ (np.ones_like(factors)[:, None] * self", "tests/core/test_sh.py"),
+    M("the basis without the Condon-Shortley phase", CORE, r"q_mm \*= -math\.sqrt", "q_mm *= math.sqrt",
+      "tests/core/test_sh.py"),
+    M("environments turned by half a texel", CORE, r"phi = \(np\.arange\(width\) \+ 0\.5\) \* \(2\.0 \* np\.pi / width\)",
+      "phi = np.arange(width) * (2.0 * np.pi / width)", "tests/core/test_sh.py"),
+    M("lighting turned the wrong way", CORE, r"return SHLighting\(rotation_matrix\(rotation, self\.order\) @",
+      "return SHLighting(rotation_matrix(np.transpose(rotation), self.order) @", "tests/core/test_sh.py"),
+    M("the lobe's energy not normalised", ANY, r"\(8\.0 \* np\.pi \* \(m \+ np\.exp2", "(4.0 * np.pi * (m + np.exp2",
+      "tests/appearance/test_lobe.py"),
+    M("relighting keeps the old ambient term", OUTPUT, r"ambient = reflectance\.illumination\.ambient \* exposure \* after / before",
+      "ambient = reflectance.illumination.ambient", "tests/output/test_views.py"),
+]  # fmt: skip
+
+GEOMETRY = [
+    M("w_r times 100", ANY, r"(prior_weight: float = number\()5e-5", r"\g<1>5e-3", "tests/test_paper.py"),
+    M("w_l a tenth", ANY, r"(landmark_weight: float = number\()10\.0", r"\g<1>1.0", "tests/test_paper.py"),
+    M("1 / |M_view| dropped", STAGES,
+      r"return float\(rho\[observation\.ok\]\.sum\(\)\) / count, np\.where\(observation\.ok, weight, 0\.0\) / count",
+      "return float(rho[observation.ok].sum()), np.where(observation.ok, weight, 0.0)", "tests/test_paper.py"),
+    M("1 / |F_view| dropped", STAGES, r"weight=config\.landmark_weight / max\(len\(view\.index\), 1\)",
+      "weight=config.landmark_weight", "tests/test_paper.py"),
+    M("the photometric term in linear units, not 0..255", STAGES, r"^WHITE = 255\.0", "WHITE = 1.0",
+      "tests/test_paper.py tests/stages/test_geometry_terms.py"),
+    M("the prior's gradient dropped", STAGES, r"gradient\[inside\] \+= weight \* x\[at\]", "gradient[inside] += 0 * x[at]",
+      "tests/stages/test_geometry_terms.py"),
+    M("the elimination of point colours left out", STAGES, r"system\.dense\(\) - rows\.T @ rows", "system.dense()",
+      "tests/stages/test_geometry_terms.py"),
+    M("Geman and McClure's weight not squared", SOLVE, r"return squared \* q, q \* q", "return squared * q, q",
+      "tests/solve/test_solve.py"),
+    M("Huber's weight 1 everywhere", SOLVE, r"np\.where\(beyond, scale / np\.where\(beyond, r, 1\.0\), 1\.0\)",
+      "np.ones_like(r)", "tests/solve/test_solve.py"),
+    M("a step that raises the energy is taken", SOLVE, r"if ratio >= self\.minimum_ratio:.*", "if ratio >= -10.0:",
+      "tests/solve/test_solve.py"),
+    M("a step cut off at its bounds, the rest not solved for again", SOLVE, r"^BOUND_ROUNDS = 12", "BOUND_ROUNDS = 1",
+      "tests/solve/test_solve.py"),
+    M("running out of iterations called converged", SOLVE, r"system, outcome = acceptance\.initial_size, None, Outcome\.MAX_ITERATIONS",
+      "system, outcome = acceptance.initial_size, None, Outcome.CONVERGED", "tests/solve/test_solve.py"),
+    M("the resume key without stage 2", "mifit/steps.py", r'"settings": \[\[type\(s\)\.__name__, dataclasses\.asdict\(s\)\] for s in step\.settings\],',
+      '"settings": [] if step.part == "reflectance" else [dataclasses.asdict(s) for s in step.settings],',
+      "tests/test_pipeline.py"),
+    M("the resume key without what a step is given", "mifit/steps.py",
+      r'"inputs": \{part: current\[part\] for part in step\.inputs\}', '"inputs": {}', "tests/test_pipeline.py"),
+]  # fmt: skip
+
+MESH = [
+    M("the mesh stage's detail ten times longer", STAGES, r"length = config\.detail \* 10\.0 / model\.unit_mm",
+      "length = config.detail * 100.0 / model.unit_mm", "tests/stages/test_refine_mesh.py"),
+    M("trusted positions ignored", CORE, r"\+ self\._anchor\[:, None\] \* trusted", "+ 0.5 * self._anchor[:, None] * trusted",
+      "tests/core/test_mesh_update.py"),
+    M("folded faces stay folded", CORE, r"if not folded\.any\(\):", "if True:",
+      "tests/core/test_mesh_update.py"),
+    M("displacement with the wrong sign", CORE, r"return np\.sum\(at \* normals, axis=1\)",
+      "return -np.sum(at * normals, axis=1)", "tests/core/test_mesh_update.py"),
+    M("tangents of the wrong hand", ANY, r"np\.where\(orientation < 0, -1\.0, 1\.0\)", "np.where(orientation < 0, 1.0, -1.0)",
+      "tests/output/test_export.py tests/output/test_folder.py"),
+]  # fmt: skip
+
+MUTATIONS = [*CONVENTIONS, *MEASURES, *LIGHT, *GEOMETRY, *MESH]

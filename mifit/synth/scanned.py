@@ -1,0 +1,257 @@
+"""A scanned head with its maps, moved rigidly and path traced, as a capture with truth.
+
+Nothing of the head comes from a morphable model, and nothing of its skin from this project's shading: what a fit makes
+of such a capture is evidence where its own kind of heads is a test.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from mifit.capture.transforms import Shot, View, write_transforms
+from mifit.core.camera import Camera
+from mifit.core.files import replacing, write_text
+from mifit.core.image import read_image, write_image
+from mifit.core.mesh import vertex_normals
+from mifit.core.ply import write_ply
+from mifit.errors import InputError
+from mifit.progress import Progress, silent
+from mifit.render.pathtrace import Material, PathTracer, Surface
+
+MAPS = ("albedo", "specular", "roughness", "displacement")
+MAP_SIZE = 1024
+GLOSS = (0.15, 0.85)
+"""Weight of the glossy lobe where a specular map is black and white."""
+ROUGHNESS = (0.48, 0.30)
+"""Roughness where a specular map is black and white and no roughness map is given."""
+RELIEF = 0.05
+"""Centimetres between black and white of a displacement map."""
+SWING = np.array([12.0, 6.0, 3.0, 0.8, 0.5, 0.5])
+"""Degrees of yaw, pitch and roll, centimetres of shift."""
+NOSE_DEPTH = 9.0
+"""Centimetres from the point that the head turns about to the tip of its nose."""
+ENVIRONMENT_ROWS = 512
+
+
+@dataclass(frozen=True)
+class ScannedHead:
+    """A head in centimetres, y up, nose along +z, turned about the origin.
+
+    Attributes
+    ----------
+    vertices : (V, 3), faces : (F, 3), uv : (V, 2)
+        One texture coordinate per vertex; row 0 of a map is at v = 1.
+    maps : dict of (S, S, ...) float32
+        ``albedo`` (linear, 0..1), ``specular`` and ``roughness`` (0..1), ``displacement`` (centimetres).
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    uv: NDArray[np.float32]
+    maps: dict[str, NDArray[np.float32]]
+
+    @classmethod
+    def load(
+        cls, path: str | Path, maps: Mapping[str, str | Path], unit_mm: float = 10.0, flip_v: bool = False
+    ) -> ScannedHead:
+        """Read a mesh with texture coordinates (glTF, OBJ, PLY) and its maps.
+
+        Parameters
+        ----------
+        path : path
+        maps : dict of name to path
+            ``albedo`` must be there; see `MAPS`. Images with an 8-bit transfer curve are decoded for the albedo only.
+        unit_mm : float
+            Millimetres per unit of the mesh.
+        flip_v : bool
+            Turn the maps upside down: glTF counts v from the top, most other formats from the bottom, and some files
+            keep the other one's habit.
+
+        Raises
+        ------
+        InputError
+            No mesh, no texture coordinates, an unknown or unreadable map.
+        """
+        try:
+            mesh = trimesh.load(path, process=False, force="mesh")
+        except Exception as error:  # trimesh raises whatever its readers do
+            raise InputError(f"{path}: not a readable mesh ({error})") from None
+        uv = getattr(mesh.visual, "uv", None)
+        if not len(getattr(mesh, "faces", ())) or uv is None or len(uv) != len(mesh.vertices):
+            raise InputError(f"{path}: found no triangles with texture coordinates, expected a textured head")
+        unknown = sorted(set(maps) - set(MAPS))
+        if unknown or "albedo" not in maps:
+            raise InputError(
+                f"maps: found {', '.join(sorted(maps)) or 'none'}; expected albedo, and of {', '.join(MAPS[1:])}"
+            )
+        vertices = np.asarray(mesh.vertices, dtype=np.float64) * unit_mm / 10.0
+        middle = 0.5 * (vertices[:, 0].min() + vertices[:, 0].max())
+        near = np.abs(vertices[:, 0] - middle) < 0.2 * np.ptp(vertices[:, 0])
+        nose = vertices[near][np.argmax(vertices[near, 2])]
+        height = np.ptp(vertices[:, 1])
+        if not 10 < height < 100:
+            raise InputError(
+                f"{path}: the head is {height:.3g} cm high at {unit_mm:g} mm per unit, expected 10 to 100; set the unit"
+            )
+        vertices -= (middle, nose[1], nose[2] - NOSE_DEPTH)
+        uv = np.asarray(uv, np.float32)
+        if flip_v:
+            uv = uv * np.float32((1, -1)) + np.float32((0, 1))
+        return cls(vertices, np.asarray(mesh.faces), uv, _read_maps(maps))
+
+    def posed(self, pose: tuple[NDArray, NDArray]) -> NDArray[np.float64]:
+        """World-space vertices under a rotation (3, 3) and translation (3,)."""
+        return self.vertices @ pose[0].T + pose[1]
+
+
+def _read_maps(files: Mapping[str, str | Path]) -> dict[str, NDArray[np.float32]]:
+    maps = {}
+    for name, path in files.items():
+        image = read_image(path)
+        if name != "albedo":  # no colours: the codes themselves are the values
+            image = _codes(image) if Path(path).suffix.lower() not in (".exr", ".hdr") else image
+            image = image.mean(axis=-1)
+        size = min(MAP_SIZE, min(image.shape[:2]))
+        maps[name] = _resized(image, size)
+    size = len(maps["albedo"])
+    maps = {
+        k: cv2.resize(v, (size, size), interpolation=cv2.INTER_AREA) if len(v) != size else v for k, v in maps.items()
+    }
+    gloss = maps.get("specular", np.full((size, size), 0.4, np.float32))
+    if "roughness" not in maps:
+        maps["roughness"] = ROUGHNESS[0] + (ROUGHNESS[1] - ROUGHNESS[0]) * gloss
+    maps["specular"] = GLOSS[0] + (GLOSS[1] - GLOSS[0]) * gloss
+    relief = maps.get("displacement", np.zeros((size, size), np.float32))
+    maps["displacement"] = np.float32(RELIEF) * relief
+    maps["albedo"] = np.clip(maps["albedo"], 0.005, 0.95)
+    return {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in maps.items()}
+
+
+def _resized(image: NDArray, size: int) -> NDArray[np.float32]:
+    if image.shape[:2] == (size, size):
+        return np.asarray(image, dtype=np.float32)
+    return cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
+def _codes(linear: NDArray) -> NDArray[np.float32]:
+    """The sRGB codes 0..1 of decoded values."""
+    x = np.clip(linear, 0.0, 1.0)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
+def rigid_motion(timesteps: int, seed: int) -> list[tuple[NDArray, NDArray]]:
+    """Rotation and translation per timestep, smooth in time; the first looks almost straight ahead."""
+    rng = np.random.default_rng([seed, 31])
+    speed, phase = rng.uniform(0.6, 1.2, 6), rng.uniform(-0.15, 0.15, 6)
+    found = []
+    for t in range(timesteps):
+        yaw, pitch, roll, *shift = SWING * np.sin(phase + speed * t)
+        rotation = Rotation.from_euler("yxz", [yaw, pitch, roll], degrees=True).as_matrix()
+        found.append((rotation, np.array(shift)))
+    return found
+
+
+def synthesize_scan(
+    out: str | Path,
+    head: ScannedHead,
+    cameras: Sequence[Camera],
+    environment: NDArray,
+    relit: Mapping[str, NDArray] | None = None,
+    timesteps: int = 4,
+    seed: int = 0,
+    spp: int = 64,
+    progress: Progress = silent,
+) -> Path:
+    """Render a capture of a scanned head, with truth beside it.
+
+    ``truth/NNNN.ply`` is the mesh in world space (centimetres), ``truth/maps.npz`` albedo, specular and roughness,
+    ``truth/relit_NAME.exr`` the last camera's view of the first timestep under another environment, linear, and
+    ``truth/environment_NAME.exr`` that environment; ``truth/meta.json`` has the factor of each to the
+    sensor's range. There are no landmarks: `mifit landmarks` finds them.
+
+    Parameters
+    ----------
+    out : path
+        Capture folder.
+    head : ScannedHead
+    cameras : sequence of Camera
+        The last one is the held-out view by custom.
+    environment : (H, W, 3)
+        Lat-long radiance.
+    relit : dict of name to (H, W, 3), optional
+        Environments of the relit truths.
+    timesteps, seed, spp : int
+    progress : Progress
+
+    Returns
+    -------
+    Path
+        ``out``; ``transforms.json`` is written last.
+    """
+    from mifit.synth.compose import expose
+
+    out, relit = Path(out), dict(relit or {})
+    total = timesteps + len(relit)
+    maps = head.maps
+    material = Material(maps["albedo"], maps["specular"], maps["roughness"], maps["displacement"])
+    tracer = PathTracer({"head": material}, environment)
+    poses = rigid_motion(timesteps, seed)
+
+    def surface(pose: tuple[NDArray, NDArray]) -> Surface:
+        world = head.posed(pose)
+        return Surface(world, vertex_normals(world, head.faces), head.uv, head.faces, "head")
+
+    exposure, relit_exposure = 0.0, {}
+    shots = []
+    progress("Rendering", 0, total)
+    for t, pose in enumerate(poses):
+        placed = surface(pose)
+        images = tracer.render([placed], cameras, spp, seed=seed * 100_003 + t)
+        if not t:
+            exposure = _exposure(images[0])
+        for c, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+            shot = Shot(camera.name, t, out / "images" / camera.name / f"{t:04d}.png")
+            write_image(shot.image, expose(image[..., :3] * exposure, np.random.default_rng([seed, t, c, 22])))
+            shots.append(shot)
+        grey = np.full_like(placed.vertices, 0.5)
+        write_ply(out / "truth" / f"{t:04d}.ply", placed.vertices, head.faces, placed.normals, head.uv, grey)
+        progress("Rendering", t + 1, total)
+    with replacing(out / "truth" / "maps.npz") as temporary:
+        np.savez_compressed(temporary, **{name: value.astype(np.float16) for name, value in maps.items()})
+    for i, (name, light) in enumerate(relit.items()):
+        light = _reduced(light)
+        image = PathTracer({"head": material}, light).render([surface(poses[0])], cameras[-1:], spp, seed=seed + i)[0]
+        relit_exposure[name] = _exposure(image)
+        write_image(out / "truth" / f"relit_{name}.exr", image[..., :3])
+        write_image(out / "truth" / f"environment_{name}.exr", light)
+        progress("Rendering", timesteps + i + 1, total)
+    note = {"exposure": exposure, "relit_exposure": relit_exposure, "seed": seed, "spp": spp}
+    write_text(out / "truth" / "meta.json", json.dumps(note, indent=1) + "\n")
+    write_transforms(out / "transforms.json", [View.of(camera) for camera in cameras], shots, "cm")
+    return out
+
+
+def _exposure(image: NDArray) -> float:
+    """Factor that puts the brightest skin, highlights aside, near the upper end of the sensor's range."""
+    seen = image[image[..., 3] > 0.9]
+    level = float(np.percentile(seen[:, :3].max(axis=1), 97)) if len(seen) else 0.0
+    if not level > 0:
+        raise InputError("env: the head is black under this environment, expected some radiance above zero")
+    return 0.7 / level
+
+
+def _reduced(environment: NDArray) -> NDArray[np.float32]:
+    height, width = environment.shape[:2]
+    if height <= ENVIRONMENT_ROWS:
+        return environment.astype(np.float32)
+    size = (round(width * ENVIRONMENT_ROWS / height), ENVIRONMENT_ROWS)
+    return cv2.resize(environment, size, interpolation=cv2.INTER_AREA).astype(np.float32)

@@ -1,0 +1,198 @@
+"""Captures of scanned heads, heads that talk and turn, and the public Digital Emily scenes."""
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from benchmarks import scan
+from mifit.capture import Capture
+from mifit.capture.digital_emily import import_digital_emily, read_camera
+from mifit.cli import main
+from mifit.core.image import read_image, write_image
+from mifit.errors import InputError
+from mifit.morphable import MorphableModel
+from mifit.synth import head as heads
+from mifit.synth.scanned import ScannedHead, rigid_motion
+
+MAP = 64
+
+
+def egg(path: Path) -> Path:
+    """A head-sized egg with a nose at +z, in decimetres, with a map of its own per half."""
+    sphere = trimesh.creation.uv_sphere(count=[24, 24])
+    vertices = sphere.vertices * (0.8, 1.2, 0.9)
+    nose = np.argmax(vertices[:, 2])
+    vertices[nose, 2] += 0.2
+    uv = np.stack([0.5 + 0.3 * vertices[:, 0], 0.5 + 0.3 * vertices[:, 1]], axis=1)
+    visual = trimesh.visual.TextureVisuals(uv=uv)
+    trimesh.Trimesh(vertices, sphere.faces, visual=visual, process=False).export(path)
+    return path
+
+
+@pytest.fixture
+def files(tmp_path):
+    colour = np.zeros((MAP, MAP, 3), np.uint8)
+    colour[: MAP // 2] = (40, 40, 200)  # BGR: the upper half is red
+    colour[MAP // 2 :] = (200, 40, 40)
+    cv2.imwrite(str(tmp_path / "albedo.png"), colour)
+    cv2.imwrite(str(tmp_path / "specular.png"), np.full((MAP, MAP), 128, np.uint8))
+    write_image(tmp_path / "light.exr", np.ones((8, 16, 3), np.float32))
+    write_image(tmp_path / "other.exr", np.full((8, 16, 3), 3.0, np.float32))
+    return egg(tmp_path / "egg.ply"), tmp_path
+
+
+def test_a_scan_is_placed_in_centimetres_with_its_maps_the_right_way_up(files):
+    mesh, folder = files
+    found = ScannedHead.load(mesh, {"albedo": folder / "albedo.png"}, unit_mm=100.0)
+    assert np.ptp(found.vertices[:, 1]) == pytest.approx(24, abs=0.1)
+    nose = found.vertices[np.argmax(found.vertices[:, 2])]
+    assert nose[2] == pytest.approx(9.0) and abs(nose[1]) < 1e-9
+    top = scan.sample_map(found.maps["albedo"], found.uv[[np.argmax(found.vertices[:, 1])]])[0]
+    assert top[0] > 4 * top[2]
+    turned = ScannedHead.load(mesh, {"albedo": folder / "albedo.png"}, unit_mm=100.0, flip_v=True)
+    top = scan.sample_map(turned.maps["albedo"], turned.uv[[np.argmax(turned.vertices[:, 1])]])[0]
+    assert top[2] > 4 * top[0]
+    assert set(found.maps) == {"albedo", "specular", "roughness", "displacement"}
+
+
+@pytest.mark.parametrize(
+    "maps, unit, message",
+    [({}, 100.0, "expected albedo"), ({"albedo": "a", "gloss": "b"}, 100.0, "expected albedo, and of"),
+     ({"albedo": "a"}, 1.0, "0.239 cm high at 1 mm per unit, expected 10 to 100")],
+)  # fmt: skip
+def test_scans_that_can_not_be_used_are_refused(files, maps, unit, message):
+    with pytest.raises(InputError, match=message):
+        ScannedHead.load(files[0], maps, unit)
+    bare = files[1] / "bare.ply"
+    trimesh.creation.box().export(bare)
+    with pytest.raises(InputError, match="no triangles with texture coordinates"):
+        ScannedHead.load(bare, {"albedo": "a"}, unit)
+
+
+def test_the_motion_is_rigid_smooth_and_starts_straight_ahead():
+    poses = rigid_motion(6, 3)
+    assert all(np.allclose(r @ r.T, np.eye(3)) for r, _ in poses)
+    angles = [math.degrees(math.acos(min(1.0, (np.trace(r) - 1) / 2))) for r, _ in poses]
+    assert angles[0] < 3 and max(angles) > 5
+    assert [np.array_equal(a[0], b[0]) for a, b in zip(poses, rigid_motion(6, 3), strict=True)] == [True] * 6
+
+
+def test_a_scan_becomes_a_capture_with_truth(files, variant):
+    mesh, folder = files
+    out = folder / "out"
+    arguments = ["synth", "--out", out, "--head", mesh, "--unit-mm", 100, "--maps", f"albedo={folder / 'albedo.png'}",
+                 f"specular={folder / 'specular.png'}", "--env", folder / "light.exr", "--relit", folder / "other.exr",
+                 "--timesteps", 2, "--width", 96, "--height", 72, "--spp", 4, "--quiet"]  # fmt: skip
+    assert main([str(a) for a in arguments]) == 0
+    capture = Capture.load(out)
+    assert capture.cameras == ("left", "right", "third") and capture.timesteps == (0, 1)
+    truth = [scan.read_scan(capture, t) for t in (0, 1)]
+    assert truth[0].uv is not None and truth[0].maps["albedo"].shape == (MAP, MAP, 3)
+    gap = [np.linalg.norm(t.vertices[7] - t.vertices[-1]) for t in truth]
+    assert gap[0] == pytest.approx(gap[1], rel=1e-5) and np.abs(truth[0].vertices - truth[1].vertices).max() > 0.3
+    # The upper half is red, the lower one blue, and the truth says so of the same pixels.
+    camera = capture.camera("third")
+    for t in (0, 1):
+        front = truth[t].vertices[:, 2] > 5
+        for part, channel in ((truth[t].vertices[:, 1] > 3, 0), (truth[t].vertices[:, 1] < -3, 2)):
+            pixel = camera.project(truth[t].vertices[front & part].mean(0)).astype(int)
+            colour = capture.frame("third", t).image[pixel[1], pixel[0]]
+            assert colour[channel] > 2 * colour[2 - channel]
+    ((view, light, exposure),) = scan.relit_truths(capture).values()
+    relit = read_image(view) * exposure
+    assert 0.5 < np.percentile(relit.max(axis=-1)[relit.sum(-1) > 0], 95) < 0.9
+    assert light.name == "environment_other.exr"
+    assert main([str(a) for a in arguments]) == 2  # the folder holds something
+
+
+def test_options_of_scans_and_of_models_do_not_mix(files, capsys):
+    mesh, folder = files
+    common = ["synth", "--out", str(folder / "x"), "--quiet"]
+    assert main([*common, "--maps", "albedo=a.png"]) == 2
+    assert main([*common, "--head", str(mesh), "--maps", "albedo"]) == 2
+    assert main([*common, "--head", str(mesh), "--maps", "albedo=a.png", "--motion", "talk"]) == 2
+    said = capsys.readouterr().err
+    assert "belong to --head" in said and "NAME=FILE" in said and "--motion: found with --head" in said
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    return MorphableModel.load("builtin:coarse")
+
+
+def test_a_talking_head_moves_its_mouth_and_keeps_its_brows(coarse):
+    poses = heads.draw_motion(coarse, 60, 4, 0.1, np.zeros(3), "talk")
+    shapes = np.stack([coarse.expression[coarse.landmarks] @ p.expression for p in poses]) * coarse.unit_mm
+    mouth, brows = (np.ptp(shapes[:, part], axis=0).max() for part in (slice(48, 68), slice(17, 27)))
+    assert mouth > 4 and mouth > 3 * brows
+    steps = np.abs(np.diff(shapes, axis=0)).max()
+    assert 0.2 < steps < 4  # millimetres a frame: neither still nor jumping
+    angles = [np.degrees(np.arccos(min(1.0, (np.trace(p.rotation) - 1) / 2))) for p in poses]
+    assert max(angles) < 15
+
+
+def test_a_turning_head_goes_from_side_to_side_without_expression(coarse):
+    poses = heads.draw_motion(coarse, 121, 4, 0.1, np.zeros(3), "turn")
+    yaw = np.degrees([np.arctan2(p.rotation[0, 2], p.rotation[2, 2]) for p in poses])
+    assert yaw.max() > 30 and yaw.min() < -30 and np.abs(np.diff(yaw)).max() < 4
+    assert not any(p.expression.any() for p in poses)
+
+
+PBRT = """Film "image"
+# Camera begin
+Scale -1 1 1
+LookAt {0} {1} {2} {3} {4} {5} 0 1 0
+Camera "perspective"
+    "float fov" [{6}]
+WorldBegin
+    Texture "fov" "float fov" [1]
+"""
+
+
+def emily(folder: Path) -> Path:
+    """The layout of the repository, with two cameras that look at the origin."""
+    data, images = folder / "maya/renderData", folder / "maya/images/Emily_2_1_Assemble_pbrt/1080x1680/jpg"
+    images.mkdir(parents=True)
+    data.mkdir(parents=True)
+    trimesh.creation.icosphere(radius=9.0).export(data / "__Cache__Emily_head_mesh.ply")
+    for number, (x, z) in ((1, (-30.0, 90.0)), (2, (0.0, 100.0))):
+        name = f"Emily_2_1_Assemble_pbrt.{number:04d}"
+        (data / f"{name}.pbrt").write_text(PBRT.format(x, 0, z, 0.5 * x, 0, 0.5 * z, 10))
+        cv2.imwrite(str(images / f"{name}.jpg"), np.full((90, 60, 3), 128, np.uint8))
+    (folder / "LICENSE").write_text("MIT")
+    return folder
+
+
+def test_digital_emily_becomes_a_capture_with_its_mesh_as_truth(tmp_path, capsys):
+    repository = emily(tmp_path / "repository")
+    assert main(["import", "--digital-emily", str(repository), "--out", str(tmp_path / "out")]) == 0
+    assert "mifit landmarks" in capsys.readouterr().out
+    capture = Capture.load(tmp_path / "out")
+    assert capture.cameras == ("c1", "c2") and capture.units == "cm"
+    for name in capture.cameras:
+        camera = capture.camera(name)
+        assert camera.project(np.zeros(3)) == pytest.approx((30, 45))
+        assert camera.fx == pytest.approx(30 / math.tan(math.radians(5)))
+        assert camera.project(np.array([0.0, 1.0, 0.0]))[1] < 45  # up is up
+    assert capture.camera("c1").position == pytest.approx((-30, 0, 90))
+    assert capture.camera("c1").project(np.array([1.0, 0, 0]))[0] > 30  # and right is right
+    truth = scan.read_scan(capture, 0)
+    assert np.linalg.norm(truth.vertices, axis=1) == pytest.approx(9.0)
+    assert (tmp_path / "out" / "LICENSE").exists()
+
+
+def test_other_folders_are_not_taken_for_digital_emily(tmp_path):
+    with pytest.raises(InputError, match="expected a checkout"):
+        import_digital_emily(tmp_path, tmp_path / "out")
+    repository = emily(tmp_path / "repository")
+    with pytest.raises(InputError, match="missing; expected the picture"):
+        import_digital_emily(repository, tmp_path / "out", size="3482x5218")
+    assert not (tmp_path / "out").exists()
+    scene = repository / "x.pbrt"
+    scene.write_text("LookAt 1 2 3 4 5 6 0 1 0\nWorldBegin")
+    with pytest.raises(InputError, match="found no float fov"):
+        read_camera(scene, "c1", 10, 10)
