@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 import mifit
 from mifit.capture import Capture
-from mifit.capture.face_mesh import MediaPipe
+from mifit.capture.face_mesh import FaceMesh
 from mifit.core.files import write_text
 from mifit.core.image import load_image, to_8_bit
 from mifit.morphable import MorphableModel
@@ -30,15 +30,15 @@ RIDGE = 1e-4
 """Penalty on the weights, relative to squared eye distances."""
 
 
-def observe(folder: Path, model: MorphableModel, detector: MediaPipe) -> list[tuple[NDArray, NDArray, NDArray]]:
+def observe(folder: Path, model: MorphableModel, detector: FaceMesh) -> list[tuple[NDArray, NDArray, NDArray]]:
     """(mesh points (478, 2), true landmarks (68, 2), visible (68,)) of every image in which a face is found."""
     capture, seen = Capture.load(folder), []
     for (camera, timestep), shot in capture.shots.items():
-        mesh = detector.mesh(to_8_bit(load_image(shot.image).pixels))
+        face = detector.face(to_8_bit(load_image(shot.image).pixels))
         marks = capture.landmarks(camera, timestep)
-        if mesh is not None and marks is not None:
+        if face is not None and marks is not None:
             vertices = np.load(folder / "truth" / f"{timestep:04d}.npz")["vertices"]
-            seen.append((mesh, capture.camera(camera).project(vertices[model.landmarks]), marks.visible))
+            seen.append((face.points[:, :2], capture.camera(camera).project(vertices[model.landmarks]), marks.visible))
     return seen
 
 
@@ -69,7 +69,8 @@ def main() -> None:
     mifit.set_variant("auto")
     model = MorphableModel.load(arguments.model)
     seen = []
-    with tempfile.TemporaryDirectory() as folder, MediaPipe() as detector:
+    detector = FaceMesh()
+    with tempfile.TemporaryDirectory() as folder:
         for i in range(arguments.subjects):
             out = Path(folder) / str(i)
             synthesize(out, timesteps=2, model=arguments.model, seed=arguments.seed + i, width=340, height=240, spp=9)

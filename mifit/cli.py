@@ -116,6 +116,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     p = add("doctor", "what of the set-up works, what doesn't, and the command that mends it")
     p.add_argument("--json", action="store_true", help="print JSON")
+    p.add_argument("--install", choices=["landmarks"], help="fetch the networks that find landmarks, then check")
 
     p = add("demo", "fit a small capture made on the spot, judge it on the held-out view, write a report")
     p.add_argument("--out", type=_path, default=Path("out/demo"), help="folder to write (default: out/demo)")

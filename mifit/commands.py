@@ -37,9 +37,14 @@ def _say(arguments: Namespace, text: str) -> None:
 
 def doctor(arguments: Namespace) -> int:
     """Print what works; exit code 1 when the pipeline can't run."""
+    from mifit.capture.face_networks import install_networks, missing, networks_folder
     from mifit.render.variant import doctor
 
-    checks = doctor()
+    if arguments.install == "landmarks":
+        install_networks()
+    problem = missing()
+    found = "not ready" if problem else str(networks_folder())
+    checks = [*doctor(), {"check": "landmarks", "ok": not problem, "required": False, "found": found, "fix": problem}]
     if arguments.json:
         print(json.dumps(checks, indent=2))
     else:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.capture.face_mesh import MediaPipe, environment_python
+from mifit.capture.face_mesh import FaceMesh
+from mifit.capture.face_networks import missing
 from mifit.errors import InputError, MifitError
 
 DETECTORS = ("mediapipe", "face-alignment", "lbf:FOLDER")
@@ -32,8 +31,7 @@ class Detector(Protocol):
         """
 
 
-@contextlib.contextmanager
-def open_detector(name: str | None = None) -> Iterator[Detector]:
+def open_detector(name: str | None = None) -> Detector:
     """Open a detector by name.
 
     Parameters
@@ -54,20 +52,18 @@ def open_detector(name: str | None = None) -> Iterator[Detector]:
         name = "face-alignment" if importlib.util.find_spec("face_alignment") else "mediapipe"
     kind, _, folder = name.partition(":")
     if kind == "mediapipe":
-        with MediaPipe() as detector:
-            yield detector
-    elif kind == "face-alignment":
-        yield FaceAlignment()
-    elif kind == "lbf" and folder:
-        yield Lbf(Path(folder))
-    else:
-        raise InputError(f"detector: found {name!r}, expected one of {', '.join(DETECTORS)}")
+        return FaceMesh()
+    if kind == "face-alignment":
+        return FaceAlignment()
+    if kind == "lbf" and folder:
+        return Lbf(Path(folder))
+    raise InputError(f"detector: found {name!r}, expected one of {', '.join(DETECTORS)}")
 
 
 def available() -> dict[str, bool]:
     """Which detectors would start without installing anything."""
     return {
-        "mediapipe": environment_python().exists(),
+        "mediapipe": not missing(),
         "face-alignment": importlib.util.find_spec("face_alignment") is not None,
     }
 

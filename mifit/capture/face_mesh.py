@@ -1,89 +1,55 @@
-"""MediaPipe Face Mesh as a landmark detector, in an environment of its own.
+"""MediaPipe Face Mesh as a landmark detector: three small networks, run in this process.
 
-MediaPipe 0.10.21 carries its models in its wheel, but needs NumPy below 2, so it can't share mifit's environment. One
-is made in the user's cache folder on first use (`make_environment`) and spoken to through a pipe.
+A face is found (BlazeFace, full range), a square about it that stands as upright as its eyes goes through the mesh
+network (468 points), and squares about the eyes through the iris network, which places eyelids and iris. The mesh
+tells better than the finder where its face is, so it is run again on the square about its own points. Where no face
+is found, the image is tried turned and in parts: faces in profile, lying or far away.
+
+References: Bazarevsky et al., "BlazeFace" (2019); Kartynnik et al., "Real-time facial surface geometry" (2019);
+Ablavatski et al., "Real-time pupil tracking" (2020).
 """
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import subprocess
-import sys
-import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from pathlib import Path
-from types import TracebackType
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.files import cache_folder
-from mifit.errors import MifitError
+from mifit.capture.face_networks import Network
 
-REQUIREMENTS = ("mediapipe==0.10.21", "numpy<2")
 SCATTER = 0.045
 """Standard deviation that stage 1 gives the points, as a part of the face's width. Chosen among four values by the fits
 of three captures. Their median error is 1.5 per cent, but neighbours share it and all images of a head repeat it, so
 that a sum over all points must weigh less than if they were independent."""
-PYTHONS = ((3, 9), (3, 12))
-"""First and last Python that the wheel of REQUIREMENTS exists for."""
-
-
-def environment_python() -> Path:
-    """The interpreter of MediaPipe's environment, whether it has been made yet or not."""
-    folder = cache_folder() / "mediapipe-0.10.21"
-    return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
-
-
-def make_environment() -> Path:
-    """Make MediaPipe's environment unless it is there; returns its interpreter.
-
-    Raises
-    ------
-    MifitError
-        No suitable Python, or the packages can't be installed; the message holds pip's last line.
-    """
-    python = environment_python()
-    if python.exists():
-        return python
-    folder = python.parents[1]
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(prefix=".mediapipe-", dir=folder.parent))
-    try:
-        _run([_base_python(), "-m", "venv", str(part)])
-        inside = part / python.relative_to(folder)
-        _run([str(inside), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *REQUIREMENTS])
-        if not folder.exists():  # another process may have been faster
-            os.replace(part, folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    return python
-
-
-def _base_python() -> str:
-    if PYTHONS[0] <= sys.version_info[:2] <= PYTHONS[1]:
-        return sys.executable
-    for minor in range(PYTHONS[1][1], PYTHONS[0][1] - 1, -1):
-        found = shutil.which(f"python3.{minor}")
-        if found:
-            return found
-    raise MifitError(
-        f"mediapipe: found Python {sys.version_info[0]}.{sys.version_info[1]} only, expected 3.9 to 3.12; "
-        "install one of those (for example python3.12), or name another --detector"
-    )
-
-
-def _run(command: list[str]) -> None:
-    done = subprocess.run(command, capture_output=True, text=True)
-    if done.returncode:
-        lines = [line for line in (done.stderr or done.stdout).splitlines() if line.strip()]
-        raise MifitError(
-            f"mediapipe: '{' '.join(command[1:4])} ...' failed: {lines[-1] if lines else 'no output'}; "
-            f"install {' and '.join(REQUIREMENTS)} into a virtual environment at {environment_python().parents[1]}"
-        )
+POINTS, IRIS = 468, 5
+"""Points of the mesh, and of each iris."""
+SCORE, PRESENCE = 0.3, 0.9
+"""Probability from which the finder's boxes are tried, and from which the mesh network's face is one."""
+MARGIN, EYE_MARGIN = 1.5, 2.3
+"""Squares about a face and an eye, relative to the larger side of their points: what the networks were trained on."""
+TURNS = (35.0, -35.0, 90.0, -90.0, 180.0)
+"""Degrees by which an image without an upright face is turned."""
+UPRIGHT = np.radians(30.0)
+"""Angle of the eyes up to which a face stands upright: the finder was trained on such faces, and in one that lies it
+finds something else."""
+ROUNDS = 3
+"""Runs of the mesh network, each about the points of the last."""
+STRIDE = 4
+"""Pixels between the finder's anchors."""
+EYE_CORNERS = ((33, 133), (263, 362))
+EYE_CONTOURS = (
+    (33, 7, 163, 144, 145, 153, 154, 155, 133, 246, 161, 160, 159, 158, 157, 173),
+    (263, 249, 390, 373, 374, 380, 381, 382, 362, 466, 388, 387, 386, 385, 384, 398),
+)
+"""Mesh points on the rim of each eye, as the iris network lists them."""
+SIDES, TOP_CHIN = (234, 454), (10, 152)
+"""Mesh points at the ears, and at the hairline and chin."""
 
 
 @cache
@@ -94,86 +60,230 @@ def landmark_map() -> NDArray[np.float64]:
     """
     text = (resources.files("mifit.capture") / "face_mesh_68.json").read_text(encoding="utf-8")
     table = json.loads(text)
-    weights = np.zeros((68, 478))
+    weights = np.zeros((68, POINTS + 2 * IRIS))
     for row, (index, weight) in enumerate(zip(table["index"], table["weight"], strict=True)):
         weights[row, index] = weight
     return weights
 
 
-class MediaPipe:
-    """Face Mesh in a process of its own; a context manager.
+@dataclass(frozen=True)
+class Face:
+    """One face as the networks see it.
+
+    Attributes
+    ----------
+    points : (478, 3) float64
+        Face Mesh points and two irises (centre, then four on its rim): x and y in pixels, the first pixel's centre at
+        (0.5, 0.5), and depth in pixels, growing away from the camera, its origin within the head.
+    presence : float
+        Probability that it is a face.
+    """
+
+    points: NDArray[np.float64]
+    presence: float
+
+    @property
+    def area(self) -> float:
+        """Of the box about the mesh, square pixels."""
+        return float(np.ptp(self.points[:POINTS, :2], axis=0).prod())
+
+    @property
+    def angle(self) -> float:
+        """Of the line through the eyes in the image, radians from x towards y; 0 for an upright head."""
+        right, left = self.points[EYE_CORNERS[0][0]], self.points[EYE_CORNERS[1][0]]
+        return float(np.arctan2(left[1] - right[1], left[0] - right[0]))
+
+    @property
+    def landmarks(self) -> NDArray[np.float64]:
+        """(68, 2) iBUG points."""
+        return landmark_map() @ self.points[:, :2]
+
+    @property
+    def iris(self) -> NDArray[np.float64]:
+        """(2, 3) centre and radius of the iris of the person's right and left eye, pixels."""
+        rims = self.points[POINTS:, :2].reshape(2, IRIS, 2)
+        radius = np.linalg.norm(rims[:, 1:] - rims[:, :1], axis=2).mean(axis=1)
+        return np.column_stack([rims[:, 0], radius])
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """(3, 3) head to camera axes: columns are the head's left, up and front in x right, y down, z away."""
+        left = self.points[SIDES[1]] - self.points[SIDES[0]]
+        up = self.points[TOP_CHIN[0]] - self.points[TOP_CHIN[1]]
+        left /= np.linalg.norm(left)
+        up -= left * (up @ left)
+        up /= np.linalg.norm(up)
+        return np.column_stack([left, up, np.cross(left, up)])
+
+
+@dataclass(frozen=True)
+class _Square:
+    """A turned square in an image: centre (2,) and side in pixels, angle in radians (x towards y)."""
+
+    centre: NDArray[np.float64]
+    side: float
+    angle: float
+
+    def to_image(self) -> NDArray[np.float64]:
+        """(2, 3) affine map from the unit square to image pixels."""
+        c, s = self.side * np.cos(self.angle), self.side * np.sin(self.angle)
+        turn = np.array([[c, -s], [s, c]])
+        return np.column_stack([turn, self.centre - turn @ (0.5, 0.5)])
+
+    def cut(self, image: NDArray, size: int, mirrored: bool = False) -> NDArray[np.float32]:
+        """(size, size, 3) the square's content, 0..1; black beside the image."""
+        step = self.to_image()
+        if mirrored:
+            step = np.column_stack([-step[:, 0], step[:, 1], step[:, 2] + step[:, 0]])
+        matrix = np.column_stack([step[:, :2] / size, step @ (0.5 / size, 0.5 / size, 1.0) - 0.5])
+        blur = self.side / size  # pixels of the image in one of the square's
+        if blur > 1.5:
+            image = cv2.GaussianBlur(image, (0, 0), 0.4 * blur)
+        cut = cv2.warpAffine(image, matrix, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        return cut.astype(np.float32) / 255.0
+
+    @classmethod
+    def about(cls, points: NDArray, first: NDArray, second: NDArray, margin: float) -> _Square:
+        """The square about points (N, 2) in which the way from ``first`` to ``second`` is level."""
+        angle = float(np.arctan2(*(second - first)[::-1]))
+        c, s = np.cos(angle), np.sin(angle)
+        turned = points @ np.array([[c, -s], [s, c]])
+        low, high = turned.min(axis=0), turned.max(axis=0)
+        centre = np.array([[c, -s], [s, c]]) @ (0.5 * (low + high))
+        return cls(centre, margin * float((high - low).max()), angle)
+
+
+@dataclass(frozen=True)
+class _Box:
+    """What the finder takes for a face with this probability."""
+
+    score: float
+    square: _Square
+
+
+def _windows(image: NDArray) -> Iterator[list[_Square]]:
+    """Where to look for faces: the image, the image turned, and parts of it."""
+    height, width = image.shape[:2]
+    middle, side = np.array([width / 2, height / 2]), float(max(height, width))
+    yield [_Square(middle, side, 0.0)]
+    yield [_Square(middle, side, np.radians(turn)) for turn in TURNS]
+    for part in (0.6, 0.35):
+        reach = part * side
+        columns, rows = (
+            np.linspace(reach / 2, n - reach / 2, int(np.ceil(2 * n / reach)) - 1) if n > reach else [n / 2]
+            for n in (width, height)
+        )
+        yield [_Square(np.array([x, y]), reach, 0.0) for y in rows for x in columns]
+
+
+class FaceMesh:
+    """The three networks behind the interface of a `Detector`.
 
     Raises
     ------
     MifitError
-        The environment can't be made or the process ends early.
+        The runtime or a network file is missing.
     """
 
     name, scatter = "mediapipe", SCATTER
 
     def __init__(self) -> None:
-        worker = Path(__file__).with_name("face_mesh_worker.py")
-        self._errors = tempfile.TemporaryFile()
-        self._process = subprocess.Popen(
-            [str(make_environment()), "-I", str(worker)],  # -I: nothing of this environment or folder is imported
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
+        self._find, self._mesh, self._iris = map(
+            Network, ("face_detection_full_range", "face_landmark", "iris_landmark")
         )
-        if self._answer() != b"ready\n":
-            self.close()
-            raise self._failure()
-
-    def __enter__(self) -> MediaPipe:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the process."""
-        assert self._process.stdin is not None
-        try:
-            self._process.stdin.close()
-        except BrokenPipeError:
-            pass
-        try:
-            self._process.wait(timeout=10)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-
-    def mesh(self, image: NDArray[np.uint8]) -> NDArray[np.float64] | None:
-        """(478, 2) Face Mesh points in pixels of an RGB image (H, W, 3), or None when no face is found."""
-        assert self._process.stdin is not None
-        height, width = image.shape[:2]
-        try:
-            self._process.stdin.write(f"{width} {height}\n".encode() + np.ascontiguousarray(image).tobytes())
-            self._process.stdin.flush()
-        except BrokenPipeError:
-            raise self._failure() from None
-        line = self._answer()
-        if not line:
-            raise self._failure()
-        points = json.loads(line)
-        return None if points is None else np.array(points, dtype=np.float64)
 
     def detect(self, image: NDArray[np.uint8]) -> NDArray[np.float64] | None:
         """(68, 2) iBUG points in pixels, the first pixel's centre at (0.5, 0.5), or None when no face is found."""
-        mesh = self.mesh(image)
-        return None if mesh is None else landmark_map() @ mesh
+        face = self.face(image)
+        return None if face is None else face.landmarks
 
-    def _answer(self) -> bytes:
-        assert self._process.stdout is not None
-        return self._process.stdout.readline()
+    def face(self, image: NDArray[np.uint8], near: NDArray | None = None) -> Face | None:
+        """The largest face of an RGB image (H, W, 3), or None.
 
-    def _failure(self) -> MifitError:
-        self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        folder = environment_python().parents[1]
-        return MifitError(
-            f"mediapipe: its process ended early ({lines[-1] if lines else 'no message'}); remove {folder}, "
-            "and it is made anew"
-        )
+        Parameters
+        ----------
+        near : (N, 2), optional
+            Points about which a face is expected, in pixels: looked at before the image is searched.
+        """
+        image = np.ascontiguousarray(image)
+        if near is not None:
+            level = np.array([1.0, 0.0])
+            found = self._settle(image, _Square.about(near, 0 * level, level, MARGIN))
+            if found is not None:
+                return found
+        for windows in _windows(image):
+            boxes = [(w, box) for w in windows for box in self._boxes(image, w)]
+            faces = [(box.score, face) for w, box in boxes if (face := self._upright(image, w, box)) is not None]
+            if faces:
+                return max(faces, key=lambda pair: pair[0] * pair[1].area)[1]
+        return None
+
+    def _upright(self, image: NDArray, window: _Square, box: _Box) -> Face | None:
+        """The face in a box; None where it lies in the window that it was found in: then it is something else."""
+        face = self._settle(image, box.square)
+        if face is None:
+            return None
+        turned = np.angle(np.exp(1j * (face.angle - window.angle)))
+        return face if abs(turned) < UPRIGHT else None
+
+    def _boxes(self, image: NDArray, window: _Square) -> list[_Box]:
+        """The likeliest faces of a part of an image, at most two."""
+        size = self._find.size
+        cells = size // STRIDE
+        out = self._find(2.0 * window.cut(image, size) - 1.0)
+        score = 1.0 / (1.0 + np.exp(-np.clip(out[cells * cells], -80, 80)))
+        raw = out[cells * cells * 16].reshape(-1, 16)
+        found: list[_Box] = []
+        taken: list[NDArray] = []
+        for i in np.argsort(-score)[:50]:
+            if score[i] < SCORE or len(found) == 2:
+                break
+            anchor = (np.array([i % cells, i // cells]) + 0.5) / cells
+            centre, extent = raw[i, :2] / size + anchor, raw[i, 2:4] / size
+            if any(np.abs(centre - other).max() < 0.5 * extent.max() for other in taken):
+                continue
+            taken.append(centre)
+            corners = centre + 0.5 * extent * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+            eyes = raw[i, 4:8].reshape(2, 2) / size + anchor
+            step = window.to_image()
+            corners, eyes = (v @ step[:, :2].T + step[:, 2] for v in (corners, eyes))
+            # The box stands upright in the window, the square as the eyes do: about the box's centre and side.
+            side = MARGIN * float(extent.max()) * window.side
+            angle = float(np.arctan2(*(eyes[1] - eyes[0])[::-1]))
+            found.append(_Box(float(score[i]), _Square(corners.mean(axis=0), side, angle)))
+        return found
+
+    def _settle(self, image: NDArray, square: _Square) -> Face | None:
+        """The mesh about a square, and again about its own points; None where it isn't a face."""
+        for _ in range(ROUNDS):
+            size = self._mesh.size
+            out = self._mesh(square.cut(image, size))
+            presence = float(1.0 / (1.0 + np.exp(-np.clip(out[1][0], -80, 80))))
+            if presence < PRESENCE:
+                return None
+            raw = out[3 * POINTS].reshape(-1, 3).astype(np.float64) / size
+            step = square.to_image()
+            flat = raw[:, :2] @ step[:, :2].T + step[:, 2]
+            points = np.column_stack([flat, raw[:, 2] * square.side])
+            square = _Square.about(flat, flat[EYE_CORNERS[0][0]], flat[EYE_CORNERS[1][0]], MARGIN)
+        return Face(self._with_eyes(image, points), presence)
+
+    def _with_eyes(self, image: NDArray, points: NDArray) -> NDArray[np.float64]:
+        """Mesh points with the rims of the eyes as the iris network has them, and the irises after them."""
+        points, irises = points.copy(), []
+        size = self._iris.size
+        level = points[EYE_CORNERS[1][0], :2] - points[EYE_CORNERS[0][0], :2]
+        for k, (corners, contour) in enumerate(zip(EYE_CORNERS, EYE_CONTOURS, strict=True)):
+            about = points[list(corners), :2]
+            square = _Square.about(about, 0 * level, level, EYE_MARGIN)
+            # The network knows one eye: the other is shown to it in a mirror.
+            out = self._iris(square.cut(image, size, mirrored=k == 1))
+            step = square.to_image()
+            rim, iris = (out[n].reshape(-1, 3)[:, :2].astype(np.float64) / size for n in (213, 15))
+            for values in (rim, iris):
+                if k == 1:
+                    values[:, 0] = 1.0 - values[:, 0]
+            points[list(contour), :2] = rim[: len(contour)] @ step[:, :2].T + step[:, 2]
+            depth = points[list(corners), 2].mean()
+            irises.append(np.column_stack([iris @ step[:, :2].T + step[:, 2], np.full(IRIS, depth)]))
+        return np.vstack([points, *irises])

