@@ -1,8 +1,8 @@
 """Stage results kept beside a result folder, so that a killed run goes on where it stopped.
 
-One ``.npz`` per stage in ``RESULT/.checkpoint``: the arrays of an estimate, its scalars as JSON and the key of
-all that it was computed from. A file whose key differs is not used. Written beside and renamed; loading one
-never runs code.
+One ``.npz`` per stage in ``RESULT/.mifit/checkpoints``: the arrays of an estimate, its scalars as JSON, a digest of
+both and the key of all that it was computed from. A file whose key differs, or whose content isn't what was written,
+is not used. Written beside and renamed; loading one never runs code.
 """
 
 from __future__ import annotations
@@ -10,16 +10,22 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+from mifit.appearance.illumination import Illumination, light_from
+from mifit.appearance.lobe import Lobe
 from mifit.core.estimate import Report
 from mifit.core.files import replacing
 from mifit.core.npz import read_npz
 
 T = TypeVar("T")
+RECORDS: dict[str, type] = {cls.__name__: cls for cls in (Report, Illumination, Lobe)}
+"""Dataclasses that an estimate may hold."""
+ARRAY, RECORD, LIGHT = "$array", "$record", "$light"
 
 
 def digest(value: Any) -> str:
@@ -29,35 +35,66 @@ def digest(value: Any) -> str:
 
 
 def save(folder: Path, stage: str, estimate: Any, key: str) -> None:
-    """Write one stage's estimate (a dataclass of arrays, scalars and a ``Report``)."""
-    arrays, scalars = {}, {}
-    for field in dataclasses.fields(estimate):
-        value = getattr(estimate, field.name)
-        if isinstance(value, np.ndarray):
-            arrays[field.name] = value
-        elif isinstance(value, Report):
-            scalars[field.name] = dataclasses.asdict(value)
-        else:
-            scalars[field.name] = value
-    arrays["_meta"] = np.frombuffer(json.dumps({"key": key, "scalars": scalars}).encode(), dtype=np.uint8)
+    """Write one stage's estimate (a dataclass of arrays, scalars and the records of `RECORDS`)."""
+    arrays: dict[str, np.ndarray] = {}
+    fields = {f.name: _plain(getattr(estimate, f.name), f.name, arrays) for f in dataclasses.fields(estimate)}
+    values = json.loads(json.dumps(fields))  # as they will be read: keys as text, tuples as lists
+    meta = {"key": key, "values": values, "content": _content(arrays, values)}
+    arrays["_meta"] = np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8)
     with replacing(folder / f"{stage}.npz") as temporary, open(temporary, "wb") as stream:
-        np.savez(stream, **arrays)
+        np.savez(stream, **arrays)  # type: ignore[arg-type]
 
 
 def load(folder: Path, stage: str, cls: type[T], key: str) -> T | None:
-    """Read a stage's estimate back; None when there is none, it is damaged, or it has another key."""
+    """Read a stage's estimate back; None when there is none, it is damaged or changed, or it has another key."""
     path = folder / f"{stage}.npz"
     try:
-        values: dict[str, Any] = dict(read_npz(path))
-        meta = json.loads(bytes(values.pop("_meta")).decode())
-        if meta["key"] != key:
+        arrays: dict[str, np.ndarray] = dict(read_npz(path))
+        meta = json.loads(bytes(arrays.pop("_meta")).decode())
+        if meta["key"] != key or meta["content"] != _content(arrays, meta["values"]):
             return None
-        for name, value in meta["scalars"].items():
-            if name == "report":
-                value = Report(**{**value, "warnings": tuple(value["warnings"])})
-            elif isinstance(value, list):
-                value = tuple(value)
-            values[name] = value
-        return cls(**values)
+        return cls(**{name: _restored(value, arrays) for name, value in meta["values"].items()})
     except (OSError, ValueError, KeyError, TypeError):  # InputError is a ValueError
         return None
+
+
+def _plain(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
+    """A value as JSON, its arrays put aside under names made of ``name``."""
+    if isinstance(value, np.ndarray):
+        arrays[name] = value
+        return {ARRAY: name}
+    if dataclasses.is_dataclass(value) and type(value) in RECORDS.values():
+        fields = dataclasses.fields(value)
+        return {RECORD: type(value).__name__} | {
+            f.name: _plain(getattr(value, f.name), f"{name}.{f.name}", arrays) for f in fields
+        }
+    if hasattr(value, "document"):
+        return {LIGHT: value.document()}
+    if isinstance(value, (tuple, list)):
+        return [_plain(item, f"{name}.{k}", arrays) for k, item in enumerate(value)]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _restored(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """The value that `_plain` made JSON of; lists come back as tuples, but for those inside dictionaries."""
+    if isinstance(value, list):
+        return tuple(_restored(item, arrays) for item in value)
+    if not isinstance(value, dict):
+        return value
+    if ARRAY in value:
+        return arrays[value[ARRAY]]
+    if LIGHT in value:
+        return light_from(value[LIGHT])
+    if RECORD in value:
+        return RECORDS[value[RECORD]](**{k: _restored(v, arrays) for k, v in value.items() if k != RECORD})
+    return value
+
+
+def _content(arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> str:
+    """Digest of what an estimate holds, so that a changed value or shape is noticed."""
+    state = hashlib.sha256(json.dumps(values, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        state.update(f"{name}{array.shape}{array.dtype}".encode())
+        state.update(array.tobytes())
+    return state.hexdigest()

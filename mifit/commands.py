@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 import sys
@@ -19,7 +18,6 @@ from mifit.errors import InputError
 if TYPE_CHECKING:
     from mifit.reconstruction import Reconstruction
 
-CHECKPOINTS = ".checkpoint"
 DEMO = {"model": "builtin:coarse", "width": 340, "height": 240, "spp": 32, "timesteps": 3}
 """Size of the capture that ``mifit demo`` makes: small enough for seconds, large enough to show a face."""
 
@@ -63,11 +61,23 @@ def demo(arguments: Namespace) -> None:
     capture = out / "capture"
     progress = console_progress(arguments.quiet)
     _use_variant(arguments)
+    from mifit.result.ownership import MARK, check_ours, claim, clear, remember
     from mifit.synth import synthesize
 
-    shutil.rmtree(capture, ignore_errors=True)
+    check_ours(out)
+    if (out / "result.json").exists() and not (capture / MARK).is_dir():
+        raise InputError(f"--out {out}: holds a result that isn't the demo's; name another folder")
+    clear(capture)
+    claim(out)
     _say(arguments, "Rendering a capture: two cameras to fit, a third to judge by")
-    synthesize(capture, seed=arguments.seed, progress=progress, **DEMO)  # type: ignore[arg-type]
+    made = out / MARK / "capture"
+    shutil.rmtree(made, ignore_errors=True)  # of a demo that was killed
+    synthesize(made, seed=arguments.seed, progress=progress, **DEMO)  # type: ignore[arg-type]
+    claim(made, force=True)
+    remember(
+        made, [p.relative_to(made).as_posix() for p in made.rglob("*") if p.is_file() and MARK not in p.parts[-2:]]
+    )
+    made.rename(capture)
     common = {
         "quiet": arguments.quiet,
         "debug": arguments.debug,
@@ -202,22 +212,21 @@ def landmarks(arguments: Namespace) -> None:
 def fit(arguments: Namespace) -> None:
     """Run the stages and write the result folder."""
     import mifit
+    from mifit.result.ownership import check_ours
 
     out: Path = arguments.out
-    if (out / "result.json").exists() and not (arguments.resume or arguments.force):
-        raise InputError(f"--out {out}: holds a result already; --resume goes on with it, --force replaces it")
+    check_ours(out, arguments.force)
     if arguments.config:
         check_file(arguments.config, MAX_SETTINGS_BYTES, "configuration file")
     config = FitConfig.load(arguments.config) if arguments.config else FitConfig()
     capture = mifit.Capture.load(arguments.capture)
     model = mifit.MorphableModel.load(arguments.model)
-    out.mkdir(parents=True, exist_ok=True)  # a place that can't be written is refused now, not after the fit
     _use_variant(arguments)
+    from mifit.fitting import fit_into
     from mifit.output.report import write_report
 
-    if arguments.force:
-        shutil.rmtree(out / CHECKPOINTS, ignore_errors=True)
-    result = mifit.fit(
+    result = fit_into(
+        out,
         capture,
         model,
         cameras=arguments.cameras,
@@ -226,10 +235,9 @@ def fit(arguments: Namespace) -> None:
         until=arguments.until,
         seed=arguments.seed,
         progress=console_progress(arguments.quiet),
-        checkpoints=out / CHECKPOINTS,
+        resume=arguments.resume,
+        force=arguments.force,
     )
-    result = dataclasses.replace(result, model_source=str(arguments.model))
-    result.save(out)
     write_report(out, result, capture)
     print(f"Result: {out}")
 
@@ -243,13 +251,14 @@ def track(arguments: Namespace) -> None:
     capture = mifit.Capture.load(arguments.capture)
     _use_variant(arguments)
     from mifit.output.sequence import write_moving_pictures
-    from mifit.tracking import track_into
+    from mifit.result.ownership import remember
+    from mifit.tracking import sequence_left, track_into
 
     for name in arguments.overlay or ():
         capture.with_fitted(result.cameras).camera(name)  # an unknown one is refused now, not after the work
-    rest = [t for t in capture.timesteps if t not in result.geometry.timesteps]
-    timesteps = choose("timestep", capture.timesteps, arguments.timesteps, len(capture.timesteps))
-    timesteps = tuple(t for t in timesteps if arguments.timesteps or t in rest)
+    timesteps = sequence_left(result, capture, arguments.resume)
+    if arguments.timesteps:
+        timesteps = choose("timestep", capture.timesteps, arguments.timesteps, 0)
     progress = console_progress(arguments.quiet)
     result = track_into(
         arguments.result,
@@ -261,7 +270,8 @@ def track(arguments: Namespace) -> None:
         resume=arguments.resume,
         progress=progress,
     )
-    write_moving_pictures(arguments.result, result, capture, arguments.overlay, arguments.fps, progress)
+    written = write_moving_pictures(arguments.result, result, capture, arguments.overlay, arguments.fps, progress)
+    remember(arguments.result, [path.name for path in written])
     print(f"Result: {arguments.result}")
 
 
@@ -274,6 +284,7 @@ def evaluate(arguments: Namespace) -> None:
     _use_variant(arguments)
     from mifit.output.evaluate import evaluate
     from mifit.output.report import write_report
+    from mifit.pipeline import fitted_to
 
     found = evaluate(
         result,
@@ -284,6 +295,8 @@ def evaluate(arguments: Namespace) -> None:
         progress=console_progress(arguments.quiet),
         baseline=arguments.baseline,
     )
+    if not fitted_to(result, capture):
+        _say(arguments, f"mifit: warning: {arguments.capture}: isn't the capture that was fitted, or has changed since")
     if arguments.camera in [camera.name for camera in result.cameras]:
         _say(arguments, f"mifit: warning: camera {arguments.camera!r} was fitted, so this is no held-out error")
     if arguments.json:

@@ -199,7 +199,6 @@ def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: 
         seed=fit.seed,
         checkpoints=experiment_folder / "fits" / key[:10],
     )
-    result = dataclasses.replace(result, model_source=fit.model)
     metrics = {"fit_seconds": result.seconds}
     evaluation = None
     if e.outputs.result:

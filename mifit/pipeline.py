@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
     from mifit.reconstruction import Reconstruction
+    from mifit.result import Result
 
 T = TypeVar("T")
 ESTIMATED_CAMERAS = "the capture is uncalibrated: focal length, camera poses and so the scale are estimates"
@@ -105,6 +106,7 @@ def fit(
         config={**dataclasses.asdict(config), "seed": seed},
         cameras=tuple(capture.camera(name) for name in cameras),
         capture_digest=digest,
+        model_source=model.source,
         units=capture.units,
         unit_mm=capture.unit_mm,
         warnings=(*(() if known_cameras else (ESTIMATED_CAMERAS,)), *one_place(capture, cameras, geometry)),
@@ -156,6 +158,16 @@ def choose(kind: str, known: Sequence[T], wanted: Sequence[T] | None, default: i
     if not wanted:
         raise InputError(f"no {kind} named; the capture has {', '.join(map(str, known))}")
     return tuple(dict.fromkeys(wanted))
+
+
+def fitted_to(result: Result, capture: Capture) -> bool:
+    """Whether a result was fitted to this very capture: its calibration, images, masks and landmarks."""
+    names = [camera.name for camera in result.cameras]
+    tracked = [] if result.normals is None else result.normals.report.details.get("tracked", [])
+    timesteps = [t for t in result.timesteps if t not in tracked]
+    if not set(names) <= set(capture.cameras) or not set(timesteps) <= set(capture.timesteps):
+        return False
+    return capture.digest(names, timesteps) == result.capture_digest
 
 
 def peak_memory() -> int:

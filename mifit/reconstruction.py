@@ -17,12 +17,21 @@ from mifit.result import METHODS, Method, Result
 class Reconstruction(Result):
     """A face that can be rendered, relit, saved and read back; its attributes are those of `mifit.result.Result`."""
 
-    def save(self, folder: str | Path) -> None:
-        """Write the result folder (docs/formats.md); ``result.json`` comes last and marks it whole."""
+    def save(self, folder: str | Path, force: bool = False) -> None:
+        """Write the result folder (docs/formats.md), or replace the result that is in it.
+
+        A save that fails leaves the older result as it was. Files that mifit did not write, or that were changed since,
+        are never deleted.
+
+        Raises
+        ------
+        InputError
+            The folder holds other files and no result, and ``force`` isn't given.
+        """
         from mifit.output.scene import write_scene
         from mifit.result.writing import save
 
-        save(self, Path(folder), lambda path: write_scene(self, path, self.timesteps[0]))
+        save(self, Path(folder), lambda path: write_scene(self, path, self.timesteps[0]), force)
 
     @classmethod
     def load(cls, folder: str | Path, model: MorphableModel | None = None) -> Reconstruction:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +13,7 @@ from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, from_mapping
 from mifit.core.estimate import NormalsEstimate, Report
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
+from mifit.result.ownership import claim, locked
 from mifit.result.record import R
 from mifit.result.writing import add_timestep
 from mifit.stages.normals.mesh_refinement import MeshRefiner
@@ -45,7 +46,8 @@ def track_into(
     capture, timesteps, config, geometry_config, seed, progress
         As in `track`.
     resume : bool
-        Keep the timesteps that an earlier run has tracked; they are tracked anew otherwise.
+        Keep the timesteps that an earlier run has tracked from the same images; those whose images, masks, landmarks
+        or cameras have changed since, and all after the first of them, are tracked anew. Without it all are.
 
     Returns
     -------
@@ -67,29 +69,38 @@ def track_into(
         raise InputError(f"{folder}: found a result without reflectance, expected one of 'mifit fit' with all stages")
     tracked = [] if result.normals is None else list(result.normals.report.details.get("tracked", []))
     fitted = [t for t in result.timesteps if t not in tracked]
+    names = [camera.name for camera in result.cameras]
+    digests = {t: capture.digest(names, [t]) for t in timesteps}
     if resume:
-        timesteps = [t for t in timesteps if t not in tracked]
-    else:
-        result = _without(result, [t for t in tracked if t in timesteps])
+        timesteps = _not_yet(result, timesteps, digests)
+    result = _without(result, [t for t in tracked if t in timesteps])
+    folder = Path(folder)
+    claim(folder)
     refiner = None if result.mesh is None else mesh_refiner(result)
-    frames = track(
-        capture.with_fitted(result.cameras),
-        result.model,
-        result.geometry,
-        result.reflectance,
-        result.normals,
-        [camera.name for camera in result.cameras],
-        timesteps,
-        config,
-        geometry_config,
-        fitted,
-        seed,
-        progress,
-    )
-    for frame in frames:
-        result = extend(result, frame, refiner)
-        add_timestep(result, Path(folder), frame.timestep)
+    with locked(folder):
+        for frame in track(
+            capture.with_fitted(result.cameras),
+            result.model,
+            result.geometry,
+            result.reflectance,
+            result.normals,
+            names,
+            timesteps,
+            config,
+            geometry_config,
+            fitted,
+            seed,
+            progress,
+        ):
+            result = extend(result, frame, refiner, digests[frame.timestep])
+            add_timestep(result, folder, frame.timestep)
     return result
+
+
+def sequence_left(result: Result, capture: Capture, resume: bool) -> tuple[int, ...]:
+    """Timesteps of a capture to track by default: those without geometry, and with ``resume`` the tracked ones."""
+    tracked = [] if result.normals is None else result.normals.report.details.get("tracked", [])
+    return tuple(t for t in capture.timesteps if t not in result.timesteps or (resume and t in tracked))
 
 
 def mesh_refiner(result: Result) -> MeshRefiner:
@@ -100,8 +111,18 @@ def mesh_refiner(result: Result) -> MeshRefiner:
     return MeshRefiner(result.model, len(result.reflectance.diffuse), settings)
 
 
-def extend(result: R, frame: TrackedFrame, refiner: MeshRefiner | None = None) -> R:
-    """A result with one more timestep; its normals' report lists it under ``tracked``.
+def _not_yet(result: Result, timesteps: Sequence[int], digests: Mapping[int, str]) -> list[int]:
+    """The timesteps that aren't in a result, or whose images are others now, or that come after one of those."""
+    details = {} if result.normals is None else result.normals.report.details
+    known = details.get("tracked_from", {})
+    kept = [t for t in timesteps if t in details.get("tracked", []) and known.get(str(t)) == digests[t]]
+    changed = [t for t in timesteps if t in details.get("tracked", []) and t not in kept]
+    # A frame starts from the one before.
+    return [t for t in timesteps if t not in kept or (changed and t > min(changed))]
+
+
+def extend(result: R, frame: TrackedFrame, refiner: MeshRefiner | None = None, digest: str = "") -> R:
+    """A result with one more timestep; its normals' report lists it under ``tracked``, with the images' digest.
 
     With a refiner its refined mesh is made too.
     """
@@ -115,7 +136,11 @@ def extend(result: R, frame: TrackedFrame, refiner: MeshRefiner | None = None) -
         },
     )
     before = result.normals or NormalsEstimate((), frame.normal_object[None][:0], Report("converged"))
-    details = {**before.report.details, "tracked": [*before.report.details.get("tracked", []), frame.timestep]}
+    details = {
+        **before.report.details,
+        "tracked": [*before.report.details.get("tracked", []), frame.timestep],
+        "tracked_from": {**before.report.details.get("tracked_from", {}), str(frame.timestep): digest},
+    }
     report = replace(
         before.report,
         seconds=before.report.seconds + frame.seconds,

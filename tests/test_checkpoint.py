@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from mifit import checkpoint
-from mifit.core.estimate import NormalsEstimate, Report
+from mifit.appearance.illumination import DistantLight, Illumination
+from mifit.appearance.lobe import Lobe
+from mifit.core.estimate import NormalsEstimate, ReflectanceEstimate, Report
 
 
 @pytest.fixture
@@ -30,6 +32,40 @@ def test_other_key_missing_and_damaged(tmp_path, estimate):
     assert checkpoint.load(tmp_path, "normals", NormalsEstimate, "other") is None
     path = tmp_path / "normals.npz"
     path.write_bytes(path.read_bytes()[:200])
+    assert checkpoint.load(tmp_path, "normals", NormalsEstimate, "key") is None
+
+
+def test_lighting_and_lobe_round_trip(tmp_path):
+    rng = np.random.default_rng(1)
+    lights = (DistantLight(np.array([0.0, 0.6, 0.8]), 0.1, np.array([1.0, 2.0, 1 / 3])),)
+    maps = rng.random((4, 4, 3)), rng.random((4, 4)), rng.random((4, 4))
+    for exponent in (11.0, rng.uniform(5, 50, (4, 4))):
+        lobe = Lobe(exponent, 3.0, True)
+        light = Illumination(rng.standard_normal((9, 3)), lights, 0.1)
+        estimate = ReflectanceEstimate(*maps, light, lobe, "shadowed", Report("converged", details={"tried": [[1, 2]]}))
+        checkpoint.save(tmp_path, "reflectance", estimate, "key")
+        back = checkpoint.load(tmp_path, "reflectance", ReflectanceEstimate, "key")
+        assert back is not None and back.report == estimate.report and back.shading_model == "shadowed"
+        np.testing.assert_array_equal(back.diffuse, estimate.diffuse)
+        np.testing.assert_array_equal(back.illumination.unknowns, light.unknowns)
+        np.testing.assert_array_equal(back.lobe.exponent, exponent)
+        assert back.illumination.ambient == 0.1 and back.lobe.fresnel == 3.0
+        assert back.illumination.lights[0].document() == lights[0].document()
+
+
+@pytest.mark.parametrize("damage", ["nan", "shape", "scalar"])
+def test_changed_content_is_not_used(tmp_path, estimate, damage):
+    checkpoint.save(tmp_path, "normals", estimate, "key")
+    path = tmp_path / "normals.npz"
+    with np.load(path) as data:
+        arrays = dict(data)
+    if damage == "nan":
+        arrays["normal_object"][0, 1, 2] = np.nan
+    elif damage == "shape":
+        arrays["normal_object"] = arrays["normal_object"][:1]
+    else:
+        arrays["_meta"] = np.frombuffer(bytes(arrays["_meta"]).replace(b"[0, 2]", b"[0, 7]"), np.uint8)
+    np.savez(path, **arrays)
     assert checkpoint.load(tmp_path, "normals", NormalsEstimate, "key") is None
 
 

@@ -82,11 +82,13 @@ class Stages:
     def __init__(self, monkeypatch):
         self.ran = []
         result = ball_result()
-        for name, part in (
-            ("fit_geometry", "geometry"), ("find_surface", "geometry"), ("infer_reflectance", "reflectance"), ("refine_shape", "geometry"),
-            ("refine_normals", "normals"), ("refine_mesh", "mesh"),
+        for module, name, part in (
+            ("fit_geometry", "fit_geometry", "geometry"), ("find_surface", "find_surface", "geometry"),
+            ("infer_reflectance", "infer_reflectance", "reflectance"), ("refine_shape", "refine_shape", "geometry"),
+            ("normals.normal_refinement", "refine_normals", "normals"),
+            ("normals.mesh_refinement", "refine_mesh", "mesh"),
         ):  # fmt: skip
-            monkeypatch.setattr(f"mifit.stages.{name}.{name}", self.stand_in(name, getattr(result, part)))
+            monkeypatch.setattr(f"mifit.stages.{module}.{name}", self.stand_in(name, getattr(result, part)))
 
     def stand_in(self, name, estimate):
         def run(*arguments, **options):
@@ -96,17 +98,22 @@ class Stages:
         return run
 
 
+def made_up_capture(digest="digest", timesteps=(0, 3)):
+    """What `mifit.fit` asks of a capture before and after its stages."""
+    image = np.ones((4, 5, 3), np.float32)
+    frame = SimpleNamespace(image=image, valid=image[..., 0] > 0, clipped=image[..., 0] > 2, visible=np.ones(68, bool))
+    cameras = {c.name: c for c in ball_result().cameras}
+    return SimpleNamespace(
+        cameras=tuple(cameras), timesteps=timesteps, camera=cameras.get, frame=lambda name, t: frame, calibrated=True,
+        digest=lambda cameras, timesteps: digest, units="cm", unit_mm=10.0,
+    )  # fmt: skip
+
+
 @pytest.fixture
 def fitted(monkeypatch):
     """A function that fits a made-up capture with given settings, and the stages that it ran."""
     stages = Stages(monkeypatch)
-    image = np.ones((4, 5, 3), np.float32)
-    frame = SimpleNamespace(image=image, valid=image[..., 0] > 0, clipped=image[..., 0] > 2, visible=np.ones(68, bool))
-    cameras = {c.name: c for c in ball_result().cameras}
-    capture = SimpleNamespace(
-        cameras=tuple(cameras), timesteps=(0, 3), camera=cameras.get, frame=lambda name, t: frame, calibrated=True,
-        digest=lambda cameras, timesteps: "digest", units="cm", unit_mm=10.0,
-    )  # fmt: skip
+    capture = made_up_capture()
     model = ball_result().model
 
     def run(config, folder, **options):
@@ -128,7 +135,7 @@ RUNS = (
 )
 
 
-@pytest.mark.parametrize(("section", "name"), SETTINGS, ids=".".join)
+@pytest.mark.parametrize(("section", "name"), SETTINGS, ids=[f"{a}.{b}" for a, b in SETTINGS])
 def test_a_changed_setting_reruns_the_steps_that_depend_on_it(fitted, tmp_path, section, name):
     assert fitted(BASE, tmp_path) == list(RUNS)
     assert fitted(BASE, tmp_path) == []

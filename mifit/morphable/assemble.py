@@ -61,6 +61,7 @@ def complete(
         landmarks found or given.
     """
     computed = albedo is None or uv is None or landmarks is None
+    given = [np.asarray(array) for pair in (albedo, uv) if pair is not None for array in pair]
     if source is not None:
         beside = source.parent / f"{source.name}.landmarks.json"
         if beside.is_file():
@@ -95,7 +96,7 @@ def complete(
         unit_mm=unit_mm,
         expression_names=expression_names,
         expression_bounds=expression_bounds,  # type: ignore[arg-type]
-        fingerprint=fingerprint(mean, faces, identity, expression, landmarks) if computed else "",
+        fingerprint=fingerprint(mean, faces, identity, expression, landmarks, *given) if computed else "",
     )
 
 

@@ -36,5 +36,5 @@ def finer_model(model: MorphableModel, subdivisions: int) -> MorphableModel:
         uv=topology.uv,
         face_mask=topology.face_mask,
         symmetry=None,
-        fingerprint=f"{model.fingerprint}/{subdivisions}" if model.fingerprint else "",
+        fingerprint=f"{model.digest}-{subdivisions}" if model.fingerprint else "",
     )

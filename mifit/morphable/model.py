@@ -74,7 +74,8 @@ class MorphableModel:
         Lower and upper bounds of each expression coefficient; infinite when free.
     fingerprint : str
         What identifies a model whose arrays are partly computed: sums repeat only to rounding (their order depends
-        on threads and memory), so its bytes can't. Empty for a model that is known by its content.
+        on threads and memory), so its bytes can't. It holds for the content that it was given with, whose digest
+        is added after a slash, and for no other. Empty for a model that is known by its content.
 
     Raises
     ------
@@ -140,6 +141,9 @@ class MorphableModel:
             raise InputError(f"{self.name}: unit_mm is {self.unit_mm}, expected a positive number")
         if (self.expression_bounds[:, 0] > self.expression_bounds[:, 1]).any():
             raise InputError(f"{self.name}: expression_bounds has a lower bound above its upper bound")
+
+        if self.fingerprint and "/" not in self.fingerprint:
+            self._set("fingerprint", f"{self.fingerprint}/{self._content}")
 
     def _set(self, key: str, value: object) -> None:
         object.__setattr__(self, key, value)
@@ -276,9 +280,13 @@ class MorphableModel:
 
     @cached_property
     def digest(self) -> str:
-        """Hexadecimal digest of all content but the name, or the fingerprint of a model that has one."""
-        if self.fingerprint:
-            return self.fingerprint
+        """Hexadecimal digest of all content but the name, or the fingerprint of content that is as it was given."""
+        name, _, content = self.fingerprint.partition("/")
+        return name if name and content == self._content else self._content
+
+    @cached_property
+    def _content(self) -> str:
+        """Hexadecimal digest of all values but the name and the fingerprint."""
         h = hashlib.blake2b(digest_size=16)
         for f in fields(self):
             value = getattr(self, f.name)
@@ -286,8 +294,13 @@ class MorphableModel:
                 h.update(f"{f.name}{value.shape}{value.dtype}".encode())
                 h.update(value.data)
             elif f.name != "name":
-                h.update(f"{f.name}={value!r}".encode())
+                h.update(f"{f.name}={('' if f.name == 'fingerprint' else value)!r}".encode())
         return h.hexdigest()
+
+    @property
+    def source(self) -> str:
+        """What `load` read the model from, an absolute path or ``"builtin"``; empty for a model made otherwise."""
+        return str(self.__dict__.get("_source", ""))
 
     @classmethod
     def from_template(
@@ -335,7 +348,11 @@ class MorphableModel:
         InputError
             The file is missing, damaged or of no known kind; the message says what was found.
         """
-        return _PROVIDED["load"](path, kind)
+        model = _PROVIDED["load"](path, kind)
+        # Not a field: a model that is made from this one by `replace` is no longer the file's.
+        named = isinstance(path, str) and path.partition(":")[0] == "builtin"
+        model._set("_source", str(path) if named else str(Path(path).resolve()))
+        return model
 
     def save(self, path: str | Path) -> None:
         """Write the model as an ``.npz`` file, whole or not at all."""

@@ -136,16 +136,18 @@ def write_moving_pictures(
     cameras: Sequence[str] | None = None,
     fps: float = 12.0,
     progress: Progress = silent,
-) -> None:
+) -> list[Path]:
     """Write what shows a tracked sequence: ``overlay_CAMERA.mp4`` per camera and ``sequence.glb``.
 
-    Cameras are those of the fit by default. Parameters as in `write_overlay`.
+    Cameras are those of the fit by default. Parameters as in `write_overlay`. Returns the files.
     """
     folder = Path(folder)
     names = [camera.name for camera in reconstruction.cameras] if cameras is None else cameras
-    for name in names:
-        write_overlay(reconstruction, capture, name, folder / f"overlay_{file_name(name)}.mp4", fps, progress)
+    overlays = [folder / f"overlay_{file_name(name)}.mp4" for name in names]
+    for name, path in zip(names, overlays, strict=True):
+        write_overlay(reconstruction, capture, name, path, fps, progress)
     write_glb(reconstruction, folder / "sequence.glb", animate=sorted(reconstruction.timesteps), fps=fps)
+    return [*overlays, folder / "sequence.glb"]
 
 
 def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> None:

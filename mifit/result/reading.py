@@ -24,6 +24,7 @@ from mifit.core.split_mesh import SplitMesh, split_at_seams
 from mifit.core.subdivision import split_faces
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
+from mifit.result.ownership import finish
 from mifit.result.record import R
 from mifit.result.writing import FORMAT_VERSION
 
@@ -31,7 +32,7 @@ from mifit.result.writing import FORMAT_VERSION
 def load(cls: type[R], folder: Path, model: MorphableModel | None = None) -> R:
     """Read a result folder as a `Result` or a class made from it; see `Reconstruction.load`."""
     path = folder / "result.json"
-    document = _read_document(folder, path)
+    document = read_document(folder)
     try:
         if model is None:
             model = _load_model(document["model"], path)
@@ -67,8 +68,10 @@ def load(cls: type[R], folder: Path, model: MorphableModel | None = None) -> R:
         raise InputError(f"{path}: holds a value of the wrong kind ({error}); fit again") from None
 
 
-def _read_document(folder: Path, path: Path) -> dict[str, Any]:
-    """Parse ``result.json`` and check that it is one, of this version."""
+def read_document(folder: Path) -> dict[str, Any]:
+    """Parse ``result.json`` and check that it is one, of this version; InputError otherwise."""
+    finish(folder)
+    path = folder / "result.json"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a result that `mifit fit` wrote")
     try:

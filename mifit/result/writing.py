@@ -21,44 +21,40 @@ from mifit.core.mesh import vertex_normals
 from mifit.core.ply import write_ply
 from mifit.core.split_mesh import SplitMesh, split_at_seams, tangent_space_map
 from mifit.core.subdivision import split_faces
+from mifit.result.ownership import claim, replacing_files
 from mifit.result.record import Result
 
 FORMAT_VERSION = 1
 
 
-def save(result: Result, folder: Path, write_scene: Callable[[Path], None]) -> None:
-    """Write a result folder; ``write_scene`` writes the scene file that it is given, and those beside it.
+def save(result: Result, folder: Path, write_scene: Callable[[Path], None], force: bool = False) -> None:
+    """Write a result folder, or replace what an older result left in it; see `Reconstruction.save`.
 
-    An older ``result.json`` goes first and the new one comes last: a folder that has one is whole.
+    All files are written beside the old ones first, so that one that fails leaves the old result whole.
+    ``write_scene`` writes the scene file that it is given, and those beside it.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "result.json").unlink(missing_ok=True)
-    for pattern in (
-        "geometry/*.ply",
-        "refined/*.ply",
-        "maps/*",
-        "lighting.exr",
-        "scene*.xml",
-        "scene_files/*",
-        "overlay_*.mp4",
-        "sequence.glb",
-    ):
-        for old in folder.glob(pattern):
-            old.unlink()
-    surfaces = _surfaces(result)
-    for timestep in result.timesteps:
-        _write_timestep(result, folder, timestep, surfaces)
-    if result.reflectance is not None:
-        for name in ("diffuse", "specular", "confidence"):
-            write_image(folder / "maps" / f"{name}.exr", getattr(result.reflectance, name))
-        write_image(folder / "lighting.exr", result.lighting.to_latlong())
-    write_scene(folder / "scene.xml")
-    write_text(folder / "result.json", json.dumps(_document(result), indent=1, allow_nan=False) + "\n")
+    claim(folder, force)
+    with replacing_files(folder, only=True) as new:
+        surfaces = _surfaces(result)
+        for timestep in result.timesteps:
+            _write_timestep(result, new, timestep, surfaces)
+        if result.reflectance is not None:
+            for name in ("diffuse", "specular", "confidence"):
+                write_image(new / "maps" / f"{name}.exr", getattr(result.reflectance, name))
+            write_image(new / "lighting.exr", result.lighting.to_latlong())
+        write_scene(new / "scene.xml")
+        _write_document(result, new)
 
 
 def add_timestep(result: Result, folder: Path, timestep: int) -> None:
-    """Write the files of one timestep of a result into its folder, then ``result.json`` anew."""
-    _write_timestep(result, folder, timestep, _surfaces(result))
+    """Write the files of one timestep of a result into its folder, and ``result.json`` anew, all or none."""
+    claim(folder)
+    with replacing_files(folder) as new:
+        _write_timestep(result, new, timestep, _surfaces(result))
+        _write_document(result, new)
+
+
+def _write_document(result: Result, folder: Path) -> None:
     write_text(folder / "result.json", json.dumps(_document(result), indent=1, allow_nan=False) + "\n")
 
 
@@ -175,7 +171,8 @@ def _document(result: Result) -> dict[str, Any]:
 
 def _source(source: str) -> str:
     """A model's source that still holds when the working folder changes."""
-    return str(Path(source).resolve()) if source and Path(source).exists() else source
+    named = source.partition(":")[0] == "builtin"
+    return str(Path(source).resolve()) if source and not named and Path(source).exists() else source
 
 
 def _camera_document(camera: Camera) -> dict[str, Any]:

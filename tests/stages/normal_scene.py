@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -75,6 +77,10 @@ class Scene:
 
     def with_fitted(self, cameras: object) -> Scene:
         return self
+
+    def digest(self, cameras: Sequence[str], timesteps: Sequence[int]) -> str:
+        images = [self.frames[name, t].image for name in cameras for t in timesteps]
+        return hashlib.sha256(b"".join(np.ascontiguousarray(image).tobytes() for image in images)).hexdigest()
 
     def frame(self, name: str, timestep: int) -> Frame:
         self.requested.add(name)

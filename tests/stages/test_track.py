@@ -281,6 +281,28 @@ def test_without_resume_frames_are_tracked_anew(scene, fit_truth, saved):
     assert again.timesteps == again.mesh.timesteps == (0, 1)
 
 
+def test_frames_whose_images_changed_are_tracked_anew(scene, fit_truth, saved):
+    from mifit.tracking import sequence_left, track_into
+
+    track_into(saved, reload(saved), scene, (1, 2), CONFIG)
+    assert len(fit_truth) == 2
+    assert track_into(saved, reload(saved), scene, (1, 2), CONFIG, resume=True).timesteps == (0, 1, 2)
+    assert len(fit_truth) == 2
+    frames = dict(scene.frames)
+    name = CAMERAS[0]
+    frames[name, 2] = replace(frames[name, 2], image=0.9 * frames[name, 2].image)
+    again = track_into(saved, reload(saved), replace(scene, frames=frames), (1, 2), CONFIG, resume=True)
+    assert len(fit_truth) == 3 and again.timesteps == (0, 1, 2)
+    # A frame starts from the one before: with the first, the second is tracked anew as well.
+    frames[name, 1] = replace(frames[name, 1], image=0.9 * frames[name, 1].image)
+    changed = replace(scene, frames=frames, timesteps=(0, 1, 2))
+    assert sequence_left(reload(saved), changed, resume=False) == ()
+    steps = sequence_left(reload(saved), changed, resume=True)
+    assert steps == (1, 2)
+    track_into(saved, reload(saved), changed, steps, CONFIG, resume=True)
+    assert len(fit_truth) == 5
+
+
 def test_a_result_without_reflectance_is_refused(scene, saved):
     from mifit.tracking import track_into
 

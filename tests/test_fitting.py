@@ -1,0 +1,153 @@
+"""`mifit fit` into a folder: what is refused before work starts, what goes on, and what is never lost."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import mifit
+from mifit import commands
+from mifit.config import FitConfig, MeshConfig, ReflectanceConfig
+from mifit.errors import InputError
+from mifit.fitting import fit_into
+from mifit.pipeline import fitted_to
+from mifit.reconstruction import Reconstruction
+from mifit.result import ownership
+from tests.output.conftest import ball_result
+from tests.output.test_result_safety import tree
+from tests.test_pipeline import Stages, made_up_capture
+
+ALL = ["fit_geometry", "find_surface", "infer_reflectance", "refine_normals", "refine_mesh"]
+
+
+@pytest.fixture
+def fit(monkeypatch, tmp_path):
+    """Fit a made-up capture into a folder with stand-ins for the stages; returns those that ran."""
+    stages = Stages(monkeypatch)
+    model = ball_result().model
+    model.save(tmp_path / "ball.npz")
+    model = mifit.MorphableModel.load(tmp_path / "ball.npz")
+
+    def run(folder, capture=None, **options):
+        stages.ran.clear()
+        fit_into(folder, capture or made_up_capture(), model, **options)
+        return list(stages.ran)
+
+    return run
+
+
+@pytest.fixture
+def tracked(fit, tmp_path):
+    """A result with a tracked timestep."""
+    folder = tmp_path / "tracked"
+    fit(folder)
+    result = Reconstruction.load(folder)
+    report = result.normals.report
+    report = dataclasses.replace(report, details={**report.details, "tracked": [3]})
+    dataclasses.replace(result, normals=dataclasses.replace(result.normals, report=report)).save(folder)
+    return folder
+
+
+def test_a_foreign_folder_is_refused_before_any_work(fit, tmp_path, monkeypatch):
+    (tmp_path / "photos" / "maps").mkdir(parents=True)
+    (tmp_path / "photos" / "maps" / "mine.png").write_text("mine")
+    with pytest.raises(InputError, match="photos: found a folder that mifit did not make"):
+        fit(tmp_path / "photos")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="did not make"):
+        fit("")  # the current folder
+    assert fit(tmp_path / "photos", force=True) == ALL
+    assert (tmp_path / "photos" / "maps" / "mine.png").read_text() == "mine"
+
+
+def test_a_result_is_not_replaced_unasked(fit, tmp_path):
+    assert fit(tmp_path / "out") == ALL
+    before = tree(tmp_path / "out")
+    with pytest.raises(InputError, match="holds a result already"):
+        fit(tmp_path / "out")
+    assert fit(tmp_path / "out", resume=True) == [] and tree(tmp_path / "out") == before
+    assert fit(tmp_path / "out", force=True) == ALL
+
+
+def test_a_shorter_fit_keeps_what_a_longer_one_made(fit, tmp_path):
+    fit(tmp_path / "out")
+    before = tree(tmp_path / "out")
+    assert fit(tmp_path / "out", resume=True, until="geometry") == [] and tree(tmp_path / "out") == before
+    other = FitConfig(reflectance=ReflectanceConfig(exponent=33.0))
+    with pytest.raises(InputError, match="has stage reflectance and stage normals, which going on with another config"):
+        fit(tmp_path / "out", resume=True, until="geometry", config=other)
+    assert tree(tmp_path / "out") == before
+    assert fit(tmp_path / "out", resume=True, config=other) == ALL[2:]
+
+
+def test_tracked_frames_stay(fit, tracked):
+    before = tree(tracked)
+    assert fit(tracked, resume=True, timesteps=[0]) == []
+    with pytest.raises(InputError, match="timesteps 3, which were tracked"):
+        fit(tracked, resume=True, timesteps=[0], config=FitConfig(mesh=MeshConfig(detail=0.4)))
+    assert tree(tracked) == before
+
+
+def test_two_fits_into_one_folder_exclude_each_other(fit, tmp_path):
+    ownership.claim(tmp_path / "out")
+    with ownership.locked(tmp_path / "out"), pytest.raises(InputError, match="another mifit is writing into it"):
+        fit(tmp_path / "out")
+
+
+def test_a_result_knows_the_capture_it_was_fitted_to(fit, tmp_path):
+    fit(tmp_path / "out")
+    result = Reconstruction.load(tmp_path / "out")
+    assert fitted_to(result, made_up_capture())
+    assert not fitted_to(result, made_up_capture(digest="another person"))
+    assert not fitted_to(result, made_up_capture(timesteps=(0,)))
+
+
+def test_a_result_knows_its_model(fit, tmp_path, monkeypatch):
+    fit(tmp_path / "out")
+    monkeypatch.chdir("/")
+    assert Reconstruction.load(tmp_path / "out").model.source == str(tmp_path / "ball.npz")
+    builtin = mifit.MorphableModel.load("builtin:coarse")
+    assert builtin.source == "builtin:coarse" and dataclasses.replace(builtin, unit_mm=1.0).source == ""
+
+
+def test_the_models_digest_is_that_of_its_content(tmp_path):
+    model = mifit.MorphableModel.load("builtin:coarse")
+    assert model.fingerprint
+    for name in ("mean", "mean_albedo", "albedo_modes", "identity"):
+        changed = dataclasses.replace(model, **{name: getattr(model, name) * np.float32(1.01)})
+        assert changed.digest != model.digest, name
+    model.save(tmp_path / "m.npz")
+    assert mifit.MorphableModel.load(tmp_path / "m.npz").digest == model.digest
+    with np.load(tmp_path / "m.npz") as data:
+        arrays = dict(data)
+    np.savez(tmp_path / "m.npz", **{**arrays, "mean": arrays["mean"] * np.float32(1.01)})
+    assert mifit.MorphableModel.load(tmp_path / "m.npz").digest != model.digest
+
+
+def test_the_demo_leaves_the_users_capture_alone(variant, tmp_path, monkeypatch):
+    made = []
+
+    def synthesize(folder, **_):
+        made.append(folder)
+        folder.mkdir(parents=True)
+        (folder / "transforms.json").write_text("{}")
+
+    monkeypatch.setattr("mifit.synth.synthesize", synthesize)
+    monkeypatch.setattr(commands, "fit", lambda arguments: None)
+    monkeypatch.setattr(commands, "evaluate", lambda arguments: None)
+    arguments = SimpleNamespace(out=tmp_path / "out", quiet=True, debug=False, variant="llvm_ad_rgb", seed=0)
+    mine = tmp_path / "out" / "capture" / "images" / "mine.png"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("mine")
+    with pytest.raises(InputError, match="did not make"):
+        commands.demo(arguments)
+    assert mine.read_text() == "mine" and not made
+    arguments.out = tmp_path / "again"
+    commands.demo(arguments)
+    commands.demo(arguments)  # its own capture is replaced
+    assert (tmp_path / "again" / "capture" / "transforms.json").is_file() and len(made) == 2
+    (tmp_path / "again" / "capture" / "mine.png").write_text("mine")
+    with pytest.raises(InputError, match=r"found mine\.png"):
+        commands.demo(arguments)
+    assert (tmp_path / "again" / "capture" / "mine.png").read_text() == "mine"
