@@ -3,7 +3,7 @@ ACTIVE := $(or $(VIRTUAL_ENV),$(CONDA_PREFIX))
 BIN := $(or $(ACTIVE),.venv)/bin
 OUT ?= out/demo
 
-.PHONY: help demo test quick bench notebooks docs lint clean
+.PHONY: help demo test quick bench notebooks docs lint package clean
 
 help:
 	@echo "make demo       fit a small capture made on the spot and write $(OUT)/report.html"
@@ -13,6 +13,7 @@ help:
 	@echo "make notebooks  runs the notebooks in reduced size"
 	@echo "make docs       builds the documentation into site/"
 	@echo "make lint       ruff and mypy"
+	@echo "make package    builds wheel and sdist and tries the wheel in an empty environment"
 
 demo:
 	@.ci/setup
@@ -44,6 +45,10 @@ lint:
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+package:
+	@.ci/setup test
+	@.ci/package
 
 clean:
 	rm -rf .venv build dist site *.egg-info

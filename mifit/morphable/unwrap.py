@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 
 from mifit.core.mesh import edges
+from mifit.errors import InputError
 
 
 def unwrap(mean: NDArray, faces: NDArray, mask: NDArray) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
@@ -94,7 +95,12 @@ def _square(t: NDArray) -> NDArray:
 
 
 def _xatlas(mean: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
-    import xatlas  # only meshes without a disc need it
+    try:
+        import xatlas
+    except ImportError:
+        raise InputError(
+            "found a face area that is no disc and has no texture coordinates; give it some, or pip install xatlas"
+        ) from None
 
     _, corners, uv = xatlas.parametrize(np.ascontiguousarray(mean, dtype=np.float32), faces.astype(np.uint32))
     return np.clip(uv, 0.0, 1.0), corners

@@ -203,13 +203,19 @@ def doctor() -> list[dict]:
     if total:
         fix = "close other programs; a fit of 512 x 512 maps needs about 2 GB"
         checks.append(_check("memory", free >= 2.0, f"{free:.1f} GB free of {total:.1f}", fix, required=False))
-    for package, purpose in (("OpenEXR", "EXR images"), ("xatlas", "UV charts"), ("cv2", "images and video")):
+    for package, purpose in (
+        ("OpenEXR", "EXR images"),
+        ("cv2", "images and video"),
+        ("xatlas", "texture coordinates for models without"),
+        ("viser", "the live view"),
+    ):
+        required = package in ("OpenEXR", "cv2")
         try:
             __import__(package)
-            checks.append(_check(package, True, purpose, "", required=True))
+            checks.append(_check(package, True, purpose, "", required))
         except ImportError as error:
             name = "opencv-contrib-python-headless" if package == "cv2" else package
-            checks.append(_check(package, False, f"{error}", f"pip install {name}", required=True))
+            checks.append(_check(package, False, f"{error}", f"pip install {name}", required))
     return checks
 
 
