@@ -72,3 +72,24 @@ def test_changed_content_is_not_used(tmp_path, estimate, damage):
 def test_digest_follows_every_value():
     assert checkpoint.digest({"a": 1, "b": [1, 2]}) == checkpoint.digest({"b": [1, 2], "a": 1})
     assert checkpoint.digest({"a": 1}) != checkpoint.digest({"a": 2})
+
+
+def test_lighting_and_lobe_come_back_to_the_last_bit(tmp_path):
+    rng = np.random.default_rng(1)
+    light = DistantLight(np.array([0.6, 0.0, 0.8]), 0.01, rng.random(3))
+    estimate = ReflectanceEstimate(
+        diffuse=rng.random((4, 4, 3), dtype=np.float32),
+        specular=rng.random((4, 4), dtype=np.float32),
+        confidence=rng.random((4, 4), dtype=np.float32),
+        illumination=Illumination(rng.normal(size=(9, 3)), (light,), 0.1),
+        lobe=Lobe(150.0, 8.0),
+        shading_model="shadowed",
+        report=Report("converged"),
+    )
+    checkpoint.save(tmp_path, "reflectance", estimate, "key")
+    back = checkpoint.load(tmp_path, "reflectance", ReflectanceEstimate, "key")
+    np.testing.assert_array_equal(back.illumination.unknowns, estimate.illumination.unknowns)
+    np.testing.assert_array_equal(back.illumination.lights[0].direction, light.direction)
+    assert back.illumination.lights[0].radius == light.radius and back.illumination.ambient == 0.1
+    assert back.lobe == estimate.lobe and back.shading_model == "shadowed"
+    np.testing.assert_array_equal(back.diffuse, estimate.diffuse)
