@@ -134,6 +134,8 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--motion", choices=["poses", "talk", "turn"], default="poses", help="talk and turn: 30 timesteps are a second"
     )
+    p.add_argument("--outside", type=_real, default=0.5, help="millimetres by which heads leave the model's span")
+    p.add_argument("--landmark-bias", type=_real, default=0.0, help="millimetres; a detector's is about 2 (default: 0)")
     p.add_argument(
         "--head", type=_path, help="a scanned head with texture coordinates (.glb, .obj, .ply), moved rigidly"
     )
@@ -170,6 +172,7 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("capture", type=_path)
     p.add_argument("--out", type=_path, required=True, help="result folder to write")
     p.add_argument("--config", type=_path, help="TOML file with tables geometry, reflectance, shape, normals, mesh")
+    p.add_argument("--preset", choices=["default", "paper"], help="paper: the paper as written")
     p.add_argument("--model", default="builtin", help="morphable model: a path or builtin (default)")
     p.add_argument("--cameras", type=_names, help="cameras to use, e.g. left,right; default: the first two")
     p.add_argument("--timesteps", type=_timesteps, help="e.g. 0,1,2,3 or 0-3; default: the first four")

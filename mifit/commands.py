@@ -9,7 +9,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mifit.config import FitConfig, NormalsConfig, from_mapping
+from mifit.config import PRESETS, FitConfig, NormalsConfig, from_mapping
 from mifit.console import console_progress
 from mifit.core.files import check_file, write_text
 from mifit.core.limits import MAX_SETTINGS_BYTES
@@ -90,6 +90,7 @@ def demo(arguments: Namespace) -> None:
             capture=capture,
             out=out,
             config=None,
+            preset=None,
             model=DEMO["model"],
             cameras=["left", "right"],
             timesteps=None,
@@ -138,6 +139,8 @@ def synth(arguments: Namespace) -> None:
         spp=arguments.spp,
         tone=arguments.tone,
         motion=arguments.motion,
+        outside=arguments.outside,
+        landmark_bias=arguments.landmark_bias,
         progress=console_progress(arguments.quiet),
     )
     print(f"Capture: {arguments.out}")
@@ -145,20 +148,15 @@ def synth(arguments: Namespace) -> None:
 
 def _synth_scan(arguments: Namespace) -> None:
     """A capture of a scanned head."""
-    for name, default in (("subjects", 1), ("motion", "poses"), ("tone", None)):
+    for name, default in (("subjects", 1), ("motion", "poses"), ("tone", None), ("landmark_bias", 0.0)):
         if getattr(arguments, name) != default:
-            raise InputError(f"--{name}: found with --head, whose shape and skin are the scan's; leave it out")
-    maps = {}
-    for text in arguments.maps:
-        name, separator, file = text.partition("=")
-        if not (separator and file):
-            raise InputError(f"--maps {text}: expected NAME=FILE, such as albedo=colour.jpg")
-        maps[name] = Path(file)
+            option = name.replace("_", "-")
+            raise InputError(f"--{option}: found with --head, whose shape and skin are the scan's; leave it out")
     from mifit.synth.compose import place_cameras, read_environment
-    from mifit.synth.scanned import ScannedHead, synthesize_scan
+    from mifit.synth.scanned import ScannedHead, maps_of, synthesize_scan
     from mifit.synth.studio import studio_environment
 
-    head = ScannedHead.load(arguments.head, maps, arguments.unit_mm, arguments.flip_v)
+    head = ScannedHead.load(arguments.head, maps_of(arguments.maps), arguments.unit_mm, arguments.flip_v)
     environment = read_environment(arguments.env) if arguments.env else studio_environment(arguments.seed)
     relit = {path.stem: read_environment(path) for path in arguments.relit}
     _use_variant(arguments)
@@ -168,10 +166,10 @@ def _synth_scan(arguments: Namespace) -> None:
         place_cameras(arguments.width, arguments.height),
         environment,
         relit,
-        timesteps=arguments.timesteps,
-        seed=arguments.seed,
-        spp=arguments.spp,
-        progress=console_progress(arguments.quiet),
+        arguments.timesteps,
+        arguments.seed,
+        arguments.spp,
+        console_progress(arguments.quiet),
     )
     print(f"Capture: {arguments.out}; it has no landmarks yet: mifit landmarks {arguments.out}")
 
@@ -218,7 +216,11 @@ def fit(arguments: Namespace) -> None:
     check_ours(out, arguments.force)
     if arguments.config:
         check_file(arguments.config, MAX_SETTINGS_BYTES, "configuration file")
-    config = FitConfig.load(arguments.config) if arguments.config else FitConfig()
+    if arguments.config and arguments.preset:
+        raise InputError(
+            f"--preset {arguments.preset}: found with --config {arguments.config}, expected one of the two"
+        )
+    config = FitConfig.load(arguments.config) if arguments.config else PRESETS[arguments.preset or "default"]()
     capture = mifit.Capture.load(arguments.capture)
     model = mifit.MorphableModel.load(arguments.model)
     _use_variant(arguments)

@@ -37,6 +37,11 @@ class GeometryConfig:
         30.0, "objective paper: residual from which a pixel counts as an outlier", "of 255", above=0, most=WEIGHT
     )
     albedo_prior: float = number(1.0, "objective paper: factor on the prior of the albedo", least=0, most=WEIGHT)
+    as_written: bool = flag(
+        False,
+        "objective paper: the paper's terms and no others, so no robust penalty, no contour that slides, no pull of "
+        "the ambient term, no blur, and light and albedo as they come",
+    )
     surface_points: int = number(3000, "points of the surface that are compared between images", least=1, most=200_000)
     texture_weight: float = number(
         0.03, "independent measurements per surface point and image: neighbours share pixels", above=0, most=WEIGHT
@@ -64,7 +69,7 @@ class ShapeConfig:
     )
 
 
-SHADINGS = ["auto", "paper", "prefiltered", "shadowed", "keyed"]
+SHADINGS = ["auto", "paper", "printed", "prefiltered", "shadowed", "keyed"]
 """What ``shading`` may be; registering a shading model (``appearance.models``) adds its name."""
 
 
@@ -150,6 +155,7 @@ class NormalsConfig:
         1e-3, "the paper's w1, for images and normal maps in 8-bit steps", least=0, most=WEIGHT
     )
     magnitude_weight: float = number(3.0, "the paper's w2, likewise", least=0, most=WEIGHT)
+    robust: bool = flag(True, "give outliers less weight; false: plain squares, as in the paper")
     max_iterations: int = number(100, "iterations at most", least=1, most=100_000)
 
 
@@ -187,3 +193,28 @@ class FitConfig:
     def load(cls, path: str | Path) -> FitConfig:
         """Read a TOML file with one table per stage; raises InputError that names file, key and value."""
         return from_mapping(cls, read_toml(path), str(path))
+
+    @classmethod
+    def paper(cls) -> FitConfig:
+        """The paper as it is written: its terms, weights, units, starts and order, and nothing added (docs/paper.md).
+
+        Its smoothness weight 0.001 is for colours and maps of 0..255: E_O grows with their square, E_H with them, so
+        that with values of 0..1 it is 0.001 / 255.
+        """
+        return cls(
+            geometry=GeometryConfig(objective="paper", as_written=True),
+            surface=SurfaceConfig(enabled=False),
+            reflectance=ReflectanceConfig(
+                solver="adam",
+                shading="printed",
+                robust=False,
+                smoothness_weight=0.001 / 255.0,
+                specular_smoothness=1.0,
+                max_iterations=60,
+            ),
+            normals=NormalsConfig(solver="adam", magnitude_weight=0.3, robust=False),
+        )
+
+
+PRESETS = {"default": FitConfig, "paper": FitConfig.paper}
+"""What ``mifit fit --preset`` knows."""

@@ -70,12 +70,35 @@ def test_failed_subjects_stay_in_the_table():
         "subject": 0,
         "light": "studio",
         "tone": 0.25,
-        "seconds": 3.0,
+        "outside_mm": 0.5,
+        "seconds": {"full": 3.0},
         "methods": {"pca": figures, "diffuse": {**figures, "psnr": 2.0}, "full": {**figures, "psnr": 4.5}},
-        "truth": dict.fromkeys(table1.TRUTHS, 0.5),
+        "truth": {"full": dict.fromkeys(table1.TRUTHS, 0.5), "diffuse": dict.fromkeys(table1.TRUTHS, 0.25)},
+        "unconverged": {"full": ["geometry"], "diffuse": []},
     }
     other = {**row, "subject": 2, "methods": {**row["methods"], "full": {**figures, "psnr": 5.5}}}
+    other["unconverged"] = {"full": [], "diffuse": []}
     text = table1.markdown([row, other], {1: "InputError: no landmarks"})
     assert "2 of 3 subjects" in text and "| 1 | failed: InputError: no landmarks |" in text
-    assert "4.00 dB above `pca` and 3.00 dB above `diffuse`" in text and "5.00 ± 0.50" in text
+    assert "4.00 dB above `pca` and 3.00 dB above a refit without specular" in text and "5.00 ± 0.50" in text
+    assert "| `full`: everything |" in text and "| 1 of 2 |" in text and "| 0 of 2 |" in text
+    assert "true geometry is used here" in text and "| geometry | 3 |" in text
+    tables = [part.splitlines() for part in text.split("\n\n") if part.startswith("|")]
+    assert len(tables) == 4
+    for lines in tables:
+        assert len({line.count("|") for line in lines}) == 1
     assert "0 of 1 subjects" in table1.markdown([], {0: "RuntimeError: x"})
+
+
+def test_one_table_has_one_commit(tmp_path, monkeypatch):
+    rows = iter([{"subject": 0, "commit": "a", "methods": {"full": {"psnr": 1.0}}},
+                 {"subject": 1, "commit": "b", "methods": {"full": {"psnr": 1.0}}}])  # fmt: skip
+    monkeypatch.setattr(table1, "run_subject", lambda *arguments: next(rows))
+    monkeypatch.setattr(table1, "RESULTS", tmp_path)
+    with pytest.raises(RuntimeError, match="judged at the commits a, b"):
+        table1.run(2, 1, tmp_path, table1.REDUCED, "builtin", 64, "table1")
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_third_head_is_far_outside_the_model():
+    assert [table1.outside(i) > 2 for i in range(15)].count(True) == 5

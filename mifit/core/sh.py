@@ -140,6 +140,11 @@ def cosine_coefficients(order: int) -> Array:
     return out
 
 
+def radiance_of_shading(shading: ArrayLike) -> Array:
+    """(9, 3) radiance under which a white Lambertian surface has a shading: the paper's l_k to incident light."""
+    return np.asarray(shading, dtype=np.float64) * (np.pi / cosine_coefficients(3)[bands(3)])[:, None]
+
+
 def lobe_coefficients(exponent: float, order: int) -> Array:
     """(B,) factors by which Blinn-Phong's lobe scales each band when it is convolved about the mirror direction.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeVar
 
@@ -13,7 +12,7 @@ from mifit.appearance.illumination import Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
-from mifit.core.sh import SHLighting, bands, cosine_coefficients
+from mifit.core.sh import SHLighting, radiance_of_shading
 from mifit.core.subdivision import split_faces
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
@@ -112,7 +111,7 @@ class Result:
         """What lights the face; without stage 2, the radiance whose irradiance gives stage 1's shading."""
         if self.reflectance is not None:
             return self.reflectance.illumination
-        radiance = self.geometry.shading * (math.pi / cosine_coefficients(3)[bands(3)])[:, None]
+        radiance = radiance_of_shading(self.geometry.shading)
         return Illumination(radiance, ambient=self.geometry.ambient)
 
     @property

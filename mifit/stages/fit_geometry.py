@@ -83,10 +83,11 @@ def fit_geometry(
     start = fit_landmarks(model, views, state, config.landmark_noise, priors_of(config))
     journal.phase("landmarks", _usable(start.solution, "landmarks"))
     config = replace(config, landmark_noise=start.noise)
+    used = views if config.as_written else start.views  # the paper's landmarks are fixed vertices
 
     def refine(gains: Mapping[str, Sequence[float]]) -> GeometryEstimate:
         return _refine_and_pack(
-            capture, model, cameras, timesteps, config, seed, journal, start.state, start.views, None, None, gains
+            capture, model, cameras, timesteps, config, seed, journal, start.state, used, None, None, gains
         )
 
     found = refine({})
@@ -222,7 +223,9 @@ def _refine_and_pack(
         for _ in range(config.rounds):
             state, solution = refine_by_texture(model, state, views, visibility, points, config, reference)
             journal.phase("texture", _usable(solution, "images"))
-    if fixed is not None:
+    if config.objective == "paper" and config.as_written and fixed is None:
+        coefficients = appearance
+    elif fixed is not None:
         coefficients = np.concatenate([fixed.albedo, fixed.shading.ravel(), [fixed.ambient]])
     else:
         coefficients = _appearance(model, state, visibility, config, seed, journal)

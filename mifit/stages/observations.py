@@ -163,7 +163,7 @@ class Surface:
         self.texels: TexelMap = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
         if not len(self.texels.index):
             raise InputError(f"model {model.name}: its face area covers no texel of a map of {size} texels a side")
-        self.trust = trust
+        self.trust, self.geometry = trust, geometry
         self.faces = model.faces
         self.vertices = [np.asarray(v, dtype=np.float64) for v in geometry.vertices]
         self.normals = [vertex_normals(v, model.faces) for v in self.vertices]

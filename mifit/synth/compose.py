@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.capture.landmark_files import Landmarks, write_landmarks
+from mifit.capture.landmark_files import write_landmarks
 from mifit.capture.transforms import MIN_SIDE, Shot, View, write_transforms
 from mifit.core.camera import Camera
 from mifit.core.files import replacing, write_text
@@ -33,18 +33,18 @@ from mifit.morphable import MorphableModel
 from mifit.progress import Progress, silent
 from mifit.render.gbuffer import SurfaceScene
 from mifit.render.pathtrace import Material, PathTracer, Surface
-from mifit.synth import head
+from mifit.synth import detector, head
 from mifit.synth.skin import SkinMaps, SkinStyle, paint
 from mifit.synth.studio import studio_environment
 
 DISTANCE = 72.0
 """Centimetres from the cameras to the head."""
+MOST_MM = 20.0
+"""Of what moves a head or a landmark away from the model."""
 FULL_WELL = 12000.0
 """Electrons of a pixel at linear value 1: shot noise."""
 READ_NOISE = 0.0012
 """Standard deviation of the sensor's read noise in linear image units."""
-DETECTOR_NOISE = 0.8
-"""Pixels of landmark error at a width of 680; proportional to the width."""
 
 
 def synthesize(
@@ -59,6 +59,8 @@ def synthesize(
     spp: int = 64,
     tone: float | None = None,
     motion: head.Motion = "poses",
+    outside: float = head.OUTSIDE,
+    landmark_bias: float = 0.0,
     progress: Progress = silent,
 ) -> Path:
     """Render a capture of an unseen subject, with ground truth beside it.
@@ -87,6 +89,11 @@ def synthesize(
         Skin from 0, fair, to 1, deep; drawn for each subject by default.
     motion : {"poses", "talk", "turn"}
         How the head moves, see `head.draw_motion`.
+    outside : float
+        Millimetres by which heads leave what the model spans, see `head.neutral_shape`.
+    landmark_bias : float
+        Millimetres, standard deviation of each coordinate of a landmark's bias, see `detector.draw_bias`; by default
+        landmarks are true but for noise.
     progress : Progress
 
     Returns
@@ -110,6 +117,9 @@ def synthesize(
         ("seed", seed, 0, MAX_SEED),
     ):
         check_range(name, value, low, high)
+    for name, length in (("outside", outside), ("landmark_bias", landmark_bias)):
+        if not 0 <= length <= MOST_MM:
+            raise InputError(f"{name}: found {length}, expected 0 to {MOST_MM:g} mm")
     if tone is not None and not 0 <= tone <= 1:
         raise InputError(f"tone: found {tone}, expected 0 (fair) to 1 (deep)")
     shape = MorphableModel.load(model)
@@ -119,7 +129,8 @@ def synthesize(
     map_size = 1024 if min(width / 680, height / 480) > 0.6 else 512
     for i in range(subjects):
         folder = out if subjects == 1 else out / f"subject_{i:02d}"
-        subject = _draw_subject(shape, SkinStyle.draw(seed + i, tone), timesteps, map_size, motion)
+        subject = _draw_subject(shape, SkinStyle.draw(seed + i, tone), timesteps, map_size, motion, outside)
+        subject = dataclasses.replace(subject, landmark_bias=landmark_bias)
         light = studio_environment(seed + i) if radiance is None else radiance
         start = i * (timesteps + 1)
         _write_capture(
@@ -174,10 +185,11 @@ class _Subject:
     skin: dict[str, SkinMaps]
     parts: dict[str, SplitMesh]
     eyes: list[NDArray[np.float64]]
+    landmark_bias: float
 
 
 def _draw_subject(
-    model: MorphableModel, style: SkinStyle, timesteps: int, map_size: int, motion: head.Motion
+    model: MorphableModel, style: SkinStyle, timesteps: int, map_size: int, motion: head.Motion, outside: float
 ) -> _Subject:
     seed = style.seed
     scale = model.unit_mm / 10.0  # the world is in centimetres
@@ -197,7 +209,7 @@ def _draw_subject(
             uv, faces_uv = head.wrap_uv(uv, faces_uv)
         skin[name] = paint(rasterize_uv(uv, faces_uv, map_size), mean_mm, normals, faces, model.landmarks, style)
         parts[name] = split_at_seams(MeshPart(faces, faces_uv, uv))
-    neutral = head.neutral_shape(model, seed)
+    neutral = head.neutral_shape(model, seed, outside)
     centre = neutral[model.landmarks[27:48]].mean(axis=0) - np.array([0.0, 0.0, 55.0 / model.unit_mm])
     eyes = (
         []
@@ -208,7 +220,7 @@ def _draw_subject(
         ]
     )
     poses = head.draw_motion(model, timesteps, seed, scale, centre, motion)
-    return _Subject(model, seed, neutral, poses, scale, skin, parts, eyes)
+    return _Subject(model, seed, neutral, poses, scale, skin, parts, eyes, 0.0)
 
 
 def _write_capture(
@@ -225,6 +237,7 @@ def _write_capture(
     exposure = _exposure(tracer, subject, cameras[0])
     _write_maps(folder / "truth" / "maps.npz", subject.skin["face"])
     visibility = SurfaceScene(subject.neutral, subject.model.faces)
+    bias = detector.draw_bias(subject.seed, subject.landmark_bias / 10.0)  # mm -> cm
     shots = []
     advance(1)
     for t, pose in enumerate(subject.poses):
@@ -243,7 +256,8 @@ def _write_capture(
             )
             assert shot.landmarks is not None
             write_image(shot.image, expose(image[..., :3] * exposure, rng))
-            write_landmarks(shot.landmarks, _detect(subject.model, world, camera, visibility, rng))
+            marks = detector.mark(subject.model, world, camera, visibility, rng, bias @ pose.rotation.T)
+            write_landmarks(shot.landmarks, marks)
             shots.append(shot)
         with replacing(folder / "truth" / f"{t:04d}.npz") as temporary:
             np.savez_compressed(
@@ -314,19 +328,6 @@ def expose(radiance: NDArray, rng: np.random.Generator) -> NDArray[np.float32]:
     signal = np.clip(radiance, 0.0, None)
     noisy = signal + rng.standard_normal(signal.shape) * np.sqrt(signal / FULL_WELL + READ_NOISE**2)
     return np.clip(noisy, 0.0, 1.0).astype(np.float32)
-
-
-def _detect(
-    model: MorphableModel, world: NDArray, camera: Camera, scene: SurfaceScene, rng: np.random.Generator
-) -> Landmarks:
-    """True landmarks as a detector would find them: with noise, and knowing which are hidden."""
-    points = world[model.landmarks]
-    normals = vertex_normals(world, model.faces)[model.landmarks]
-    pixels = camera.project(points)
-    facing = np.einsum("nk,nk->n", normals, camera.position - points) > 0
-    inside = (pixels > 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
-    noise = DETECTOR_NOISE * camera.width / 680 * rng.standard_normal(pixels.shape)
-    return Landmarks(pixels + noise, facing & inside & scene.visible_from(points, camera.position))
 
 
 def _write_maps(path: Path, maps: SkinMaps) -> None:

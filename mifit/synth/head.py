@@ -31,17 +31,21 @@ class HeadPose:
     translation: NDArray[np.float64]
 
 
-def neutral_shape(model: MorphableModel, seed: int) -> NDArray[np.float64]:
+OUTSIDE = 0.5
+"""Millimetres by which a subject's surface leaves the model's span by default."""
+
+
+def neutral_shape(model: MorphableModel, seed: int, outside: float = OUTSIDE) -> NDArray[np.float64]:
     """(V, 3) vertices of a subject without expression, object space.
 
     Identity coefficients are drawn from the model's prior at 0.7 standard deviations, then every vertex moves
-    along its normal by smooth noise of 0.5 mm, which no mode of the model spans.
+    along its normal by smooth noise of ``outside`` millimetres, most of which no mode of the model spans.
     """
     rng = np.random.default_rng([seed, 11])
     identity = 0.7 * np.clip(rng.standard_normal(model.n_identity), -2.0, 2.0)
     shape = np.asarray(model.shape(identity), dtype=np.float64)
     noise = smooth_noise(model.mean * model.unit_mm, 28.0, rng, octaves=2)
-    return shape + (0.5 / model.unit_mm) * noise[:, None] * vertex_normals(shape, model.faces)
+    return shape + (outside / model.unit_mm) * noise[:, None] * vertex_normals(shape, model.faces)
 
 
 Motion = Literal["poses", "talk", "turn"]

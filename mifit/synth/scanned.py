@@ -113,6 +113,17 @@ class ScannedHead:
         return self.vertices @ pose[0].T + pose[1]
 
 
+def maps_of(texts: Sequence[str]) -> dict[str, Path]:
+    """``NAME=FILE`` texts as a dictionary; InputError for any other text."""
+    maps = {}
+    for text in texts:
+        name, separator, file = text.partition("=")
+        if not (separator and file):
+            raise InputError(f"--maps {text}: expected NAME=FILE, such as albedo=colour.jpg")
+        maps[name] = Path(file)
+    return maps
+
+
 def _read_maps(files: Mapping[str, str | Path]) -> dict[str, NDArray[np.float32]]:
     maps = {}
     for name, path in files.items():

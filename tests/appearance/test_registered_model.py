@@ -117,5 +117,5 @@ def test_the_integrator_knows_it(variant, sheen):
 def test_an_unknown_model_is_named(sheen):
     with pytest.raises(InputError, match=r"found 'phong', expected one of .*'sheen'"):
         ReflectanceConfig(shading="phong")
-    with pytest.raises(InputError, match="found 'phong', expected one of paper, prefiltered, shadowed, sheen"):
+    with pytest.raises(InputError, match="found 'phong', expected one of paper, printed, prefiltered, shadowed, sheen"):
         models.get("phong")

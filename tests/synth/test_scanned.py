@@ -196,3 +196,35 @@ def test_other_folders_are_not_taken_for_digital_emily(tmp_path):
     scene.write_text("LookAt 1 2 3 4 5 6 0 1 0\nWorldBegin")
     with pytest.raises(InputError, match="found no float fov"):
         read_camera(scene, "c1", 10, 10)
+
+
+def test_a_detectors_bias_is_the_same_in_all_images_of_a_head(coarse, variant):
+    from mifit.render.gbuffer import SurfaceScene
+    from mifit.synth import detector
+    from mifit.synth.compose import place_cameras
+
+    bias = detector.draw_bias(5, 0.2)
+    assert np.array_equal(bias, detector.draw_bias(5, 0.2)) and not np.array_equal(bias, detector.draw_bias(6, 0.2))
+    world = coarse.mean.astype(float) * coarse.unit_mm / 10
+    scene, pixels = SurfaceScene(world, coarse.faces), {}
+    for camera in place_cameras(680, 480):
+        off = [detector.mark(coarse, world, camera, scene, np.random.default_rng(i), bias).points for i in range(40)]
+        true = camera.project(world[coarse.landmarks])
+        pixels[camera.name] = np.mean(off, axis=0) - true
+        scatter = np.std(off, axis=0).mean()
+        assert scatter == pytest.approx(detector.NOISE, rel=0.1)
+    shown = np.linalg.norm(pixels["third"], axis=1).mean()
+    assert shown == pytest.approx(1.25 * 0.2 * 1530 / 72, rel=0.15)
+    # One displacement in space explains what all cameras show.
+    for camera in place_cameras(680, 480):
+        expected = camera.project(world[coarse.landmarks] + bias) - camera.project(world[coarse.landmarks])
+        assert np.abs(pixels[camera.name] - expected).max() < 0.8
+
+
+def test_heads_leave_the_model_by_the_stated_length(coarse):
+    near, far = (heads.neutral_shape(coarse, 2, outside) for outside in (0.0, 2.0))
+    gap = np.linalg.norm(far - near, axis=1) * coarse.unit_mm
+    assert np.sqrt((gap**2).mean()) == pytest.approx(2.0, rel=0.35)
+    rest = near - coarse.mean
+    modes = coarse.identity.reshape(-1, coarse.n_identity).astype(float)
+    assert np.abs(rest.ravel() - modes @ np.linalg.lstsq(modes, rest.ravel(), rcond=None)[0]).max() < 1e-4

@@ -7,7 +7,7 @@ instance. Fits, renders, relighting and the ``shdirect`` plugin then know it by 
 from __future__ import annotations
 
 from mifit.appearance.models.base import ShadingModel, Transfer
-from mifit.appearance.models.paper import PaperModel
+from mifit.appearance.models.paper import PaperModel, PrintedModel
 from mifit.appearance.models.prefiltered import PrefilteredModel
 from mifit.appearance.models.shadowed import ShadowedModel
 from mifit.config import SHADINGS
@@ -39,5 +39,5 @@ def get(name: str | ShadingModel) -> ShadingModel:
     return _MODELS[name]
 
 
-for _model in (PaperModel(), PrefilteredModel(), ShadowedModel()):
+for _model in (PaperModel(), PrintedModel(), PrefilteredModel(), ShadowedModel()):
     register(_model)

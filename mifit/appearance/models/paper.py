@@ -11,6 +11,9 @@ from mifit.appearance.models.base import ShadingModel, Transfer
 GUARD = 0.1
 """Cosine between normal and dominant direction below which the paper's L(p) is faded out."""
 
+SMALLEST = 1e-3
+"""The same where nothing is to be added to the paper: as small as single precision bears."""
+
 
 class PaperModel(ShadingModel):
     """Ambient, SH irradiance, and the plain lobe ``(n . h)^m`` under a light in the dominant direction d.
@@ -22,6 +25,7 @@ class PaperModel(ShadingModel):
     """
 
     name = "paper"
+    guard = GUARD
     turns = True
     bands = 3
     exponent = 5.0
@@ -33,10 +37,19 @@ class PaperModel(ShadingModel):
     ) -> Transfer:
         """Both parts have the diffuse transfer; the specular one times `paper_specular`."""
         diffuse = diffuse_transfer(n, lobe.order)
-        return Transfer(diffuse, diffuse, paper_specular(n, v, dominant_direction(coefficients), lobe.exponent))
+        return Transfer(
+            diffuse, diffuse, paper_specular(n, v, dominant_direction(coefficients), lobe.exponent, self.guard)
+        )
 
 
-def paper_specular(n: Any, v: Any, direction: Any, exponent: Any) -> Any:
+class PrintedModel(PaperModel):
+    """The paper's shading as it is printed: ``L(p)`` is the quotient itself but for where its divisor vanishes."""
+
+    name = "printed"
+    guard = SMALLEST
+
+
+def paper_specular(n: Any, v: Any, direction: Any, exponent: Any, guard: float = GUARD) -> Any:
     """Factor by which the paper's specular term scales the shading: ``(n . h)^m / (n . d)``, guarded."""
     import drjit as dr
 
@@ -45,4 +58,4 @@ def paper_specular(n: Any, v: Any, direction: Any, exponent: Any) -> Any:
     cos_h = dr.dot(n, h * dr.rsqrt(dr.maximum(dr.squared_norm(h), 1e-8)))
     # The power of a floor instead of zero: its logarithm, and so the derivative by the exponent, stays finite.
     power = dr.select(cos_h > 0.0, dr.power(dr.clip(cos_h, 1e-4, 1.0), exponent), 0.0)
-    return power * c / (dr.square(c) + GUARD * GUARD)
+    return power * c / (dr.square(c) + guard * guard)

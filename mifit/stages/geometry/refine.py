@@ -201,9 +201,17 @@ def paper_problem(
     # w_l / |F_view| per view
     weighted = tuple(replace(view, weight=config.landmark_weight / max(len(view.index), 1)) for view in views)
     priors = {name: config.prior_weight for name in ("identity", "albedo", "expression")}
-    priors["ambient"] = AMBIENT_PRIOR * WHITE**2
+    if not config.as_written:
+        priors["ambient"] = AMBIENT_PRIOR * WHITE**2
     if layout.log_scale:
         priors["log_scale"] = priors_of(config)["log_scale"]
-    pixels = visibility.pixels(full, config.pixels, config.texture_sigma, seed)
-    term = LandmarkTerm(weighted, OUTLIER_PIXELS * config.landmark_noise)
-    return RenderingProblem(model, layout, full.frames, pixels, term, config.robust_colour, priors), x
+    blur, robust_pixels, robust_colour = (
+        config.texture_sigma,
+        OUTLIER_PIXELS * config.landmark_noise,
+        config.robust_colour,
+    )
+    if config.as_written:
+        blur, robust_pixels, robust_colour = 0.0, np.inf, np.inf
+    pixels = visibility.pixels(full, config.pixels, blur, seed)
+    term = LandmarkTerm(weighted, robust_pixels)
+    return RenderingProblem(model, layout, full.frames, pixels, term, robust_colour, priors), x

@@ -227,7 +227,7 @@ def frame_problem(
         shade,
         config.laplacian_weight * NORMAL_STEPS / IMAGE_STEPS**2,
         config.magnitude_weight * (NORMAL_STEPS / IMAGE_STEPS) ** 2,
-        OUTLIER * max(residual_scale(views, shade), 1e-4),
+        OUTLIER * max(residual_scale(views, shade), 1e-4) if config.robust else np.inf,
         prior_correction,
     )
     return problem, rows, base

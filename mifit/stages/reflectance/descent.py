@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mifit.appearance import models
 from mifit.appearance.lobe import Lobe
 from mifit.config import ReflectanceConfig
+from mifit.core.sh import radiance_of_shading
 from mifit.progress import Progress
 from mifit.solve import Outcome
 from mifit.stages.observations import Observations, Surface
@@ -33,22 +34,25 @@ def fit_adam(
 ) -> tuple[Fitted, dict, tuple[str, ...]]:
     """Minimise the paper's objective by Adam; ``shading = auto`` means the paper's model.
 
-    Lighting starts from a Lambertian least-squares fit with the model's albedo, as stage 1 leaves it, and the
-    specular map from zero.
+    Without robust weights lighting and ambient start from stage 1's, as in the paper; with them from a Lambertian
+    least-squares fit with the model's albedo. The specular map starts from zero.
     """
     name = "paper" if config.shading == "auto" else config.shading
     model = models.get(candidate(name).model)
     forward = plain_forward(model, config.exponent or PAPER_EXPONENT, config, surface)
     seen = surface.observe(np.arange(len(surface)))
-    subset = surface.sample(2000, np.random.default_rng(seed))
-    lambert = Forward.of(models.get("prefiltered"), 3, Lobe(PAPER_EXPONENT))
-    start = fit_lighting(seen.take(subset), lambert, albedo[subset], config, 1, specular=0.0)
-    radiance = np.zeros((forward.unknowns, 3))
-    radiance[:9] = start.light
+    radiance, ambient = np.zeros((forward.unknowns, 3)), 0.0
+    if config.robust or not surface.geometry.shading.any():
+        subset = surface.sample(2000, np.random.default_rng(seed))
+        lambert = Forward.of(models.get("prefiltered"), 3, Lobe(PAPER_EXPONENT))
+        radiance[:9] = fit_lighting(seen.take(subset), lambert, albedo[subset], config, 1, specular=0.0).light
+    else:
+        radiance[:9] = radiance_of_shading(surface.geometry.shading)
+        ambient = max(surface.geometry.ambient, 0.0) if model.has_ambient else 0.0
     steps = config.max_iterations * STEPS_PER_ITERATION
     result = minimize_by_adam(
         gather_samples(surface, seen, forward, albedo, config),
-        forward.lit(radiance),
+        forward.lit(radiance, ambient),
         config.specular_difference_weight,
         (config.smoothness_weight, config.smoothness_weight * config.specular_smoothness),
         steps,
