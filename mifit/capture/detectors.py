@@ -127,7 +127,13 @@ class Lbf:
 
 
 def _cascade(path: Path) -> Any:
-    cascade = cv2.CascadeClassifier(str(path))
+    try:
+        cascade = cv2.CascadeClassifier(str(path))
+        empty = cascade.empty()
+    except (cv2.error, SystemError):
+        empty = True
+    if empty:
+        raise InputError(f"{path}: not a readable Haar cascade; expected one as OpenCV ships them")
     return lambda image: cascade.detectMultiScale(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), 1.1, 3)
 
 

@@ -186,14 +186,24 @@ def _room(path: Path, temporary: Path) -> Iterator[None]:
 
 
 def cache_folder() -> Path:
-    """Where mifit keeps what it makes once: ``MIFIT_CACHE``, else ``mifit`` in the user's cache folder."""
-    if os.environ.get("MIFIT_CACHE"):
-        return Path(os.environ["MIFIT_CACHE"])
-    base = os.environ.get("XDG_CACHE_HOME")
+    """Where mifit keeps what it makes once: ``MIFIT_CACHE``, else ``mifit`` in the user's cache folder.
+
+    Variables that are empty count as unset.
+
+    Raises
+    ------
+    InputError
+        A variable that isn't an absolute path: the place would depend on where a program runs.
+    """
+    named, base = os.environ.get("MIFIT_CACHE"), os.environ.get("XDG_CACHE_HOME")
     try:
-        return Path(base) / "mifit" if base else Path.home() / ".cache" / "mifit"
+        folder = Path(named) if named else (Path(base) if base else Path.home() / ".cache") / "mifit"
     except RuntimeError:  # no home folder
-        return Path(os.devnull) / "mifit"
+        folder = Path(os.devnull).absolute() / "mifit"
+    if not folder.is_absolute():
+        name = "MIFIT_CACHE" if named else "XDG_CACHE_HOME"
+        raise InputError(f"{name}: found {named or base!r}, expected an absolute path")
+    return folder
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -206,3 +206,28 @@ def test_a_full_disk_behind_standard_output() -> None:
     with open("/dev/full", "w") as full:
         done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and "No space left" in done.stderr
+
+
+# -- the cache folder -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", ["", "somewhere/else"])
+def test_the_cache_is_never_in_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: str) -> None:
+    from mifit.core.files import cache_folder
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MIFIT_CACHE", value)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    if value:
+        with pytest.raises(InputError, match="MIFIT_CACHE: found 'somewhere/else', expected an absolute path"):
+            cache_folder()
+    else:
+        assert cache_folder() == tmp_path / "cache" / "mifit"
+
+
+def test_a_broken_cascade_is_named(tmp_path: Path) -> None:
+    from mifit.capture.detectors import _cascade
+
+    (tmp_path / "c.xml").write_text("<opencv_storage><a/></opencv_storage>")
+    with pytest.raises(InputError, match=r"c\.xml: not a readable Haar cascade"):
+        _cascade(tmp_path / "c.xml")
