@@ -18,12 +18,22 @@ from mifit.core.files import FULL
 from mifit.core.limits import MAX_RENDERED_PIXELS, MAX_SAMPLES, MAX_SEED, MAX_TIMESTEPS
 from mifit.errors import InputError, MifitError
 
+LONGEST = 1000
+"""Characters of a message; one that quotes more of an input says nothing."""
+
 
 class _Parser(argparse.ArgumentParser):
     """Reports bad usage in one line."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+        self.exit(2, f"{self.prog}: {_one_line(message)}; see {self.prog} --help\n")
+
+
+def _one_line(text: str) -> str:
+    """A message as one line of a terminal: no control characters, and not without end."""
+    line = " ".join(text.split())
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+    return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
 
 
 def _names(text: str) -> list[str]:
@@ -264,7 +274,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Without ``argv`` this is the program itself, which owns its process: what C libraries print is dropped.
     """
-    arguments = build_parser().parse_args(argv)
+    parser = build_parser()
+    for word in sys.argv[1:] if argv is None else argv:
+        if word.startswith("--") and word.endswith("=--"):  # argparse would make an empty list of it
+            parser.error(f"argument {word[:-3]}: found '--', expected a value")
+    arguments = parser.parse_args(argv)
     if argv is None and not arguments.debug:
         drop_chatter()
     try:
@@ -291,13 +305,13 @@ def _run(command: Callable[[Any], int | None], arguments: argparse.Namespace) ->
 
 def _report(error: Exception) -> int:
     """One line on stderr and the exit code that goes with the error."""
-    message = " ".join(str(error).split())
+    message = _one_line(str(error))
     if isinstance(error, MifitError):
         print(f"mifit: {message}", file=sys.stderr)
         return 2 if isinstance(error, InputError) else 1
     if isinstance(error, OSError) and (error.filename or error.errno in FULL):
         place = error.filename or "an output file"
-        print(f"mifit: {place}: {error.strerror}; what was there is unchanged", file=sys.stderr)
+        print(_one_line(f"mifit: {place}: {error.strerror}; what was there is unchanged"), file=sys.stderr)
         return 2
     if isinstance(error, MemoryError):
         print("mifit: not enough memory; use fewer timesteps, smaller images or smaller maps", file=sys.stderr)

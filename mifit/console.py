@@ -33,7 +33,7 @@ def drop_chatter() -> None:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when FFmpeg is first used
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # read when OpenCV is loaded
     if "cv2" in sys.modules:
-        sys.modules["cv2"].setLogLevel(0)
+        sys.modules["cv2"].utils.logging.setLogLevel(0)
     set_decoding_context(no_chatter)
 
 

@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import itertools
 import math
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -308,7 +309,7 @@ def _resolved(experiment: Experiment, folder: Path, where: str) -> Experiment:
         raise InputError(f"{where}: [reference] needs [render]")
 
     def absolute(text: str) -> str:
-        return str((folder / text).resolve())
+        return os.path.abspath(folder / text)  # links stay: following a loop of them raises
 
     def model(text: str) -> str:
         return text if text.startswith("builtin") else absolute(text)

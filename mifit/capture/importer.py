@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -119,8 +120,8 @@ def _sources(
 def _named(paths: list[Path], stems: bool) -> list[tuple[Path, str]]:
     """Camera names: the files' stems (folders' names), or their parents' where those coincide."""
     for names in (
-        [path.stem if stems else path.resolve().name for path in paths],
-        [path.resolve().parent.name for path in paths],
+        [path.stem if stems else Path(os.path.abspath(path)).name for path in paths],
+        [Path(os.path.abspath(path)).parent.name for path in paths],
     ):
         if len(set(names)) == len(names) and all(names):
             return list(zip(paths, names, strict=True))
