@@ -3,12 +3,13 @@ ACTIVE := $(or $(VIRTUAL_ENV),$(CONDA_PREFIX))
 BIN := $(or $(ACTIVE),.venv)/bin
 OUT ?= out/demo
 
-.PHONY: help demo test quick bench notebooks docs lint package clean
+.PHONY: help demo test quick attack bench notebooks docs lint package clean
 
 help:
 	@echo "make demo       fit a small capture made on the spot and write $(OUT)/report.html"
 	@echo "make test       all tests"
 	@echo "make quick      the tests that take seconds"
+	@echo "make attack     all damaged and hostile inputs, kills and full disks (an hour)"
 	@echo "make bench      reduced benchmarks, renews benchmarks/results"
 	@echo "make notebooks  runs the notebooks in reduced size"
 	@echo "make docs       builds the documentation into site/"

@@ -124,6 +124,7 @@ def synthesize(
         raise InputError(f"tone: found {tone}, expected 0 (fair) to 1 (deep)")
     shape = MorphableModel.load(model)
     radiance = None if env is None else read_environment(env)
+    out.mkdir(parents=True, exist_ok=True)  # a place that can't be written is refused now, not after the first render
     total = subjects * (timesteps + 1)
     cameras = place_cameras(width, height)
     map_size = 1024 if min(width / 680, height / 480) > 0.6 else 512

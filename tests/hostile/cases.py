@@ -204,12 +204,24 @@ def places(base: Path) -> Iterator[Case]:
             named = tuple("X.bad" if a == "X" else a for a in arguments)
             yield Case(f"places:{command}:{kind}", named, needs, lambda work, make=make: make(work / "X.bad"))
     for out in ("capture", "capture/transforms.json", "/proc/none/x", "", "env.hdr/x", "x" * 300):
-        yield Case(f"places:import out:{out[:20]}", ("import", "--images", "pictures/left", "--out", out), ("pictures", "capture", "env.hdr"))
-        yield Case(f"places:synth out:{out[:20]}", ("synth", "--out", out, "--width", "32", "--height", "32"), ("capture", "env.hdr"))
+        yield Case(
+            f"places:import out:{out[:20]}",
+            ("import", "--images", "pictures/left", "--out", out),
+            ("pictures", "capture", "env.hdr"),
+        )
+        yield Case(
+            f"places:synth out:{out[:20]}",
+            ("synth", "--out", out, "--width", "32", "--height", "32"),
+            ("capture", "env.hdr"),
+        )
     for out in ("/proc/none/x", "", "env.hdr/x", "x" * 300 + ".npz", "capture.npz"):
+
         def taken(work: Path) -> None:
             (work / "capture.npz").mkdir()
-        yield Case(f"places:convert out:{out[:20]}", ("model", "convert", "ball.npz", out), ("ball.npz", "env.hdr"), taken)
+
+        yield Case(
+            f"places:convert out:{out[:20]}", ("model", "convert", "ball.npz", out), ("ball.npz", "env.hdr"), taken
+        )
         yield Case(f"places:fit out:{out[:20]}", ("fit", "nothing", "--out", out), ("env.hdr",))
 
 
@@ -255,17 +267,56 @@ def words(base: Path) -> Iterator[Case]:
     """Names that don't exist, are empty, or are made of control characters."""
     odd = ("", "nothing", "\x1b[31m", "../../x", "a" * 5000, "\u202e", "None")
     for value in odd:
-        yield Case(f"words:variant:{value[:8]!r}", ("turntable", "result", "--out", "out", f"--variant={value}"), ("result",))
-        yield Case(f"words:units:{value[:8]!r}", ("import", "--images", "pictures/left", "--out", "out", f"--units={value}"), ("pictures",))
-        yield Case(f"words:kind:{value[:8]!r}", ("model", "convert", "ball.npz", "out.npz", f"--kind={value or '?'}"), ("ball.npz",))
-        yield Case(f"words:camera:{value[:8]!r}", ("evaluate", "result", "--capture", "capture", f"--camera={value}"), ("result", "capture"))
-        yield Case(f"words:cameras:{value[:8]!r}", ("fit", "capture", "--out", "out", f"--cameras={value}"), ("capture",))
-        yield Case(f"words:detector:{value[:8]!r}", ("landmarks", "capture", f"--detector={value or '?'}"), ("capture",))
-        yield Case(f"words:format:{value[:8]!r}", ("export", "result", f"--format={value}", "--out", "out.x"), ("result",))
-        yield Case(f"words:set:{value[:8]!r}", ("run", "experiment.toml", "--out", "out", "--set", value), ("experiment.toml", "capture"))
+        yield Case(
+            f"words:variant:{value[:8]!r}", ("turntable", "result", "--out", "out", f"--variant={value}"), ("result",)
+        )
+        yield Case(
+            f"words:units:{value[:8]!r}",
+            ("import", "--images", "pictures/left", "--out", "out", f"--units={value}"),
+            ("pictures",),
+        )
+        yield Case(
+            f"words:kind:{value[:8]!r}",
+            ("model", "convert", "ball.npz", "out.npz", f"--kind={value or '?'}"),
+            ("ball.npz",),
+        )
+        yield Case(
+            f"words:camera:{value[:8]!r}",
+            ("evaluate", "result", "--capture", "capture", f"--camera={value}"),
+            ("result", "capture"),
+        )
+        yield Case(
+            f"words:cameras:{value[:8]!r}", ("fit", "capture", "--out", "out", f"--cameras={value}"), ("capture",)
+        )
+        yield Case(
+            f"words:detector:{value[:8]!r}", ("landmarks", "capture", f"--detector={value or '?'}"), ("capture",)
+        )
+        yield Case(
+            f"words:format:{value[:8]!r}", ("export", "result", f"--format={value}", "--out", "out.x"), ("result",)
+        )
+        yield Case(
+            f"words:set:{value[:8]!r}",
+            ("run", "experiment.toml", "--out", "out", "--set", value),
+            ("experiment.toml", "capture"),
+        )
         yield Case(f"words:command:{value[:8]!r}", (value,))
     for suffix in ("", ".gif", ".exr.exe", ".mp4"):
-        yield Case(f"words:render out:{suffix}", ("render", "result", "--capture", "capture", "--camera", "left", "--timestep", "99", "--out", f"out{suffix}"), ("result", "capture"))
+        yield Case(
+            f"words:render out:{suffix}",
+            (
+                "render",
+                "result",
+                "--capture",
+                "capture",
+                "--camera",
+                "left",
+                "--timestep",
+                "99",
+                "--out",
+                f"out{suffix}",
+            ),
+            ("result", "capture"),
+        )
 
 
 # -- documents ------------------------------------------------------------------------------------------------------
@@ -334,19 +385,33 @@ def documents(base: Path) -> Iterator[Case]:
         for file, arguments, needs in (
             ("capture/transforms.json", ("fit", "capture", "--out", "out"), ("capture",)),
             ("result/result.json", ("turntable", "result", "--out", "out"), ("result",)),
-            ("capture/landmarks/left/0000.json", ("import", "--transforms", "capture/transforms.json", "--out", "out"), ("capture",)),
+            (
+                "capture/landmarks/left/0000.json",
+                ("import", "--transforms", "capture/transforms.json", "--out", "out"),
+                ("capture",),
+            ),
             ("fit.toml", ("fit", "capture", "--out", "out", "--config", "fit.toml"), ("capture", "fit.toml")),
             ("experiment.toml", ("run", "experiment.toml", "--out", "out"), ("capture", "experiment.toml")),
         ):
             if file.endswith("toml") and name == "list":
                 continue  # a table's head
-            yield Case(f"documents:{file}:{name}", arguments, needs, lambda work, f=file, d=data: (work / f).write_bytes(d) and None)
+            yield Case(
+                f"documents:{file}:{name}",
+                arguments,
+                needs,
+                lambda work, f=file, d=data: (work / f).write_bytes(d) and None,
+            )
     for key, value in (
         ("texture_size", 10**9), ("texture_size", -1), ("texture_size", '"x"'), ("texture_size", "[]"), ("nothing", 1),
         ("bands", 99), ("exponent", -1), ("exponent", "nan"), ("exponent", "inf"), ("shading", '"x"'), ("exponent", "{}"),
     ):  # fmt: skip
         text = f"[reflectance]\n{key} = {value}\n"
-        yield Case(f"documents:settings:{key}:{value}", ("fit", "capture", "--out", "out", "--config", "fit.toml"), ("capture", "fit.toml"), lambda work, t=text: (work / "fit.toml").write_text(t) and None)
+        yield Case(
+            f"documents:settings:{key}:{value}",
+            ("fit", "capture", "--out", "out", "--config", "fit.toml"),
+            ("capture", "fit.toml"),
+            lambda work, t=text: (work / "fit.toml").write_text(t) and None,
+        )
 
 
 # -- pixels ---------------------------------------------------------------------------------------------------------
@@ -423,7 +488,9 @@ def landmarks(base: Path) -> Iterator[Case]:
     def case(name: str, suffix: str, data: bytes) -> Case:
         def prepare(work: Path) -> None:
             (work / "capture" / f"marks{suffix}").write_bytes(data)
-            _write_json(work / "capture" / "transforms.json", _edit(document, ("frames", 0, "landmark_path"), f"marks{suffix}"))
+            _write_json(
+                work / "capture" / "transforms.json", _edit(document, ("frames", 0, "landmark_path"), f"marks{suffix}")
+            )
 
         return Case(f"landmarks:{suffix}:{name}", command, ("capture",), prepare)
 
@@ -466,7 +533,12 @@ def calibrations(base: Path) -> Iterator[Case]:
 
     def case(name: str, file: str, data: str | bytes) -> Case:
         raw = data.encode() if isinstance(data, str) else data
-        return Case(f"calibrations:{name}", (*command, file), ("pictures",), lambda work: (work / file).write_bytes(raw) and None)
+        return Case(
+            f"calibrations:{name}",
+            (*command, file),
+            ("pictures",),
+            lambda work: (work / file).write_bytes(raw) and None,
+        )
 
     for file in ("stereo.yml", "stereo.xml"):
         text = (base / file).read_text()
@@ -507,15 +579,28 @@ def colmap(base: Path) -> Iterator[Case]:
                 changed = [*lines]
                 changed[row] = " ".join([*words_[:i], value, *words_[i + 1 :]])
                 text = "\n".join(changed) + "\n"
-                sound = (file == "images.txt" and 5 <= i <= 7 and value in ("-1",)) or (file == "cameras.txt" and value == "-1" and i > 5)
+                sound = (file == "images.txt" and 5 <= i <= 7 and value in ("-1",)) or (
+                    file == "cameras.txt" and value == "-1" and i > 5
+                )
                 sound |= file == "images.txt" and 1 <= i <= 4 and value == "-1"
-                yield Case(f"colmap:{file} {i}:{value[:6]}", command, ("colmap",), lambda work, f=file, t=text: (work / "colmap" / f).write_text(t) and None, sound)
+                yield Case(
+                    f"colmap:{file} {i}:{value[:6]}",
+                    command,
+                    ("colmap",),
+                    lambda work, f=file, t=text: (work / "colmap" / f).write_text(t) and None,
+                    sound,
+                )
         for name in ("../../../etc/passwd", "/etc/passwd", "..", "left/../../x"):
             if file == "images.txt":
                 changed = [*lines]
                 changed[row] = " ".join([*words_[:9], name])
                 text = "\n".join(changed) + "\n"
-                yield Case(f"colmap:name {name}", command, ("colmap",), lambda work, t=text: (work / "colmap" / "images.txt").write_text(t) and None)
+                yield Case(
+                    f"colmap:name {name}",
+                    command,
+                    ("colmap",),
+                    lambda work, t=text: (work / "colmap" / "images.txt").write_text(t) and None,
+                )
 
 
 def videos(base: Path) -> Iterator[Case]:
@@ -524,7 +609,13 @@ def videos(base: Path) -> Iterator[Case]:
     data = (base / "left.avi").read_bytes()
 
     def case(name: str, content: bytes, may_pass: bool = False) -> Case:
-        return Case(f"videos:{name}", command, ("left.avi", "right.avi"), lambda work: (work / "left.avi").write_bytes(content) and None, may_pass)
+        return Case(
+            f"videos:{name}",
+            command,
+            ("left.avi", "right.avi"),
+            lambda work: (work / "left.avi").write_bytes(content) and None,
+            may_pass,
+        )
 
     for part in (0.0, 0.01, 0.1, 0.4, 0.7):
         yield case(f"cut at {part}", data[: int(part * len(data))])
@@ -548,7 +639,13 @@ def models(base: Path) -> Iterator[Case]:
     """Every kind of model cut short and spoilt, and what each format allows to be claimed."""
 
     def case(name: str, file: str, data: bytes, may_pass: bool = False) -> Case:
-        return Case(f"models:{name}", ("model", "info", file), (), lambda work: (work / file).write_bytes(data) and None, may_pass)
+        return Case(
+            f"models:{name}",
+            ("model", "info", file),
+            (),
+            lambda work: (work / file).write_bytes(data) and None,
+            may_pass,
+        )
 
     for path in sorted((base / "models").iterdir()):
         if path.suffix == ".json":
@@ -562,7 +659,11 @@ def models(base: Path) -> Iterator[Case]:
             spoilt[rng.integers(0, min(len(data), 2000), 5)] = rng.integers(0, 256, 5)
             yield case(f"{path.name} spoilt {i}", path.name, spoilt.tobytes(), True)
     nested = b"\x80\x02})" + b"".join(b"q%c0h%ch%c\x86" % (i, i, i) for i in range(60)) + b"Ns."
-    collisions = b"\x80\x02}(" + b"".join(b"\x8a\x0b" + (i * (2**61 - 1)).to_bytes(11, "little") + b"N" for i in range(1, 60_000)) + b"u."
+    collisions = (
+        b"\x80\x02}("
+        + b"".join(b"\x8a\x0b" + (i * (2**61 - 1)).to_bytes(11, "little") + b"N" for i in range(1, 60_000))
+        + b"u."
+    )
     puts = b"\x80\x02}" + b"".join(b"p%d\n" % (i * (2**61 - 1)) for i in range(1, 60_000)) + b"."
     array = b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\nK\x00\x85U\x01btR"
     for name, data in {
@@ -574,13 +675,23 @@ def models(base: Path) -> Iterator[Case]:
         "pickle loop": b"\x80\x02]q\0h\0a.", "pickle bare": b"\x80\x02.", "pickle marks": b"\x80\x02" + b"(" * 100_000 + b".", "pickle dup": b"\x80\x02}" + b"2" * 1_200_000 + b".",
     }.items():  # fmt: skip
         yield case(name, "m.pkl", data)
-    for name, shape, dtype in (("huge", "(1073741824, 3)", "<f4"), ("object", "(4, 3)", "|O"), ("deep", "(" * 2000, "<f4"), ("many", f"({'1,' * 2000})", "<f4"), ("negative", "(-4, 3)", "<f4")):
+    for name, shape, dtype in (
+        ("huge", "(1073741824, 3)", "<f4"),
+        ("object", "(4, 3)", "|O"),
+        ("deep", "(" * 2000, "<f4"),
+        ("many", f"({'1,' * 2000})", "<f4"),
+        ("negative", "(-4, 3)", "<f4"),
+    ):
+
         def npz(work: Path, shape: str = shape, dtype: str = dtype) -> None:
             text = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}"
             text = text.ljust(-(len(text) + 11) % 64 + len(text)) + "\n"
             with zipfile.ZipFile(work / "m.npz", "w") as archive:
                 archive.writestr("mifit_model.npy", _npy(np.int64(1)))
-                archive.writestr("mean.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", len(text)) + text.encode() + bytes(64))
+                archive.writestr(
+                    "mean.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", len(text)) + text.encode() + bytes(64)
+                )
+
         yield Case(f"models:npz {name}", ("model", "info", "m.npz"), (), npz)
 
     def bomb(work: Path) -> None:
@@ -593,19 +704,34 @@ def models(base: Path) -> Iterator[Case]:
         yield Case(f"models:h5 {kind}", ("model", "info", "m.h5"), (), lambda work, k=kind: _h5(work / "m.h5", k))
     head = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
     for kind in (0, 1, 9, 14, 15, 19, 20, 25, 1000, 2**31):
-        body = struct.pack("<IIII", 6, 8, 6, 0) + struct.pack("<IIii", 5, 8, 1, 1) + struct.pack("<II", 1, 7) + b"shapeMU\0"
+        body = (
+            struct.pack("<IIII", 6, 8, 6, 0)
+            + struct.pack("<IIii", 5, 8, 1, 1)
+            + struct.pack("<II", 1, 7)
+            + b"shapeMU\0"
+        )
         body += struct.pack("<II", kind, 8) + bytes(8)
         yield case(f"mat type {kind}", "m.mat", head + struct.pack("<II", 14, len(body)) + body)
     for claimed in (0xFFFFFFFF, 0x7FFFFFFF, 0):
         yield case(f"mat claims {claimed}", "m.mat", head + struct.pack("<II", 14, claimed) + bytes(64))
-        yield case(f"packed mat claims {claimed}", "m.mat", head + struct.pack("<II", 15, claimed) + zlib.compress(bytes(10**7)))
+        yield case(
+            f"packed mat claims {claimed}",
+            "m.mat",
+            head + struct.pack("<II", 15, claimed) + zlib.compress(bytes(10**7)),
+        )
     for values in ((1, 3 << 28, 1), (4, 12, 1), (2, -3, 1), (1, 12, 2**31 - 1)):
         yield case(f"eos {values}", "m.bin", struct.pack("<Iii", *values) + bytes(100))
-    for name, index, mesh in (("index", "{}", "v 0 0 0\n"), ("mesh", '{"idx_to_landmark_verts": [0], "expressions": []}', "v nan 0 0\nf 1/1 1/1 1/1\n"), ("names", '{"idx_to_landmark_verts": [0], "expressions": ["../../../etc/passwd"]}', "v 0 0 0\n")):
+    for name, index, mesh in (
+        ("index", "{}", "v 0 0 0\n"),
+        ("mesh", '{"idx_to_landmark_verts": [0], "expressions": []}', "v nan 0 0\nf 1/1 1/1 1/1\n"),
+        ("names", '{"idx_to_landmark_verts": [0], "expressions": ["../../../etc/passwd"]}', "v 0 0 0\n"),
+    ):
+
         def folder(work: Path, index: str = index, mesh: str = mesh) -> None:
             (work / "m").mkdir()
             (work / "m" / "vertex_indices.json").write_text(index)
             (work / "m" / "generic_neutral_mesh.obj").write_text(mesh)
+
         yield Case(f"models:ict {name}", ("model", "info", "m"), (), folder)
 
 
@@ -662,7 +788,19 @@ def _leaves(document: Any, prefix: tuple = ()) -> Iterator[tuple]:
 def results(base: Path) -> Iterator[Case]:
     """Every key of ``result.json`` that is needed to read a result."""
     document = json.loads((base / "result" / "result.json").read_text())
-    free = {"stages", "config", "seconds", "peak_memory", "warnings", "mifit_version", "digest", "gains", "name", "status", "energies"}
+    free = {
+        "stages",
+        "config",
+        "seconds",
+        "peak_memory",
+        "warnings",
+        "mifit_version",
+        "digest",
+        "gains",
+        "name",
+        "status",
+        "energies",
+    }
     for place in _leaves(document):
         if len(place) > 4 or (free & set(map(str, place))):
             continue
@@ -682,15 +820,28 @@ def result_files(base: Path) -> Iterator[Case]:
     """Files of a result missing, swapped, cut short and spoilt."""
     for path in sorted((base / "result").rglob("*")):
         name = str(path.relative_to(base))
-        if path.is_dir() or "scene" in name or path.suffix in (".png", ".html", ".json", ".xml") or "lighting.exr" in name or "confidence" in name:
+        if (
+            path.is_dir()
+            or "scene" in name
+            or path.suffix in (".png", ".html", ".json", ".xml")
+            or "lighting.exr" in name
+            or "confidence" in name
+        ):
             continue
         data = path.read_bytes()
         for kind, change in {
             "missing": None, "empty": b"", "half": data[: len(data) // 2], "noise": np.random.default_rng(0).bytes(len(data)),
         }.items():  # fmt: skip
+
             def prepare(work: Path, name: str = name, change: bytes | None = change) -> None:
                 (work / name).unlink() if change is None else (work / name).write_bytes(change)
-            yield Case(f"result files:{name}:{kind}", ("relight", "result", "--env", "missing.hdr", "--out", "out"), ("result",), prepare)
+
+            yield Case(
+                f"result files:{name}:{kind}",
+                ("relight", "result", "--env", "missing.hdr", "--out", "out"),
+                ("result",),
+                prepare,
+            )
 
 
 def experiments(base: Path) -> Iterator[Case]:
@@ -708,7 +859,12 @@ def experiments(base: Path) -> Iterator[Case]:
         "synth": "[fit.synth]\nwidth = 20000\nheight = 20000\n[fit]\n", "synth spp": "[fit]\n[fit.synth]\nspp = 0\n", "synth size": "[fit]\n[fit.synth]\nwidth = 200000\n", "digits": "a = " + "9" * 100_000, "deep": "a = " + "[" * 100_000,
         "dates": "name = 2020-01-01\n[fit]\ncapture = 12:00:00\n", "null": 'name = "a\\u0000b"\n[render]\nscene = "x\\u0000"\n', "dotted": '[fit]\ncapture = "capture"\n[sweep.grid]\n"fit..seed" = [1]\n', "path key": '[fit]\ncapture = "capture"\n[sweep.grid]\n"../../x" = [1]\n',
     }.items():  # fmt: skip
-        yield Case(f"experiments:{name}", ("run", "e.toml", "--out", "out"), ("capture",), lambda work, t=text: (work / "e.toml").write_text(t) and None)
+        yield Case(
+            f"experiments:{name}",
+            ("run", "e.toml", "--out", "out"),
+            ("capture",),
+            lambda work, t=text: (work / "e.toml").write_text(t) and None,
+        )
 
 
 # -- names and links ------------------------------------------------------------------------------------------------
@@ -727,19 +883,48 @@ def names(base: Path) -> Iterator[Case]:
         for frame in changed["frames"]:
             if frame["camera_id"] == "left":
                 frame["camera_id"] = name
-        yield Case(f"names:{name[:20]!r}", ("import", "--transforms", "capture/transforms.json", "--out", "out"), ("capture",), lambda work, d=changed: _write_json(work / "capture" / "transforms.json", d), True)
+        yield Case(
+            f"names:{name[:20]!r}",
+            ("import", "--transforms", "capture/transforms.json", "--out", "out"),
+            ("capture",),
+            lambda work, d=changed: _write_json(work / "capture" / "transforms.json", d),
+            True,
+        )
     for suffix in (".pth", ".py", ".so", "", ".png.py", ".exe"):
+
         def prepare(work: Path, suffix: str = suffix) -> None:
             (work / "capture" / "images" / "left" / "0000.png").rename(work / "capture" / f"evil{suffix or '.x'}")
-            _write_json(work / "capture" / "transforms.json", _edit(document, ("frames", 0, "file_path"), f"evil{suffix or '.x'}"))
-        yield Case(f"names:suffix {suffix}", ("import", "--transforms", "capture/transforms.json", "--out", "out"), ("capture",), prepare, True)
+            _write_json(
+                work / "capture" / "transforms.json",
+                _edit(document, ("frames", 0, "file_path"), f"evil{suffix or '.x'}"),
+            )
+
+        yield Case(
+            f"names:suffix {suffix}",
+            ("import", "--transforms", "capture/transforms.json", "--out", "out"),
+            ("capture",),
+            prepare,
+            True,
+        )
 
 
 def links(base: Path) -> Iterator[Case]:
     """Links in a capture that lead out of it."""
     for target in ("/etc/passwd", "/dev/zero", "/dev/stdin", "/proc/self/mem", "/proc/kcore", "/", "/nothing"):
-        for file in ("capture/images/left/0000.png", "capture/transforms.json", "capture/landmarks/left/0000.json", "capture/mask.png"):
+        for file in (
+            "capture/images/left/0000.png",
+            "capture/transforms.json",
+            "capture/landmarks/left/0000.json",
+            "capture/mask.png",
+        ):
+
             def prepare(work: Path, file: str = file, target: str = target) -> None:
                 (work / file).unlink()
                 (work / file).symlink_to(target)
-            yield Case(f"links:{file}:{target}", ("import", "--transforms", "capture/transforms.json", "--out", "out"), ("capture",), prepare)
+
+            yield Case(
+                f"links:{file}:{target}",
+                ("import", "--transforms", "capture/transforms.json", "--out", "out"),
+                ("capture",),
+                prepare,
+            )

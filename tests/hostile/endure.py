@@ -1,0 +1,349 @@
+"""Kill commands at random moments and fill the disk under them: nothing is lost, and resumed results are identical.
+
+``python -m tests.hostile.endure [--part N]`` runs 100 kills and 50 full disks (``--part 10``: a tenth of them) on a
+capture of 120 x 90 pixels. Commands run in processes forked from this one. Half of the kills come at a moment of the
+clock, half at one of the changes of files that the command makes (a file opened for writing, renamed, removed; a folder
+made or removed): those are the moments that matter. A full disk is a limit on the size of files, at a random byte.
+After each:
+
+- what was there before is whole: as it was, or as an unbroken run leaves it, file by file, and never mixed;
+- a command that found no room ends with exit code 2 and one line;
+- the command run again, with ``--resume`` where it has that, ends with what an unbroken run gives, bit for bit, and no
+  temporary file is left. Times, memory and the report, which shows them, aside.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.hostile.attack import preload
+
+CHANGES = {"os.remove", "os.rename", "os.mkdir", "os.rmdir", "shutil.rmtree"}
+TIMED = {"seconds", "peak_memory", "fit_seconds"}
+FIT = ("fit", "capture", "--model", "builtin:coarse", "--timesteps", "0", "--config", "fit.toml", "--quiet")
+SCENE = ("--format", "mitsuba")
+CONFIG = "[reflectance]\ntexture_size = 32\n"
+EXPERIMENT = (
+    'name = "e"\n[fit]\ncapture = "capture"\nmodel = "builtin:coarse"\ntimesteps = [0]\nuntil = "geometry"\n'
+    '[evaluate]\ncamera = "third"\n[sweep.grid]\n"fit.seed" = [0, 1]\n'
+)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended: exit code (negative: the signal), changes of files counted, seconds, standard error."""
+
+    code: int
+    changes: int
+    seconds: float
+    error: str
+
+
+def run(
+    work: Path,
+    arguments: tuple[str, ...],
+    after_changes: int | None = None,
+    after_seconds: float | None = None,
+    room: int | None = None,
+) -> Ended:
+    """Run a command in a forked process; kill it and all that it started after so many changes or seconds."""
+    counted, start = work.parent / "changes", time.monotonic()
+    counted.write_text("0")
+    sys.stdout.flush()
+    process = os.fork()
+    if process == 0:
+        _child(work, arguments, counted, after_changes, room)
+    while True:
+        found, status = os.waitpid(process, os.WNOHANG)
+        if found:
+            break
+        if after_seconds is not None and time.monotonic() - start > after_seconds:
+            os.killpg(process, signal.SIGKILL)
+            status = os.waitpid(process, 0)[1]
+            break
+        time.sleep(0.01)
+    code = os.waitstatus_to_exitcode(status)
+    return Ended(code, int(counted.read_text() or 0), time.monotonic() - start, (work.parent / "stderr").read_text())
+
+
+def _child(work: Path, arguments: tuple[str, ...], counted: Path, after: int | None, room: int | None) -> None:
+    """Never returns."""
+    code = 99
+    try:
+        os.setsid()
+        for name, descriptor in (("stdout", 1), ("stderr", 2)):
+            os.dup2(os.open(work.parent / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), descriptor)
+        os.chdir(work)
+        sys.argv = ["mifit", *arguments]
+        count, descriptor = 0, os.open(counted, os.O_WRONLY)
+
+        def hook(event: str, values: tuple) -> None:
+            nonlocal count
+            opened = event == "open" and isinstance(values[2], int) and values[2] & (os.O_WRONLY | os.O_RDWR)
+            if opened or event in CHANGES:
+                count += 1
+                os.pwrite(descriptor, str(count).encode(), 0)
+                if count == after:
+                    os.killpg(0, signal.SIGKILL)
+
+        sys.addaudithook(hook)
+        if room is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
+        from mifit.cli import main
+
+        try:
+            code = main()
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) else 1
+        sys.stdout.flush()
+        sys.stderr.flush()
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+        sys.stderr.flush()
+    finally:
+        os._exit(code)
+
+
+def content(place: Path) -> dict[str, bytes]:
+    """Files of a folder, or one file, that a user sees, without what differs between two equal runs."""
+    if place.is_file():
+        return {place.name: place.read_bytes()}
+    found = {}
+    for path in sorted(place.rglob("*")):
+        name = str(path.relative_to(place))
+        if (
+            path.is_dir()
+            or name.startswith(".mifit")
+            or "/.mifit" in name
+            or path.name in ("report.html", "summary.md")
+        ):
+            continue
+        data = path.read_bytes()
+        if path.suffix == ".json":
+            data = json.dumps(_untimed(json.loads(data)), sort_keys=True).encode()
+        found[name] = data
+    return found
+
+
+def _untimed(value: object) -> object:
+    if isinstance(value, dict):
+        return {k: _untimed(v) for k, v in value.items() if k not in TIMED}
+    return [_untimed(v) for v in value] if isinstance(value, list) else value
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A command, what lies in its folder before, and where its output is.
+
+    ``prepare`` sets the working folder up; ``again`` is the command that goes on after a break. With ``whole`` the old
+    output must be there unchanged until the new one is, all of it; else file by file.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    output: str
+    kills: int
+    fulls: int
+    prepare: Callable[[Path], None]
+    again: tuple[str, ...] | None = None
+    whole: bool = False
+    clock_only: bool = False
+
+
+def scenarios(base: Path) -> list[Scenario]:
+    """All of them; ``base`` holds a capture, a fit of it and another one."""
+
+    def copy(*names: str) -> Callable[[Path], None]:
+        def prepare(work: Path) -> None:
+            for name in names:
+                source = base / name
+                if source.is_dir():
+                    shutil.copytree(source, work / name)
+                else:
+                    shutil.copy(source, work / name)
+
+        return prepare
+
+    def over(*names: str) -> Callable[[Path], None]:
+        def prepare(work: Path) -> None:
+            copy(*names)(work)
+            shutil.copytree(base / "other", work / "out")
+
+        return prepare
+
+    given = ("capture", "fit.toml")
+    track = ("track", "capture", "--result", "result", "--timesteps", "1", "--quiet")
+    return [
+        Scenario("fit", (*FIT, "--out", "out"), "out", 22, 10, copy(*given), (*FIT, "--out", "out", "--resume")),
+        Scenario("fit over", (*FIT, "--out", "out", "--force"), "out", 14, 8, over(*given), whole=True),
+        Scenario("track", track, "result", 22, 10, copy("capture", "result"), (*track, "--resume")),
+        Scenario("export glb", ("export", "result", "--format", "glb", "--out", "x/f.glb"), "x", 8, 4, copy("result")),
+        Scenario("export obj", ("export", "result", "--format", "obj", "--out", "x/f.obj"), "x", 8, 4, copy("result")),
+        Scenario("export scene", ("export", "result", *SCENE, "--out", "x/f.xml"), "x", 8, 4, copy("result")),
+        Scenario(
+            "import", ("import", "--transforms", "capture/transforms.json", "--out", "out", "--quiet"), "out", 12, 6,
+            copy("capture"), whole=True,
+        ),
+        Scenario(
+            "run", ("run", "e.toml", "--out", "out", "--quiet"), "out", 6, 4, copy("capture", "e.toml"), clock_only=True
+        ),
+    ]  # fmt: skip
+
+
+def make_base(base: Path) -> None:
+    """A small capture and two fits of it."""
+    base.mkdir()
+    (base / "fit.toml").write_text(CONFIG)
+    (base / "e.toml").write_text(EXPERIMENT)
+    size = (
+        "--timesteps",
+        "2",
+        "--width",
+        "120",
+        "--height",
+        "90",
+        "--spp",
+        "4",
+        "--model",
+        "builtin:coarse",
+        "--quiet",
+    )
+    for arguments in (
+        ("synth", "--out", "capture", *size),
+        (*FIT, "--out", "result"),
+        (*FIT, "--out", "other", "--seed", "7"),
+    ):
+        ended = run(base, arguments)
+        if ended.code:
+            raise SystemExit(f"{arguments}: {ended.error}")
+
+
+class Broken(Exception):
+    """Something was lost, mixed or left."""
+
+
+def judge(old: dict[str, bytes], now: dict[str, bytes], new: dict[str, bytes], scenario: Scenario) -> None:
+    """What lies there after a break must be old or new, file by file; with ``whole`` all of one kind."""
+    now = {name: data for name, data in now.items() if ".part" not in name}
+    if scenario.whole:
+        if now not in (old, new):
+            names = [n for n in {*now, *old, *new} if not (now.get(n) == old.get(n) or now.get(n) == new.get(n))]
+            raise Broken(f"neither as before nor as after: {names[:4] or sorted(set(old) ^ set(now))[:4]}")
+        return
+    for name, data in now.items():
+        if name.endswith("result.json"):
+            continue  # grows by a timestep at a time: judged at the end
+        if data not in (old.get(name), new.get(name)):
+            raise Broken(f"{name} is neither as before nor as after")
+    lost = [name for name in old if name not in now and name in new]
+    if lost:
+        raise Broken(f"{lost[0]} is gone")
+
+
+def endure(scenario: Scenario, root: Path, kills: int, fulls: int, chance: random.Random) -> tuple[int, int]:
+    """Break one command again and again; returns how many kills and full disks there were."""
+
+    def fresh() -> Path:
+        shutil.rmtree(root, ignore_errors=True)
+        (root / "work").mkdir(parents=True)
+        scenario.prepare(root / "work")
+        return root / "work"
+
+    work = fresh()
+    output = work / scenario.output
+    old = content(output) if output.exists() else {}
+    unbroken = run(work, scenario.command)
+    if unbroken.code:
+        raise Broken(f"unbroken: exit {unbroken.code}: {unbroken.error}")
+    new = content(output)
+    largest = max(p.stat().st_size for p in output.rglob("*") if p.is_file())
+
+    def finish() -> None:
+        ended = run(work, scenario.again or scenario.command)
+        if ended.code:
+            raise Broken(f"run again: exit {ended.code}: {ended.error}")
+        now = content(output)
+        if now != new:
+            raise Broken(f"run again: differs in {[n for n in {*now, *new} if now.get(n) != new.get(n)][:5]}")
+        left = [p for p in work.rglob("*") if ".part" in p.name]
+        if left:
+            raise Broken(f"run again: {left[0].name} is left")
+
+    done, seconds = 0, unbroken.seconds
+    work = fresh()
+    while done < kills:
+        command = scenario.command if not output.exists() else (scenario.again or scenario.command)
+        if scenario.clock_only or done % 2:
+            ended = run(work, command, after_seconds=chance.uniform(0.05, 0.95) * seconds)
+        else:
+            ended = run(work, command, after_changes=chance.randint(1, max(unbroken.changes, 1)))
+        if ended.code != -signal.SIGKILL:  # it had less left to do: it ended before its moment
+            if ended.code:
+                raise Broken(f"going on: exit {ended.code}: {ended.error}")
+            work = fresh()
+            continue
+        done += 1
+        if output.exists() or old:
+            judge(old, content(output) if output.exists() else {}, new, scenario)
+        if done % 4 == 0 or done == kills:
+            finish()
+            work = fresh()
+    for _ in range(fulls):
+        work = fresh()
+        ended = run(work, scenario.command, room=chance.randint(0, largest - 1))
+        lines = ended.error.splitlines()
+        if ended.code != 2 or len(lines) != 1:
+            raise Broken(f"no room: exit {ended.code} with {len(lines)} lines: {ended.error[-600:]}")
+        judge(old, content(output) if output.exists() else {}, new, scenario)
+        finish()
+    return done, fulls
+
+
+def main() -> int:
+    """Command line; exit code 1 when something was lost, mixed or left."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--part", type=int, default=1, help="an N-th of the kills and full disks")
+    parser.add_argument("--only", default="", help="commands whose names hold this text")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    preload()
+    wrong, total = 0, [0, 0]
+    with tempfile.TemporaryDirectory(prefix="endure-") as name:
+        root = Path(name)
+        make_base(root / "base")
+        for scenario in scenarios(root / "base"):
+            if arguments.only not in scenario.name:
+                continue
+            kills, fulls = (-(-n // arguments.part) for n in (scenario.kills, scenario.fulls))
+            start = time.monotonic()
+            try:
+                counts = endure(
+                    scenario, root / "case", kills, fulls, random.Random(f"{arguments.seed} {scenario.name}")
+                )
+                total = [a + b for a, b in zip(total, counts, strict=True)]
+                seconds = time.monotonic() - start
+                print(f"{scenario.name:<16}{counts[0]:>4} kills{counts[1]:>4} full disks  {seconds:.0f} s", flush=True)
+            except Broken as error:
+                wrong += 1
+                print(f"WRONG {scenario.name}: {error}", flush=True)
+                print("      " + " ".join(sorted(content(root / "case" / "work")))[:2000], flush=True)
+    print(f"{total[0]} kills, {total[1]} full disks; {wrong} commands wrong")
+    return bool(wrong)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
