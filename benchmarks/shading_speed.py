@@ -111,7 +111,7 @@ class Cached:
         import mitsuba as mi
 
         from mifit.appearance import kernels, models
-        from mifit.appearance.image import assemble
+        from mifit.appearance.formation import form_image
         from mifit.appearance.lobe import Lobe
 
         parameters = [*self.maps, self.light]
@@ -123,7 +123,7 @@ class Cached:
         chosen = models.get(model)
         lobe = kernels.prepare(Lobe(EXPONENT, normalized=chosen.normalized), ORDER)
         white, specular = chosen.shade(n, self.view, lobe, coefficients, self.traced)
-        residual = assemble(0.0, mi.Color3f(red, green, blue), white, gloss, specular) - self.target
+        residual = form_image(0.0, mi.Color3f(red, green, blue), white, gloss, specular) - self.target
         # The loss beside its gradient in one kernel, instead of a kernel for the sum and one that shades again.
         loss = dr.zeros(mi.Float, 1)
         value = dr.squared_norm(dr.detach(mi.Vector3f(residual))) / (3 * self.count)

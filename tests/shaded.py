@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from mifit.appearance import models
+from mifit.appearance.formation import Appearance
 from mifit.appearance.illumination import Illumination
-from mifit.appearance.image import Appearance
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.occlusion import Occlusion
 

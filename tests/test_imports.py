@@ -145,10 +145,7 @@ SAME_MEANING = {
 """Names that several places share because they mean the same there: commands and what they call, and a few more."""
 
 
-NOT_YET = {
-    "vector", "image", "assemble", "register", "SurfacePoints", "Source", "bend", "Material", "scene", "fit_adam",
-    "Surface", "refine", "descent",
-}  # fmt: skip
+NOT_YET = {"Source", "scene", "Surface"}
 """Names that still mean several things; none may be added."""
 
 

@@ -19,7 +19,7 @@ from mifit.stages.geometry.points import PointBasis
 from mifit.stages.geometry.refine import paper_problem
 from mifit.stages.geometry.rendering import PixelView, RenderingProblem
 from mifit.stages.geometry.start import State
-from mifit.stages.reflectance import descent
+from mifit.stages.reflectance import paper_solver
 from mifit.stages.reflectance.als import _add
 from mifit.stages.reflectance.maps import TexelSystems, laplacian
 from mifit.stages.reflectance.objective import energies
@@ -202,9 +202,9 @@ def test_the_lightings_equations_are_data_and_difference_terms(two_views):
 def test_adams_objective_is_the_papers(two_views, variant):
     import mitsuba as mi
 
-    from mifit.appearance.arrays import vector
+    from mifit.appearance.arrays import on_device
+    from mifit.appearance.formation import Appearance
     from mifit.appearance.illumination import Illumination
-    from mifit.appearance.image import Appearance
     from mifit.appearance.lobe import Lobe
     from mifit.stages.reflectance.adam import Samples, _Objective
 
@@ -220,7 +220,7 @@ def test_adams_objective_is_the_papers(two_views, variant):
     )  # fmt: skip
     appearance = Appearance(models.get("printed"), Illumination(np.ones((9, 3))), Lobe(5.0, None, False))
     objective = _Objective(samples, appearance, 0.25, (0.7, 2.1))
-    shaded = tuple(vector(mi.Color3f, part[texel, image]) for part in (s.shade, s.glint))
+    shaded = tuple(on_device(mi.Color3f, part[texel, image]) for part in (s.shade, s.glint))
     values = s.maps[s.texels.index]
     base, offset = s.albedo.ravel(), (values[:, :3] - s.albedo).ravel()
     found = objective.terms(
@@ -245,13 +245,13 @@ def test_the_papers_exponent_and_bands():
         assert (model.exponent, model.bands, model.fresnel, model.normalized, model.has_ambient) == (
             5.0, 3, None, False, True,
         )  # fmt: skip
-    assert descent.PAPER_EXPONENT == 5.0
+    assert paper_solver.PAPER_EXPONENT == 5.0
 
 
 def test_the_printed_highlight_is_the_quotient(variant):
     import mitsuba as mi
 
-    from mifit.appearance.arrays import vector
+    from mifit.appearance.arrays import on_device
     from mifit.appearance.models.paper import SMALLEST, paper_specular
 
     n = RNG.normal(size=(200, 3))
@@ -260,11 +260,11 @@ def test_the_printed_highlight_is_the_quotient(variant):
     to = mi.Vector3f(*map(float, v)), mi.Vector3f(*map(float, d))
     cosine, h = n @ d, (d + v) / np.linalg.norm(d + v)
     lit = cosine > 0.05
-    found = np.array(paper_specular(vector(mi.Vector3f, n), *to, 5.0, SMALLEST))
+    found = np.array(paper_specular(on_device(mi.Vector3f, n), *to, 5.0, SMALLEST))
     expected = np.maximum(n @ h, 0) ** 5 / np.maximum(cosine, 1e-9)
     np.testing.assert_allclose(found[lit], expected[lit], rtol=2e-3)
     assert (found[cosine <= 0] == 0).all()
-    guarded = np.array(paper_specular(vector(mi.Vector3f, n), *to, 5.0))
+    guarded = np.array(paper_specular(on_device(mi.Vector3f, n), *to, 5.0))
     assert (guarded[lit] < 0.999 * expected[lit]).any()
 
 

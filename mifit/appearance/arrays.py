@@ -28,7 +28,7 @@ def aligned(values: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray[Any]:
     return out
 
 
-def vector(kind: Any, values: NDArray) -> Any:
+def on_device(kind: Any, values: NDArray) -> Any:
     """(N, 3) array -> Dr.Jit vector of a kind, such as ``mi.Vector3f``."""
     return kind(*map(aligned, np.asarray(values).T))
 

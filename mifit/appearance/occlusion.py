@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mifit.appearance.arrays import aligned, stored, vector
+from mifit.appearance.arrays import aligned, on_device, stored
 from mifit.appearance.illumination import Illumination
 from mifit.appearance.kernels import diffuse_transfer, sh_basis
 from mifit.core.mesh import interpolate, vertex_normals
@@ -27,7 +27,7 @@ OFFSET = 1e-3
 
 
 @dataclass(frozen=True)
-class SurfacePoints:
+class MeshPoints:
     """N points on a mesh.
 
     Attributes
@@ -85,7 +85,7 @@ class Occlusion:
     def trace(
         cls,
         mesh: OccludingMesh,
-        points: SurfacePoints,
+        points: MeshPoints,
         illumination: Illumination,
         seed: int = 0,
         smooth: bool = True,
@@ -95,7 +95,7 @@ class Occlusion:
         Parameters
         ----------
         mesh : OccludingMesh
-        points : SurfacePoints
+        points : MeshPoints
         illumination : Illumination
             Its number of bands, and its compact lights.
         seed : int
@@ -196,8 +196,8 @@ def _trace(
     count, size = len(points), order * order
     if not count:
         return np.zeros((0, size), np.float32)
-    n = vector(mi.Vector3f, np.asarray(normals, dtype=np.float32))
-    origin = vector(mi.Vector3f, np.asarray(points + offset * normals, dtype=np.float32))
+    n = on_device(mi.Vector3f, np.asarray(normals, dtype=np.float32))
+    origin = on_device(mi.Vector3f, np.asarray(points + offset * normals, dtype=np.float32))
     frame = mi.Frame3f(n)
     shift = mi.PCG32(size=count, initstate=seed)
     shift_u, shift_v = shift.next_float32(), shift.next_float32()
@@ -219,11 +219,11 @@ def _trace(
         corners = [dr.gather(mi.UInt, indices, hit.prim_index * 3 + k, blocked) for k in range(3)]
         out = []
         for k, (s, yk) in enumerate(zip(sums, y, strict=True)):
-            lit = sum(
+            reflected = sum(
                 wc * dr.gather(mi.Float, at_vertices, c * size + k, blocked)
                 for wc, c in zip(weights, corners, strict=True)
             )
-            out.append(s + dr.select(blocked, albedo * lit - yk, 0.0))
+            out.append(s + dr.select(blocked, albedo * reflected - yk, 0.0))
         return i + 1, out
 
     _, sums = dr.while_loop(

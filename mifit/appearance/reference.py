@@ -30,12 +30,12 @@ def carried_brdf(
     fresnel: ArrayLike,
     normalized: bool = True,
 ) -> Array:
-    """The lobe carried about the mirror direction with its rise, for unit vectors (..., 3); zero below the horizon."""
+    """The lobe carried about the mirror direction, Fresnel factor included; zero below the horizon."""
     li, v, n = (np.asarray(x, dtype=np.float64) for x in (light, view, normal))
     nl, nv, lv = (li * n).sum(-1), (v * n).sum(-1), (li * v).sum(-1)
     c = np.clip(2.0 * nl * nv - lv, 0.0, 1.0)
     half = np.sqrt(np.maximum(0.5 * (1.0 + lv), 0.0))  # h.v
-    rise = 1.0 + np.asarray(fresnel) * (1.0 - half) ** 5
+    factor = 1.0 + np.asarray(fresnel) * (1.0 - half) ** 5
     lobe = (0.5 * (1.0 + c)) ** (0.5 * np.asarray(exponent, dtype=np.float64)) * c
-    value = normalization(exponent, normalized) * rise * lobe * 2.0 / np.maximum(nl + nv, 1e-300)
+    value = normalization(exponent, normalized) * factor * lobe * 2.0 / np.maximum(nl + nv, 1e-300)
     return np.where((nl > 0) & (nv > 0), value, 0.0)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.image import Appearance, assemble
-from mifit.appearance.occlusion import OccludingMesh, SurfacePoints
+from mifit.appearance.formation import Appearance, form_image
+from mifit.appearance.occlusion import MeshPoints, OccludingMesh
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.sh import basis
@@ -108,7 +108,7 @@ def trace_mesh(vertices: NDArray, faces: NDArray, camera: Camera, oversampling: 
 
 
 @dataclass(frozen=True)
-class Material:
+class SampledMaterial:
     """Surface properties under every sample of a `VisibleSurface`.
 
     Attributes
@@ -124,7 +124,7 @@ class Material:
     specular: NDArray[np.float32]
 
 
-def surface_material(reconstruction: Result, surface: VisibleSurface, timestep: int) -> Material:
+def surface_material(reconstruction: Result, surface: VisibleSurface, timestep: int) -> SampledMaterial:
     """Look up maps in the face area, and the fitted model's vertex albedo and the mesh's normals elsewhere."""
     model, geometry = reconstruction.model, reconstruction.geometry
     rotation = geometry.rotation[reconstruction.index(timestep)]
@@ -137,7 +137,7 @@ def surface_material(reconstruction: Result, surface: VisibleSurface, timestep: 
     diffuse[inside] = sample_map(maps.diffuse, uv)
     specular[inside] = sample_map(maps.specular, uv)
     normal[inside] = normalize(sample_map(maps.normal, uv)) @ rotation.T
-    return Material(normal.astype(np.float32), diffuse.astype(np.float32), specular)
+    return SampledMaterial(normal.astype(np.float32), diffuse.astype(np.float32), specular)
 
 
 def render_local(
@@ -168,13 +168,13 @@ def shade_methods(
         material = surface_material(reconstruction, surface, timestep)
         base = _mesh_normals(reconstruction, surface, timestep)
         appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: _look_up(model, surface, m)))
-        points = SurfacePoints(surface.points, base, surface.face, surface.weights)
+        points = MeshPoints(surface.points, base, surface.face, surface.weights)
         occlusion = appearance.trace(OccludingMesh(SurfaceScene(vertices, model.faces)), points)
         shaded = appearance.shade_bent(material.normal, base, surface.view, occlusion, surface.points)
         ambient = np.float32(reflectance.illumination.ambient)
         for method in finer:
             specular = material.specular[:, None] if method == "full" else np.float32(0.0)
-            out[method] = surface.image(assemble(ambient, material.diffuse, shaded[0], specular, shaded[1]))
+            out[method] = surface.image(form_image(ambient, material.diffuse, shaded[0], specular, shaded[1]))
     return {m: out[m] for m in methods}
 
 

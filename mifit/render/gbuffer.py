@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.arrays import aligned, vector
+from mifit.appearance.arrays import aligned, on_device
 from mifit.core.camera import Camera
 from mifit.errors import InputError
 
@@ -155,7 +155,7 @@ class SurfaceScene:
         if any(camera.distortion):
             raise InputError(f"camera {camera.name}: found lens distortion, expected an undistorted camera")
         directions = camera.pixel_rays(camera.pixel_centres()).reshape(-1, 3)
-        ray = mi.Ray3f(mi.Point3f(camera.position), vector(mi.Vector3f, directions))
+        ray = mi.Ray3f(mi.Point3f(camera.position), on_device(mi.Vector3f, directions))
         hit = self.rays.ray_intersect_preliminary(ray, coherent=True)
         dr.eval(hit.t, hit.prim_uv, hit.prim_index)  # one kernel: each array read would trace the rays again
         valid = np.array(hit.is_valid()).astype(bool)
@@ -196,7 +196,7 @@ class SurfaceScene:
         distance = np.linalg.norm(direction, axis=1)
         direction /= np.maximum(distance, 1e-30)[:, None]
         reach = np.maximum(distance - SHADOW_EPSILON * self._diagonal, 0.0)
-        ray = mi.Ray3f(mi.Point3f(np.asarray(origin, dtype=np.float64)), vector(mi.Vector3f, direction))
+        ray = mi.Ray3f(mi.Point3f(np.asarray(origin, dtype=np.float64)), on_device(mi.Vector3f, direction))
         ray.maxt = mi.Float(reach.astype(np.float32))
         hit = self.rays.ray_test(ray)
         return ~np.array(hit).astype(bool)
@@ -226,8 +226,8 @@ class SurfaceScene:
             raise InputError(f"directions: found {len(directions)}, expected at most 32")
         if not len(points):
             return np.zeros(0, np.uint32)
-        n = vector(mi.Vector3f, normals)
-        origin = vector(mi.Vector3f, points) + SHADOW_EPSILON * self._diagonal * n
+        n = on_device(mi.Vector3f, normals)
+        origin = on_device(mi.Vector3f, points) + SHADOW_EPSILON * self._diagonal * n
         toward = mi.Float(aligned(directions).ravel())
 
         def body(i: Any, bits: Any) -> tuple[Any, Any]:

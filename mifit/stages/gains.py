@@ -1,9 +1,9 @@
 """Exposure and white balance of each camera relative to the first, from what cameras say of the same surface points.
 
-A matt point sends the same light to all cameras, so between two of them its colours differ by their gains alone: the
-start is a robust mean of the log ratios. Skin is not matt, and its sheen adds more to one camera than to another (4 to
-9 per cent between two views 40 degrees apart of a head lit from one side), so lighting with a specular lobe is fitted
-to the corrected colours, and what it leaves unexplained per camera corrects the gains, in turns.
+A diffuse point sends the same light to all cameras, so between two of them its colours differ by their gains alone: the
+start is a robust mean of the log ratios. Skin is not diffuse alone, and its sheen adds more to one camera than to
+another (4 to 9 per cent between two views 40 degrees apart of a head lit from one side), so lighting with a specular
+lobe is fitted to the corrected colours, and what it leaves unexplained per camera corrects the gains, in turns.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance import models
-from mifit.appearance.image import assemble
+from mifit.appearance.formation import form_image
 from mifit.appearance.lobe import Lobe
 from mifit.config import ReflectanceConfig
 from mifit.core.estimate import GeometryEstimate
@@ -106,7 +106,7 @@ def _usable(seen: Observations) -> NDArray[np.bool_]:
 
 
 def _from_ratios(parts: Sequence[Observations], cameras: int) -> tuple[NDArray[np.float64], list[int]]:
-    """(C, 3) log gains as if the skin were matt, and the cameras that shared points join to the first."""
+    """(C, 3) log gains as if the skin were diffuse alone, and the cameras that shared points join to the first."""
     links: list[tuple[int, int, NDArray, float]] = []
     for a in range(cameras):
         for b in range(a + 1, cameras):
@@ -150,7 +150,7 @@ def _shared_points(parts: Sequence[Observations], count: int, rng: np.random.Gen
 def _from_lighting(
     seen: Observations, albedo: NDArray, log_gain: NDArray, known: list[int], progress: Progress
 ) -> NDArray[np.float64]:
-    """(C, 3) log gains with which lighting, gloss and albedo explain all cameras alike."""
+    """(C, 3) log gains with which lighting and both albedos explain all cameras alike."""
     model = models.get("prefiltered")
     forward = Forward.of(model, BANDS, Lobe(EXPONENT, model.fresnel))
     problem = lighting_problem(seen, forward, np.zeros((BANDS**2, 3)), albedo, ReflectanceConfig().robust)
@@ -190,7 +190,7 @@ def _unexplained(
     """(C, 3) robust mean log ratio of each camera's colours to the fitted ones, less the first camera's."""
     light = found.light.astype(np.float32)
     diffuse, specular = (np.einsum("njk,kc->njc", t, light) for t in (problem.diffuse, problem.specular))
-    fitted = assemble(0.0, found.diffuse[:, None], diffuse, found.specular[:, None, None], specular)
+    fitted = form_image(0.0, found.diffuse[:, None], diffuse, found.specular[:, None, None], specular)
     usable = _usable(seen) & (fitted.min(axis=2) > DARKEST)
     ratio = np.log(np.maximum(problem.colour, DARKEST)) - np.log(np.maximum(fitted, DARKEST))
     out = np.zeros((cameras, 3))

@@ -16,10 +16,10 @@ from mifit.progress import Progress, silent
 from mifit.solve import Outcome
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.als import fit_als
-from mifit.stages.reflectance.descent import fit_adam
 from mifit.stages.reflectance.fill import blend_unseen, mirrored_coordinates
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.objective import energies
+from mifit.stages.reflectance.paper_solver import fit_adam
 
 if TYPE_CHECKING:
     from mifit.capture import Capture

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.image import Appearance, assemble
-from mifit.appearance.occlusion import SurfacePoints
+from mifit.appearance.formation import Appearance, form_image
+from mifit.appearance.occlusion import MeshPoints
 from mifit.config import GeometryConfig, ShapeConfig
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
 from mifit.errors import ConvergenceError
@@ -150,16 +150,16 @@ def _shade(surface: Surface, seen: Observations, reflectance: ReflectanceEstimat
     appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: surface.texels.from_map(m)[seen.texel]))
     ambient = reflectance.illumination.ambient
     shadows = [
-        appearance.trace(mesh, SurfacePoints(seen.point[:, k], seen.normal[:, k], seen.face, seen.barycentric))
+        appearance.trace(mesh, MeshPoints(seen.point[:, k], seen.normal[:, k], seen.face, seen.barycentric))
         for k, mesh in enumerate(surface.meshes)
     ]
 
     def shade(normals: NDArray, image: int) -> tuple[NDArray, NDArray]:
         step = seen.step[image]
-        diffuse, glossy = appearance.shade_bent(
+        diffuse, specular_light = appearance.shade_bent(
             normals, seen.normal[:, step], seen.view[:, image], shadows[step], seen.point[:, step]
         )
-        rest = assemble(ambient, 0.0, diffuse, specular[:, None], glossy)
+        rest = form_image(ambient, 0.0, diffuse, specular[:, None], specular_light)
         return diffuse.astype(np.float64), rest.astype(np.float64)
 
     return shade

@@ -133,8 +133,8 @@ def track(
         warnings = list(found.report.warnings)
         if refound:
             warnings.append(f"timestep {timestep}: lost the face and found it again by its landmarks")
-        aim = memory.offsets(found)
-        frame = refine_frame(capture, model, found, reflectance, cameras, config, texels, aim, seed)
+        prior = memory.offsets(found)
+        frame = refine_frame(capture, model, found, reflectance, cameras, config, texels, prior, seed)
         if frame.measured == 0.0:
             warnings.append(f"timestep {timestep}: no camera measures the face; normals are those of the frames before")
         memory.add(found, frame.normal_object)

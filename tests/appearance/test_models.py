@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mifit.appearance import reference
-from mifit.appearance.image import diffuse_matrix
+from mifit.appearance.formation import diffuse_matrix
 from mifit.appearance.lobe import normalization
 from mifit.appearance.models.paper import GUARD
 from mifit.core import sh

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mifit.appearance.image import diffuse_matrix
+from mifit.appearance.formation import diffuse_matrix
 from mifit.appearance.occlusion import trace_transfer
 from mifit.core import sh
 from mifit.errors import InputError

@@ -33,7 +33,7 @@ class SheenModel(ShadingModel):
 
 @pytest.fixture(scope="module")
 def sheen():
-    models.register(SheenModel())
+    models.register_model(SheenModel())
     yield "sheen"
     models._MODELS.pop("sheen")
     SHADINGS.remove("sheen")

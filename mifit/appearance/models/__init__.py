@@ -1,6 +1,6 @@
 """Shading models: one file each, objects with one interface in one registry.
 
-Adding one: derive from `ShadingModel`, name it, say what a point sends to the eye (`transfer`), and `register` an
+Adding one: derive from `ShadingModel`, name it, say what a point sends to the eye (`transfer`), and `register_model` an
 instance. Fits, renders, relighting and the ``shdirect`` plugin then know it by its name.
 """
 
@@ -13,12 +13,12 @@ from mifit.appearance.models.shadowed import ShadowedModel
 from mifit.config import SHADINGS
 from mifit.errors import InputError
 
-__all__ = ["ShadingModel", "Transfer", "get", "names", "register"]
+__all__ = ["ShadingModel", "Transfer", "get", "names", "register_model"]
 
 _MODELS: dict[str, ShadingModel] = {}
 
 
-def register(model: ShadingModel) -> None:
+def register_model(model: ShadingModel) -> None:
     """Make a shading model known by its name; one of the same name is replaced."""
     _MODELS[model.name] = model
     if model.name not in SHADINGS:
@@ -40,4 +40,4 @@ def get(name: str | ShadingModel) -> ShadingModel:
 
 
 for _model in (PaperModel(), PrintedModel(), PrefilteredModel(), ShadowedModel()):
-    register(_model)
+    register_model(_model)

@@ -30,7 +30,7 @@ def make() -> type:
           $n' = \mathrm{normalize}(n + a\,s + b\,t)$ in the shading frame $(s, t, n)$; raw slopes of either sign; a
           third channel is ignored
         - `normalized` (bool, default true): which $N(m)$
-        - `fresnel` (float or texture, optional): rise of the lobe towards grazing angles, see below; 0 or more
+        - `fresnel` (float or texture, optional): how much stronger the lobe is at grazing angles, see below
 
         Normalised, $N(m) = \frac{(m+2)(m+4)}{8\pi\,(m + 2^{-m/2})}$: the lobe alone reflects all light at normal
         incidence and less elsewhere; where $C_d + C_s > 1$ both are divided by their sum, so that no energy is gained.
@@ -44,10 +44,10 @@ def make() -> type:
         \frac{2}{n' \cdot l + n' \cdot v}, \qquad c = \max(r \cdot l, 0)$$
 
         It is reciprocal: $r \cdot l$ and $h \cdot v$ are the same when $l$ and $v$ change places. At the mirror
-        direction $h \cdot v = n' \cdot v$, which is the rise that `shdirect` and mifit's own renders have. A `fresnel`
-        of 0 is the carried lobe without a rise; without the parameter the lobe is Blinn-Phong's, which fades and leans
-        towards the normal at grazing angles. Normalised, the risen albedo stops at $1 - C_d$, so that no energy is
-        gained.
+        direction $h \cdot v = n' \cdot v$, which is the factor that `shdirect` and mifit's own renders have. A
+        `fresnel` of 0 is the carried lobe without that factor; without the parameter the lobe is Blinn-Phong's, which
+        fades and leans towards the normal at grazing angles. Normalised, the albedo with its factor stops at $1 - C_d$,
+        so that no energy is gained.
 
         The normal correction is the paper's $\delta_n$ as slopes in the tangent plane instead of spherical coordinates:
         those have a pole where the azimuth means nothing and its derivative vanishes, and for a small correction that

@@ -17,7 +17,7 @@ def make() -> type:
     from mitsuba.python.ad.integrators.common import ADIntegrator
 
     from mifit.appearance import kernels, models
-    from mifit.appearance.image import assemble
+    from mifit.appearance.formation import form_image
     from mifit.appearance.occlusion import trace_transfer
     from mifit.render.gbuffer import MESH_FACES, MESH_POSITIONS, SurfaceScene
 
@@ -130,7 +130,7 @@ def make() -> type:
                 n.z = dr.select(flipped, -n.z, n.z)
                 normal = mi.Vector3f(si.sh_frame.to_world(n))
                 shaded = self.model.shade(normal, -ray.d, lobe, coefficients, traced)
-                image = assemble(self.ambient, diffuse, shaded[0], specular, shaded[1])
+                image = form_image(self.ambient, diffuse, shaded[0], specular, shaded[1])
                 radiance = dr.select(front, image, radiance)
             return radiance, si.is_valid() | (not self.hide), [], None
 

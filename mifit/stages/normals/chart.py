@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 
-def bend(frame: tuple[Any, Any, Any], a: Any, b: Any) -> Any:
+def bent_normal(frame: tuple[Any, Any, Any], a: Any, b: Any) -> Any:
     """The chart of `core.bend.bend`."""
     n, t1, t2 = frame
     p, q = 0.5 * a, 0.5 * b
@@ -14,12 +14,12 @@ def bend(frame: tuple[Any, Any, Any], a: Any, b: Any) -> Any:
     return (t1 * (2.0 * p) + t2 * (2.0 * q) + n * (1.0 - square)) / (1.0 + square)
 
 
-def bend_jacobian(frame: tuple[Any, Any, Any], a: Any, b: Any) -> tuple[Any, Any]:
-    """Derivatives of `bend` by a and b."""
+def bent_normal_jacobian(frame: tuple[Any, Any, Any], a: Any, b: Any) -> tuple[Any, Any]:
+    """Derivatives of `bent_normal` by a and b."""
     n, t1, t2 = frame
     p, q = 0.5 * a, 0.5 * b
     scale = 1.0 / (1.0 + p * p + q * q)
-    total = n + bend(frame, a, b)
+    total = n + bent_normal(frame, a, b)
     return (t1 - total * p) * scale, (t2 - total * q) * scale
 
 

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.image import Appearance
-from mifit.appearance.occlusion import SurfacePoints
+from mifit.appearance.formation import Appearance
+from mifit.appearance.occlusion import MeshPoints
 from mifit.config import NormalsConfig
 from mifit.core.bend import bend, tangent_plane, texel_neighbours
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
@@ -212,7 +212,7 @@ def frame_problem(
     ]
     diffuse, specular = (texels.from_map(m)[rows] for m in (reflectance.diffuse, reflectance.specular))
     appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: texels.from_map(m)[rows]))
-    points = SurfacePoints(part.point[:, 0], base[rows], part.face, part.barycentric)
+    points = MeshPoints(part.point[:, 0], base[rows], part.face, part.barycentric)
     occlusion = appearance.trace(surface.meshes[0], points, seed)
     shade = texel_shade(appearance, diffuse, specular, views, occlusion, points.position)
     patch = TexelMap(texels.size, texels.index[rows], texels.face[rows], texels.weights[rows])

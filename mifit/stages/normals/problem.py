@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.arrays import aligned, vector
-from mifit.appearance.image import Appearance, assemble
+from mifit.appearance.arrays import aligned, on_device
+from mifit.appearance.formation import Appearance, form_image
 from mifit.appearance.occlusion import Occlusion
-from mifit.stages.normals.chart import bend, bend_jacobian, conjugate_gradients, solve_blocks
+from mifit.stages.normals.chart import bent_normal, bent_normal_jacobian, conjugate_gradients, solve_blocks
 
 L1_FLOOR = 1e-4
 """Radians below which the L1 norm is rounded off: sqrt(c^2 + floor^2); its reweighting stays finite."""
@@ -68,14 +68,14 @@ def texel_shade(
     import drjit as dr
     import mitsuba as mi
 
-    albedo, specular_albedo = vector(mi.Color3f, diffuse), mi.Float(aligned(specular))
+    albedo, specular_albedo = on_device(mi.Color3f, diffuse), mi.Float(aligned(specular))
     ambient = mi.Float(float(appearance.illumination.ambient))
     dr.make_opaque(ambient)
     shaders = [appearance.shader(view.normal, view.direction, occlusion, points) for view in views]
 
     def shade(n: Any, v: Any, view: int) -> Any:
         d, s = shaders[view](n, v)
-        return assemble(ambient, albedo, d, specular_albedo, s)
+        return form_image(ambient, albedo, d, specular_albedo, s)
 
     return shade
 
@@ -121,9 +121,9 @@ class NormalProblem:
         self._degree = sum(dr.select(n != dr.arange(mi.UInt32, self._count), mi.Float(1), 0) for n in self._near)
         self.views = [
             (
-                vector(mi.Color3f, v.colour),
+                on_device(mi.Color3f, v.colour),
                 mi.Float(aligned(v.weight)),
-                vector(mi.Vector3f, v.direction),
+                on_device(mi.Vector3f, v.direction),
                 _frame(v.normal, v.tangents),
             )
             for v in views
@@ -134,7 +134,7 @@ class NormalProblem:
         self._w1 = dr.opaque(mi.Float, float(laplacian_weight))
         self._w2 = dr.opaque(mi.Float, float(magnitude_weight))
         self._huber = dr.opaque(mi.Float, float(huber))
-        self._prior = vector(mi.Vector3f, np.zeros((self._count, 3)) if prior is None else prior)
+        self._prior = on_device(mi.Vector3f, np.zeros((self._count, 3)) if prior is None else prior)
         dr.eval(self._degree, self._prior)
 
     def energies(self, offsets: NDArray) -> dict[str, float]:
@@ -143,7 +143,7 @@ class NormalProblem:
 
     def normals(self, offsets: NDArray, view: int) -> NDArray[np.float32]:
         """(N, 3) refined normals in the frame of one view, world space."""
-        return np.array(bend(self.views[view][3], *self.load(offsets))).T
+        return np.array(bent_normal(self.views[view][3], *self.load(offsets))).T
 
     # Energy ---------------------------------------------------------------------------------------------------------
 
@@ -163,7 +163,7 @@ class NormalProblem:
         import drjit as dr
 
         colour, weight, direction, frame = self.views[view]
-        residual = colour - self._shade(bend(frame, a, b), direction, view)
+        residual = colour - self._shade(bent_normal(frame, a, b), direction, view)
         return self._penalty(weight, dr.squared_norm(residual))
 
     def _penalty(self, weight: Any, square: Any) -> Any:
@@ -179,7 +179,7 @@ class NormalProblem:
         """Energy of the corrections' length per texel."""
         import drjit as dr
 
-        return self._w2 * dr.squared_norm(bend(self._base, a, b) - self._base[0] - self._prior)
+        return self._w2 * dr.squared_norm(bent_normal(self._base, a, b) - self._base[0] - self._prior)
 
     def roughness(self, a: Any, b: Any) -> Any:
         """Energy of the corrections' Laplacian per texel."""
@@ -188,7 +188,7 @@ class NormalProblem:
 
         if not self._smooth:
             return dr.zeros(mi.Float, self._count)
-        delta = bend(self._base, a, b) - self._base[0]
+        delta = bent_normal(self._base, a, b) - self._base[0]
         dr.eval(delta)
         return self._w1 * dr.sum(dr.sqrt(dr.square(self._laplacian(delta)) + L1_FLOOR**2))
 
@@ -214,7 +214,7 @@ class NormalProblem:
             for i in range(2):
                 x = [mi.Float(a), mi.Float(b)]
                 dr.enable_grad(x[i])
-                shading = self._shade(bend(frame, *x), direction, k)
+                shading = self._shade(bent_normal(frame, *x), direction, k)
                 dr.set_grad(x[i], 1.0)
                 dr.enqueue(dr.ADMode.Forward, x[i])
                 dr.traverse(dr.ADMode.Forward)
@@ -244,8 +244,8 @@ class NormalProblem:
         import drjit as dr
 
         ga, gb, haa, hab, hbb = system
-        delta = bend(self._base, a, b) - self._base[0]
-        ja, jb = bend_jacobian(self._base, a, b)
+        delta = bent_normal(self._base, a, b) - self._base[0]
+        ja, jb = bent_normal_jacobian(self._base, a, b)
         # d/dx of w2 |delta - prior|^2
         pull = 2.0 * self._w2 * (delta - self._prior)
         irls = None
@@ -304,7 +304,7 @@ class NormalProblem:
             x, y = a + da, b + db
             good = x * x + y * y < 4.0  # a right angle
             for _, weight, direction, frame in self.views:
-                good &= (weight <= 0) | (dr.dot(bend(frame, x, y), direction) >= FACING)
+                good &= (weight <= 0) | (dr.dot(bent_normal(frame, x, y), direction) >= FACING)
             factor = dr.select(good, 1.0, 0.5 if attempt < 3 else 0.0)
             da, db = da * factor, db * factor
         return a + da, b + db
@@ -333,7 +333,7 @@ def residual_scale(views: Sequence[NormalView], shade: TexelShade) -> float:
 
     lengths = []
     for k, view in enumerate(views):
-        shown = shade(vector(mi.Vector3f, view.normal), vector(mi.Vector3f, view.direction), k)
+        shown = shade(on_device(mi.Vector3f, view.normal), on_device(mi.Vector3f, view.direction), k)
         residual = view.colour - np.array(mi.Color3f(shown)).T
         lengths.append(np.linalg.norm(residual, axis=1)[np.asarray(view.weight) > 0])
     every = np.concatenate(lengths) if lengths else np.zeros(0)
@@ -352,7 +352,7 @@ def term_totals(local: dict[str, Any], rough: Any) -> dict[str, float]:
 def _frame(normals: NDArray, tangents: NDArray) -> tuple[Any, Any, Any]:
     import mitsuba as mi
 
-    return tuple(vector(mi.Vector3f, v) for v in (normals, tangents[:, 0], tangents[:, 1]))  # type: ignore[return-value]
+    return tuple(on_device(mi.Vector3f, v) for v in (normals, tangents[:, 0], tangents[:, 1]))  # type: ignore[return-value]
 
 
 def stored_offsets(a: Any, b: Any) -> NDArray[np.float64]:

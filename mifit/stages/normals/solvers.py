@@ -53,10 +53,10 @@ def gauss_newton(
         new_rough = problem.roughness(x, y)
         after = term_totals(found, new_rough)
         before = sum(totals.values())
-        risen = sum(after.values()) > before
-        damping = dr.select(worse | risen, dr.maximum(8.0 * damping, 0.05), 0.25 * damping)
+        increased = sum(after.values()) > before
+        damping = dr.select(worse | increased, dr.maximum(8.0 * damping, 0.05), 0.25 * damping)
         dr.eval(damping, x, y)
-        if risen:
+        if increased:
             rejected += 1
             continue
         system = tuple(dr.select(worse, old, new) for old, new in zip(system, new_system, strict=True))

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.arrays import aligned, vector
+from mifit.appearance.arrays import aligned, on_device
+from mifit.appearance.formation import Appearance, form_image
 from mifit.appearance.illumination import Illumination
-from mifit.appearance.image import Appearance, assemble
 from mifit.appearance.kernels import prepare
 from mifit.errors import InputError
 
@@ -119,7 +119,7 @@ def minimize_by_adam(
     begin = np.zeros(n, np.float32) if specular is None else np.asarray(specular, dtype=np.float32)
     # Optimisers of their own: each variable steps at the values that the ones before it have just taken.
     light = _Bounded(mi.Float(aligned(start)), rates[0], mi.Float(aligned(low)), mi.Float(aligned(high)))
-    gloss = _Bounded(mi.Float(aligned(begin)), rates[1], 0.0, 1.0)
+    specular_albedo = _Bounded(mi.Float(aligned(begin)), rates[1], 0.0, 1.0)
     offset = _Bounded(dr.zeros(mi.Float, 3 * n), rates[2], -base, 1.0 - base)
     history: dict[str, list[float]] = {name: [] for name in HISTORY}
 
@@ -128,19 +128,19 @@ def minimize_by_adam(
         return values, scale * dr.gather(mi.Float, x, 3 * k)
 
     for iteration in range(iterations):
-        light.step(lambda x: problem.total(problem.shade(*unpack(x)), gloss.value, base, offset.value))
+        light.step(lambda x: problem.total(problem.shade(*unpack(x)), specular_albedo.value, base, offset.value))
         shaded = problem.shade(*unpack(light.value))
         dr.eval(shaded)
-        gloss.step(lambda x, s=shaded: problem.total(s, x, base, offset.value))
-        offset.step(lambda x, s=shaded: problem.total(s, gloss.value, base, x))
-        for name, value in zip(HISTORY, problem.terms(shaded, gloss.value, base, offset.value), strict=True):
+        specular_albedo.step(lambda x, s=shaded: problem.total(s, x, base, offset.value))
+        offset.step(lambda x, s=shaded: problem.total(s, specular_albedo.value, base, x))
+        for name, value in zip(HISTORY, problem.terms(shaded, specular_albedo.value, base, offset.value), strict=True):
             history[name].append(float(value[0]))
         if on_iteration is not None:
             on_iteration(iteration + 1)
     final = np.array(light.value, dtype=np.float64) * scale
     diffuse = np.array(base + offset.value, dtype=np.float32).reshape(n, 3)
     illumination = Illumination(final[:-1].reshape(k, 3), ambient=float(final[-1]))
-    return AdamResult(illumination, diffuse, np.array(gloss.value, dtype=np.float32), history)
+    return AdamResult(illumination, diffuse, np.array(specular_albedo.value, dtype=np.float32), history)
 
 
 class _Bounded:
@@ -183,8 +183,8 @@ class _Objective:
 
         self.model, self.lobe = appearance.model, prepare(appearance.lobe, appearance.order)
         self.difference, self.smoothness = difference, smoothness
-        self.normal, self.view = vector(mi.Vector3f, samples.normal), vector(mi.Vector3f, samples.view)
-        self.colour, self.weight = vector(mi.Color3f, samples.colour), vector(mi.Color3f, samples.weight)
+        self.normal, self.view = on_device(mi.Vector3f, samples.normal), on_device(mi.Vector3f, samples.view)
+        self.colour, self.weight = on_device(mi.Color3f, samples.colour), on_device(mi.Color3f, samples.weight)
         self.texel = mi.UInt(aligned(samples.texel, np.uint32))
         self.first, self.second = (mi.UInt(aligned(x, np.uint32)) for x in (samples.first, samples.second))
         self.traced = None
@@ -201,15 +201,15 @@ class _Objective:
         d, s = self.model.shade(self.normal, self.view, self.lobe, coefficients, self.traced)
         return d, s, ambient
 
-    def terms(self, shaded: tuple[Any, Any, Any], gloss: Any, base: Any, offset: Any) -> tuple[Any, Any, Any]:
+    def terms(self, shaded: tuple[Any, Any, Any], specular_albedo: Any, base: Any, offset: Any) -> tuple[Any, Any, Any]:
         """Data, specular difference and smoothness terms, weighted."""
         import drjit as dr
         import mitsuba as mi
 
         d, s, ambient = shaded
-        y = dr.gather(mi.Float, gloss, self.texel)
+        y = dr.gather(mi.Float, specular_albedo, self.texel)
         x = mi.Color3f(*(dr.gather(mi.Float, base + offset, 3 * self.texel + c) for c in range(3)))
-        residual = self.colour - assemble(ambient, x, d, y, s)
+        residual = self.colour - form_image(ambient, x, d, y, s)
         data = dr.sum(_total(self.weight * dr.square(residual)))
         pair = mi.Float(0.0)
         if self.difference > 0 and len(self.first):
@@ -219,7 +219,7 @@ class _Objective:
             at = dr.gather(mi.Float, y, self.first)
             pair = self.difference * dr.sum(_total(both * dr.square(observed - at * shown)))
         rough = mi.Float(0.0)
-        for values, stride, shift, weight in [(gloss, 1, 0, self.smoothness[1])] + [
+        for values, stride, shift, weight in [(specular_albedo, 1, 0, self.smoothness[1])] + [
             (offset, 3, c, self.smoothness[0]) for c in range(3)
         ]:
             if weight > 0:
@@ -227,9 +227,9 @@ class _Objective:
                 rough += weight * dr.sum(dr.abs(sum(around) - 4.0 * centre))
         return data, pair, rough
 
-    def total(self, shaded: tuple[Any, Any, Any], gloss: Any, base: Any, offset: Any) -> Any:
+    def total(self, shaded: tuple[Any, Any, Any], specular_albedo: Any, base: Any, offset: Any) -> Any:
         """The whole objective."""
-        data, pair, rough = self.terms(shaded, gloss, base, offset)
+        data, pair, rough = self.terms(shaded, specular_albedo, base, offset)
         return data + pair + rough
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.image import Appearance, assemble
+from mifit.appearance.formation import Appearance, form_image
 from mifit.config import ReflectanceConfig
 from mifit.core.sh import LUMINANCE
 from mifit.progress import Progress
@@ -75,23 +75,27 @@ def fit_maps(
             progress("Reflectance maps", number * len(chunks) + done, passes * len(chunks))
             if kept is None:
                 seen = surface.observe(chunk)
-                shade, glint = forward.shade(seen, found.light)
+                diffuse_light, specular_light = forward.shade(seen, found.light)
             else:
-                seen, shade, glint = kept
+                seen, diffuse_light, specular_light = kept
             if len(chunks) == 1:
-                kept = seen, shade, glint
+                kept = seen, diffuse_light, specular_light
             weight = seen.weight[..., None] * noise_weight(seen.colour, config.robust)
             target = seen.colour - np.float32(found.ambient)
             if maps is None or not config.robust:
                 weight = np.where(seen.clipped[..., None], np.float32(0.0), weight)
             else:
                 texel = maps.reshape(-1, 4)[index[chunk]]
-                residual = target - assemble(0.0, texel[:, None, :3], shade, texel[:, 3, None, None], glint)
-                weight, spread = active_weight(weight, seen.clipped, residual, config.robust)
+                residual = target - form_image(
+                    0.0, texel[:, None, :3], diffuse_light, texel[:, 3, None, None], specular_light
+                )
+                weight, deviation = active_weight(weight, seen.clipped, residual, config.robust)
                 data += float((weight * residual**2).sum())
-                sigmas.append(spread)
+                sigmas.append(deviation)
             systems.append(
-                TexelSystems.accumulate(target, weight, shade, glint, pairs, config.specular_difference_weight)
+                TexelSystems.accumulate(
+                    target, weight, diffuse_light, specular_light, pairs, config.specular_difference_weight
+                )
             )
         if sigmas:
             energy["data"].append(data)
@@ -127,7 +131,7 @@ def fit_als(
     if not config.robust:
         found, maps, energy = alternate(surface, forward, found, maps, prior, albedo, config, progress)
     energy = {"lighting": found.energy} if config.robust else energy
-    return Fitted(forward.lit(found.light, found.ambient), maps, sigma, energy, found.outcome), choice, ()
+    return Fitted(forward.under(found.light, found.ambient), maps, sigma, energy, found.outcome), choice, ()
 
 
 def alternate(
@@ -185,10 +189,10 @@ def exact_lighting(
     for chunk in surface.chunks(8 * k):
         seen = surface.observe(chunk)
         diffuse, specular = forward.transfers(seen, found.light)
-        glint = values[chunk, 3][:, None, None] * specular
+        specular_light = values[chunk, 3][:, None, None] * specular
         for c in range(3):
-            rows = values[chunk, c][:, None, None] * diffuse + glint
-            _add(system[c], right[c], surface.pairs, seen, c, rows, glint, config.specular_difference_weight)
+            rows = values[chunk, c][:, None, None] * diffuse + specular_light
+            _add(system[c], right[c], surface.pairs, seen, c, rows, specular_light, config.specular_difference_weight)
     floor = 1e-9 * np.trace(system, axis1=1, axis2=2)[:, None, None] / k
     return np.linalg.solve(system + floor * np.eye(k), right[..., None])[..., 0].T, 0.0
 
@@ -218,15 +222,15 @@ def _turning_step(
             ahead, behind = (forward.transfers(seen, found.light + s * change)[1] for s in (1.0, -1.0))
             turning.append(y * ((ahead - behind) @ light) * np.float32(0.5 / reach))
         for c in range(3):
-            glint = np.zeros((*diffuse.shape[:2], 3 * k + 1), np.float32)
-            glint[..., c * k : (c + 1) * k] = y * specular
+            specular_light = np.zeros((*diffuse.shape[:2], 3 * k + 1), np.float32)
+            specular_light[..., c * k : (c + 1) * k] = y * specular
             for band, slope in enumerate(turning):
                 for other in range(3):
-                    glint[..., other * k + band + 1] += np.float32(LUMINANCE[other]) * slope[..., c]
-            rows = glint.copy()
+                    specular_light[..., other * k + band + 1] += np.float32(LUMINANCE[other]) * slope[..., c]
+            rows = specular_light.copy()
             rows[..., c * k : (c + 1) * k] += values[chunk, c][:, None, None] * diffuse
             rows[..., -1] = 1.0
-            _add(system, right, surface.pairs, seen, c, rows, glint, config.specular_difference_weight)
+            _add(system, right, surface.pairs, seen, c, rows, specular_light, config.specular_difference_weight)
     floor = 1e-9 * float(np.trace(system)) / len(system)
     solution = np.linalg.solve(system + floor * np.eye(len(system)), right)
     if solution[-1] < 0.0:
@@ -241,12 +245,12 @@ def _add(
     seen: Observations,
     channel: int,
     rows: NDArray,
-    glint: NDArray,
+    specular_light: NDArray,
     difference: float,
 ) -> None:
     """Add one channel's data and difference terms to normal equations, in place.
 
-    ``rows`` (N, J, K) are the derivatives of the image, ``glint`` those of its specular part.
+    ``rows`` (N, J, K) are the derivatives of the image, ``specular_light`` those of its specular part.
     """
     colour, weight = seen.colour[..., channel], seen.measured
     flat = rows.reshape(-1, rows.shape[-1])
@@ -255,6 +259,6 @@ def _add(
     right += weighted.T @ colour.ravel()
     for a, b in pairs:
         both = difference * np.minimum(weight[:, a], weight[:, b])
-        step = glint[:, a] - glint[:, b]
+        step = specular_light[:, a] - specular_light[:, b]
         system += (step * both[:, None]).T @ step
         right += (step * both[:, None]).T @ (colour[:, a] - colour[:, b])

@@ -162,7 +162,7 @@ def _with_light(
                 forward = forward.with_lobe(replace(forward.lobe, exponent=best))
             found = fit_lighting(part, forward, expected, config, 8)
             mean = np.sqrt(np.pi) / 2.0 * found.light[0]  # irradiance from everywhere, pi times the mean radiance
-            (irradiance,) = (light.colour for light in forward.lit(found.light).illumination.lights)
+            (irradiance,) = (light.colour for light in forward.under(found.light).illumination.lights)
             if irradiance @ LUMINANCE < FAINT * mean @ LUMINANCE:
                 return None
     return forward

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.formation import Appearance
 from mifit.appearance.illumination import Illumination, Light
-from mifit.appearance.image import Appearance
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
-from mifit.appearance.occlusion import OccludingMesh, Occlusion, SurfacePoints
+from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion
 from mifit.stages.observations import Observations
 
 CHUNK = 1 << 19
@@ -63,7 +63,7 @@ class Forward:
         """Number K of lighting unknowns per channel: coefficients, and a colour per compact light."""
         return self.order**2 + len(self.lights)
 
-    def lit(self, light: NDArray, ambient: float = 0.0) -> Appearance:
+    def under(self, light: NDArray, ambient: float = 0.0) -> Appearance:
         """The appearance under lighting unknowns (K, 3)."""
         illumination = self.appearance.illumination.with_unknowns(light, ambient)
         return replace(self.appearance, illumination=illumination)
@@ -82,14 +82,14 @@ class Forward:
         ``light`` (K, 3) matters to models that turn with the lighting alone.
         """
         n, j = seen.weight.shape
-        found = self.lit(light).transfers(*_flat(seen), self.occlusion(seen), _points(seen))
+        found = self.under(light).transfers(*_flat(seen), self.occlusion(seen), _points(seen))
         return found[0].reshape(n, j, -1), found[1].reshape(n, j, -1)
 
     def shade(self, seen: Observations, light: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Diffuse and specular radiance (N, J, 3) at unit albedo, without ambient."""
         n, j = seen.weight.shape
         diffuse, specular = np.empty((n, j, 3), np.float32), np.empty((n, j, 3), np.float32)
-        appearance, step = self.lit(light), max(1, CHUNK // j)
+        appearance, step = self.under(light), max(1, CHUNK // j)
         for start in range(0, n, step):
             rows = slice(start, start + step)
             part = seen.take(rows)
@@ -142,6 +142,6 @@ def _points(seen: Observations) -> NDArray:
     return seen.point[:, seen.step].reshape(-1, 3)
 
 
-def _surface_points(seen: Observations, step: int) -> SurfacePoints:
+def _surface_points(seen: Observations, step: int) -> MeshPoints:
     """The texels on the mesh of one timestep."""
-    return SurfacePoints(seen.point[:, step], seen.normal[:, step], seen.face, seen.barycentric)
+    return MeshPoints(seen.point[:, step], seen.normal[:, step], seen.face, seen.barycentric)

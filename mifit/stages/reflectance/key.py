@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.formation import form_image
 from mifit.appearance.illumination import DistantLight
-from mifit.appearance.image import assemble
 from mifit.stages.observations import Observations
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import (
@@ -50,8 +50,8 @@ class Candidates:
         The model without a compact light.
     rows : three of (n * J, K)
         Derivative of the image by the lighting, per channel.
-    weight, residual, shade, glint : (n, J, 3)
-    diffuse : (n, 3), gloss : (n,)
+    weight, residual, diffuse_light, specular_light : (n, J, 3)
+    diffuse : (n, 3), specular_albedo : (n,)
     inverse : (n, 4, 4), cross : (n, 4, 3K), own_right : (n, 4)
         The texels' blocks of the normal equations.
     factor : (3K, 3K), right : (3K,)
@@ -63,10 +63,10 @@ class Candidates:
     rows: list[NDArray]
     weight: NDArray
     residual: NDArray
-    shade: NDArray
-    glint: NDArray
+    diffuse_light: NDArray
+    specular_light: NDArray
     diffuse: NDArray
-    gloss: NDArray
+    specular_albedo: NDArray
     inverse: NDArray
     cross: NDArray
     own_right: NDArray
@@ -81,12 +81,14 @@ class Candidates:
         k = forward.order**2
         light = found.light.astype(np.float32)
         x, y = found.diffuse[:, None], found.specular[:, None, None]
-        residual = problem.colour - assemble(0.0, x, problem.diffuse @ light, y, problem.specular @ light)
+        residual = problem.colour - form_image(0.0, x, problem.diffuse @ light, y, problem.specular @ light)
         weight = bounded_weight(problem, residual)
         plain = replace(problem, diffuse=problem.diffuse[..., :k], specular=problem.specular[..., :k])
-        shade, glint = plain.diffuse @ light[:k], plain.specular @ light[:k]
-        residual = problem.colour - assemble(0.0, x, shade, y, glint)
-        normal = linearize(plain, found.light[:k], found.diffuse, found.specular, shade, glint, residual, weight)
+        diffuse_light, specular_light = plain.diffuse @ light[:k], plain.specular @ light[:k]
+        residual = problem.colour - form_image(0.0, x, diffuse_light, y, specular_light)
+        normal = linearize(
+            plain, found.light[:k], found.diffuse, found.specular, diffuse_light, specular_light, residual, weight
+        )
         inverse, reduced, right = normal.eliminate(3 * k, 1e-4)
         rows = [(x[..., c : c + 1] * plain.diffuse + y * plain.specular).reshape(-1, k) for c in range(3)]
         return cls(
@@ -95,8 +97,8 @@ class Candidates:
             rows,
             weight,
             residual,
-            shade,
-            glint,
+            diffuse_light,
+            specular_light,
             found.diffuse,
             found.specular,
             inverse,
@@ -117,13 +119,13 @@ class Candidates:
         own = np.zeros((len(by_diffuse), 4, 3), np.float32)
         system, right, across = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3 * k))
         for c in range(3):
-            column = self.diffuse[:, None, c] * by_diffuse + self.gloss[:, None] * by_specular
+            column = self.diffuse[:, None, c] * by_diffuse + self.specular_albedo[:, None] * by_specular
             weighted = self.weight[..., c] * column
             system[c, c] = (weighted * column).sum()
             right[c] = (weighted * self.residual[..., c]).sum()
             across[c, c * k : (c + 1) * k] = weighted.ravel() @ self.rows[c]
-            own[:, c, c] = (weighted * self.shade[..., c]).sum(1)
-            own[:, 3, c] = (weighted * self.glint[..., c]).sum(1)
+            own[:, c, c] = (weighted * self.diffuse_light[..., c]).sum(1)
+            own[:, 3, c] = (weighted * self.specular_light[..., c]).sum(1)
         moved = np.matmul(self.inverse, own)
         system -= np.tensordot(own, moved, ([0, 1], [0, 1]))
         right -= np.tensordot(moved, self.own_right, ([0, 1], [0, 1]))
@@ -146,9 +148,9 @@ def scan(candidates: Candidates) -> tuple[NDArray[np.float64], float]:
         part = directions[start : start + 32]
         bits = candidates.forward.open_towards(candidates.seen, part)
         for number, direction in enumerate(part):
-            lit = (bits >> np.uint32(number)) & 1
-            if lit.mean() > LEAST:
-                gain = candidates.explained(direction, WIDE, np.where(lit, np.uint32(0xFFFFFFFF), np.uint32(0)))
+            visible = (bits >> np.uint32(number)) & 1
+            if visible.mean() > LEAST:
+                gain = candidates.explained(direction, WIDE, np.where(visible, np.uint32(0xFFFFFFFF), np.uint32(0)))
                 if gain > most:
                     best, most = direction, gain
     return best, most

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.image import assemble
+from mifit.appearance.formation import form_image
 from mifit.core.sh import bands, basis
 from mifit.solve import Outcome
 
@@ -165,19 +165,21 @@ def solve_lighting(
     """
     n = len(problem.specular)
     diffuse = problem.albedo.astype(np.float32).copy()
-    gloss = np.full(n, specular, dtype=np.float32)
-    light = _initial(problem, diffuse, gloss) if start is None else np.array(start, dtype=np.float64)
+    specular_albedo = np.full(n, specular, dtype=np.float32)
+    light = _initial(problem, diffuse, specular_albedo) if start is None else np.array(start, dtype=np.float64)
     energy: list[float] = []
     ambient, sigma, unexplained, damping, outcome = 0.0, 0.0, np.inf, 1e-3, Outcome.MAX_ITERATIONS
-    state = light, ambient, diffuse, gloss
+    state = light, ambient, diffuse, specular_albedo
     best = state
     for _ in range(iterations):
-        light, ambient, diffuse, gloss = state
-        shade = np.einsum("njk,kc->njc", problem.diffuse, light.astype(np.float32))
-        glint = np.einsum("njk,kc->njc", problem.specular, light.astype(np.float32))
-        shown = assemble(np.float32(ambient), diffuse[:, None], shade, gloss[:, None, None], glint)
+        light, ambient, diffuse, specular_albedo = state
+        diffuse_light = np.einsum("njk,kc->njc", problem.diffuse, light.astype(np.float32))
+        specular_light = np.einsum("njk,kc->njc", problem.specular, light.astype(np.float32))
+        shown = form_image(
+            np.float32(ambient), diffuse[:, None], diffuse_light, specular_albedo[:, None, None], specular_light
+        )
         residual = problem.colour - shown
-        weight, spread = active_weight(problem.weight, problem.clipped, residual, robust)
+        weight, deviation = active_weight(problem.weight, problem.clipped, residual, robust)
         current = float((weight * residual**2).sum())
         if not energy and not np.isfinite(current):
             outcome = Outcome.DIVERGED
@@ -191,32 +193,43 @@ def solve_lighting(
             if energy and abs(energy[-1] - current) < tolerance * energy[-1]:
                 outcome = Outcome.CONVERGED
             energy.append(current)
-            best, sigma = state, spread
+            best, sigma = state, deviation
             bounded = float((bounded_weight(problem, residual) * residual**2).sum())
             unexplained = float(np.sqrt(bounded / max(float(problem.weight.sum()), 1e-12)))
             damping = max(0.1 * damping, DAMPING)
-            system = linearize(problem, light, diffuse, gloss, shade, glint, residual, weight, priors, spread)
+            system = linearize(
+                problem,
+                light,
+                diffuse,
+                specular_albedo,
+                diffuse_light,
+                specular_light,
+                residual,
+                weight,
+                priors,
+                deviation,
+            )
             if outcome is Outcome.CONVERGED:
                 break
         step = system.solve(with_ambient, damping)
-        light, ambient, diffuse, gloss = best
+        light, ambient, diffuse, specular_albedo = best
         light = light + step.light
         ambient = max(ambient + step.ambient, 0.0)
         diffuse = np.clip(diffuse + step.diffuse, 0.0, 1.5).astype(np.float32)
-        gloss = np.clip(gloss + step.gloss, 0.0, 1.0).astype(np.float32)
+        specular_albedo = np.clip(specular_albedo + step.specular_albedo, 0.0, 1.0).astype(np.float32)
         gain = gauge(diffuse, problem.albedo, problem.weight)
-        state = light * gain, ambient, (diffuse / gain).astype(np.float32), (gloss / gain).astype(np.float32)
-    light, ambient, diffuse, gloss = best
-    return LightingSolution(light, ambient, diffuse, gloss, sigma, unexplained, energy, outcome)
+        state = light * gain, ambient, (diffuse / gain).astype(np.float32), (specular_albedo / gain).astype(np.float32)
+    light, ambient, diffuse, specular_albedo = best
+    return LightingSolution(light, ambient, diffuse, specular_albedo, sigma, unexplained, energy, outcome)
 
 
 def linearize(
     problem: LightingProblem,
     light: NDArray,
     diffuse: NDArray,
-    gloss: NDArray,
-    shade: NDArray,
-    glint: NDArray,
+    specular_albedo: NDArray,
+    diffuse_light: NDArray,
+    specular_light: NDArray,
     residual: NDArray,
     weight: NDArray,
     priors: LightingPriors = LightingPriors(),
@@ -224,12 +237,14 @@ def linearize(
 ) -> _Normal:
     """Normal equations about a state, with priors beside residuals of standard deviation `sigma`."""
     k, order = problem.specular.shape[-1], problem.order
-    system = _Normal.accumulate(problem, diffuse, gloss, shade, glint, residual, weight)
+    system = _Normal.accumulate(problem, diffuse, specular_albedo, diffuse_light, specular_light, residual, weight)
     extra = k - order * order  # compact lights are kept from negative values one by one
     directions = np.pad(basis(fibonacci_sphere(NEGATIVE_DIRECTIONS), order), ((0, extra), (0, extra)))
     directions[NEGATIVE_DIRECTIONS:, order * order :] = np.eye(extra)
-    expected = expected_specular(gloss, (problem.weight > 0).any(axis=2))
-    system.add_priors(priors, light, diffuse, gloss, problem.albedo, _stiffness(order, k), directions, sigma, expected)
+    expected = expected_specular(specular_albedo, (problem.weight > 0).any(axis=2))
+    system.add_priors(
+        priors, light, diffuse, specular_albedo, problem.albedo, _stiffness(order, k), directions, sigma, expected
+    )
     return system
 
 
@@ -266,13 +281,15 @@ def bounded_weight(problem: LightingProblem, residual: NDArray) -> NDArray[np.fl
     return np.where(problem.clipped[..., None] & (residual <= 0), np.float32(0.0), weight)
 
 
-def _initial(problem: LightingProblem, diffuse: NDArray, gloss: NDArray) -> NDArray[np.float64]:
+def _initial(problem: LightingProblem, diffuse: NDArray, specular_albedo: NDArray) -> NDArray[np.float64]:
     """Linear least squares for the lighting with fixed maps."""
     k = problem.specular.shape[-1]
     stiffness = _stiffness(problem.order, k)
     light = np.zeros((k, 3))
     for c in range(3):
-        rows = (diffuse[:, None, None, c] * problem.diffuse + gloss[:, None, None] * problem.specular).reshape(-1, k)
+        rows = (
+            diffuse[:, None, None, c] * problem.diffuse + specular_albedo[:, None, None] * problem.specular
+        ).reshape(-1, k)
         w = np.where(problem.clipped, 0, problem.weight[..., c]).ravel()
         h = (rows * w[:, None]).T @ rows
         scale = max(float(np.trace(h)) / k, 1e-12)
@@ -286,7 +303,7 @@ class _Step:
     light: NDArray[np.float64]
     ambient: float
     diffuse: NDArray[np.float32]
-    gloss: NDArray[np.float32]
+    specular_albedo: NDArray[np.float32]
 
 
 @dataclass
@@ -304,9 +321,9 @@ class _Normal:
         cls,
         problem: LightingProblem,
         diffuse: NDArray,
-        gloss: NDArray,
-        shade: NDArray,
-        glint: NDArray,
+        specular_albedo: NDArray,
+        diffuse_light: NDArray,
+        specular_light: NDArray,
         residual: NDArray,
         weight: NDArray,
     ) -> _Normal:
@@ -316,9 +333,9 @@ class _Normal:
         cross = np.zeros((n, 4, 3 * k + 1), np.float32)
         for c in range(3):
             block = slice(c * k, (c + 1) * k)
-            rows = diffuse[:, None, None, c] * problem.diffuse + gloss[:, None, None] * problem.specular
+            rows = diffuse[:, None, None, c] * problem.diffuse + specular_albedo[:, None, None] * problem.specular
             w, r = weight[..., c], residual[..., c]
-            jd, js = shade[..., c], glint[..., c]
+            jd, js = diffuse_light[..., c], specular_light[..., c]
             weighted = rows * w[..., None]
             flat = weighted.reshape(-1, k)
             system[block, block] = flat.T @ rows.reshape(-1, k)
@@ -342,7 +359,7 @@ class _Normal:
         priors: LightingPriors,
         light: NDArray,
         diffuse: NDArray,
-        gloss: NDArray,
+        specular_albedo: NDArray,
         albedo: NDArray,
         stiffness: NDArray,
         sphere_basis: NDArray,
@@ -361,7 +378,7 @@ class _Normal:
             self.own_right[:, c] += pull * (albedo[:, c] - diffuse[:, c])
         pull = max(priors.specular * float(np.median(self.own[:, 3, 3])), specular_pull(expected, sigma))
         self.own[:, 3, 3] += pull
-        self.own_right[:, 3] += pull * (expected - gloss)
+        self.own_right[:, 3] += pull * (expected - specular_albedo)
         radiance = sphere_basis @ light
         for c in range(3):
             block = slice(c * k, (c + 1) * k)

@@ -38,28 +38,34 @@ class TexelSystems:
 
     @classmethod
     def accumulate(
-        cls, colour: NDArray, weight: NDArray, shade: NDArray, glint: NDArray, pairs: NDArray, difference: float
+        cls,
+        colour: NDArray,
+        weight: NDArray,
+        diffuse_light: NDArray,
+        specular_light: NDArray,
+        pairs: NDArray,
+        difference: float,
     ) -> TexelSystems:
         """Sum observations (N, J, 3) into blocks.
 
         Parameters
         ----------
-        colour, weight, shade, glint : (N, J, 3)
+        colour, weight, diffuse_light, specular_light : (N, J, 3)
             Observed colour, its weight, and the diffuse and specular reflection at unit albedo.
         pairs : (P, 2) int
             Images of the same timestep whose difference is specular only (the paper's E_S).
         difference : float
             Weight of the difference term, lambda_S.
         """
-        wd = weight * shade
-        ss = (weight * glint * glint).sum((1, 2))
-        sr = (weight * glint * colour).sum((1, 2))
+        wd = weight * diffuse_light
+        ss = (weight * specular_light * specular_light).sum((1, 2))
+        sr = (weight * specular_light * colour).sum((1, 2))
         for a, b in pairs:
             both = difference * np.minimum(weight[:, a], weight[:, b])
-            step = glint[:, a] - glint[:, b]
+            step = specular_light[:, a] - specular_light[:, b]
             ss += (both * step * step).sum(1)
             sr += (both * step * (colour[:, a] - colour[:, b])).sum(1)
-        return cls((wd * shade).sum(1), (wd * glint).sum(1), (wd * colour).sum(1), ss, sr)
+        return cls((wd * diffuse_light).sum(1), (wd * specular_light).sum(1), (wd * colour).sum(1), ss, sr)
 
     @classmethod
     def join(cls, parts: list[TexelSystems]) -> TexelSystems:

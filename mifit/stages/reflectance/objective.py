@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.image import assemble
+from mifit.appearance.formation import form_image
 from mifit.config import ReflectanceConfig
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.forward import Forward
@@ -43,13 +43,15 @@ def energies(
     data = difference = 0.0
     for chunk in surface.chunks():
         seen = surface.observe(chunk)
-        shade, glint = forward.shade(seen, light)
+        diffuse_light, specular_light = forward.shade(seen, light)
         weight = seen.measured[..., None]
         x, y = values[chunk, None, :3], values[chunk, 3, None, None]
-        data += float((weight * (seen.colour - assemble(np.float32(ambient), x, shade, y, glint)) ** 2).sum())
+        data += float(
+            (weight * (seen.colour - form_image(np.float32(ambient), x, diffuse_light, y, specular_light)) ** 2).sum()
+        )
         for a, b in surface.pairs:
             both = np.minimum(weight[:, a], weight[:, b])
-            shown = y[:, 0] * (glint[:, a] - glint[:, b])
+            shown = y[:, 0] * (specular_light[:, a] - specular_light[:, b])
             difference += float((both * (seen.colour[:, a] - seen.colour[:, b] - shown) ** 2).sum())
     offset = maps.copy()
     offset[..., :3] -= surface.texels.to_map(albedo.astype(maps.dtype))

@@ -1,7 +1,7 @@
 """How an image is formed: a shading model, what lights the surface, its lobe, and what stands in the light's way.
 
 The image of a point is ``ambient + albedo * diffuse + specular_albedo * specular``, with diffuse and specular radiance
-at unit albedo from smooth and from compact lights. `assemble` is the only place that says so.
+at unit albedo from smooth and from compact lights. `form_image` is the only place that says so.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mifit.appearance import models
-from mifit.appearance.arrays import aligned, expect, stored, vector
+from mifit.appearance.arrays import aligned, expect, on_device, stored
 from mifit.appearance.illumination import Illumination, Light
 from mifit.appearance.kernels import PreparedLobe, diffuse_transfer, prepare
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
 from mifit.appearance.models.base import Shade
-from mifit.appearance.occlusion import OccludingMesh, Occlusion, SurfacePoints
+from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion
 from mifit.errors import InputError
 
 OPEN = Occlusion()
 
 
-def assemble(ambient: Any, albedo: Any, diffuse: Any, specular_albedo: Any, specular: Any) -> Any:
+def form_image(ambient: Any, albedo: Any, diffuse: Any, specular_albedo: Any, specular: Any) -> Any:
     """The image of points, from diffuse and specular radiance at unit albedo; NumPy or Dr.Jit, shapes broadcast."""
     return ambient + albedo * diffuse + specular_albedo * specular
 
@@ -64,7 +64,7 @@ class Appearance:
         """Number of bands of the smooth light."""
         return self.illumination.order
 
-    def trace(self, mesh: OccludingMesh, points: SurfacePoints, seed: int = 0) -> Occlusion:
+    def trace(self, mesh: OccludingMesh, points: MeshPoints, seed: int = 0) -> Occlusion:
         """What of the mesh stands between points on it and the light, as far as this appearance asks."""
         return Occlusion.trace(mesh, points, self.illumination, seed, self.model.needs_shadows)
 
@@ -104,7 +104,9 @@ class Appearance:
         scene = _Scene(self, base, view, occlusion, points)
         if not scene.count:
             return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
-        return scene.store(scene.shader()(vector(type(scene.n), expect(normals, (scene.count, 3), "normals")), scene.v))
+        return scene.store(
+            scene.shader()(on_device(type(scene.n), expect(normals, (scene.count, 3), "normals")), scene.v)
+        )
 
     def shader(
         self, base: ArrayLike, view: ArrayLike, occlusion: Occlusion = OPEN, points: ArrayLike | None = None
@@ -174,9 +176,9 @@ class _Scene:
         self.count = len(np.asarray(normals))
         shape = (self.count, 3)
         self.n, self.v = (
-            vector(mi.Vector3f, expect(x, shape, name)) for x, name in ((normals, "normals"), (view, "view"))
+            on_device(mi.Vector3f, expect(x, shape, name)) for x, name in ((normals, "normals"), (view, "view"))
         )
-        self.points = None if points is None else vector(mi.Point3f, expect(points, shape, "points"))
+        self.points = None if points is None else on_device(mi.Point3f, expect(points, shape, "points"))
         self.shadowed = None
         if shadows and self.model.needs_shadows:
             if occlusion.transfer is None:
@@ -240,4 +242,4 @@ def diffuse_matrix(normals: ArrayLike, order: int) -> NDArray[np.float32]:
     import mitsuba as mi
 
     n = expect(normals, (len(np.asarray(normals)), 3), "normals")
-    return stored(diffuse_transfer(vector(mi.Vector3f, n), order), len(n))
+    return stored(diffuse_transfer(on_device(mi.Vector3f, n), order), len(n))

@@ -52,7 +52,7 @@ def fit_adam(
     steps = config.max_iterations * STEPS_PER_ITERATION
     result = minimize_by_adam(
         gather_samples(surface, seen, forward, albedo, config),
-        forward.lit(radiance, ambient),
+        forward.under(radiance, ambient),
         config.specular_difference_weight,
         (config.smoothness_weight, config.smoothness_weight * config.specular_smoothness),
         steps,
