@@ -229,6 +229,11 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add_rate(p)
 
+    p = add("view", "a live view in the browser: turn the head and the light, switch parts, load an environment")
+    p.add_argument("result", type=_path, help="result folder")
+    p.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine only)")
+    p.add_argument("--port", type=_at_least(0), default=8080, help="default: 8080; 0 takes a free one")
+
     p = add("relight", "relit views under a measured environment")
     p.add_argument("result", type=_path)
     p.add_argument("--env", type=_path, required=True, help="lat-long environment, .hdr or .exr")

@@ -361,6 +361,21 @@ def turntable(arguments: Namespace) -> None:
     print(f"Views: {arguments.out}")
 
 
+def view(arguments: Namespace) -> None:
+    """Show a result in the browser until the user ends it."""
+    result = _result_and_variant(arguments)
+    from mifit.output.live_view import LiveView
+
+    live = LiveView(result, arguments.host, arguments.port)
+    print(f"View: {live.address} (end with Ctrl+C)", flush=True)
+    try:
+        live.run()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        live.close()
+
+
 def relight(arguments: Namespace) -> None:
     """Write views under another environment."""
     result = _result_and_variant(arguments)

@@ -10,7 +10,9 @@ import pytest
 
 from mifit.cli import main
 
-COMMANDS = "doctor demo synth import landmarks fit track evaluate render turntable relight export run model".split()
+COMMANDS = (
+    "doctor demo synth import landmarks fit track evaluate render turntable view relight export run model".split()
+)
 
 
 def run(capsys, *arguments):

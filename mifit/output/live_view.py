@@ -1,0 +1,257 @@
+"""A live view of a result in the browser: turn the head and the light, switch parts, load an environment.
+
+The browser keeps the camera; every picture is rendered here by the code that renders files, a small one at once and
+a full one when the camera rests. Rendering stays in the thread that set Mitsuba's variant: callbacks of the server
+only note what was asked for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from mifit.core.camera import Camera
+from mifit.core.image import to_8_bit
+from mifit.core.mesh import normalize
+from mifit.errors import InputError, MifitError
+from mifit.output.deferred import render_local
+from mifit.output.relight import relit
+from mifit.output.turntable import on_backdrop, orbit_camera
+from mifit.result import METHODS, Method, Result
+
+ROWS = (160, 600)
+"""Rows of a picture while something moves, and when it rests."""
+REST = 0.3
+"""Seconds without a change after which the full picture is rendered."""
+LABELS = {"pca": "morphable model", "diffuse": "without specular", "full": "everything"}
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the controls ask for.
+
+    Attributes
+    ----------
+    method : {"full", "diffuse", "pca"}
+    timestep : int
+    turn : float
+        Of the light about the vertical, degrees.
+    environment : path or None
+        Lat-long environment in place of the recovered light.
+    """
+
+    method: Method
+    timestep: int
+    turn: float = 0.0
+    environment: Path | None = None
+
+
+class Picture:
+    """Renders what is shown from any camera and keeps the last relit result.
+
+    Parameters
+    ----------
+    result : Result
+    """
+
+    def __init__(self, result: Result) -> None:
+        self._result = result
+        self._lit: tuple[tuple[float, Path | None], Result] = ((0.0, None), result)
+
+    def render(self, shown: Shown, camera: Camera) -> NDArray[np.uint8]:
+        """(H, W, 3) 8-bit sRGB; raises InputError for an environment that can't be read."""
+        key = (shown.turn, shown.environment)
+        if self._lit[0] != key:
+            self._lit = (key, under(self._result, *key))
+        image = render_local(self._lit[1], camera, shown.timestep, shown.method, 1)
+        return to_8_bit(on_backdrop(image))
+
+
+def under(result: Result, turn: float, environment: Path | None) -> Result:
+    """A result under its own light or an environment, turned about the vertical by degrees."""
+    if environment is not None:
+        return relit(result, environment, rotate=turn)
+    if turn == 0.0 or result.reflectance is None:
+        return result
+    rotation = Rotation.from_rotvec(np.radians(turn) * vertical(result)).as_matrix()
+    illumination = result.reflectance.illumination.rotated(rotation)
+    return replace(result, reflectance=replace(result.reflectance, illumination=illumination))
+
+
+def vertical(result: Result) -> NDArray[np.float64]:
+    """(3,) unit vector: up in the mean of the fitted cameras."""
+    return normalize(-np.mean([c.rotation[1] for c in result.cameras], axis=0))
+
+
+def browser_camera(wxyz: NDArray, position: NDArray, fov: float, aspect: float, rows: int) -> Camera:
+    """The camera of a browser window.
+
+    Parameters
+    ----------
+    wxyz : (4,), position : (3,)
+        Rotation, camera to world in OpenCV's axes, as a quaternion; centre in world space.
+    fov : float
+        Vertical field of view in radians.
+    aspect : float
+        Width over height.
+    rows : int
+        Height of the picture in pixels.
+    """
+    columns = int(np.clip(round(rows * aspect), 16, 8 * rows))
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix().T
+    pose[:3, 3] = -pose[:3, :3] @ position
+    focal = 0.5 * rows / np.tan(0.5 * fov)
+    return Camera("browser", columns, rows, focal, focal, columns / 2, rows / 2, pose)
+
+
+class LiveView:
+    """A server that shows a result; `run` answers requests until it is stopped.
+
+    Parameters
+    ----------
+    result : Result
+        Fitted, tracked or relit.
+    host, port : str, int
+        Where the server listens; port 0 takes a free one.
+
+    Raises
+    ------
+    InputError
+        The result has no cameras, or viser isn't installed.
+    MifitError
+        The port is taken.
+    """
+
+    def __init__(self, result: Result, host: str = "127.0.0.1", port: int = 8080) -> None:
+        try:
+            import viser
+        except ImportError:
+            raise InputError('the live view needs viser; install it with: pip install "mifit[view]"') from None
+        self._start = orbit_camera(result, result.timesteps[0], 0.0)
+        self._up = vertical(result)
+        face = result.geometry.vertices[0][np.unique(result.model.faces[result.model.face_mask])]
+        self._centre = 0.5 * (face.min(0) + face.max(0)).astype(np.float64)
+        self._steps = sorted(result.timesteps)
+        self._picture = Picture(result)
+        self._shown = Shown(result.methods[-1], self._steps[0])
+        self._changed: dict[int, float] = {}  # client -> when its picture went out of date
+        self._coarse: set[int] = set()  # clients whose last picture was a small one
+        self._woken = threading.Event()
+        self._folder = tempfile.TemporaryDirectory(prefix="mifit-view-")
+        try:
+            with contextlib.redirect_stdout(io.StringIO()):  # it prints a table of its own
+                self._server = viser.ViserServer(host=host, port=port, label="mifit", verbose=False)
+        except OSError as error:
+            raise MifitError(f"port {port}: taken or forbidden ({error.strerror}); choose another by --port") from None
+        self._server.scene.set_up_direction(self._up)
+        self._server.scene.world_axes.visible = False
+        self._server.gui.configure_theme(control_width="small", show_logo=False, show_share_button=False)
+        self._controls(result)
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(self._gone)
+
+    @property
+    def address(self) -> str:
+        """Where a browser finds the view."""
+        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+
+    def run(self, until: Callable[[], bool] = lambda: False) -> None:
+        """Answer requests until ``until`` says so, or for ever."""
+        playing = time.monotonic()
+        while not until():
+            self._woken.wait(0.05)
+            self._woken.clear()
+            if self._play is not None and self._play.value and time.monotonic() - playing > 0.15:
+                playing = time.monotonic()
+                steps = self._steps
+                self._step.value = steps[(steps.index(self._shown.timestep) + 1) % len(steps)]
+            now = time.monotonic()
+            for client, handle in self._server.get_clients().items():
+                if client in self._changed:
+                    del self._changed[client]
+                    self._coarse.add(client)
+                    self._send(handle, ROWS[0])
+                    self._rested = now
+                elif client in self._coarse and now - self._rested > REST:
+                    self._coarse.discard(client)
+                    self._send(handle, ROWS[1])
+
+    def close(self) -> None:
+        """Stop the server."""
+        self._server.stop()
+        self._folder.cleanup()
+
+    def _controls(self, result: Result) -> None:
+        gui = self._server.gui
+        parts = {LABELS[m]: m for m in METHODS if m in result.methods}
+        shown = gui.add_dropdown("Show", tuple(parts), initial_value=LABELS[self._shown.method])
+        shown.on_update(lambda _: self._show(method=parts[shown.value]))
+        self._play: Any = None
+        if len(self._steps) > 1:
+            self._step = gui.add_slider("Timestep", self._steps[0], self._steps[-1], 1, self._steps[0])
+            self._step.on_update(
+                lambda _: self._show(timestep=min(self._steps, key=lambda t: abs(t - int(self._step.value))))
+            )
+            self._play = gui.add_checkbox("Play", False)
+        if result.reflectance is not None:
+            turn = gui.add_slider("Turn light", -180.0, 180.0, 5.0, 0.0)
+            turn.on_update(lambda _: self._show(turn=float(turn.value)))
+            load = gui.add_upload_button("Load environment (.hdr, .exr)")
+            load.on_upload(lambda _: self._upload(load.value.name, load.value.content))
+            gui.add_button("Recovered light").on_click(lambda _: self._show(environment=None))
+        front = gui.add_button("Look from the front")
+        front.on_click(lambda event: self._place(event.client))
+        self._message = gui.add_markdown("")
+
+    def _show(self, **changes: Any) -> None:
+        self._shown = replace(self._shown, **changes)
+        self._ask(*self._server.get_clients())
+
+    def _ask(self, *clients: int) -> None:
+        for client in clients:
+            self._changed[client] = time.monotonic()
+        self._woken.set()
+
+    def _upload(self, name: str, content: bytes) -> None:
+        path = Path(self._folder.name) / f"{time.monotonic_ns()}{Path(name).suffix.lower()}"
+        path.write_bytes(content)
+        self._show(environment=path)
+
+    def _connected(self, client: Any) -> None:
+        self._place(client)
+        client.camera.on_update(lambda _: self._ask(client.client_id))
+        self._ask(client.client_id)
+
+    def _gone(self, client: Any) -> None:
+        self._changed.pop(client.client_id, None)
+        self._coarse.discard(client.client_id)
+
+    def _place(self, client: Any) -> None:
+        """Put a browser's camera in front of the face."""
+        camera = client.camera
+        camera.position = self._start.position  # first: it takes the point looked at along
+        camera.up_direction, camera.look_at = self._up, self._centre
+        camera.fov = 2 * np.arctan(0.5 * self._start.height / self._start.fy)
+
+    def _send(self, client: Any, rows: int) -> None:
+        seen = client.camera
+        camera = browser_camera(seen.wxyz, seen.position, seen.fov, seen.aspect, rows)
+        try:
+            image = self._picture.render(self._shown, camera)
+        except InputError as error:
+            self._message.content = f"**{error}**"
+            self._show(environment=None)
+            return
+        client.scene.set_background_image(image, format="jpeg", jpeg_quality=90)
