@@ -44,14 +44,16 @@ def run_capture(name: str, work: Path) -> dict[str, Any]:
 
 def markdown(rows: dict[str, dict[str, Any]]) -> str:
     lines = [
-        "| capture | pca dB | diffuse dB | full dB | full RMSE | mesh mm | rotation ° | shading | seconds | MB |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| capture | pca dB | specular dropped dB | full dB | full RMSE | mesh mm | rotation ° | shading | unconverged "
+        "| seconds | MB |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, row in rows.items():
+        stopped = ", ".join(stage for stage, outcome in row["outcomes"].items() if outcome != "converged") or "none"
         psnr = " | ".join(f"{row['methods'][m]['psnr']:.2f}" for m in METHODS)
         lines.append(
             f"| {name} | {psnr} | {row['methods']['full']['rmse']:.2f} | {row['mesh_mm']:.2f} "
-            f"| {row['rotation_degrees']:.2f} | {row['shading']} | {sum(row['seconds'].values()):.0f} "
+            f"| {row['rotation_degrees']:.2f} | {row['shading']} | {stopped} | {sum(row['seconds'].values()):.0f} "
             f"| {row['peak_memory_mb']} |"
         )
     return "\n".join(lines) + "\n"

@@ -16,9 +16,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import sys
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,7 +41,9 @@ from mifit.output.baseline import image_based
 ICT = str(SHARED / "models" / "ict_facekit" / "ict_facekit_head.npz")
 FITS = ("full", "refit", "paper")
 JUDGED = ("views", "mesh", "surface", "relit")
-RELIT_SAMPLES = 64
+RELIT_SAMPLES = 32
+SIZE = 256
+"""Texels along the side of the maps, unless --size says otherwise: more show little at these pictures' sizes."""
 SEED = 0
 
 
@@ -133,7 +137,7 @@ def judge_case(
     if "views" in parts:
         found["held_out"] = judge.judge_views(rows, capture, case.held_out, case.timesteps, case.fitted)
         some = {label: row for label, row in rows.items() if not label.endswith("dropped")}
-        found["fitted"] = judge.judge_views(some, capture, case.fitted, case.timesteps, case.fitted)
+        found["fitted"] = judge.judge_views(some, capture, case.fitted, case.timesteps, case.fitted, perceptual=False)
         found["fitted"] = {k: v for k, v in found["fitted"].items() if not k.startswith("image-based")}
     if "mesh" in parts and has_scan:
         meshes = {name: result for name, result in fits.items() if name != "refit"} or {"refit": main}
@@ -141,7 +145,7 @@ def judge_case(
     if "surface" in parts and has_scan:
         found["surface"] = {name: judge.judge_surface(r, capture, case.fitted) for name, r in fits.items()}
     if "relit" in parts and judge.scan.relit_truths(capture):
-        lit = {label: row for label, row in rows.items() if not label.endswith("pca")}
+        lit = {label: row for label, row in rows.items() if not label.endswith(("pca", "paper: specular dropped"))}
         found["relit"] = judge.judge_relit(
             lit, capture, case.held_out[0], case.timesteps[0], ("local", "path"), samples
         )
@@ -208,6 +212,24 @@ def cases_of(arguments: argparse.Namespace) -> tuple[list[Case], list[str]]:
     return cases, skipped
 
 
+def run_case(case: Case, arguments: argparse.Namespace, config: FitConfig) -> dict[str, Any]:
+    """Fit and judge one case; one that fails stays in the table as failing."""
+    mifit.set_variant("auto")
+    began, used = time.perf_counter(), time.process_time()
+    try:
+        if arguments.judge:
+            fits = {"full": Reconstruction.load(arguments.judge)}
+        else:
+            fits = fits_of(case, arguments.rows, config)
+        figures = judge_case(case, fits, arguments.parts, arguments.relit_samples)
+        if arguments.pictures:
+            write_pictures(arguments.pictures, case, fits)
+    except MifitError as error:
+        return {"label": case.label, "failed": str(error)}
+    spent = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - used}
+    return {**figures, **{key: round(value, 1) for key, value in spent.items()}}
+
+
 def main() -> int:
     def names(text: str) -> tuple[str, ...]:
         return tuple(text.split(","))
@@ -219,7 +241,7 @@ def main() -> int:
     parser.add_argument("--captures", nargs="+", default=list(dict.fromkeys(case.capture for case in CASES)))
     parser.add_argument("--rows", nargs="+", choices=FITS, default=list(FITS), help="fits to make")
     parser.add_argument("--parts", nargs="+", choices=JUDGED, default=list(JUDGED), help="what to judge")
-    parser.add_argument("--size", type=int, help="texels along the side of the maps; default: that of the settings")
+    parser.add_argument("--size", type=int, default=SIZE, help="texels along the side of the maps")
     parser.add_argument("--timesteps", type=numbers, help="0,1,... instead of each case's")
     parser.add_argument("--cameras", type=names, help="cameras to fit, instead of each case's")
     parser.add_argument("--held-out", type=names, help="cameras to judge by")
@@ -228,41 +250,35 @@ def main() -> int:
     parser.add_argument("--judge", type=Path, help="a result folder to judge in place of fitting")
     parser.add_argument("--relit-samples", type=int, default=RELIT_SAMPLES)
     parser.add_argument("--pictures", type=Path, help="folder for one strip of images per case")
+    parser.add_argument("--jobs", type=int, default=2, help="cases at a time, each in a process of its own")
     parser.add_argument("--json", type=Path, help="write the figures to a file of one's own")
     a = parser.parse_args()
-    mifit.set_variant("auto")
     before = conditions()
     config = FitConfig.load(a.config) if a.config else FitConfig()
-    if a.size:
-        config = replace_size(config, a.size)
+    config = replace_size(config, a.size)
     cases, skipped = cases_of(a)
-    found, started = [], time.perf_counter()
+    started = time.perf_counter()
     for text in skipped:
         print(f"left out: {text}", file=sys.stderr, flush=True)
-    for case in cases:
-        began = time.perf_counter()
-        try:
-            fits = {"full": Reconstruction.load(a.judge)} if a.judge else fits_of(case, a.rows, config)
-            figures = judge_case(case, fits, a.parts, a.relit_samples)
-        except MifitError as error:  # a case that fails stays in the table as failing
-            found.append({"label": case.label, "failed": str(error)})
-            print(f"{case.label}: failed: {error}", file=sys.stderr, flush=True)
-            continue
-        if a.pictures:
-            write_pictures(a.pictures, case, fits)
-        found.append({**figures, "seconds": round(time.perf_counter() - began, 1)})
-        print(f"{case.label}: {found[-1]['seconds']:.0f} s\n{json.dumps(figures)}", file=sys.stderr, flush=True)
-    out = {
-        "cases": found,
-        "left_out": skipped,
-        "seconds": round(time.perf_counter() - started, 1),
-        "conditions": {"before": before, "after": conditions()},
-    }
-    whole = all(getattr(a, key) == parser.get_default(key) for key in vars(a) if key not in ("pictures", "json"))
-    if whole and not skipped:
-        record("foreign", out, seeds=SEED)
-        write_text(RESULTS / "foreign.md", foreign_tables.markdown(found))
-        write_text(RESULTS / "foreign_short.md", foreign_tables.short(found))
+    whole = all(getattr(a, k) == parser.get_default(k) for k in vars(a) if k not in ("pictures", "json", "jobs"))
+    found: list[dict[str, Any]] = []
+    with ProcessPoolExecutor(a.jobs, multiprocessing.get_context("spawn")) as pool:
+        waiting = [pool.submit(run_case, case, a, config) for case in cases]
+        for case, future in zip(cases, waiting, strict=True):
+            found.append(future.result())
+            text = json.dumps({k: v for k, v in found[-1].items() if k != "fits"})
+            print(f"{case.label}: {found[-1].get('seconds', 0):.0f} s\n{text}", file=sys.stderr, flush=True)
+            out = {
+                "cases": found,
+                "left_out": [*skipped, *(f"{c.label}: the run was broken off" for c in cases[len(found) :])],
+                "seconds": round(time.perf_counter() - started, 1),
+                "jobs": a.jobs,
+                "conditions": {"before": before, "after": conditions()},
+            }
+            if whole and not skipped:  # after each case, so that a run that is broken off leaves what it measured
+                record("foreign", out, seeds=SEED)
+                write_text(RESULTS / "foreign.md", foreign_tables.markdown(found))
+                write_text(RESULTS / "foreign_short.md", foreign_tables.short(found))
     if a.json:
         write_text(a.json, json.dumps(out, indent=2) + "\n")
     print(foreign_tables.markdown(found))

@@ -51,8 +51,20 @@ from mifit.output.evaluate import evaluate
 CONFIG = FitConfig(reflectance=ReflectanceConfig(texture_size=64))
 WRONG_MM, WRONG_DB = 5.0, 20.0
 """A result is wrong when its vertices are further off, or its third view is worse, than this."""
-UNRELATED = "the lighting had not converged"
-"""A warning that says nothing about a wrong result: at these sizes good ones have it too."""
+FITTING = {
+    "mesh": (
+        "distance",
+        "how far away",
+        "landmarks scatter",
+        "landmarks",
+        "standard deviations",
+        "calibration",
+        "units",
+    ),
+    "view": ("clipped", "no pixel of the face", "exposure", "noise", "no camera measures"),
+}
+"""What a warning must speak of to fit a mesh that is wrong, or a view that is wrong though the mesh isn't."""
+UNITS, MARKS = ("unit", "scale", "too large", "too small"), ("landmarks scatter", "detector", "order", "in one place")
 SAME_MM = 0.01
 """Vertices of two results that are the same."""
 
@@ -73,6 +85,8 @@ class Case:
         Last stage.
     same : bool
         The result must be the base capture's.
+    warning : tuple of str
+        Words of which a warning must have one to fit a wrong result; default: those of `FITTING`.
     """
 
     name: str
@@ -83,6 +97,7 @@ class Case:
     timesteps: tuple[int, ...] | None = None
     until: Literal["geometry", "reflectance", "normals"] = "reflectance"
     same: bool = False
+    warning: tuple[str, ...] = ()
 
 
 CASES = (
@@ -112,7 +127,9 @@ CASES = (
     Case("mirror-like skin", "skin", traced(skin=captures.recoloured(lambda a: a, specular=1.0, roughness=0.05))),
     Case("millimetres", "numbers", damaged(world=lambda x: 10 * x, document=captures.with_units("mm"))),
     Case("metres", "numbers", damaged(world=lambda x: x / 100, document=captures.with_units("m"))),
-    Case("centimetres declared as metres", "numbers", damaged(document=captures.with_units("m")), "either"),
+    Case(
+        "centimetres declared as metres", "numbers", damaged(document=captures.with_units("m")), "either", warning=UNITS
+    ),
     Case("world origin 100 m away", "numbers", damaged(world=lambda x: x + 1e4)),
     Case("world origin 10 km away", "numbers", damaged(world=lambda x: x + 1e6), "either"),
     Case("world origin 1000 km away", "numbers", damaged(world=lambda x: x + 1e8), "either"),
@@ -122,11 +139,11 @@ CASES = (
     Case("negative pixels in EXR", "numbers", captures.spoilt_exr(-1.0)),
     Case("landmarks 4 pixels to the right", "landmarks", moved(lambda p, rng: p + np.array([4.0, 0.0]))),
     Case("landmarks 30 pixels to the right", "landmarks", moved(lambda p, rng: p + np.array([30.0, 0.0])), "either"),
-    Case("left taken for right", "landmarks", moved(lambda p, rng: p[captures.MIRRORED]), "either"),
+    Case("left taken for right", "landmarks", moved(lambda p, rng: p[captures.MIRRORED]), "either", warning=MARKS),
     Case("eight landmarks 35 pixels off", "landmarks", moved(captures.outliers)),
     Case("half of the landmarks hidden", "landmarks", damaged(landmarks=captures.half_hidden)),
-    Case("all landmarks anywhere", "landmarks", moved(captures.anywhere), "either"),
-    Case("all landmarks in one point", "landmarks", moved(lambda p, rng: 0 * p + 70.0), "either"),
+    Case("all landmarks anywhere", "landmarks", moved(captures.anywhere), "either", warning=MARKS),
+    Case("all landmarks in one point", "landmarks", moved(lambda p, rng: 0 * p + 70.0), "either", warning=MARKS),
     Case("NaN landmarks", "landmarks", moved(lambda p, rng: p * np.nan), "either"),
     Case("no landmarks in one camera", "landmarks", damaged(document=captures.without_landmarks("right"))),
     Case("no landmarks", "landmarks", damaged(document=captures.without_landmarks()), "refuse"),
@@ -221,9 +238,11 @@ def verdict(case: Case, row: dict[str, Any]) -> str:
         return "fails: not refused"
     if row.get("difference_mm", 0.0) > SAME_MM:
         return f"fails: differs by {row['difference_mm']:.2g} mm"
-    wrong = not (row["mesh_mm"] <= WRONG_MM and row["third_db"] >= WRONG_DB)
-    said = [text for text in row["warnings"] if not text.startswith(UNRELATED)]
-    return "fails: wrong without a word" if wrong and not said else "ok"
+    wrong = "mesh" if not row["mesh_mm"] <= WRONG_MM else "view" if not row["third_db"] >= WRONG_DB else ""
+    said = [text for text in row["warnings"] if any(word in text for word in case.warning or FITTING.get(wrong, ()))]
+    if not wrong or said:
+        return "ok"
+    return "fails: wrong, and the warnings are of something else" if row["warnings"] else "fails: wrong without a word"
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
@@ -232,7 +251,8 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     lines = [
         f"{passed} of {len(rows)} cases are met well. Images of {WIDTH} x {HEIGHT}, {TIMESTEPS} timesteps, the coarse",
         "model; errors of vertices (face area, no alignment) and of the third view in the case's own exposure.",
-        f"Measured at commit {', '.join(dict.fromkeys(row['commit'] for row in rows))}.",
+        f"Measured at commit {', '.join(dict.fromkeys(row['commit'] for row in rows))}. Errors of vertices use true",
+        "geometry; a wrong result is met well only by a warning that speaks of what is wrong.",
         "",
         "| case | outcome | vertices mm | third dB | what is said | verdict |",
         "|---|---|---|---|---|---|",
@@ -281,7 +301,11 @@ def stored_rows() -> dict[str, dict[str, Any]]:
 
 
 def write(rows: dict[str, dict[str, Any]]) -> None:
-    """Judge all rows by the present measure and write both tables."""
+    """Judge all rows by the present measure and write both tables; rows of several commits make no table."""
+    commits = sorted({row["commit"] for row in rows.values()})
+    if len(commits) > 1:
+        print(f"not recorded: rows of the commits {', '.join(commits)}; run all cases at one", file=sys.stderr)
+        return
     judged = [{**rows[case.name], "verdict": verdict(case, rows[case.name])} for case in CASES if case.name in rows]
     record("hard_cases", {"cases": judged}, seeds=SEED)
     write_text(RESULTS / "hard_cases.md", markdown(judged))

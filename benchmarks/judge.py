@@ -108,7 +108,12 @@ Methods = Mapping[str, tuple[Reconstruction, str]]
 
 
 def judge_views(
-    rows: Methods, capture: Capture, names: Sequence[str], timesteps: Sequence[int], fitted: Sequence[str]
+    rows: Methods,
+    capture: Capture,
+    names: Sequence[str],
+    timesteps: Sequence[int],
+    fitted: Sequence[str],
+    perceptual: bool = True,
 ) -> dict[str, dict[str, Any]]:
     """Errors of every row, and of image-based rendering on its mesh and on the scan, in some views.
 
@@ -121,7 +126,7 @@ def judge_views(
     def add(row: str, image: Image, at: View, regions: dict[str, NDArray[np.bool_]]) -> None:
         for region, pixels in regions.items():
             tally = tallies.setdefault(row, {}).setdefault(region, Tally())
-            tally.add(image, at.photograph, pixels, perceptual=region == "skin")
+            tally.add(image, at.photograph, pixels, perceptual=perceptual and region == "skin")
 
     for timestep in timesteps:
         truth = scan.read_scan(capture, timestep)

@@ -132,7 +132,7 @@ TERMS = [
     M("C_d smoothed instead of its offset, objective", STAGES,
       r"^    offset\[\.\.\., :3\] -= surface\.texels\.to_map.*$", "", "tests/test_paper.py"),
     M("C_d smoothed instead of its offset, maps", STAGES, r"base\[\.\.\., 3\] = 0\.0", "base[...] = 0.0",
-      "tests/stages/test_infer_reflectance.py"),
+      "tests/test_paper.py"),
     M("both maps smoothed alike by Adam", STAGES, r"\(gloss, 1, 0, self\.smoothness\[1\]\)",
       "(gloss, 1, 0, self.smoothness[0])", "tests/test_paper.py"),
     M("w1 in other units", STAGES, r"config\.laplacian_weight \* NORMAL_STEPS / IMAGE_STEPS\*\*2",

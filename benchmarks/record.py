@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from benchmarks.measure import conditions
 from mifit.core.files import write_text
 
 RESULTS = Path(__file__).parent / "results"
@@ -43,7 +44,7 @@ def machine() -> dict[str, Any]:
 def record(name: str, figures: dict[str, Any], seeds: Any = 0) -> Path:
     """Write ``figures`` to ``benchmarks/results/NAME.json`` and return its path."""
     path = RESULTS / f"{name}.json"
-    content = {"benchmark": name, "machine": machine(), "seeds": seeds, "figures": figures}
+    content = {"benchmark": name, "machine": machine(), "load": conditions(), "seeds": seeds, "figures": figures}
     write_text(path, json.dumps(content, indent=2) + "\n")
     return path
 

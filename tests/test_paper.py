@@ -21,7 +21,7 @@ from mifit.stages.geometry.rendering import PixelView, RenderingProblem
 from mifit.stages.geometry.start import State
 from mifit.stages.reflectance import paper_solver
 from mifit.stages.reflectance.als import _add
-from mifit.stages.reflectance.maps import TexelSystems, laplacian
+from mifit.stages.reflectance.maps import Smoothness, TexelSystems, laplacian, solve_maps
 from mifit.stages.reflectance.objective import energies
 from tests.output.conftest import ball_camera, ball_model
 from tests.stages.test_geometry_terms import SmoothImage, random_points, scene  # noqa: F401
@@ -197,6 +197,20 @@ def test_the_lightings_equations_are_data_and_difference_terms(two_views):
     zero = papers(np.zeros(k))
     for light in RNG.normal(size=(3, k)):
         assert light @ system @ light - 2 * right @ light == pytest.approx(papers(light) - zero, rel=1e-5)
+
+
+def test_the_maps_are_smoothed_as_an_offset_from_the_models_albedo():
+    size, index = 16, np.arange(256)
+    rows, columns = np.indices((size, size))
+    prior = np.zeros((size, size, 4), np.float32)
+    prior[..., :3] = 0.4 + 0.1 * np.where((rows + columns) % 2, 1.0, -1.0)[..., None]
+    noisy = prior[..., :3] + 0.1 + 0.05 * np.random.default_rng(1).normal(size=(size, size, 3))
+    ones = np.ones((256, 1, 3), np.float32)
+    systems = TexelSystems.accumulate(
+        noisy.reshape(256, 1, 3).astype(np.float32), ones, ones, 0 * ones, np.zeros((0, 2), int), 0.0
+    )  # fmt: skip
+    found = solve_maps(systems, index, prior, Smoothness(1.0, 1.0), iterations=300)[..., :3] - prior[..., :3]
+    assert found.mean() == pytest.approx(0.1, abs=0.02) and np.abs(laplacian(found)).mean() < 0.02
 
 
 def test_adams_objective_is_the_papers(two_views, variant):
