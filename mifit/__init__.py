@@ -15,6 +15,7 @@ _EXPORTS = {
     "MorphableModel": "mifit.morphable",
     "Camera": "mifit.core.camera",
     "SHLighting": "mifit.core.sh",
+    "Illumination": "mifit.appearance.illumination",
     "FitConfig": "mifit.config",
     "GeometryConfig": "mifit.config",
     "ReflectanceConfig": "mifit.config",

@@ -327,11 +327,20 @@ def render(arguments: Namespace) -> None:
     import mifit
     from mifit.core.image import write_image
 
+    turned = {name: getattr(arguments, name) for name in ("yaw", "pitch", "distance")}
+    turned = {name: value for name, value in turned.items() if value is not None}
+    if arguments.camera and turned:
+        raise InputError(f"--camera {arguments.camera}: found --{next(iter(turned))} beside it, expected one of both")
     result = mifit.Reconstruction.load(arguments.result)
-    capture = mifit.Capture.load(arguments.capture)
-    camera = capture.with_fitted(result.cameras).camera(arguments.camera)
+    timestep = result.timesteps[0] if arguments.timestep is None else arguments.timestep
+    if not arguments.camera:
+        camera = result.orbit(**turned, timestep=timestep)
+    elif arguments.capture:
+        camera = mifit.Capture.load(arguments.capture).with_fitted(result.cameras).camera(arguments.camera)
+    else:
+        camera = result.camera(arguments.camera)
     _use_variant(arguments)
-    image = result.render(camera, arguments.timestep, method=arguments.method, integrator=arguments.integrator)
+    image = result.render(camera, timestep, method=arguments.method, integrator=arguments.integrator)
     write_image(arguments.out, image)
     print(f"Image: {arguments.out}")
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,9 @@ from mifit.core.camera import Camera
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.result import METHODS, Method, Result
+
+if TYPE_CHECKING:
+    from mifit.output.relight import Lighting
 
 
 class Reconstruction(Result):
@@ -90,13 +94,7 @@ class Reconstruction(Result):
             Timestep not fitted, unknown method or integrator, or a method whose stage did not run.
         """
         self.index(timestep)
-        if method not in METHODS:
-            raise InputError(f"method: found {method!r}, expected one of {', '.join(METHODS)}")
-        if method not in self.methods:
-            raise InputError(
-                f"method {method!r} needs reflectance, but this fit ended after the geometry stage; "
-                "use 'pca', or fit with --until reflectance"
-            )
+        self._check(method)
         if integrator == "local":
             from mifit.output.deferred import render_local
 
@@ -107,33 +105,132 @@ class Reconstruction(Result):
             return render_path(self, camera, timestep, method, samples or 64, seed)
         raise InputError(f"integrator: found {integrator!r}, expected 'local' or 'path'")
 
-    def relight(
-        self, environment: str | Path | NDArray, rotate: float = 0.0, exposure: float | None = None
-    ) -> Reconstruction:
-        """Put the face under another environment.
+    def scene(
+        self,
+        integrator: str | Mapping[str, Any] = "path",
+        timestep: int | None = None,
+        cameras: Sequence[Camera] | None = None,
+        method: Method = "full",
+        samples: int = 16,
+    ) -> Any:
+        """A loaded Mitsuba scene of one timestep, to render and to differentiate.
 
         Parameters
         ----------
-        environment : path or (H, W, 3) array
-            Lat-long linear radiance (``.hdr``, ``.exr``) in the axes of Mitsuba's ``envmap``: +y up, the middle column
-            towards +z.
-        rotate : float
-            Turns the environment about the vertical (+y) by degrees.
-        exposure : float, optional
-            Factor on its radiance. A capture doesn't tell how its exposure relates to that of an environment
-            file; by default the mean radiance stays that of the recovered lighting.
+        integrator : str or dict
+            A plugin: ``"path"``, ``"prb"``, ``"direct"`` or another of Mitsuba's, or ``"shdirect"``, which gets the
+            fit's shading model and ambient term; or a dictionary as ``mi.load_dict`` takes it.
+        timestep : int, optional
+            Default: the first that was fitted.
+        cameras : sequence of Camera, optional
+            Default: the fitted cameras.
+        method : {"full", "diffuse", "pca"}
+            As in `render`.
+        samples : int
+            Samples per pixel where ``mi.render`` is given none.
 
         Returns
         -------
-        Reconstruction
-            The same face; its `render` uses the environment's spherical harmonics (``local``), or all of it
-            (``path``). The ambient term grows with the mean radiance.
+        mi.Scene
+            With ids that don't change: the BSDF ``skin``, the emitters ``light`` (``shenv``, or an ``envmap`` after
+            `relight` with an image) and ``light_1`` ... (compact lights), the shapes ``face`` and ``rest``, and sensors
+            ``camera_NAME``. So ``mi.traverse(scene)`` has ``skin.diffuse_reflectance.data`` (S, S, 3),
+            ``skin.specular_reflectance.data`` (S, S, 1), ``skin.normal_correction.data``, ``skin.exponent.value`` and
+            ``light.coefficients`` (B*B, 3). Lengths are in the result's units, colours linear, row 0 of textures at
+            v = 1 as in the maps.
 
         Raises
         ------
         InputError
-            No environment map, or a fit that ended before stage 2.
+            A timestep that was not fitted, a camera with lens distortion, or an integrator that can't be made.
         """
-        from mifit.output.relight import relit
+        from mifit.output.scene import load_result_scene
 
-        return relit(self, environment, rotate, exposure)
+        timestep = self.timesteps[0] if timestep is None else timestep
+        self.index(timestep)
+        self._check(method)
+        return load_result_scene(
+            self, timestep, integrator, self.cameras if cameras is None else cameras, method, samples
+        )
+
+    def orbit(
+        self, yaw: float = 0.0, pitch: float = 0.0, distance: float | None = None, timestep: int | None = None
+    ) -> Camera:
+        """A camera that looks at the face, with image size and focal length of the fitted cameras.
+
+        Parameters
+        ----------
+        yaw : float
+            Degrees about the vertical; 0 is straight from the front, positive ones see the head's left side.
+        pitch : float
+            Degrees upwards.
+        distance : float, optional
+            From the middle of the face, the result's units; default: that of the fitted cameras.
+        timestep : int, optional
+            Default: the first that was fitted.
+
+        Raises
+        ------
+        InputError
+            A result without cameras, or a distance that isn't positive.
+        """
+        from mifit.output.turntable import orbit_camera
+
+        return orbit_camera(self, self.timesteps[0] if timestep is None else timestep, yaw, pitch, distance)
+
+    @overload
+    def relight(
+        self, lighting: Lighting, rotate: float | NDArray = 0.0, exposure: float | None = None
+    ) -> Reconstruction: ...
+    @overload
+    def relight(
+        self, lighting: Lighting, *, exposure: float | None = None, rotations: Sequence[float | NDArray]
+    ) -> list[Reconstruction]: ...
+    def relight(
+        self,
+        lighting: Lighting,
+        rotate: float | NDArray = 0.0,
+        exposure: float | None = None,
+        rotations: Sequence[float | NDArray] | None = None,
+    ) -> Reconstruction | list[Reconstruction]:
+        """Put the face under another light.
+
+        Parameters
+        ----------
+        lighting : path, (H, W, 3) array, SHLighting or Illumination
+            A path or an array is a lat-long environment of linear radiance (``.hdr``, ``.exr``) in the axes of
+            Mitsuba's ``envmap``: +y up, the middle column towards +z. `SHLighting` replaces all light by its harmonics,
+            `Illumination` all of it, ambient term included.
+        rotate : float or (3, 3)
+            Turns the light about the vertical (+y) by degrees, or by a rotation R: what came from d comes from R d.
+        exposure : float, optional
+            Factor on the radiance. A capture doesn't tell how its exposure relates to that of an environment file; for
+            those the mean radiance by default stays that of the recovered lighting. The others are taken as they are.
+        rotations : sequence, optional
+            Several values of ``rotate``, for which the environment is read and projected once.
+
+        Returns
+        -------
+        Reconstruction, or a list of one for each of ``rotations``
+            The same face; its `render` uses the environment's spherical harmonics (``local``), or all of it
+            (``path``). The ambient term grows with the mean radiance, but for `Illumination`, which has its own.
+
+        Raises
+        ------
+        InputError
+            No environment map, no rotation, or a fit that ended before stage 2.
+        """
+        from mifit.output.relight import relit_many
+
+        lit = relit_many(self, lighting, [rotate] if rotations is None else rotations, exposure)
+        return lit[0] if rotations is None else lit
+
+    def _check(self, method: Method) -> None:
+        """InputError for a method that there isn't, or that this result can't show."""
+        if method not in METHODS:
+            raise InputError(f"method: found {method!r}, expected one of {', '.join(METHODS)}")
+        if method not in self.methods:
+            raise InputError(
+                f"method {method!r} needs reflectance, but this fit ended after the geometry stage; "
+                "use 'pca', or fit with --until reflectance"
+            )

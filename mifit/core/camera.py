@@ -13,14 +13,15 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from mifit.core.values import same
 from mifit.errors import InputError
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
     """A pinhole camera.
 
@@ -54,6 +55,100 @@ class Camera:
                 f"camera {self.name!r}: found {self.width} x {self.height} pixels and focal lengths {self.fx:g}, "
                 f"{self.fy:g}, expected positive numbers"
             )
+
+    def __eq__(self, other: object) -> bool:
+        return same(self, other) if isinstance(other, Camera) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.width, self.height, self.fx, self.fy, self.cx, self.cy))
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: ArrayLike,
+        target: ArrayLike = (0.0, 0.0, 0.0),
+        up: ArrayLike = (0.0, 1.0, 0.0),
+        width: int = 680,
+        height: int = 480,
+        fov: float = 20.0,
+        name: str = "view",
+    ) -> Camera:
+        """A camera at a place that looks at a point, with square pixels and the principal point in the middle.
+
+        Parameters
+        ----------
+        eye, target : (3,)
+            World space.
+        up : (3,)
+            World direction that is up in the image; not along the view.
+        width, height : int
+            Pixels.
+        fov : float
+            Horizontal field of view in degrees, above 0 and below 180.
+        name : str
+
+        Raises
+        ------
+        InputError
+            A field of view out of range, or no view: eye at the target, or ``up`` along the view.
+        """
+        if not 0.0 < fov < 180.0:
+            raise InputError(f"fov: found {fov}, expected degrees above 0 and below 180")
+        start, forward = np.asarray(eye, dtype=np.float64), np.asarray(target, dtype=np.float64) - eye
+        right = np.cross(forward, np.asarray(up, dtype=np.float64))
+        lengths = np.linalg.norm(forward), np.linalg.norm(right)
+        if not min(lengths) > 1e-9 * max(1.0, *np.abs(start)):
+            raise InputError(f"look_at: found eye {eye}, target {target}, up {up}, expected three that give a view")
+        forward, right = forward / lengths[0], right / lengths[1]
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+        pose[:3, 3] = -pose[:3, :3] @ start
+        focal = 0.5 * width / math.tan(math.radians(0.5 * fov))
+        return cls(name, width, height, focal, focal, 0.5 * width, 0.5 * height, pose)
+
+    def orbit(
+        self,
+        yaw: float = 0.0,
+        pitch: float = 0.0,
+        target: ArrayLike = (0.0, 0.0, 0.0),
+        up: ArrayLike = (0.0, 1.0, 0.0),
+        distance: float | None = None,
+        name: str | None = None,
+    ) -> Camera:
+        """This camera moved about a point, which stays where it is in the image.
+
+        Parameters
+        ----------
+        yaw : float
+            Degrees about ``up``; positive ones move the camera to its right.
+        pitch : float
+            Degrees upwards, after the yaw.
+        target : (3,)
+            World point to move about.
+        up : (3,)
+            World direction of the axis.
+        distance : float, optional
+            From the target, the capture's units; default: as it is.
+        name : str, optional
+            Default: this camera's name with the angles.
+
+        Raises
+        ------
+        InputError
+            A distance that isn't positive.
+        """
+        if distance is not None and not distance > 0:
+            raise InputError(f"distance: found {distance}, expected a number above 0")
+        centre, axis = np.asarray(target, dtype=np.float64), np.asarray(up, dtype=np.float64)
+        turn = _rotation(axis, yaw)
+        turn = _rotation(turn @ self.rotation[0], -pitch) @ turn
+        away = turn @ (self.position - centre)
+        if distance is not None:
+            away *= distance / np.linalg.norm(away)
+        pose = np.eye(4)
+        pose[:3, :3] = self.rotation @ turn.T
+        pose[:3, 3] = -pose[:3, :3] @ (centre + away)
+        return replace(self, name=name or f"{self.name}{yaw:+g}{pitch:+g}", world_to_camera=pose)
 
     @property
     def rotation(self) -> NDArray[np.float64]:
@@ -120,3 +215,11 @@ class Camera:
         """(H, W, 2) coordinates of all pixel centres."""
         y, x = np.mgrid[0 : self.height, 0 : self.width]
         return np.stack([x + 0.5, y + 0.5], axis=-1)
+
+
+def _rotation(axis: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
+    """(3, 3) rotation about an axis by the right-hand rule (Rodrigues)."""
+    x, y, z = axis / np.linalg.norm(axis)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = math.radians(degrees)
+    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)

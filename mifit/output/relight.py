@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -32,18 +33,54 @@ MAP_ROWS = 512
 """Rows to which an environment is reduced; finer light than 0.35 degrees makes no difference on skin."""
 
 
-def relit(
-    reconstruction: R,
-    environment: str | Path | NDArray,
-    rotate: float = 0.0,
-    exposure: float | None = None,
-) -> R:
+Lighting = str | Path | NDArray | SHLighting | Illumination
+"""What a face can be put under: an environment file or image, spherical harmonics, or everything that lights it."""
+
+
+def relit(reconstruction: R, lighting: Lighting, rotate: float | NDArray = 0.0, exposure: float | None = None) -> R:
     """Replace the lighting of a reconstruction; see `Reconstruction.relight`."""
+    return relit_many(reconstruction, lighting, [rotate], exposure)[0]
+
+
+def relit_many(
+    reconstruction: R, lighting: Lighting, rotations: Sequence[float | NDArray], exposure: float | None = None
+) -> list[R]:
+    """Replace the lighting by one that is turned in several ways; an environment is read and projected once."""
     reflectance = reconstruction.reflectance
     if reflectance is None:
         raise InputError("relighting needs reflectance, but this fit ended after the geometry stage; fit it further")
-    name = environment if isinstance(environment, (str, Path)) else "environment"
-    image = read_image(environment) if isinstance(environment, (str, Path)) else np.asarray(environment, np.float32)
+    if exposure is not None and not (np.isfinite(exposure) and exposure > 0):
+        raise InputError(f"exposure: found {exposure!r}, expected a positive number")
+    turns = [_rotation(rotation) for rotation in rotations]
+    if isinstance(lighting, Illumination):
+        lit = lighting if exposure is None else lighting.scaled(exposure)
+        return [reconstruction.with_illumination(lit.rotated(turn)) for turn in turns]
+    before = float(reconstruction.lighting.coefficients[0] @ LUMINANCE)
+    image = None if isinstance(lighting, SHLighting) else _environment(lighting)
+    smooth = SHLighting.from_envmap(image, reconstruction.lighting.order) if image is not None else lighting
+    after = float(smooth.coefficients[0] @ LUMINANCE)
+    if not after > 0:
+        raise InputError(f"lighting: found a mean luminance of {after:g}, expected one above 0")
+    if exposure is None:
+        exposure = before / after if image is not None else 1.0
+    # The ambient term stands for light that the model leaves out, such as interreflection: it grows with the light.
+    ambient = reflectance.illumination.ambient * exposure * after / before
+    lit = Illumination(exposure * smooth.coefficients, ambient=ambient)
+    shown = None if image is None else (exposure * image).astype(np.float32)
+    return [
+        replace(
+            reconstruction.with_illumination(lit.rotated(turn)),
+            environment=shown,
+            environment_rotation=None if shown is None else turn,
+        )
+        for turn in turns
+    ]
+
+
+def _environment(source: str | Path | NDArray) -> NDArray[np.float32]:
+    """A lat-long image of linear radiance, checked, of at most `MAP_ROWS` rows."""
+    name = source if isinstance(source, (str, Path)) else "environment"
+    image = read_image(source) if isinstance(source, (str, Path)) else np.asarray(source, np.float32)
     if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8 or not np.isfinite(image).all():
         raise InputError(f"{name}: found an image of shape {image.shape}, expected a finite lat-long image (H, W, 3)")
     if (image < 0).any() or not image.any():
@@ -51,29 +88,20 @@ def relit(
     if image.shape[0] > MAP_ROWS:
         width = round(image.shape[1] * MAP_ROWS / image.shape[0])
         image = cv2.resize(image, (width, MAP_ROWS), interpolation=cv2.INTER_AREA)
-    angle = np.radians(rotate)
-    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    lighting = SHLighting.from_envmap(image, reconstruction.lighting.order).rotate(turn)
-    before = float(reconstruction.lighting.coefficients[0] @ LUMINANCE)
-    after = float(lighting.coefficients[0] @ LUMINANCE)
-    if exposure is None:
-        exposure = before / after
-    if not (np.isfinite(exposure) and exposure > 0):
-        raise InputError(f"exposure: found {exposure!r}, expected a positive number")
-    # The ambient term stands for light that the model leaves out, such as interreflection: it grows with the light.
-    ambient = reflectance.illumination.ambient * exposure * after / before
-    changed = replace(reflectance, illumination=Illumination(exposure * lighting.coefficients, ambient=ambient))
-    return replace(reconstruction, reflectance=changed, environment=exposure * _turned(image, angle))
+    return image
 
 
-def _turned(image: NDArray[np.float32], angle: float) -> NDArray[np.float32]:
-    """A lat-long image with the environment turned about +y: what came from azimuth phi comes from phi - angle."""
-    width = image.shape[1]
-    shift = -angle / (2 * np.pi) * width
-    whole = int(np.floor(shift))
-    part = np.float32(shift - whole)
-    rolled = np.roll(image, whole, axis=1)
-    return rolled * (1 - part) + np.roll(rolled, 1, axis=1) * part
+def _rotation(value: float | NDArray) -> NDArray[np.float64]:
+    """(3, 3) rotation: itself, or about +y by degrees."""
+    if np.ndim(value) == 0:
+        if not np.isfinite(value):
+            raise InputError(f"rotation: found {value}, expected a finite angle in degrees")
+        angle = np.radians(float(value))
+        return np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    turn = np.asarray(value, dtype=np.float64)
+    if turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
+        raise InputError(f"rotation: found {turn.tolist()}, expected degrees about +y or a rotation matrix (3, 3)")
+    return turn
 
 
 def write_relit(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,6 +41,7 @@ def write_scene(
     timestep: int,
     cameras: Sequence[Camera] | None = None,
     method: Method = "full",
+    integrator: Mapping[str, Any] | None = None,
 ) -> None:
     """Write ``NAME.xml`` with mifit's plugins, ``NAME_stock.xml`` for plain Mitsuba, and their files.
 
@@ -63,6 +64,8 @@ def write_scene(
         Sensors in this order; default: the fitted cameras.
     method : {"full", "diffuse", "pca"}
         What to leave out, see `Reconstruction.render`.
+    integrator : dict, optional
+        Of ``NAME.xml``, as ``mi.load_dict`` takes it; default: ``path``.
 
     Raises
     ------
@@ -73,10 +76,10 @@ def write_scene(
     cameras = reconstruction.cameras if cameras is None else cameras
     files = path.with_name(re.sub(r"[^\w.-]", "_", path.stem) + "_files")
     scenes = [
-        (name, scene_description(reconstruction, cameras, method, stock, files.name), needs)
-        for name, stock, needs in (
-            (path, False, "Needs mifit.register_plugins()."),
-            (path.with_name(f"{path.stem}_stock.xml"), True, "Plain Mitsuba renders this."),
+        (name, scene_description(reconstruction, cameras, method, stock, files.name, chosen), needs)
+        for name, stock, needs, chosen in (
+            (path, False, "Needs mifit.register_plugins().", integrator),
+            (path.with_name(f"{path.stem}_stock.xml"), True, "Plain Mitsuba renders this.", None),
         )
     ]
     _write_files(reconstruction, files, timestep, method)
@@ -172,8 +175,41 @@ def _slopes(
     return flat
 
 
+def load_result_scene(
+    reconstruction: Result,
+    timestep: int,
+    integrator: str | Mapping[str, Any],
+    cameras: Sequence[Camera],
+    method: Method,
+    samples: int,
+) -> Any:
+    """A loaded ``mi.Scene`` of one timestep; see `Reconstruction.scene`."""
+    from mifit.render.scene import load_scene
+
+    with tempfile.TemporaryDirectory(prefix="mifit-scene-") as folder:
+        path = Path(folder) / "scene.xml"
+        chosen = {"type": integrator} if isinstance(integrator, str) else dict(integrator)
+        if chosen["type"] == "shdirect":
+            # What it shades is the smooth light, whatever an environment has beside it.
+            reconstruction = replace(reconstruction, environment=None, environment_rotation=None)
+            full = method != "pca" and reconstruction.reflectance is not None
+            light = reconstruction.illumination
+            chosen = {
+                "type": "shdirect",
+                "model": reconstruction.reflectance.shading_model if full else "prefiltered",
+                "ambient": float(light.ambient if full else reconstruction.geometry.ambient),
+            } | chosen
+        write_scene(reconstruction, path, timestep, cameras, method, {"hide_emitters": True} | chosen)
+        return load_scene(path, spp=samples)
+
+
 def scene_description(
-    reconstruction: Result, cameras: Sequence[Camera], method: Method, stock: bool, files: str
+    reconstruction: Result,
+    cameras: Sequence[Camera],
+    method: Method,
+    stock: bool,
+    files: str,
+    integrator: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The scene of `write_scene` as a plain dictionary (`render.description`), its files in the folder ``files``.
 
@@ -182,10 +218,8 @@ def scene_description(
     """
     if method == "pca":
         reconstruction = replace(reconstruction, reflectance=None, normals=None)
-    scene: dict[str, Any] = {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": Parameter("max_depth", 5), "hide_emitters": True},
-    }
+    path = {"type": "path", "max_depth": Parameter("max_depth", 5), "hide_emitters": True}
+    scene: dict[str, Any] = {"type": "scene", "integrator": path if integrator is None else dict(integrator)}
     for name, camera in zip(sensor_ids(cameras), cameras, strict=True):
         scene[name] = sensor_description(camera.with_square_pixels() if stock else camera, Parameter("spp", 64))
     scene["skin"] = _skin(reconstruction, files, stock)
@@ -194,6 +228,10 @@ def scene_description(
         scene["rest"] = _shape(f"{files}/rest.ply", _vertex_albedo(stock))
     if stock or reconstruction.environment is not None:
         scene["light"] = {"type": "envmap", "filename": f"{files}/environment.exr"}
+        if reconstruction.environment is not None and reconstruction.environment_rotation is not None:
+            pose = np.eye(4)
+            pose[:3, :3] = reconstruction.environment_rotation
+            scene["light"]["to_world"] = pose
     else:
         rows = reconstruction.illumination.radiance
         text = ",  ".join(" ".join(f"{x:.9g}" for x in row) for row in rows)

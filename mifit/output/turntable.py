@@ -25,16 +25,19 @@ BACKDROP = 0.35
 """Linear grey behind the head on sheets and in animations."""
 
 
-def orbit_camera(reconstruction: Result, timestep: int, degrees: float) -> Camera:
+def orbit_camera(
+    reconstruction: Result, timestep: int, degrees: float, pitch: float = 0.0, distance: float | None = None
+) -> Camera:
     """A camera that looks at the face from an angle about the vertical; 0 is straight from the front.
 
     Image size, focal length and distance are those of the fitted cameras; positive angles move the camera to
-    its right, so that it sees the head's left side. The vertical is the fitted cameras' mean up axis.
+    its right, so that it sees the head's left side, and a positive ``pitch`` upwards. The vertical is the fitted
+    cameras' mean up axis.
 
     Raises
     ------
     InputError
-        The result has no cameras.
+        The result has no cameras, or ``distance`` isn't positive.
     """
     if not reconstruction.cameras:
         raise InputError("this result has no cameras, so there is no image size to render at; give one to render()")
@@ -45,15 +48,12 @@ def orbit_camera(reconstruction: Result, timestep: int, degrees: float) -> Camer
     up = normalize(-np.mean([c.rotation[1] for c in reconstruction.cameras], axis=0))
     front = reconstruction.geometry.rotation[i][:, 2]
     front = normalize(front - (front @ up) * up)
-    right = np.cross(up, front)
-    angle = np.radians(degrees)
-    away = np.cos(angle) * front + np.sin(angle) * right
-    distance = np.mean([np.linalg.norm(c.position - centre) for c in reconstruction.cameras])
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([np.cross(up, away), -up, -away])
-    pose[:3, 3] = -pose[:3, :3] @ (centre + distance * away)
+    reach = float(np.mean([np.linalg.norm(c.position - centre) for c in reconstruction.cameras]))
+    facing = Camera.look_at(centre + reach * front, centre, up)
     middle = {"cx": first.width / 2, "cy": first.height / 2}
-    return replace(first, name=f"orbit{degrees:+g}", world_to_camera=pose, distortion=(), **middle)
+    camera = replace(first, world_to_camera=facing.world_to_camera, distortion=(), **middle)
+    name = f"orbit{degrees:+g}" + (f"{pitch:+g}" if pitch else "")
+    return camera.orbit(degrees, pitch, centre, up, distance, name)
 
 
 def write_turntable(

@@ -24,9 +24,6 @@ KINDS = {
     "envmap": "emitter",
     "shenv": "emitter",
     "hdrfilm": "film",
-    "path": "integrator",
-    "prb": "integrator",
-    "shdirect": "integrator",
     "box": "rfilter",
     "independent": "sampler",
     "multijitter": "sampler",
@@ -37,7 +34,7 @@ KINDS = {
     "bitmap": "texture",
     "mesh_attribute": "texture",
 }
-"""What each plugin is: the name of its XML element."""
+"""What each plugin is: the name of its XML element. An ``integrator`` may be any."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +106,7 @@ def _element(name: str, value: Any, indent: str, top: bool = False) -> list[str]
         return [f"{indent}<ref id={quoteattr(value['id'])} {label}/>"]
     if value["type"] == "rgb":
         return [f'{indent}<rgb {label} value="{", ".join(repr(float(x)) for x in value["value"])}"/>']
-    tag = KINDS[value["type"]]
+    tag = name if name == "integrator" else KINDS[value["type"]]
     inner = [line for key, item in value.items() if key != "type" for line in _element(key, item, indent + "    ")]
     start = f'{indent}<{tag} type="{value["type"]}" {f"id={quoteattr(name)}" if top else label}'
     return [start + ">", *inner, f"{indent}</{tag}>"] if inner else [start + "/>"]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mifit.appearance.illumination import Illumination
 from mifit.appearance.lobe import Lobe
@@ -14,6 +14,7 @@ from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.sh import SHLighting, radiance_of_shading
 from mifit.core.subdivision import split_faces
+from mifit.core.values import same
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.finer import finer_model
@@ -23,7 +24,7 @@ METHODS: tuple[Method, ...] = ("pca", "diffuse", "full")
 R = TypeVar("R", bound="Result")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """The record of ``mifit.fit``; it renders and writes nothing, see `Reconstruction`.
 
@@ -59,6 +60,8 @@ class Result:
         Things a person should know about the whole fit, in words.
     environment : (H, W, 3) float32, optional
         Lat-long radiance that `relight` put in place of the recovered lighting; path tracing uses it whole. Not saved.
+    environment_rotation : (3, 3), optional
+        Its rotation: what the image shows at d comes from R d.
     """
 
     model: MorphableModel = field(repr=False)
@@ -76,6 +79,76 @@ class Result:
     warnings: tuple[str, ...] = ()
     environment: NDArray[np.float32] | None = field(default=None, repr=False)
     mesh: MeshEstimate | None = field(default=None, repr=False)
+    environment_rotation: NDArray[np.float64] | None = field(default=None, repr=False)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether two results are the same, to the last bit."""
+        if not isinstance(other, Result):
+            return NotImplemented
+        names = [f.name for f in fields(self) if f.name != "model"]
+        return self.model.digest == other.model.digest and all(
+            same(getattr(self, name), getattr(other, name)) for name in names
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        steps = ", ".join(map(str, self.timesteps[:4])) + (", ..." if len(self.timesteps) > 4 else "")
+        parts = [f"model {self.model.name}", f"timesteps {steps}"]
+        parts.append("cameras " + (", ".join(camera.name for camera in self.cameras) or "none"))
+        if self.reflectance is not None:
+            size, lights = len(self.reflectance.diffuse), len(self.illumination.lights)
+            parts.append(f"{size} x {size} maps")
+            parts.append(f"{self.reflectance.shading_model} shading, {self.illumination.order} bands")
+            parts += [f"{lights} compact light" + "s" * (lights > 1)] * bool(lights)
+        parts += ["relit"] * (self.environment is not None)
+        return f"{type(self).__name__}({'; '.join(parts)})"
+
+    def with_albedo(self: R, diffuse: ArrayLike) -> R:
+        """The same face with another diffuse albedo.
+
+        Parameters
+        ----------
+        diffuse : (S, S, 3)
+            Linear reflectance 0..1, row 0 at v = 1, of the size of ``reflectance.diffuse``.
+
+        Raises
+        ------
+        InputError
+            Another shape, values outside 0..1, or a result without reflectance.
+        """
+        return self._with_map("diffuse", diffuse)
+
+    def with_specular(self: R, specular: ArrayLike) -> R:
+        """The same face with another specular albedo: a map (S, S), or one number for all of it; see `with_albedo`."""
+        return self._with_map("specular", specular)
+
+    def _with_map(self: R, name: str, values: ArrayLike) -> R:
+        if self.reflectance is None:
+            raise InputError(f"{name}: this result has no reflectance; fit with --until reflectance")
+        before = getattr(self.reflectance, name)
+        array = np.asarray(values, dtype=np.float32)
+        if array.ndim == 0:
+            array = np.where(self.reflectance.diffuse.any(axis=-1), array, 0).astype(np.float32)
+        if array.shape != before.shape or not np.isfinite(array).all() or array.min() < 0 or array.max() > 1:
+            raise InputError(
+                f"{name}: found shape {array.shape} with values {np.min(array):g} to {np.max(array):g}, "
+                f"expected {before.shape} with reflectances 0 to 1"
+            )
+        return replace(self, reflectance=replace(self.reflectance, **{name: array}))
+
+    def with_illumination(self: R, illumination: Illumination) -> R:
+        """The same face in another light, taken as it is; see `Reconstruction.relight` for environment maps.
+
+        Raises
+        ------
+        InputError
+            A result without reflectance.
+        """
+        if self.reflectance is None:
+            raise InputError("illumination: this result has no reflectance; fit with --until reflectance")
+        reflectance = replace(self.reflectance, illumination=illumination)
+        return replace(self, reflectance=reflectance, environment=None, environment_rotation=None)
 
     @property
     def timesteps(self) -> tuple[int, ...]:

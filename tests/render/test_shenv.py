@@ -210,5 +210,5 @@ def test_arrays_of_a_wrong_shape_are_named() -> None:
 
     with pytest.raises(InputError, match=r"found shape \(9, 2\), expected \(B\*B, 3\)"):
         read_coefficients(np.zeros((9, 2)))
-    with pytest.raises(InputError, match="expected at most 121"):
-        read_coefficients(np.zeros((144, 3)))
+    with pytest.raises(InputError, match="expected at most 100"):
+        read_coefficients(np.zeros((121, 3)))

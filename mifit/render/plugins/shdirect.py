@@ -9,6 +9,9 @@ import numpy as np
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
 
+LIGHT_SAMPLES = 16
+"""Points of a compact light that has an extent."""
+
 
 def make() -> type:
     """Define the plugin class for the current variant."""
@@ -36,7 +39,8 @@ def make() -> type:
         Closed-form direct lighting (`shdirect`)
         ----------------------------------------
 
-        Shades the first hit of `blinnphong` surfaces under one `shenv` in closed form, without sampling noise.
+        Shades the first hit of `blinnphong` surfaces under one `shenv` in closed form, without sampling noise. Compact
+        lights beside it, such as `directional` or a small `sphere` that emits, are looked at with shadows.
 
         - `model` (`paper`, `prefiltered`, `shadowed` or the name of another registered shading model, default
           `prefiltered`): how light becomes radiance, see below
@@ -101,7 +105,7 @@ def make() -> type:
             self, mode: Any, scene: Any, sampler: Any, ray: Any, active: Any = True, **_: Any
         ) -> tuple[Any, Any, list[Any], Any]:
             """Radiance along primary rays; plain automatic differentiation in every mode."""
-            emitter = self._emitter(scene)
+            emitter, compact = self._emitters(scene)
             flat = emitter.project()
             order = round((dr.width(flat) // 3) ** 0.5)
             coefficients = kernels.colours(flat, order, dr.width(ray))
@@ -132,15 +136,34 @@ def make() -> type:
                 shaded = self.model.shade(normal, -ray.d, lobe, coefficients, traced)
                 image = form_image(self.ambient, diffuse, shaded[0], specular, shaded[1])
                 radiance = dr.select(front, image, radiance)
+            for light in compact:
+                radiance += self._direct(scene, light, si, hit)
             return radiance, si.is_valid() | (not self.hide), [], None
 
-        def _emitter(self, scene: Any) -> Any:
-            """The scene's only emitter, which must be a `shenv`."""
+        def _emitters(self, scene: Any) -> tuple[Any, list[Any]]:
+            """The scene's `shenv`, of which there is one, and its other emitters, none of them an environment."""
             emitters = scene.emitters()
-            if len(emitters) != 1 or type(emitters[0]).__name__ != "SHEnvironment":
+            smooth = [e for e in emitters if type(e).__name__ == "SHEnvironment"]
+            others = [e for e in emitters if type(e).__name__ != "SHEnvironment"]
+            if len(smooth) != 1 or any(e.is_environment() for e in others):
                 found = ", ".join(type(e).__name__ for e in emitters) or "none"
-                raise InputError(f"shdirect: found emitters {found}, expected exactly one shenv")
-            return emitters[0]
+                raise InputError(
+                    f"shdirect: found emitters {found}, expected exactly one shenv, and no other environment"
+                )
+            return smooth[0], others
+
+        def _direct(self, scene: Any, light: Any, si: Any, active: Any) -> Any:
+            """What the points reflect of a compact light that they see, averaged over a fixed pattern on it."""
+            context, bsdf = mi.BSDFContext(), si.bsdf()
+            count = 1 if mi.has_flag(light.flags(), mi.EmitterFlags.Delta) else LIGHT_SAMPLES
+            total = mi.Color3f(0.0)
+            for k in range(count):
+                at = mi.Point2f((k + 0.5) / count, (k * 0.6180339887498949 + 0.5) % 1.0)
+                ds, weight = light.sample_direction(si, at, active)
+                lit = active & (ds.pdf != 0.0)
+                lit &= ~scene.ray_test(si.spawn_ray_to(ds.p), lit)
+                total += dr.select(lit, bsdf.eval(context, si, si.to_local(ds.d), lit) * weight, 0.0)
+            return total / count
 
         def _bsdfs(self, scene: Any) -> list[tuple[Any, Any, bool]]:
             """The scene's `blinnphong` objects, the pointers that surfaces carry, and whether they are two-sided."""

@@ -15,6 +15,9 @@ ROWS, COLUMNS = 64, 128
 UNIFORM_SHARE = 0.1
 """Part of the samples that is spread evenly, so that no light is missed that lies between the cells' centres."""
 
+MAX_BANDS = 10
+"""Bands that Dr.Jit's ``sh_eval`` goes up to."""
+
 CLAMPED_BANDS = 2
 """Bands to add when clamped radiance, which is no longer band limited, is projected for closed-form shading."""
 
@@ -34,8 +37,10 @@ def read_coefficients(value: Any) -> np.ndarray:
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"shenv: coefficients: found shape {array.shape}, expected (B*B, 3)")
     order_of(array)
-    if len(array) > 121:
-        raise InputError(f"shenv: coefficients: found {len(array)}, expected at most 121 (11 bands)")
+    if len(array) > MAX_BANDS**2:
+        raise InputError(
+            f"shenv: coefficients: found {len(array)}, expected at most {MAX_BANDS**2} ({MAX_BANDS} bands)"
+        )
     if not np.isfinite(array).all():
         raise InputError("shenv: coefficients: found values that are not finite")
     return array
@@ -63,7 +68,7 @@ def make() -> type:
         - `radius` (float, default 10000): radius of a sphere about the origin that holds the scene, in its units;
           `mifit.load_scene` sets it
 
-        The basis is Dr.Jit's (`dr.sh_eval`: orthonormal, with the Condon-Shortley phase), $B$ up to 11. In a dictionary
+        The basis is Dr.Jit's (`dr.sh_eval`: orthonormal, with the Condon-Shortley phase), $B$ up to 10. In a dictionary
         the coefficients are a `mi.TensorXf`; in XML a string with three numbers per function. Where the expansion is
         negative no light comes from; the derivative there is zero, as it is for the clamped value.
 
@@ -151,9 +156,9 @@ def make() -> type:
             """Coefficients of the clamped radiance in world axes, flat (K*K*3), differentiable.
 
             They are the emitter's own where nothing is clamped, rotated to the world; otherwise the projection of the
-            clamped radiance to ``CLAMPED_BANDS`` more bands.
+            clamped radiance to ``CLAMPED_BANDS`` more bands, as far as there are so many.
             """
-            order = min(self.order + CLAMPED_BANDS, 11) if self.clamps else self.order
+            order = min(self.order + CLAMPED_BANDS, MAX_BANDS) if self.clamps else self.order
             if not self.clamps and np.array_equal(self._rotation, np.eye(3)):
                 return self.coefficients.array * self.scale
             count = ROWS if self.clamps else order
