@@ -22,6 +22,9 @@ from mifit.errors import InputError
 if TYPE_CHECKING:
     from mifit.render.gbuffer import SurfaceScene
 
+BOUNCE = 0.32
+"""Albedo with which the mesh lights itself: skin of medium pigmentation, mean of the channels. Part of the light in
+the folds of a face has come this way; without it their albedo has to be too bright."""
 OFFSET = 1e-3
 """Distance by which rays start off the surface, relative to the mesh's diagonal: facets don't shadow themselves."""
 
@@ -58,11 +61,13 @@ class OccludingMesh:
         self._transfer: dict[tuple[int, int], NDArray[np.float32]] = {}
 
     def transfer(self, order: int, seed: int = 0) -> NDArray[np.float32]:
-        """(V, B*B) shadowed diffuse transfer at the vertices."""
+        """(V, B*B) shadowed diffuse transfer at the vertices, with light that the mesh throws on itself once."""
         if (order, seed) not in self._transfer:
             vertices = np.asarray(self.scene.vertices, dtype=np.float64)
             normals = vertex_normals(vertices, self.scene.faces)
-            self._transfer[order, seed] = trace_transfer(self.scene, vertices, normals, order, seed=seed)
+            self._transfer[order, seed] = trace_transfer(
+                self.scene, vertices, normals, order, seed=seed, bounce_albedo=BOUNCE
+            )
         return self._transfer[order, seed]
 
 

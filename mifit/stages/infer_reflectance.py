@@ -20,10 +20,14 @@ from mifit.stages.reflectance.fill import blend_unseen, mirrored_coordinates
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.objective import energies
 from mifit.stages.reflectance.paper_solver import fit_adam
+from mifit.stages.reflectance.priors import levelled
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
+
+
+GAUGE = "mean diffuse albedo over seen texels and channels equals that of the morphable model's mean face"
 
 
 def infer_reflectance(
@@ -39,7 +43,7 @@ def infer_reflectance(
 
     All timesteps of the geometry and all named cameras enter; albedo and lighting are shared by them. The product
     of albedo and lighting is all that images show, so the scale between the two is fixed by a convention: the mean
-    diffuse albedo over the seen texels and channels is that of the fitted morphable model. Texels that no image
+    diffuse albedo over the seen texels and channels is that of the morphable model's mean face. Texels that no image
     shows are filled from the model's albedo, shifted smoothly to agree with their surroundings.
 
     Parameters
@@ -72,6 +76,10 @@ def infer_reflectance(
     surface = Surface(capture, model, geometry, cameras, config.texture_size, trust=config.robust)
     mirrored = mirrored_coordinates(model, surface.texels) if config.symmetric_fill else None
     albedo = interpolate(geometry.vertex_albedo, model.faces, surface.texels.face, surface.texels.weights)
+    physical = config.robust and config.solver == "als" and config.shading != "paper"
+    if physical:  # the paper takes stage 1's albedo as it is
+        face = np.unique(model.faces[model.face_mask])
+        albedo = levelled(albedo, geometry.vertex_albedo[face], model.mean_albedo[face])
     albedo = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float32)
     solve = fit_adam if config.solver == "adam" else fit_als
     fitted, choice, warnings = solve(surface, albedo, config, seed, progress)
@@ -84,7 +92,7 @@ def infer_reflectance(
         warnings = (*warnings, "the lighting had not converged when the iterations ran out; raise max_iterations")
     details: dict = {
         "shading": choice,
-        "gauge": "mean diffuse albedo over seen texels and channels equals the morphable model's",
+        "gauge": GAUGE if physical else "mean diffuse albedo over seen texels and channels equals stage 1's",
         "residual": float(fitted.sigma),
         "seen": float((quality > 0).mean()),
         "texels": len(surface),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from stages.normal_scene import camera, dome_model
 
-from mifit.appearance.occlusion import trace_transfer
+from mifit.appearance.occlusion import OccludingMesh
 from mifit.capture.capture import Frame
 from mifit.core.estimate import GeometryEstimate, Report
 from mifit.core.mesh import interpolate, normalize, vertex_normals
@@ -68,9 +68,10 @@ def turning_dome(shading="prefiltered", fresnel=8.0, gloss=0.12, radiance=None, 
     """Render the capture without noise; ``depth`` stretches the dome towards the cameras."""
     model = dome_model()
     stretched = model.mean * [1.0, 1.0, depth] - [0.0, 0.0, 0.6 * (depth - 1.0)]
-    model = replace(model, mean=stretched.astype(np.float32))
     radiance = lighting(3 if shading == "paper" else 4) if radiance is None else radiance
     diffuse, specular = albedos(gloss=gloss)
+    level = np.full((len(model.mean), 3), diffuse.mean((0, 1)), np.float32)
+    model = replace(model, mean=stretched.astype(np.float32), mean_albedo=level)
     turns = [(0.0, 0.0), (0.35, 0.1), (-0.3, 0.2), (0.1, -0.35)][:steps]
     vertices, rotations = [], []
     centre = np.array([0.0, 0.0, 0.6])
@@ -80,7 +81,6 @@ def turning_dome(shading="prefiltered", fresnel=8.0, gloss=0.12, radiance=None, 
         rotations.append(turn)
         vertices.append(((model.mean - centre) @ turn.T + centre).astype(np.float32))
     count = len(turns)
-    texel = np.full((len(model.mean), 3), diffuse.mean((0, 1)), np.float32)
     geometry = GeometryEstimate(
         tuple(range(count)),
         np.zeros(1),
@@ -90,7 +90,7 @@ def turning_dome(shading="prefiltered", fresnel=8.0, gloss=0.12, radiance=None, 
         np.zeros((count, 3)),
         1.0,
         np.stack(vertices),
-        texel,
+        level,
         np.zeros((9, 3)),
         0.0,
         Report("converged"),
@@ -116,8 +116,7 @@ def render(scene, name, t, diffuse, specular, radiance, exponent, shading, fresn
     toward = normalize(view.position - point)
     traced = None
     if shading == "shadowed":
-        smooth = vertex_normals(vertices, model.faces)
-        traced = trace_transfer(SurfaceScene(vertices, model.faces), vertices, smooth, round(len(radiance) ** 0.5))
+        traced = OccludingMesh(SurfaceScene(vertices, model.faces)).transfer(round(len(radiance) ** 0.5))
         traced = interpolate(traced, model.faces, face, weights)
     d, s = shade_points(normal, toward, x, y, radiance, ambient, exponent, shading, traced, fresnel=fresnel)
     image = np.zeros((*mask.shape, 3), np.float32)

@@ -80,7 +80,8 @@ def test_maps_are_finite_in_the_box_and_confident_where_seen(found):
 def test_the_gauge_is_the_models_mean_albedo(dome, found):
     expected = dome.geometry.vertex_albedo.mean()
     assert abs(found.diffuse[found.confidence > 0.5].mean() / expected - 1) < 0.05
-    other = infer(dome, vertex_albedo=dome.geometry.vertex_albedo * np.float32(0.7))
+    darker = replace(dome.model, mean_albedo=dome.model.mean_albedo * np.float32(0.7))
+    other = infer(replace(dome, model=darker))
     ratio = other.diffuse[found.confidence > 0.9].mean() / found.diffuse[found.confidence > 0.9].mean()
     assert abs(ratio / 0.7 - 1) < 0.03
     np.testing.assert_allclose(other.illumination.radiance[0] * 0.7, found.illumination.radiance[0], rtol=0.05)
@@ -133,8 +134,17 @@ def test_the_same_seed_gives_the_same_result(dome, found):
 def test_auto_says_what_it_chose_and_why(dome):
     estimate = infer(dome, replace(CONFIG, shading="auto"))
     choice = estimate.report.details["shading"]
-    assert choice["chosen"] == estimate.shading_model == "prefiltered"
-    assert set(choice["residuals"]) == {"paper", "prefiltered", "shadowed"} and choice["why"]
+    assert choice["chosen"] == estimate.shading_model == "shadowed"
+    assert set(choice["residuals"]) == {"shadowed"} and choice["why"]
+
+
+def test_level_of_the_albedo_is_that_of_the_mean_face(dome, found):
+    """Stage 1's light is free, so the level and colour that it leaves to the albedo say nothing."""
+    dark = replace(dome.geometry, vertex_albedo=dome.geometry.vertex_albedo * np.float32([0.5, 0.4, 0.3]))
+    again = infer(replace(dome, geometry=dark))
+    np.testing.assert_allclose(again.diffuse, found.diffuse, atol=2e-3)
+    kept = infer(replace(dome, geometry=dark), replace(CONFIG, robust=False))
+    assert kept.diffuse[kept.confidence > 0.5].mean() < 0.6 * found.diffuse[found.confidence > 0.5].mean()
 
 
 def test_unseen_texels_show_the_models_albedo(dome):

@@ -17,11 +17,10 @@ from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.key import TEXELS, Candidates, find_light
 from mifit.stages.reflectance.lighting import LightingProblem, LightingSolution, solve_lighting
+from mifit.stages.reflectance.priors import EXPONENT, NORMAL_REFLECTANCE
 
 NOISE_FLOOR = 0.03
 """Read noise over shot noise, as variance in units of linear colour; 8-bit sRGB is coded about so as well."""
-EXPONENTS = (50.0, 150.0, 400.0)
-"""Exponents that are tried where none is given."""
 EXPLAINED = 0.03
 """A costlier shading model is taken where it lowers the residual by more than this part."""
 FAINT = 0.2
@@ -38,15 +37,10 @@ class Candidate:
     lights: bool = False
 
 
-CANDIDATES = {
-    "paper": Candidate("paper"),
-    "prefiltered": Candidate("prefiltered"),
-    "shadowed": Candidate("shadowed"),
-    "keyed": Candidate("shadowed", lights=True),
-}
-"""What ``shading = auto`` chooses from, cheap to costly. Other registered shading models can be asked for by name."""
-EXPONENT_MODEL = "prefiltered"
-"""Model by which the exponent is estimated: the cheapest that sees it."""
+CANDIDATES = {"shadowed": Candidate("shadowed"), "keyed": Candidate("shadowed", lights=True)}
+"""What ``shading = auto`` chooses from, cheap to costly. Every face shadows itself: a model without shadows, free to
+bend the light to its needs, explains images as well but predicts other light worse. Other registered shading models
+can be asked for by name."""
 
 
 def candidate(name: str) -> Candidate:
@@ -85,7 +79,6 @@ def choose_lighting(
         asked = candidate(config.shading)
         wanted = [asked.model, config.shading] if asked.lights else [config.shading]
     iterations = config.max_iterations if config.robust else min(START_ITERATIONS, config.max_iterations)
-    exponent = config.exponent
     for name in wanted:
         progress("Reflectance lighting", len(tried), len(wanted))
         way = candidate(name)
@@ -96,12 +89,8 @@ def choose_lighting(
                 continue
             forward = found_light
         else:
-            if exponent is None and model.exponent is None:
-                cheap = plain_forward(models.get(EXPONENT_MODEL), EXPONENTS[0], config, surface)
-                exponent = _best_exponent(seen, cheap, albedo, config)
-            own = config.exponent or model.exponent or exponent
-            assert own is not None
-            forward = plain_forward(model, own, config, surface)
+            exponent = config.exponent or model.exponent or EXPONENT
+            forward = plain_forward(model, exponent, config, surface)
         tried[name] = forward, fit_lighting(seen, forward, albedo, config, iterations)
     progress("Reflectance lighting", len(wanted), len(wanted))
     chosen, why = list(tried)[-1], "as configured"
@@ -121,16 +110,6 @@ def choose_lighting(
         "exponent": forward.lobe.typical,
     }
     return forward, found, choice
-
-
-def _best_exponent(seen: Observations, forward: Forward, albedo: NDArray, config: ReflectanceConfig) -> float:
-    """The exponent of `EXPONENTS` that explains some texels best."""
-    some = seen.take(slice(0, None, 3))
-    trials = {
-        m: fit_lighting(some, forward.with_lobe(replace(forward.lobe, exponent=m)), albedo[::3], config, 5).unexplained
-        for m in EXPONENTS
-    }
-    return min(trials, key=lambda m: trials[m])
 
 
 def _with_light(
@@ -157,9 +136,6 @@ def _with_light(
             return None
         forward = forward.with_lights((light,))
         if not again:
-            if config.exponent is None:
-                best = _best_exponent(seen, forward, albedo, config)
-                forward = forward.with_lobe(replace(forward.lobe, exponent=best))
             found = fit_lighting(part, forward, expected, config, 8)
             mean = np.sqrt(np.pi) / 2.0 * found.light[0]  # irradiance from everywhere, pi times the mean radiance
             (irradiance,) = (light.colour for light in forward.under(found.light).illumination.lights)
@@ -190,7 +166,7 @@ def fit_lighting(
     albedo: NDArray,
     config: ReflectanceConfig,
     iterations: int,
-    specular: float = 0.05,
+    specular: float = NORMAL_REFLECTANCE,
 ) -> LightingSolution:
     """Lighting and the subset's albedos; a model that turns with the lighting is linearised anew."""
     light = np.zeros((forward.unknowns, 3))
