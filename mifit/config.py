@@ -88,8 +88,8 @@ class SurfaceConfig:
     enabled: bool = flag(True, "move the surface to where all views agree; false: it stays in the model's span")
     reach: float = number(4.0, "distance from the model's surface that is searched", "millimetres", above=0, most=100)
     stiffness: float = number(
-        8.0,
-        "resistance of the displacements to bending; a wave's height is free in proportion to its length",
+        2.0,
+        "least resistance of the displacements to bending; what the images show raises it",
         above=0,
         most=WEIGHT,
     )

@@ -9,11 +9,12 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mifit.config import SurfaceConfig
 from mifit.core.estimate import GeometryEstimate, Report
 from mifit.core.mesh import normalize
-from mifit.core.uv import rasterize_uv
+from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.progress import Progress, silent
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.geometry.points import corner_matrix
@@ -40,6 +41,9 @@ FORGET_MM = 150.0
 """Wavelength above which displacements fall back to the model where nothing is measured."""
 CONTACT_MM = 1.5
 """Gap below which opposed parts of the surface, such as closed lips, move together."""
+THIN = 2
+START, STIFFEST = 20.0, 5000.0
+"""Stiffness at the start, and the largest."""
 NARROWEST = 0.03
 """Least parallax; below it, about 2 degrees between the views, depth isn't measured."""
 
@@ -87,10 +91,10 @@ def find_surface(
     if resolution.parallax < NARROWEST:
         return _unchanged(geometry, "views from nearly one place: the surface stays in the model's span", began)
     neutral = model.shape(geometry.identity).astype(np.float64)
-    plate = Plate.of(neutral, model.faces, CONTACT_MM / model.unit_mm)
-    pull = config.stiffness * (2.0 * np.pi * model.unit_mm / FORGET_MM) ** 4
+    plate = Plate.of(neutral, model.faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm)
     scene = SurfaceScene(world[0], model.faces)
     displacement = np.zeros_like(neutral)
+    stiffness = START
     levels = sweeps(resolution, config, capture.unit_mm)
     matched = 0.0
     for number, (level, half) in enumerate(levels):
@@ -107,17 +111,19 @@ def find_surface(
         found = sweep(texels, posed, step * np.arange(-half, half + 1), WINDOW, pairs)
         matched = float((found.precision > 0).mean())
         objects = [p.normal @ rotation for p, rotation in zip(posed, geometry.rotation, strict=True)]
-        displacement = solve_displacement(
+        some = thinned(texels)
+        solved = solve_displacement(
             plate,
-            corner_matrix(model.faces, texels.face, texels.weights, len(neutral)),
-            normalize(np.mean(objects, axis=0)),
-            found.offset / geometry.scale,
-            found.precision * geometry.scale**2,
+            corner_matrix(model.faces, texels.face[some], texels.weights[some], len(neutral)),
+            normalize(np.mean(objects, axis=0))[some],
+            found.offset[some] / geometry.scale,
+            found.precision[some] * (THIN * geometry.scale) ** 2,
             displacement,
-            config.stiffness,
-            pull,
+            stiffness,
             ROBUST_STEPS * step / geometry.scale,
         )
+        displacement = solved.displacement
+        stiffness = solved.likely_stiffness(config.stiffness, STIFFEST)
         world = geometry.vertices + geometry.scale * displacement @ geometry.rotation.transpose(0, 2, 1)
     progress("find surface", len(levels), len(levels))
     seconds = time.perf_counter() - began
@@ -127,6 +133,7 @@ def find_surface(
         "outcome": "converged",
         "levels": [level for level, _ in levels],
         "matched": matched,
+        "stiffness": stiffness,
         "displacement_mm": float(np.sqrt(np.mean(moved**2))),
         "seconds": seconds,
     }
@@ -136,6 +143,12 @@ def find_surface(
         displacement=displacement.astype(np.float32),
         report=_extended(geometry.report, seconds, phase),
     )
+
+
+def thinned(texels: TexelMap) -> NDArray[np.intp]:
+    """Every `THIN`-th texel along rows and columns: windows overlap, so that nothing is lost."""
+    row, column = np.divmod(texels.index, texels.size)
+    return np.flatnonzero((row % THIN == 0) & (column % THIN == 0))
 
 
 def sweeps(resolution: Resolution, config: SurfaceConfig, unit_mm: float) -> list[tuple[int, int]]:

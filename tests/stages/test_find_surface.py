@@ -140,19 +140,49 @@ def test_the_solution_is_the_minimum(model):
     vertices = np.column_stack([grid, 0.2 * rng.normal(size=36)])
     quads = [(6 * i + j, 6 * i + j + 6, 6 * i + j + 7, 6 * i + j + 1) for i in range(5) for j in range(5)]
     faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    plate = Plate.of(vertices, faces)
+    plate = Plate.of(vertices, faces, longest=10.0)
     points = sp.csr_matrix(rng.dirichlet(np.ones(36), size=80))
     normals = rng.normal(size=(80, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     offsets, precision = rng.normal(size=80), rng.uniform(0.5, 2.0, 80)
-    got = solve_displacement(
-        plate, points, normals, offsets, precision, np.zeros((36, 3)), 0.5, 0.1, robust=1e9, slide=0.02
+    solved = solve_displacement(
+        plate, points, normals, offsets, precision, np.zeros((36, 3)), 0.5, robust=1e9, slide=0.02
     )
+    got = solved.displacement
     rows = np.einsum("nv,nc->nvc", points.toarray(), normals).reshape(80, -1)
     full = np.kron(points.toarray(), np.eye(3))
     weights = np.repeat(precision, 3)
-    prior = np.kron((0.5 * plate.matrix + 0.1 * sp.diags(plate.area)).toarray(), np.eye(3))
+    prior = np.kron(0.5 * plate.matrix.toarray(), np.eye(3))
     normal_part = rows.T @ (precision[:, None] * rows)
     matrix = prior + 0.98 * normal_part + 0.02 * full.T @ (weights[:, None] * full)
     expected = np.linalg.solve(matrix, rows.T @ (precision * offsets)).reshape(-1, 3)
     np.testing.assert_allclose(got, expected, atol=2e-3 * np.abs(expected).max())
+    data = points.toarray().T @ (precision[:, None] * points.toarray())
+    trace = np.trace(np.linalg.solve(0.5 * plate.matrix.toarray() + data, data))
+    assert abs(solved.measured / trace - 1.0) < 0.3  # random probes
+    assert np.isclose(solved.energy, np.einsum("vc,vw,wc->", got, plate.matrix.toarray(), got))
+
+
+def test_noise_stiffens_and_a_signal_softens():
+    """The likely stiffness follows the size of what is measured."""
+    rng = np.random.default_rng(1)
+    side = 24
+    grid = np.stack(np.meshgrid(*[np.arange(float(side))] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    corner = (side * np.arange(side - 1)[:, None] + np.arange(side - 1)).ravel()
+    faces = np.concatenate([corner[:, None] + (0, side, side + 1), corner[:, None] + (0, side + 1, 1)])
+    plate = Plate.of(np.column_stack([grid, np.zeros(len(grid))]), faces, longest=50.0)
+    wave = np.sin(2 * np.pi * grid[:, 0] / 12.0)
+    normals = np.tile([0.0, 0.0, 1.0], (len(grid), 1))
+    found = []
+    for height in (0.0, 1.0):
+        offsets = height * wave + 0.2 * rng.normal(size=len(grid))
+        stiffness = 1.0
+        for _ in range(8):
+            solved = solve_displacement(
+                plate, sp.identity(len(grid), format="csr"), normals, offsets, np.full(len(grid), 25.0),
+                np.zeros((len(grid), 3)), stiffness, robust=1e9,
+            )  # fmt: skip
+            stiffness = solved.likely_stiffness(1e-3, 1e6)
+        found.append((stiffness, np.abs(solved.displacement[:, 2] - height * wave).mean()))
+    (still, error_still), (moved, error_moved) = found
+    assert still > 30 * moved and error_still < 0.05 and error_moved < 0.1

@@ -2,7 +2,7 @@
 
 Minimised over vectors d at the vertices (object space):
 
-    sum_i p_i rho(n_i . (W d)_i - o_i) + stiffness * sum_v |(L d)_v|^2 / a_v + pull * sum_v a_v |d_v|^2
+    sum_i p_i rho(n_i . (W d)_i - o_i) + stiffness * sum_v (|(L d)_v|^2 / a_v + (2 pi / longest)^4 a_v |d_v|^2)
 
 with the measured points W (barycentric), their normals n, offsets o and precisions p, the cotangent Laplacian L and
 areas a of the rest mesh. Only the normal component of d is measured: a point that slides on the surface costs
@@ -26,6 +26,8 @@ from mifit.core.mesh_update import cotangent_laplacian
 
 CONTACT_WEIGHT = 30.0
 """Of vertices that nearly touch, times the squared distance at which they do."""
+PROBES = 16
+"""Random vectors that estimate a trace."""
 OPPOSED = -0.2
 """Cosine between the normals of sheets that face each other."""
 ACROSS = 0.7
@@ -41,24 +43,26 @@ class Plate:
     matrix : (V, V) sparse
         Thin-plate energy, scale free: the energy of a displacement doesn't change when mesh and displacement are
         scaled together.
-    area : (V,)
     """
 
     matrix: sp.csr_matrix
-    area: NDArray[np.float64]
 
     @classmethod
-    def of(cls, vertices: NDArray, faces: NDArray, contact: float = 0.0) -> Plate:
-        """Of a rest mesh (V, 3), (F, 3); sheets closer than ``contact``, such as closed lips, move together."""
+    def of(cls, vertices: NDArray, faces: NDArray, longest: float, contact: float = 0.0) -> Plate:
+        """Of a rest mesh (V, 3), (F, 3).
+
+        Waves longer than ``longest`` are held by their height rather than by their bending; sheets closer than
+        ``contact``, such as closed lips, move together.
+        """
         rest = np.asarray(vertices, dtype=np.float64)
         laplacian = cotangent_laplacian(rest, faces)
         size = np.linalg.norm(face_cross(rest, faces), axis=1) / 6.0
         area = np.bincount(faces.ravel(), np.repeat(size, 3), minlength=len(rest))
         area = np.maximum(area, 1e-3 * max(float(np.median(area)), 1e-12))
-        matrix = laplacian.T @ sp.diags(1.0 / area) @ laplacian
+        matrix = laplacian.T @ sp.diags(1.0 / area) @ laplacian + (2.0 * np.pi / longest) ** 4 * sp.diags(area)
         if contact > 0:
             matrix = matrix + CONTACT_WEIGHT / contact**2 * _contacts(rest, faces, contact)
-        return cls(matrix.tocsr(), area)
+        return cls(matrix.tocsr())
 
 
 def _contacts(vertices: NDArray, faces: NDArray, distance: float) -> sp.csr_matrix:
@@ -82,6 +86,31 @@ def _contacts(vertices: NDArray, faces: NDArray, distance: float) -> sp.csr_matr
     return (sp.diags(np.asarray(edges.sum(1)).ravel()) - edges).tocsr()
 
 
+@dataclass(frozen=True)
+class Displaced:
+    """A solution.
+
+    Attributes
+    ----------
+    displacement : (V, 3)
+    measured : float
+        Number of degrees of freedom along the normals that the measurements determine rather than the prior.
+    energy : float
+        Of the prior, at stiffness 1.
+    """
+
+    displacement: NDArray[np.float64]
+    measured: float
+    energy: float
+
+    def likely_stiffness(self, low: float, high: float) -> float:
+        """Stiffness under which the displacement is as large as one expects, within bounds (MacKay 1992, eq. 4.8).
+
+        A head that the model spans needs no displacement: what little is found then is noise, and is held down.
+        """
+        return float(np.clip(self.measured / max(self.energy, 1e-30), low, high))
+
+
 def solve_displacement(
     plate: Plate,
     points: sp.csr_matrix,
@@ -90,11 +119,10 @@ def solve_displacement(
     precision: NDArray,
     start: NDArray,
     stiffness: float,
-    pull: float,
     robust: float,
-    sweeps: int = 3,
+    rounds: int = 3,
     slide: float = 0.02,
-) -> NDArray[np.float64]:
+) -> Displaced:
     """Displacements (V, 3) from offsets measured relative to ``start``.
 
     Parameters
@@ -107,20 +135,22 @@ def solve_displacement(
         Relative to the mesh displaced by ``start``, and their inverse variance.
     start : (V, 3)
         Current displacement; the offsets are added to it.
-    stiffness, pull : float
-        Weights of the prior.
+    stiffness : float
+        Weight of the prior.
     robust : float
         Residual where Geman and McClure's penalty turns.
-    sweeps : int
-        Reweightings.
+    rounds : int
+        Reweightings; the penalty turns at twice the residual in each one before the last.
     slide : float
         Part of a point's weight that holds it along the surface.
     """
-    prior = stiffness * plate.matrix + pull * sp.diags(plate.area)
-    target = ((points @ start) * normals).sum(1) + offsets
-    d = start.copy()
     used = precision > 0
-    points, normals, target, precision = points[used], normals[used], target[used], precision[used]
+    points, normals, precision = points[used], normals[used], precision[used]
+    at_start = points @ start
+    normal_start = (at_start * normals).sum(1)
+    target = normal_start + offsets[used]
+    held = at_start - normal_start[:, None] * normals
+    prior = stiffness * plate.matrix
     factor = spl.splu(
         (prior + points.T @ sp.diags(precision) @ points).tocsc(),
         permc_spec="MMD_AT_PLUS_A",
@@ -128,30 +158,48 @@ def solve_displacement(
         options={"SymmetricMode": True},
     )
     transposed = points.T.tocsr()
-    for number in range(sweeps):
-        scale = robust * 2.0 ** (sweeps - 1 - number)
+    d, weight = start.copy(), precision
+    for number in range(rounds):
+        scale = robust * 2.0 ** (rounds - 1 - number)
         residual = ((points @ d) * normals).sum(1) - target
         weight = precision / (1.0 + (residual / scale) ** 2) ** 2
-        along = slide * weight[:, None]
+        d = _solve(prior, points, transposed, normals, weight, target, held, d, factor, slide)
+    probes = np.random.default_rng(0).choice((-1.0, 1.0), (plate.matrix.shape[0], PROBES))
+    weighted = transposed @ (weight[:, None] * (points @ probes))
+    measured = float((probes * factor.solve(weighted)).sum()) / PROBES
+    return Displaced(d, measured, float((d * (plate.matrix @ d)).sum()))
 
-        def apply(flat: NDArray, weight: NDArray = weight, along: NDArray = along) -> NDArray:
-            x = flat.reshape(-1, 3)
-            at = points @ x
-            normal = (at * normals).sum(1, keepdims=True) * normals
-            return (prior @ x + transposed @ ((weight[:, None] - along) * normal + along * at)).ravel()
 
-        right = transposed @ (
-            (weight * target)[:, None] * normals
-            + along * ((points @ start) - ((points @ start) * normals).sum(1, keepdims=True) * normals)
-        )
-        size = d.size
-        d, _ = spl.cg(
-            spl.LinearOperator((size, size), matvec=apply),
-            right.ravel(),
-            x0=d.ravel(),
-            rtol=1e-4,
-            maxiter=60,
-            M=spl.LinearOperator((size, size), matvec=lambda r: factor.solve(r.reshape(-1, 3)).ravel()),
-        )
-        d = d.reshape(-1, 3)
-    return d
+def _solve(
+    prior: sp.csr_matrix,
+    points: sp.csr_matrix,
+    transposed: sp.csr_matrix,
+    normals: NDArray,
+    weight: NDArray,
+    target: NDArray,
+    held: NDArray,
+    start: NDArray,
+    factor: spl.SuperLU,
+    slide: float,
+) -> NDArray[np.float64]:
+    """The minimum for given weights, by conjugate gradients from ``start``."""
+    along = slide * weight[:, None]
+    across = weight[:, None] - along
+
+    def apply(flat: NDArray) -> NDArray:
+        x = flat.reshape(-1, 3)
+        at = points @ x
+        normal = (at * normals).sum(1, keepdims=True) * normals
+        return (prior @ x + transposed @ (across * normal + along * at)).ravel()
+
+    right = transposed @ ((weight * target)[:, None] * normals + along * held)
+    size = start.size
+    d, _ = spl.cg(
+        spl.LinearOperator((size, size), matvec=apply),
+        right.ravel(),
+        x0=start.ravel(),
+        rtol=1e-4,
+        maxiter=60,
+        M=spl.LinearOperator((size, size), matvec=lambda r: factor.solve(r.reshape(-1, 3)).ravel()),
+    )
+    return d.reshape(-1, 3)

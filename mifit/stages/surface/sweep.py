@@ -22,8 +22,11 @@ NOISE = 0.012
 FLOOR = 0.05
 """Disagreement (1 - correlation) that remains at best."""
 FAR = 0.1
+"""Correlation that the ends of the sweep must gain on its middle: little texture leaves the surface where it is."""
 UNIQUE = 0.2
-POWER = 1.5
+"""Correlation by which an offset must be ahead of all that aren't its neighbours to count fully."""
+POWER, INDEPENDENT = 1.5, 0.11
+"""Precision is INDEPENDENT * sharpness ** POWER: as the errors of offsets on rendered heads are."""
 LEAST_SCORE = 0.4
 """Correlation below which a texel counts as not matched."""
 
@@ -139,5 +142,5 @@ def _peak(score: NDArray, weight: NDArray, offsets: NDArray) -> Found:
     unique = np.clip((top - other) / UNIQUE, 0.0, 1.0)
     usable = (best == inner) & (weight > 0) & (top > LEAST_SCORE)
     sharpness = unique * np.maximum(curvature, 0.0) / np.maximum(1.0 - top + FLOOR, FLOOR)
-    precision = np.where(usable, weight * sharpness**POWER / step**2, 0.0)
+    precision = np.where(usable, INDEPENDENT * weight * sharpness**POWER / step**2, 0.0)
     return Found(offset.astype(np.float64), precision.astype(np.float64), top)
