@@ -10,12 +10,16 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
 from mifit.core.mesh import face_cross
+from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 
 _LANDMARKS = 68
+MAPPED_SIZE = 512
+"""Texels along the side of the map in which faces that share a place are looked for."""
 _PROVIDED: dict[str, Callable[..., Any]] = {}
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -271,6 +275,25 @@ class MorphableModel:
             fingerprint="",
             face_mask=self.face_mask if region is None else self.face_mask & region,
         )
+
+    @cached_property
+    def mapped(self) -> NDArray[np.bool_]:
+        """(F,) faces that maps hold: the face area, and charts that have a place of their own in the unit square."""
+        corners = self.uv[self.faces_uv]
+        own = self.face_mask | ((corners >= -1e-6) & (corners <= 1.0 + 1e-6)).all(axis=(1, 2))
+        order = np.flatnonzero(own)
+        maps = [rasterize_uv(self.uv, self.faces_uv[rows], MAPPED_SIZE) for rows in (order, order[::-1])]
+        first, last = order[maps[0].face], order[::-1][maps[1].face]
+        inner = (maps[0].weights.min(axis=1) > 1e-4) & (maps[1].weights.min(axis=1) > 1e-4)
+        shared = np.concatenate([first[inner & (first != last)], last[inner & (first != last)]])
+        # A chart goes as a whole: half of it would leave a ragged border.
+        rest = np.flatnonzero(own & ~self.face_mask)
+        corner = self.faces_uv[rest]
+        links = (np.ones(corner.size), (corner.ravel(), np.roll(corner, 1, axis=1).ravel()))
+        chart = sp.csgraph.connected_components(sp.coo_matrix(links, (len(self.uv),) * 2), directed=False)[1]
+        spoiled = np.unique(chart[corner[np.isin(rest, shared), 0]])
+        own[rest[np.isin(chart[corner[:, 0]], spoiled)]] = False
+        return own
 
     @cached_property
     def degenerate_faces(self) -> NDArray[np.int64]:

@@ -18,7 +18,7 @@ from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.sh import basis
 from mifit.core.uv import sample_map
-from mifit.output.surface import surface_maps
+from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
@@ -125,13 +125,18 @@ class SampledMaterial:
 
 
 def surface_material(reconstruction: Result, surface: VisibleSurface, timestep: int) -> SampledMaterial:
-    """Look up maps in the face area, and the fitted model's vertex albedo and the mesh's normals elsewhere."""
+    """Look up maps where there are maps, and vertex albedo that continues them and the mesh's normals elsewhere."""
     model, geometry = reconstruction.model, reconstruction.geometry
     rotation = geometry.rotation[reconstruction.index(timestep)]
     normal = _mesh_normals(reconstruction, surface, timestep)
-    diffuse = np.clip(interpolate(geometry.vertex_albedo, model.faces, surface.face, surface.weights), 0, 1)
-    specular = np.zeros(len(surface.face), dtype=np.float32)
-    inside = model.face_mask[surface.face]
+    inside = mapped_faces(reconstruction)[surface.face]
+    diffuse = np.zeros((len(inside), 3), dtype=np.float32)
+    specular = np.zeros(len(inside), dtype=np.float32)
+    if not inside.all():
+        values = interpolate(
+            vertex_materials(reconstruction), model.faces, surface.face[~inside], surface.weights[~inside]
+        )
+        diffuse[~inside], specular[~inside] = values[:, :3], values[:, 3]
     maps = surface_maps(reconstruction, timestep)
     uv = interpolate(model.uv, model.faces_uv, surface.face[inside], surface.weights[inside])
     diffuse[inside] = sample_map(maps.diffuse, uv)

@@ -14,7 +14,7 @@ from mifit.core.ply import write_ply
 from mifit.core.split_mesh import part_of, split_at_seams, tangent_space_map
 from mifit.errors import InputError
 from mifit.output.gltf import write_glb
-from mifit.output.surface import surface_maps
+from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
     from mifit.result import Result
@@ -98,19 +98,20 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int) -> None:
     model, i = reconstruction.model, reconstruction.index(timestep)
     vertices = reconstruction.geometry.vertices[i]
     normals = vertex_normals(vertices, model.faces)
-    mesh = split_at_seams(model)
+    mesh, mapped = split_at_seams(model), mapped_faces(reconstruction)
     maps = surface_maps(reconstruction, timestep)
     rotation = reconstruction.geometry.rotation[i]
     bent = tangent_space_map(
-        maps.normal, (vertices @ rotation)[mesh.origin], (normals @ rotation)[mesh.origin], mesh, model.face_mask
+        maps.normal, (vertices @ rotation)[mesh.origin], (normals @ rotation)[mesh.origin], mesh, mapped
     )
     stem = path.stem
     write_image(path.with_name(f"{stem}_diffuse.png"), maps.diffuse)
     write_image(path.with_name(f"{stem}_specular.png"), maps.specular)
     with replacing(path.with_name(f"{stem}_normal.png")) as temporary:
         temporary.write_bytes(encode_png(np.round(127.5 * (bent + 1)).astype(np.uint8)))
-    rest = part_of(mesh, ~model.face_mask) if not model.face_mask.all() else None
-    grey = reconstruction.geometry.vertex_albedo[rest.origin].mean(0) if rest else np.full(3, 0.5)
+    albedo = vertex_materials(reconstruction)[:, :3]
+    rest = part_of(mesh, ~mapped) if not mapped.all() else None
+    grey = albedo[rest.origin].mean(0) if rest else np.full(3, 0.5)
     colour = " ".join(f"{c:.5f}" for c in linear_to_srgb(np.clip(grey, 0, 1)))
     write_text(
         path.with_suffix(".mtl"),
@@ -118,7 +119,7 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int) -> None:
         f"map_Kd {stem}_diffuse.png\nmap_Ks {stem}_specular.png\nnorm {stem}_normal.png\n\n"
         f"newmtl rest\nillum 1\nKd {colour}\nKs 0 0 0\n",
     )
-    codes = to_8_bit(reconstruction.geometry.vertex_albedo) / 255.0
+    codes = to_8_bit(albedo) / 255.0
     lines = [f"# written by mifit; units {reconstruction.units}", f"mtllib {stem}.mtl"]
     lines += [
         f"v {x:.7g} {y:.7g} {z:.7g} {r:.4f} {g:.4f} {b:.4f}"
@@ -126,7 +127,7 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int) -> None:
     ]
     lines += [f"vt {u:.7g} {v:.7g}" for u, v in model.uv.tolist()]
     lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in normals.tolist()]
-    for name, selected in (("skin", model.face_mask), ("rest", ~model.face_mask)):
+    for name, selected in (("skin", mapped), ("rest", ~mapped)):
         lines += [f"g {name}", f"usemtl {name}"]
         for f, t in zip((model.faces[selected] + 1).tolist(), (model.faces_uv[selected] + 1).tolist(), strict=True):
             lines.append("f " + " ".join(f"{a}/{b}/{a}" for a, b in zip(f, t, strict=True)))

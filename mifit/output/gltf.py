@@ -18,7 +18,7 @@ from mifit.core.files import replacing
 from mifit.core.image import encode_png, to_8_bit
 from mifit.core.mesh import vertex_normals
 from mifit.core.split_mesh import SplitMesh, part_of, split_at_seams, tangent_space_map, tangents
-from mifit.output.surface import surface_maps
+from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
     from mifit.core.camera import Camera
@@ -73,7 +73,7 @@ def write_glb(
     """Write one timestep as a ``.glb`` file, whole or not at all.
 
     The head is in metres, in object space, under a node that holds its pose; the fitted cameras stand beside it.
-    The face area has the maps: base colour, tangent-space normals, and the specular albedo through
+    Faces with a place in the atlas have the maps: base colour, tangent-space normals, and the specular albedo through
     KHR_materials_specular. glTF has GGX lobes, so the Blinn-Phong exponent m becomes alpha = sqrt(2 / (m + 2)), the
     usual relation, and roughness = sqrt(alpha). The other faces have vertex colours. The model's expressions are
     morph targets, with the timestep's coefficients as weights. Recovered lighting is in the scene's ``extras``:
@@ -104,11 +104,13 @@ def write_glb(
 
     out = _Buffer()
     mesh = split_at_seams(model)
+    albedo = vertex_materials(reconstruction)[:, :3]
     primitives = []
-    for material, selected in enumerate((model.face_mask, ~model.face_mask)):
+    mapped = mapped_faces(reconstruction)
+    for material, selected in enumerate((mapped, ~mapped)):
         if selected.any():
             part = part_of(mesh, selected)
-            primitives.append(_primitive(out, part, base, normals, targets, material, geometry.vertex_albedo))
+            primitives.append(_primitive(out, part, base, normals, targets, material, albedo))
     images, textures, skin = _skin(out, reconstruction, timestep, mesh, posed, normals)
     head: dict[str, Any] = {"name": "head", "mesh": 0}
     animations = []
@@ -185,7 +187,7 @@ def _primitive(
         attributes["TANGENT"] = out.accessor(np.column_stack([tangent, sign]), "<f4")
         attributes["TEXCOORD_0"] = out.accessor(part.uv * (1, -1) + (0, 1), "<f4")
     else:
-        attributes["COLOR_0"] = out.accessor(np.clip(albedo[part.origin], 0, 1), "<f4")
+        attributes["COLOR_0"] = out.accessor(albedo[part.origin], "<f4")
     primitive: dict[str, Any] = {
         "attributes": attributes,
         "indices": out.accessor(part.faces.ravel(), "<u4", target=34963),
@@ -204,7 +206,7 @@ def _skin(
     """Images, textures and material of the face area."""
     maps = surface_maps(reconstruction, timestep)
     bent = tangent_space_map(
-        maps.normal, vertices[mesh.origin], normals[mesh.origin], mesh, reconstruction.model.face_mask
+        maps.normal, vertices[mesh.origin], normals[mesh.origin], mesh, mapped_faces(reconstruction)
     )
     peak = max(float(maps.specular.max()), 1e-6)
     lobe = reconstruction.lobe

@@ -24,7 +24,7 @@ from mifit.core.sh import SHLighting
 from mifit.core.split_mesh import SplitMesh, part_of, split_at_seams
 from mifit.core.uv import rasterize_uv
 from mifit.output.deferred import visible_surface
-from mifit.output.surface import surface_maps
+from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 from mifit.render.description import Parameter, to_xml
 from mifit.render.sensor import sensor_description
 
@@ -45,14 +45,15 @@ def write_scene(
 ) -> None:
     """Write ``NAME.xml`` with mifit's plugins, ``NAME_stock.xml`` for plain Mitsuba, and their files.
 
-    Both read meshes and maps from the folder ``NAME_files`` beside them. The face area has the maps; other faces
-    have the fitted model's vertex albedo. In ``NAME.xml`` the skin is ``blinnphong`` with the fitted lobe's rise
-    and the refined normals as slopes, and the light is ``shenv``. In ``NAME_stock.xml`` the skin blends ``diffuse``
-    with a ``roughconductor`` of Beckmann roughness sqrt(2 / (m + 2)), which doesn't rise, under a ``normalmap``,
-    and the light is a lat-long ``envmap``. A relit reconstruction has its environment as ``envmap`` in both. A
-    compact light is a stock ``directional`` emitter in both. The ambient term stands for light that local shading
-    leaves out, such as interreflection, so a path-traced scene doesn't have it. A camera whose pixels aren't square
-    is mifit's ``pinhole`` in ``NAME.xml``; in ``NAME_stock.xml`` it has square ones (`Camera.with_square_pixels`).
+    Both read meshes and maps from the folder ``NAME_files`` beside them. Faces with a place in the atlas have the
+    maps; others have vertex albedo that continues them. In ``NAME.xml`` the skin is ``blinnphong`` with the fitted
+    lobe's rise and the refined normals as slopes, and the light is ``shenv``. In ``NAME_stock.xml`` the skin blends
+    ``diffuse`` with a ``roughconductor`` of Beckmann roughness sqrt(2 / (m + 2)), which doesn't rise, under a
+    ``normalmap``, and the light is a lat-long ``envmap``. A relit reconstruction has its environment as ``envmap`` in
+    both. A compact light is a stock ``directional`` emitter in both. The ambient term stands for light that local
+    shading leaves out, such as interreflection, so a path-traced scene doesn't have it. A camera whose pixels aren't
+    square is mifit's ``pinhole`` in ``NAME.xml``; in ``NAME_stock.xml`` it has square ones
+    (`Camera.with_square_pixels`).
 
     Parameters
     ----------
@@ -114,7 +115,9 @@ def _write_files(reconstruction: Result, files: Path, timestep: int, method: Met
     normals = vertex_normals(vertices, model.faces)
     mesh = split_at_seams(model)
     files.mkdir(parents=True, exist_ok=True)
-    for name, selected in (("face", model.face_mask), ("rest", ~model.face_mask)):
+    albedo = vertex_materials(reconstruction)[:, :3]
+    mapped = mapped_faces(reconstruction)
+    for name, selected in (("face", mapped), ("rest", ~mapped)):
         if selected.any():
             part = part_of(mesh, selected)
             write_ply(
@@ -123,7 +126,7 @@ def _write_files(reconstruction: Result, files: Path, timestep: int, method: Met
                 part.faces,
                 normals[part.origin],
                 part.uv,
-                np.clip(geometry.vertex_albedo[part.origin], 0, 1),
+                albedo[part.origin],
                 viewer_colours=False,
             )
     maps = surface_maps(reconstruction, timestep)
@@ -158,7 +161,7 @@ def _slopes(
     model = reconstruction.model
     size = normal_object.shape[0]
     rotation = reconstruction.geometry.rotation[reconstruction.index(timestep)]
-    texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+    texels = rasterize_uv(model.uv, model.faces_uv, size, mapped_faces(reconstruction))
     n = normalize(interpolate(normals, model.faces, texels.face, texels.weights))
     p, t = vertices[model.faces].astype(np.float64), model.uv[model.faces_uv].astype(np.float64)
     d1, d2 = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
@@ -224,7 +227,7 @@ def scene_description(
         scene[name] = sensor_description(camera.with_square_pixels() if stock else camera, Parameter("spp", 64))
     scene["skin"] = _skin(reconstruction, files, stock)
     scene["face"] = _shape(f"{files}/face.ply", {"type": "ref", "id": "skin"})
-    if not reconstruction.model.face_mask.all():
+    if not mapped_faces(reconstruction).all():
         scene["rest"] = _shape(f"{files}/rest.ply", _vertex_albedo(stock))
     if stock or reconstruction.environment is not None:
         scene["light"] = {"type": "envmap", "filename": f"{files}/environment.exr"}

@@ -1,7 +1,7 @@
 """The reconstructed surface as renderers want it: maps without gaps.
 
-Maps belong to the faces of the model's ``face_mask``. Other faces may have any texture coordinates, so they are
-shown with the fitted model's vertex albedo, without specular, by the mesh's normals.
+Maps belong to the faces that have a place in the atlas (`mapped_faces`). Other faces are shown with vertex
+albedo that continues the maps without a seam, by the mesh's normals.
 """
 
 from __future__ import annotations
@@ -11,20 +11,26 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from mifit.core.membrane import membrane
 from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.core.uv import TexelMap, rasterize_uv, sample_map
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
     from mifit.result import Result
 
 
+STIFFNESS = 1e-3
+"""Of the membrane, beside vertices whose albedo is known."""
+
+
 @dataclass(frozen=True)
 class SurfaceMaps:
-    """Maps of the face area, padded across seams; row 0 at v = 1.
+    """Maps of the faces that have a place in the atlas, padded across seams; row 0 at v = 1.
 
     Attributes
     ----------
@@ -44,14 +50,14 @@ class SurfaceMaps:
 def surface_maps(reconstruction: Result, timestep: int) -> SurfaceMaps:
     """Maps of one timestep as a renderer wants them.
 
-    Texels outside the face area repeat the nearest texel inside, so bilinear look-ups at a seam see no gap.
+    Texels that belong to no face repeat the nearest texel inside, so bilinear look-ups at a seam see no gap.
     Without stage 2 the albedo is the fitted model's at 512 texels; without stage 3, or for a timestep that it
     did not refine, the normals are the mesh's.
     """
     model, geometry = reconstruction.model, reconstruction.geometry
     reflectance = reconstruction.reflectance
     size = 512 if reflectance is None else reflectance.diffuse.shape[0]
-    texels, nearest = _face_texels(model, size)
+    texels, nearest = _shown_texels(reconstruction, size)
     corners = (model.faces, texels.face, texels.weights)
     if reflectance is None:
         diffuse = texels.to_map(np.clip(interpolate(geometry.vertex_albedo, *corners), 0, 1).astype(np.float32))
@@ -68,9 +74,51 @@ def surface_maps(reconstruction: Result, timestep: int) -> SurfaceMaps:
     return SurfaceMaps(diffuse[nearest], specular[nearest], normal[nearest])
 
 
+def vertex_materials(reconstruction: Result) -> NDArray[np.float32]:
+    """Diffuse and specular albedo at the vertices: the maps' where there are maps, continued over the other faces.
+
+    Returns
+    -------
+    (V, 4) float32
+        Linear, 0..1. The diffuse part is the fitted model's albedo plus an offset that is a membrane over the mesh.
+    """
+    model, geometry, reflectance = reconstruction.model, reconstruction.geometry, reconstruction.reflectance
+    albedo = np.asarray(geometry.vertex_albedo, dtype=np.float64)
+    expected = np.column_stack([albedo, np.zeros(len(albedo))])
+    if reflectance is None:
+        return np.clip(expected, 0.0, 1.0).astype(np.float32)
+    inside = mapped_faces(reconstruction)
+    known = np.unique(model.faces[inside])
+    uv = np.zeros((len(albedo), 2))
+    uv[model.faces[inside].ravel()] = model.uv[model.faces_uv[inside].ravel()]
+    _, nearest = _shown_texels(reconstruction, len(reflectance.diffuse))
+    values = np.concatenate([reflectance.diffuse, reflectance.specular[..., None]], axis=2)[nearest]
+    offset = sample_map(values, uv[known]) - expected[known]
+    if len(known) < len(albedo):
+        where = sp.csr_matrix((np.ones(len(known)), (np.arange(len(known)), known)), (len(known), len(albedo)))
+        expected += membrane(model.mean, model.faces, where, offset, np.ones(len(known)), STIFFNESS)
+    expected[known] = offset + np.column_stack([albedo, np.zeros(len(albedo))])[known]
+    return np.clip(expected, 0.0, 1.0).astype(np.float32)
+
+
+def _shown_texels(reconstruction: Result, size: int) -> tuple[TexelMap, tuple[NDArray, NDArray]]:
+    model = reconstruction.model
+    return _texels(model, size, np.array_equal(mapped_faces(reconstruction), model.mapped))
+
+
+def mapped_faces(reconstruction: Result) -> NDArray[np.bool_]:
+    """(F,) faces that are shown with the maps: all that the atlas holds, or the face area where a fit stayed in it."""
+    model, reflectance = reconstruction.model, reconstruction.reflectance
+    if reflectance is None:
+        return model.mapped
+    texels, _ = _texels(model, len(reflectance.diffuse), True)
+    outside = ~model.face_mask[texels.face]
+    return model.mapped if texels.from_map(reflectance.diffuse)[outside].any() else model.face_mask
+
+
 @lru_cache(maxsize=4)
-def _face_texels(model: MorphableModel, size: int) -> tuple[TexelMap, tuple[NDArray, NDArray]]:
-    """Texels of the face area, and for every texel of the map the row and column of the nearest of them."""
-    texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+def _texels(model: MorphableModel, size: int, whole: bool) -> tuple[TexelMap, tuple[NDArray, NDArray]]:
+    """Texels of the faces with maps, and for every texel of the map the row and column of the nearest of them."""
+    texels = rasterize_uv(model.uv, model.faces_uv, size, model.mapped if whole else model.face_mask)
     rows, columns = distance_transform_edt(~texels.mask, return_distances=False, return_indices=True)
     return texels, (rows, columns)

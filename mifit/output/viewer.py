@@ -14,7 +14,7 @@ from mifit.core.mesh import vertex_normals
 from mifit.core.sh import SHLighting, bands, cosine_coefficients
 from mifit.core.split_mesh import part_of, split_at_seams
 from mifit.output.figures import jpeg_uri, png_uri
-from mifit.output.surface import surface_maps
+from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
     from mifit.result import Result
@@ -32,7 +32,8 @@ def viewer_data(reconstruction: Result, timestep: int) -> str:
     vertices = (geometry.vertices[i] - translation) @ rotation / scale
     mesh = split_at_seams(model)
     # Two parts that share no vertex: with maps, and without.
-    parts = [part_of(mesh, model.face_mask), part_of(mesh, ~model.face_mask)]
+    mapped = mapped_faces(reconstruction)
+    parts = [part_of(mesh, mapped), part_of(mesh, ~mapped)]
     origin = np.concatenate([p.origin for p in parts])
     uv = np.concatenate([p.uv for p in parts])
     has_maps = np.arange(len(origin)) < len(parts[0].origin)
@@ -42,7 +43,7 @@ def viewer_data(reconstruction: Result, timestep: int) -> str:
     centre = (position.min(0) + position.max(0)) / 2
     radius = float(np.abs(position - centre).max())
     face_centre = vertices[np.unique(model.faces[model.face_mask])]
-    colour = np.column_stack([to_8_bit(geometry.vertex_albedo[origin]), has_maps * 255]).astype(np.uint8)
+    colour = np.column_stack([to_8_bit(vertex_materials(reconstruction)[origin, :3]), has_maps * 255]).astype(np.uint8)
     wide = len(origin) > 65535
     maps = surface_maps(reconstruction, timestep)
     peak = max(float(maps.specular.max()), 1e-3)

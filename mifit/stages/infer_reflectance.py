@@ -73,7 +73,7 @@ def infer_reflectance(
     """
     started = time.perf_counter()
     config = config or ReflectanceConfig()
-    surface = Surface(capture, model, geometry, cameras, config.texture_size, trust=config.robust)
+    surface = Surface(capture, model, geometry, cameras, config.texture_size, config.robust, whole=config.robust)
     mirrored = mirrored_coordinates(model, surface.texels) if config.symmetric_fill else None
     albedo = interpolate(geometry.vertex_albedo, model.faces, surface.texels.face, surface.texels.weights)
     physical = config.robust and config.solver == "als" and config.shading != "paper"
@@ -87,15 +87,16 @@ def infer_reflectance(
     if not (np.isfinite(fitted.maps).all() and np.isfinite(illumination.unknowns).all()):
         raise ConvergenceError("stage 2 (reflectance): the maps or the lighting are not finite; see the images' range")
     quality = surface.quality()
-    diffuse, specular, confidence = blend_unseen(surface.texels, albedo, fitted.maps, quality, mirrored)
+    diffuse, specular, confidence = blend_unseen(model, surface.texels, albedo, fitted.maps, quality, mirrored)
     if fitted.outcome is Outcome.MAX_ITERATIONS:
         warnings = (*warnings, "the lighting had not converged when the iterations ran out; raise max_iterations")
     details: dict = {
         "shading": choice,
         "gauge": GAUGE if physical else "mean diffuse albedo over seen texels and channels equals stage 1's",
         "residual": float(fitted.sigma),
-        "seen": float((quality > 0).mean()),
-        "texels": len(surface),
+        "seen": float((quality[surface.facial] > 0).mean()),
+        "texels": int(surface.facial.sum()),
+        "texels_of_head": len(surface),
         "images": surface.image_count,
     }
     if config.solver == "adam" or not config.robust:

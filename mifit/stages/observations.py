@@ -138,6 +138,8 @@ class Surface:
         Side of the map in texels.
     trust : bool
         Weigh observations by how likely they show the point; without it by pixels alone, as the paper's sums do.
+    whole : bool
+        All texels that the model's maps hold, neck, scalp and eyes included, and not those of its face area alone.
 
     Raises
     ------
@@ -153,6 +155,7 @@ class Surface:
         cameras: Sequence[str],
         size: int,
         trust: bool = True,
+        whole: bool = False,
     ) -> None:
         if not cameras or not geometry.timesteps:
             raise InputError(
@@ -160,7 +163,9 @@ class Surface:
             )
         from mifit.render.gbuffer import SurfaceScene
 
-        self.texels: TexelMap = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+        shown = model.mapped if whole else model.face_mask
+        self.texels: TexelMap = rasterize_uv(model.uv, model.faces_uv, size, shown)
+        self.facial: NDArray[np.bool_] = model.face_mask[self.texels.face]
         if not len(self.texels.index):
             raise InputError(f"model {model.name}: its face area covers no texel of a map of {size} texels a side")
         self.trust, self.geometry = trust, geometry
@@ -175,7 +180,7 @@ class Surface:
         for i, timestep in enumerate(geometry.timesteps):
             for k, name in enumerate(cameras):
                 camera, frame = capture.camera(name), capture.frame(name, timestep)
-                covered, edge, outline = _face_pixels(self.scenes[i], self.vertices[i], model, camera)
+                covered, edge, outline = _face_pixels(self.scenes[i], self.vertices[i], model.faces, shown, camera)
                 colour = frame.image / geometry.gain(name)
                 unusable = edge | ~covered | ~frame.valid | ~np.isfinite(frame.image).all(-1)
                 self._images.append(
@@ -212,14 +217,14 @@ class Surface:
         return [np.arange(i, min(i + step, len(self))) for i in range(0, len(self), step)]
 
     def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-        """Random texels among those that some image measures, ascending; at most ``count``.
+        """Random texels of the face area among those that some image measures, ascending; at most ``count``.
 
         Raises
         ------
         InputError
             No image shows the face.
         """
-        order = rng.permutation(len(self))
+        order = rng.permutation(np.flatnonzero(self.facial))
         found: list[NDArray] = []
         total = 0
         for start in range(0, len(order), 2 * count):
@@ -340,13 +345,15 @@ def _footprint(vertices: NDArray, faces: NDArray, camera: Camera, texel_area: ND
     return (area / np.maximum(texel_area, 1e-9)).astype(np.float32)
 
 
-def _face_pixels(scene, vertices: NDArray, model: MorphableModel, camera: Camera) -> tuple[NDArray, NDArray, NDArray]:
-    """Pixels whose centre shows the front of the face area, pixels at occlusion edges, and pixels to the outline."""
+def _face_pixels(
+    scene, vertices: NDArray, faces: NDArray, shown: NDArray, camera: Camera
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Pixels that show the front of the faces (F,) ``shown``, pixels at occlusion edges, and pixels to the outline."""
     buffer = scene.gbuffer(camera)
     face = buffer.face
-    toward = camera.position - vertices[model.faces[:, 0]]
-    front = np.sum(face_cross(vertices, model.faces) * toward, axis=1) > 0
-    covered = (face >= 0) & (front & model.face_mask)[np.maximum(face, 0)]
+    toward = camera.position - vertices[faces[:, 0]]
+    front = np.sum(face_cross(vertices, faces) * toward, axis=1) > 0
+    covered = (face >= 0) & (front & shown)[np.maximum(face, 0)]
     step = EDGE_STEP * float(np.linalg.norm(np.ptp(vertices, axis=0)))
     outline = outline_distance(np.where((face >= 0) & front[np.maximum(face, 0)], buffer.depth, np.inf), step)
     return covered, outline < EDGE_PIXELS, outline

@@ -147,3 +147,22 @@ def test_digest_of_a_computed_model_does_not_depend_on_threads(ict_path):
         for threads in ("1", "2")
     }
     assert len(digests) == 1
+
+
+def test_charts_with_a_place_of_their_own_are_mapped() -> None:
+    head = MorphableModel.load("builtin:coarse")
+    assert head.mapped.all()  # scalp, neck and eyes have their own part of the atlas
+    eye = (head.mean[head.faces, 2] > 8.3).all(axis=1)
+    eye &= (
+        ~head.face_mask
+        & (np.abs(head.uv[head.faces_uv] - (0.9, 0.02)) < (0.05, 0.03)).all(axis=(1, 2))
+        & (head.mean[head.faces, 0] > 0).all(axis=1)
+    )
+    assert eye.sum() > 50
+    uv = head.uv.copy()
+    corners = np.unique(head.faces_uv[eye])
+    uv[corners] += 0.5 - uv[corners].mean(axis=0)  # onto the middle of the face
+    moved = dataclasses.replace(head, uv=uv, fingerprint="").mapped
+    assert moved[~eye].mean() > 0.99 and not moved[eye].any()
+    uv[corners] += 2.0
+    assert not dataclasses.replace(head, uv=uv, fingerprint="").mapped[eye].any()

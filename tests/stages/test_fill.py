@@ -30,7 +30,9 @@ def test_the_unseen_side_takes_what_the_other_shows(half_seen):
     albedo = np.full((len(truth), 3), 0.4, np.float32)
     errors = []
     for mirrored in (None, mirrored_coordinates(model, texels)):
-        diffuse, specular, confidence = blend_unseen(texels, albedo, texels.to_map(found), seen.astype(float), mirrored)
+        diffuse, specular, confidence = blend_unseen(
+            model, texels, albedo, texels.to_map(found), seen.astype(float), mirrored
+        )
         filled = np.concatenate([texels.from_map(diffuse), texels.from_map(specular)[:, None]], axis=1)
         errors.append(np.sqrt(np.mean((filled - truth)[~seen] ** 2)))
         np.testing.assert_allclose(filled[seen], truth[seen], atol=0.03)

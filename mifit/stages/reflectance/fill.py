@@ -2,26 +2,37 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.membrane import membrane
 from mifit.core.mesh import interpolate
 from mifit.core.uv import TexelMap, sample_map
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
+from mifit.stages.geometry.points import corner_matrix
 
 BLEND = 0.05
 """Confidence at which a texel's own estimate counts as much as its surroundings'."""
+STIFFNESS = 0.02
+"""Of the membrane, beside texels of confidence 1."""
 
 
 def blend_unseen(
-    texels: TexelMap, albedo: NDArray, maps: NDArray, quality: NDArray, mirrored: NDArray | None = None
+    model: MorphableModel,
+    texels: TexelMap,
+    albedo: NDArray,
+    maps: NDArray,
+    quality: NDArray,
+    mirrored: NDArray | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Replace texels that were hardly seen by the model's albedo plus a smooth offset from the seen ones.
+    """Replace texels that were hardly seen by the model's albedo plus an offset that continues the seen ones.
+
+    The offset is a membrane over the mesh (`core.membrane`), so that it crosses the atlas's seams.
 
     Parameters
     ----------
+    model : MorphableModel
     texels : TexelMap
     albedo : (N, 3)
         Diffuse albedo of the fitted model.
@@ -50,7 +61,9 @@ def blend_unseen(
         known = confidence + there * (1.0 - np.clip(confidence / BLEND, 0.0, 1.0))
         own = (confidence / np.maximum(known, 1e-12))[..., None]
         offset = own * offset + (1.0 - own) * opposite
-    smooth = pull_push(offset, known)
+    where = corner_matrix(model.faces, texels.face, texels.weights, model.n_vertices)
+    sheet = membrane(model.mean, model.faces, where, texels.from_map(offset), texels.from_map(known), STIFFNESS)
+    smooth = texels.to_map((where @ sheet).astype(np.float32))
     share = (known / (known + BLEND))[..., None]
     blended = share * offset + (1.0 - share) * smooth
     blended[..., :3] += expected
@@ -74,20 +87,3 @@ def mirrored_coordinates(model: MorphableModel, texels: TexelMap) -> NDArray[np.
     of_vertex = np.zeros((len(model.mean), 2))
     of_vertex[model.faces[inside].ravel()] = model.uv[model.faces_uv[inside].ravel()]
     return interpolate(of_vertex[model.symmetry], model.faces, texels.face, texels.weights)
-
-
-def pull_push(image: NDArray, weight: NDArray) -> NDArray[np.float32]:
-    """Weighted average over ever wider surroundings: the finest level that carries weight decides (S, S, C)."""
-    if image.shape[0] <= 2 or image.shape[1] <= 2:
-        total = max(float(weight.sum()), 1e-12)
-        mean = (image * weight[..., None]).sum((0, 1)) / total
-        return np.broadcast_to(mean, image.shape).astype(np.float32)
-    half = ((image.shape[1] + 1) // 2, (image.shape[0] + 1) // 2)
-    shrink = {"dsize": half, "interpolation": cv2.INTER_AREA}
-    coarse_weight = cv2.resize(weight.astype(np.float32), **shrink)
-    coarse = cv2.resize((image * weight[..., None]).astype(np.float32), **shrink)
-    coarse = coarse / np.maximum(coarse_weight, 1e-12)[..., None]
-    wide = pull_push(coarse, np.minimum(coarse_weight, 1.0))
-    wide = cv2.resize(wide, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
-    share = np.clip(weight / BLEND, 0.0, 1.0)[..., None]
-    return (share * image + (1.0 - share) * wide).astype(np.float32)
