@@ -162,7 +162,7 @@ def outcome(result: Reconstruction) -> dict[str, Any]:
         "shading": reports["reflectance"].details.get("shading", {}).get("chosen")
         if "reflectance" in reports
         else None,
-        "exponent": result.reflectance.exponent if result.reflectance else None,
+        "exponent": result.reflectance.lobe.typical if result.reflectance else None,
         "warnings": [*result.warnings, *(w for report in reports.values() for w in report.warnings)],
     }
 
