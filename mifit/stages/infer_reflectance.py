@@ -16,6 +16,7 @@ from mifit.progress import Progress, silent
 from mifit.solve import Outcome
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.als import fit_als
+from mifit.stages.reflectance.choice import fitted_models
 from mifit.stages.reflectance.fill import blend_unseen, mirrored_coordinates
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.objective import energies
@@ -76,8 +77,9 @@ def infer_reflectance(
     surface = Surface(capture, model, geometry, cameras, config.texture_size, config.robust, whole=config.robust)
     mirrored = mirrored_coordinates(model, surface.texels) if config.symmetric_fill else None
     albedo = interpolate(geometry.vertex_albedo, model.faces, surface.texels.face, surface.texels.weights)
-    physical = config.robust and config.solver == "als" and config.shading != "paper"
-    if physical:  # the paper takes stage 1's albedo as it is
+    # Albedos of a lobe that isn't normalised, such as the paper's, have no physical level: stage 1's is taken as it is.
+    physical = config.robust and config.solver == "als" and all(m.normalized for m in fitted_models(config))
+    if physical:
         face = np.unique(model.faces[model.face_mask])
         albedo = levelled(albedo, geometry.vertex_albedo[face], model.mean_albedo[face])
     albedo = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float32)

@@ -12,10 +12,8 @@ from stages.reflectance_scene import SIZE as FINE
 
 from mifit.appearance import models
 from mifit.appearance.illumination import Illumination
-from mifit.appearance.lobe import Lobe, lobe_table
-from mifit.appearance.models.paper import GUARD
+from mifit.appearance.lobe import Lobe
 from mifit.config import ReflectanceConfig
-from mifit.core import sh
 from mifit.core.mesh import interpolate
 from mifit.core.uv import sample_map
 from mifit.errors import InputError
@@ -26,7 +24,6 @@ from mifit.stages.reflectance.choice import fit_lighting, lighting_problem
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingPriors, solve_lighting
 from mifit.stages.reflectance.maps import Smoothness, TexelSystems, laplacian, solve_maps
-from tests.shaded import shade_points
 
 SIZE = 24
 CONFIG = ReflectanceConfig(texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
@@ -199,53 +196,6 @@ def test_saturated_images(dome, level):
 def test_images_that_are_wholly_clipped_are_refused(dome):
     with pytest.raises(InputError, match="clipped or invalid"):
         infer(dome.changed(lambda f: replace(f, clipped=f.valid.copy())))
-
-
-def directions(count=400, seed=0):
-    """Unit normals and views on their side."""
-    n, v = np.random.default_rng(seed).normal(size=(2, count, 3))
-    n, v = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (n, v))
-    return n, v * np.sign((n * v).sum(1))[:, None]
-
-
-@pytest.mark.parametrize("order", [4, 10])
-@pytest.mark.parametrize(("exponent", "fresnel"), [(5.0, None), (EXPONENT, 8.0), (1000.0, 8.0), (1000.0, None)])
-def test_prefiltered_shading_in_float32_is_that_in_float64(variant, order, exponent, fresnel):
-    n, v = directions()
-    radiance = np.random.default_rng(1).normal(size=(order**2, 3)) / (1 + sh.bands(order)[:, None])
-    cosine = (n * v).sum(1)
-    mirror = 2 * cosine[:, None] * n - v
-    moments = lobe_table(order)(cosine if fresnel is None else np.ones_like(cosine), exponent)
-    if fresnel is None:
-        axis = mirror + moments[1][:, None] * (n - mirror)
-        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-        albedo = moments[0]
-    else:
-        axis, albedo = mirror, moments[0] * (1 + fresnel * (1 - cosine) ** 5)
-    factors = albedo * np.concatenate([np.ones((1, len(n))), moments[2:]])
-    glint = (factors[sh.bands(order)].T * sh.basis(axis, order)) @ radiance
-    body = sh.SHLighting(radiance).irradiance(n) / np.pi
-    white = np.ones((len(n), 3))
-    d, s = shade_points(n, v, white, white[:, 0], radiance, 0.0, exponent, "prefiltered", fresnel=fresnel)
-    assert np.abs(d - body).max() < 1e-5 * np.abs(body).max()
-    assert np.abs(s - glint).max() < 3e-5 * np.abs(glint).max()
-
-
-@pytest.mark.parametrize("exponent", [1.0, 5.0, 1000.0])
-def test_the_papers_shading_in_float32_is_that_in_float64(variant, exponent):
-    n, v = directions()
-    # Grey: Mitsuba's luminance has one more digit than ours, which turns the dominant direction of coloured light.
-    radiance = np.repeat(np.random.default_rng(2).normal(size=(9, 1)), 3, axis=1)
-    radiance[0] = 4.0
-    light = sh.SHLighting(radiance)
-    d, body = light.dominant_direction(), light.irradiance(n) / np.pi
-    h = v + d
-    cos_h = np.maximum((n * (h / np.linalg.norm(h, axis=1, keepdims=True))).sum(1), 0.0)
-    c = np.maximum(n @ d, 0.0)
-    glint = body * (cos_h**exponent * c / (c**2 + GUARD**2))[:, None]
-    white = np.ones((len(n), 3))
-    _, s = shade_points(n, v, white, white[:, 0], radiance, 0.0, exponent, "paper")
-    assert np.abs(s - glint).max() < 2e-4 * np.abs(glint).max()
 
 
 WEAK = LightingPriors(roughness=1e-10, negative=0.0, albedo=1e-6, specular=1e-6)

@@ -48,6 +48,19 @@ def candidate(name: str) -> Candidate:
     return CANDIDATES.get(name) or Candidate(name)
 
 
+def wanted_candidates(config: ReflectanceConfig) -> list[str]:
+    """Names of what is to be fitted, in order; a search for lights starts from the fit of its model without them."""
+    if config.shading == "auto":
+        return list(CANDIDATES)
+    asked = candidate(config.shading)
+    return [asked.model, config.shading] if asked.lights else [config.shading]
+
+
+def fitted_models(config: ReflectanceConfig) -> list[ShadingModel]:
+    """The shading models among which settings leave a choice."""
+    return [models.get(candidate(name).model) for name in wanted_candidates(config)]
+
+
 def plain_forward(model: ShadingModel, exponent: float, config: ReflectanceConfig, surface: Surface) -> Forward:
     """A model as it is fitted, with its own number of bands and kind of lobe, without compact lights."""
     lobe = Lobe(exponent, model.fresnel, model.normalized)
@@ -74,10 +87,7 @@ def choose_lighting(
     """
     tried: dict[str, tuple[Forward, LightingSolution]] = {}
     auto = config.shading == "auto"
-    wanted = list(CANDIDATES)
-    if not auto:
-        asked = candidate(config.shading)
-        wanted = [asked.model, config.shading] if asked.lights else [config.shading]
+    wanted = wanted_candidates(config)
     iterations = config.max_iterations if config.robust else min(START_ITERATIONS, config.max_iterations)
     for name in wanted:
         progress("Reflectance lighting", len(tried), len(wanted))
