@@ -3,7 +3,7 @@
 Heads with known landmarks are synthesised, MediaPipe looks at them, and every landmark becomes the affine combination
 of its nearest mesh points that predicts it best. The result is ``mifit/capture/face_mesh_68.json``.
 
-    python benchmarks/face_mesh_map.py --model MODEL.npz --subjects 12 --out mifit/capture/face_mesh_68.json
+    python benchmarks/face_mesh_map.py --model MODEL.npz --subjects 40 --out mifit/capture/face_mesh_68.json
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from mifit.core.image import load_image, to_8_bit
 from mifit.morphable import MorphableModel
 from mifit.synth import synthesize
 
-POINTS = 16
+POINTS = 64
 """Mesh points that a landmark is combined of."""
-RIDGE = 1e-4
+RIDGE = 1e-3
 """Penalty on the weights, relative to squared eye distances."""
 
 
@@ -62,7 +62,7 @@ def main() -> None:
     """Synthesise, observe, fit, write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--model", required=True)
-    parser.add_argument("--subjects", type=int, default=12)
+    parser.add_argument("--subjects", type=int, default=40)
     parser.add_argument("--seed", type=int, default=5000)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()

@@ -29,7 +29,9 @@ class GeometryConfig:
     scale_deviation: float = number(
         0.0, "standard deviation of the model's log scale; 0: the units are trusted", least=0, most=10
     )
-    camera_gains: bool = flag(False, "find each camera's exposure and white balance relative to the first one's")
+    camera_gains: Literal["auto", "always", "never"] = one_of(
+        "auto", "find each camera's exposure and white balance relative to the first one's; auto: where they differ"
+    )
     landmark_weight: float = number(10.0, "objective paper: weight of the landmarks", least=0, most=WEIGHT)
     prior_weight: float = number(5e-5, "objective paper: weight of the model's prior", least=0, most=WEIGHT)
     pixels: int = number(2000, "objective paper: facial pixels per image, chosen at random", least=1, most=1_000_000)
@@ -202,7 +204,7 @@ class FitConfig:
         that with values of 0..1 it is 0.001 / 255.
         """
         return cls(
-            geometry=GeometryConfig(objective="paper", as_written=True),
+            geometry=GeometryConfig(objective="paper", as_written=True, camera_gains="never"),
             surface=SurfaceConfig(enabled=False),
             reflectance=ReflectanceConfig(
                 solver="adam",

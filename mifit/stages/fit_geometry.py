@@ -15,7 +15,7 @@ from mifit.errors import ConvergenceError, InputError
 from mifit.morphable import MorphableModel
 from mifit.progress import Progress, silent
 from mifit.solve import Solution
-from mifit.stages.gains import estimate_gains
+from mifit.stages.gains import differ, estimate_gains
 from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.displaced import displaced
 from mifit.stages.geometry.landmarks import LandmarkView
@@ -91,9 +91,11 @@ def fit_geometry(
         )
 
     found = refine({})
-    if not config.camera_gains:
+    if config.camera_gains == "never" or (config.camera_gains == "auto" and len(cameras) == 1):
         return found
     gains = estimate_gains(capture, model, found, cameras, seed, progress)
+    if config.camera_gains == "auto" and not differ(gains):
+        return found
     for name in cameras:
         if name not in gains:
             journal.warn(f"camera {name}: shares too little of the face with {cameras[0]} to tell its gain; taken as 1")

@@ -81,3 +81,11 @@ def test_a_camera_that_shares_nothing_is_left_out(dome):
 def test_gains_are_one_unless_known(dome):
     assert isinstance(dome.geometry, GeometryEstimate)
     assert (dome.geometry.gain("left") == 1).all() and dome.geometry.gains == {}
+
+
+def test_cameras_differ_from_a_tenth_on() -> None:
+    from mifit.stages.gains import differ
+
+    assert not differ({"left": (1.0, 1.0, 1.0), "right": (1.04, 0.97, 1.08)})
+    assert differ({"left": (1.0, 1.0, 1.0), "right": (1.25, 0.9, 1.1)})
+    assert differ({"left": (1.0, 1.0, 1.0), "right": (1.0, 0.88, 1.0)})
