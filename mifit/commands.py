@@ -23,9 +23,9 @@ DEMO = {"model": "builtin:coarse", "width": 340, "height": 240, "spp": 32, "time
 
 
 def _use_variant(arguments: Namespace) -> str:
-    import mifit
+    from mifit.render.variant import set_fitting_variant
 
-    return mifit.set_variant(arguments.variant)
+    return set_fitting_variant(arguments.variant)
 
 
 def _say(arguments: Namespace, text: str) -> None:

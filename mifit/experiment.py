@@ -26,6 +26,7 @@ from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError, MifitError
 from mifit.plan import Experiment, Plan, Run, SynthRun, load_plan
 from mifit.progress import Progress, silent
+from mifit.render.variant import set_fitting_variant
 
 FORMAT_VERSION = 1
 
@@ -143,7 +144,7 @@ def _synthetic_capture(synth: SynthRun, folder: Path, variant: str) -> Path:
     """The synthetic capture of some settings, made once and shared by all runs that name it."""
     path = folder / "captures" / checkpoint.digest(dataclasses.asdict(synth))[:10]
     if not (path / "transforms.json").exists():
-        mifit.set_variant(variant)
+        set_fitting_variant(variant)
         from mifit.synth import synthesize
 
         synthesize(path, **dataclasses.asdict(synth))
@@ -155,7 +156,7 @@ def execute(run: Run, folder: str, experiment_folder: str, variant: str) -> None
     started = time.perf_counter()
     where = Path(folder)
     where.mkdir(parents=True, exist_ok=True)
-    active = mifit.set_variant(variant)
+    active = set_fitting_variant(variant)
     job = _execute_fit if run.experiment.fit else _execute_render
     metrics = job(run.experiment, where, Path(experiment_folder), active)
     record = {

@@ -84,7 +84,9 @@ def fit(
     Images", sections 4 to 6. A Mitsuba variant must be active (``mifit.set_variant``).
     """
     from mifit.reconstruction import Reconstruction
+    from mifit.render.variant import check_active_variant
 
+    check_active_variant()
     config = config or FitConfig()
     cameras = choose("camera", capture.cameras, cameras, 2)
     timesteps = choose("timestep", capture.timesteps, timesteps, 4)

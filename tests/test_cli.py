@@ -147,7 +147,9 @@ def test_from_capture_to_figures(capsys, tiny_capture, tmp_path):
     assert figures["camera"] == "third"
     assert figures["region_pixels"] > 500
     pca, full = (figures["methods"][name]["psnr"] for name in ("pca", "full"))
-    assert full > 20 and full > pca + 2.0  # decibels: what the stages after the first are for
+    # Decibels: what the stages after the first are for. 12 samples a pixel leave the held-out image itself with noise
+    # of about 27 dB, so that a perfect fit would gain little more here; the benchmarks hold clean captures to more.
+    assert full > 20 and full > pca + 0.5
     assert "full" in table
     code, _, err = run(
         capsys, "render", out, "--capture", tiny_capture, "--camera", "third", "--timestep", "0",
@@ -186,4 +188,6 @@ def test_an_uncalibrated_capture_is_fitted_and_reported(capsys, capture, tmp_pat
     )
     assert code == 0, err
     assert (cv2.imread(str(shot), cv2.IMREAD_UNCHANGED)[..., 3] > 0).mean() > 0.05
-    assert "third" in refused(capsys, "evaluate", out, "--capture", capture, "--camera", "third")
+    code, table, err = run(capsys, "evaluate", out, "--capture", capture, "--camera", "third", "--quiet")
+    assert code == 0, err
+    assert "third" in table and "landmarks" in table  # placed by its landmarks, and said so

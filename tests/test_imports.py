@@ -35,7 +35,7 @@ MAY_IMPORT = {
     "reconstruction": DATA | {"morphable", "result", "output"},
     "steps": DATA | {"morphable", "capture", "checkpoint", "stages"},
     "tracking": DATA | {"morphable", "capture", "stages", "result"},
-    "pipeline": DATA | {"morphable", "capture", "steps", "reconstruction"},
+    "pipeline": DATA | {"morphable", "capture", "render", "steps", "reconstruction"},
     "fitting": DATA | {"morphable", "capture", "result", "reconstruction", "steps", "pipeline"},
     "plan": DATA | {"schema", "morphable", "capture", "checkpoint", "pipeline"},
     "experiment": DATA | FORMATION | {"morphable", "capture", "checkpoint", "pipeline", "plan", "synth", "output"},

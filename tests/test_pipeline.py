@@ -43,6 +43,7 @@ def test_views_from_one_place_bring_a_warning():
     assert one_place(capture, ["a", "b", "c"], geometry) == ()
 
 
+pytestmark = pytest.mark.usefixtures("variant")
 ORDER = ("geometry", "surface", "reflectance", "geometry_1", "reflectance_1", "normals", "mesh")
 FIRST = {"geometry": 0, "surface": 1, "reflectance": 2, "shape": 3, "normals": 5, "mesh": 6}
 """Section of the settings -> the first step that reads it; all later ones depend on that one's estimate."""

@@ -22,6 +22,9 @@ from mifit.errors import UnknownVariantError, VariantError
 LLVM_SUPPORTED = 19
 """From this major version on LLVM is used as found; an older one must survive a trial in a process of its own."""
 
+FITTING_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+"""Variants that the stages run under; the plugins render under any."""
+
 _ENVIRONMENT = "DRJIT_LIBLLVM_PATH"
 _TRIAL = """
 import drjit as dr
@@ -157,9 +160,8 @@ def set_variant(name: str = "auto") -> str:
 
     if name == "auto":
         name = "cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"
-    usable = [v for v in mi.variants() if v.endswith("_ad_rgb")]
-    if name not in usable:
-        raise UnknownVariantError(f"variant: found {name!r}, expected auto or one of {', '.join(usable)}")
+    if name not in mi.variants():
+        raise UnknownVariantError(f"variant: found {name!r}, expected auto or one of {', '.join(mi.variants())}")
     if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
         raise VariantError(f"variant {name}: no working CUDA device or driver here; use llvm_ad_rgb")
     if name.startswith("llvm"):
@@ -177,6 +179,32 @@ def set_variant(name: str = "auto") -> str:
             )
     mi.set_variant(name)
     return name
+
+
+def set_fitting_variant(name: str = "auto") -> str:
+    """`set_variant` for programs that fit: the plugins run under any variant, the stages under ``*_ad_rgb`` alone.
+
+    Raises
+    ------
+    UnknownVariantError
+        The variant can't fit.
+    VariantError
+        As in `set_variant`.
+    """
+    if name not in ("auto", *FITTING_VARIANTS):
+        raise UnknownVariantError(f"variant: found {name!r}, expected auto or one of {', '.join(FITTING_VARIANTS)}")
+    return set_variant(name)
+
+
+def check_active_variant() -> None:
+    """Raise VariantError unless the active Mitsuba variant is one that can fit."""
+    import mitsuba as mi
+
+    if mi.variant() not in FITTING_VARIANTS:
+        raise VariantError(
+            f"Mitsuba variant: found {mi.variant()}, expected one of {', '.join(FITTING_VARIANTS)} to be active; "
+            "call mifit.set_variant('auto') first"
+        )
 
 
 def doctor() -> list[dict]:

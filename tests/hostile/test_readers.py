@@ -250,10 +250,12 @@ def test_sweep_of_a_billion_runs(tmp_path: Path, capsys) -> None:
 def test_unknown_and_scalar_variants_are_bad_usage(capsys) -> None:
     for name in ("nonsense", "scalar_rgb"):
         assert main(["turntable", "x", "--out", "y", "--variant", name]) == 2
-    from mifit.render.variant import set_variant
+    from mifit.render.variant import set_fitting_variant, set_variant
 
     with pytest.raises(InputError, match="expected auto or one of llvm_ad_rgb"):
-        set_variant("scalar_rgb")
+        set_fitting_variant("scalar_rgb")
+    with pytest.raises(InputError, match=r"expected auto or one of .*scalar_rgb"):
+        set_variant("nonsense")
 
 
 def test_cameras_without_pixels(tmp_path: Path) -> None:

@@ -207,8 +207,6 @@ def recover(scene, shading, bands, exponent, fresnel, monkeypatch):
     weak = {"priors": WEAK, "tolerance": 1e-7}
     monkeypatch.setattr(choice, "solve_lighting", lambda *a, **k: solve_lighting(*a, **{**k, **weak}))
     surface, seen, forward, albedo = problem_of(scene, shading, bands, exponent, fresnel, FINE)
-    if shading == "shadowed":
-        forward = replace(forward, traced=surface.trace(bands), faces=scene.model.faces)
     config = replace(CONFIG, shading=shading, bands=bands, exponent=exponent)
     light = fit_lighting(seen, forward, albedo, config, 100)
     shade, glint = forward.shade(seen, light.light)
