@@ -179,7 +179,6 @@ def execute(run: Run, folder: str, experiment_folder: str, variant: str) -> None
 
 def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: str) -> dict[str, float]:
     """Fit, evaluate and relight; returns the figures of the table."""
-    from mifit.config import FitConfig
     from mifit.output.evaluate import evaluate
     from mifit.output.relight import evaluate_relit, write_relit
     from mifit.output.report import write_report
@@ -195,7 +194,7 @@ def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: 
         mifit.MorphableModel.load(fit.model),
         cameras=fit.cameras,
         timesteps=fit.timesteps,
-        config=FitConfig(fit.geometry, fit.reflectance, fit.normals, fit.mesh, fit.shape),
+        config=fit.config,
         until=fit.until,
         seed=fit.seed,
         checkpoints=experiment_folder / "fits" / key[:10],

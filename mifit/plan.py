@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import mifit
 from mifit import checkpoint
-from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, ReflectanceConfig, ShapeConfig
+from mifit.config import FitConfig
 from mifit.core.files import check_file, file_digest, file_name
 from mifit.core.limits import MAX_IMAGE_BYTES, MAX_RUNS, MAX_SAMPLES, MAX_SEED, MAX_SETTINGS_BYTES
 from mifit.errors import InputError
@@ -58,8 +58,8 @@ class SynthRun:
 
 
 @settings
-class FitRun:
-    """Fit a capture; the settings of ``mifit fit``."""
+class FitRun(FitConfig):
+    """Fit a capture; the settings of ``mifit fit``, those of its stages among them."""
 
     capture: str | None = text(None, "capture folder")
     synth: SynthRun | None = part_or_none("a capture made for the experiment, instead of a folder")
@@ -68,11 +68,11 @@ class FitRun:
     timesteps: tuple[Index, ...] | None = several(None, "timesteps to use; none: the first four")
     until: Literal["geometry", "reflectance", "normals"] = one_of("normals", "last stage")
     seed: int = number(0, "seed of everything random", least=0, most=SEEDS)
-    geometry: GeometryConfig = part(GeometryConfig)
-    reflectance: ReflectanceConfig = part(ReflectanceConfig)
-    normals: NormalsConfig = part(NormalsConfig)
-    mesh: MeshConfig = part(MeshConfig)
-    shape: ShapeConfig = part(ShapeConfig)
+
+    @property
+    def config(self) -> FitConfig:
+        """The settings of the stages alone."""
+        return FitConfig(**{f.name: getattr(self, f.name) for f in dataclasses.fields(FitConfig)})
 
 
 @settings
@@ -250,13 +250,16 @@ def _toml_value(text: str) -> Any:
 
 
 def _assign(table: dict, key: str, value: Any, where: str) -> None:
-    """Set a dotted key in nested tables, which are made as needed."""
+    """Set a dotted key in nested tables, which are made as needed; a capture takes the place of a synthetic one."""
     *parents, last = key.split(".")
     for name in parents:
         table = table.setdefault(name, {})
         if not isinstance(table, dict):
             raise InputError(f"{where}: {key}: {name} is a value, expected a table")
     table[last] = value
+    other = {"capture": "synth", "synth": "capture"}.get(last)
+    if other and parents in (["fit"], ["relight"]):
+        table.pop(other, None)
 
 
 def _points(sweep: Any, where: str) -> Iterator[dict[str, Any]]:

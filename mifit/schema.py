@@ -10,7 +10,7 @@ import dataclasses
 import difflib
 import types
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -87,8 +87,7 @@ def settings(cls: type[T]) -> type[T]:
         try:
             construct(self, *args, **kwargs)
         except pydantic.ValidationError as error:
-            name = cls.__name__.removesuffix("Config").lower()
-            raise InputError(_message("", made, error, f"{name}." if name else "")) from None
+            raise InputError(_message("", made, error, cls.__name__.removesuffix("Config").lower())) from None
 
     made.__init__ = __init__  # type: ignore[method-assign]
     return typing.cast("type[T]", made)
@@ -167,33 +166,34 @@ def expectation(field: FieldInfo) -> str:
     return words
 
 
-def _message(where: str, cls: type, error: pydantic.ValidationError, prefix: str = "") -> str:
-    """One line for all that is wrong, or for the first few."""
-    found = [prefix + _line(cls, e) for e in error.errors(include_url=False)[:_MOST_ERRORS]]
+def _message(where: str, cls: type, error: pydantic.ValidationError, table: str = "") -> str:
+    """One line for all that is wrong, or for the first few; ``table``: the name of what is made."""
+    found = [_line(cls, e, [table] if table else []) for e in error.errors(include_url=False)[:_MOST_ERRORS]]
     return (f"{where}: " if where else "") + "; ".join(dict.fromkeys(found))
 
 
-def _line(cls: type, error: Any) -> str:
-    """Say what is wrong with one key."""
-    location: Sequence[str | int] = error["loc"]
-    path = [str(key) for key in location]
-    owner, field = cls, None
+def _line(cls: type, error: Any, before: list[str]) -> str:
+    """Say what is wrong with one key, whose path starts with the names ``before``."""
+    path = [str(key) for key in error["loc"]]
+    owner: type | None = cls
+    field = None
     for depth, key in enumerate(path):
-        known = _fields(owner)
+        known = _fields(owner) if owner is not None else {}
+        if owner is None:
+            break  # inside a list or a table of the user's own
         if key not in known:
             near = difflib.get_close_matches(key, known, 1)
             hint = f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(known)}"
-            return f"{'.'.join(path[:depth])}{': ' if depth else ''}unknown key '{_shorter(key)}'; {hint}"
+            place = ".".join([*before, *path[:depth]])
+            return f"{place}{': ' if place else ''}unknown key '{_shorter(key)}'; {hint}"
         field = known[key]
-        inner = _settings_in(field.annotation)
-        if inner is None:
-            break
-        owner = inner
-    name = _shorter(".".join(path))
+        owner = _settings_in(field.annotation)
+    name = _shorter(".".join([*before, *path]))
     if error["type"] == "missing":
         return f"key '{name}' is missing"
-    if error["type"] == "value_error":
-        return f"{name}{': ' if name else ''}{error['ctx']['error']}"
+    if error["type"] == "value_error":  # of one value, or of a table: then it says itself which key it means
+        separator = "" if not name else ": " if owner is None else "."
+        return f"{name}{separator}{error['ctx']['error']}"
     assert field is not None, error
     return f"{name}: found {_shown(error['input'])}, expected {expectation(field)}"
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from mifit.config import FitConfig, ReflectanceConfig
+from mifit.config import FitConfig, MeshConfig, ReflectanceConfig
 from mifit.errors import InputError
 from mifit.plan import (
     EvaluateRun,
@@ -55,9 +55,9 @@ def test_nested_values_and_integers_for_floats():
         ({"reflectance": {"exponent": -1}}, "reflectance.exponent: found -1, expected a finite number from 1 to 10000"),
         ({"reflectance": {"robust": 1}}, "reflectance.robust: found 1, expected true or false"),
         ({"reflectance": {"solver": "sgd"}}, "found 'sgd', expected one of 'als', 'adam'"),
-        ({"reflectance": {"solver": "adam", "shading": "keyed"}}, "reflectance: shading: found 'keyed' with solver"),
+        ({"reflectance": {"solver": "adam", "shading": "keyed"}}, "reflectance.shading: found 'keyed' with solver"),
         ({"reflectance": 3}, "reflectance: found 3, expected a table"),
-        ({"geometry": {"texture_sigma": 7.0}}, "geometry: texture_sigma: found 7.0, expected below texture_window"),
+        ({"geometry": {"texture_sigma": 7.0}}, "geometry.texture_sigma: found 7.0, expected below texture_window"),
         ({"shape": {"rounds": -1}}, "shape.rounds: found -1, expected a whole number from 0 to 10"),
         ({"shape": {"shading_weight": 0}}, "shape.shading_weight: found 0, expected a finite number above 0"),
         ({"mesh": {"detail": 0}}, "mesh.detail: found 0, expected a finite number above 0, at most 100 centimetres"),
@@ -78,7 +78,7 @@ def test_settings_made_in_python_are_checked_alike_and_stay_as_they_are():
     config = ReflectanceConfig()
     with pytest.raises(InputError, match="exponent: found 0"):
         dataclasses.replace(config, exponent=0)
-    with pytest.raises(InputError, match="unknown key 'band'; did you mean 'bands'"):
+    with pytest.raises(InputError, match="reflectance: unknown key 'band'; did you mean 'bands'"):
         ReflectanceConfig(band=3)
     with pytest.raises(dataclasses.FrozenInstanceError):
         config.bands = 5
@@ -126,6 +126,13 @@ def test_every_setting_is_within_its_bounds_and_explained():
     ):  # fmt: skip
         made = from_mapping(cls, needed, "here")
         assert from_mapping(cls, dataclasses.asdict(made), "defaults") == made
+
+
+def test_an_experiment_has_every_setting_of_a_fit():
+    keys = {key for key, *_ in list_settings(FitRun)}
+    assert {key for key, *_ in list_settings(FitConfig)} < keys
+    run = from_mapping(FitRun, {"capture": "x", "mesh": {"detail": 0.5}}, "here")
+    assert run.config == FitConfig(mesh=MeshConfig(detail=0.5))
 
 
 @pytest.mark.parametrize(

@@ -144,7 +144,10 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
         # Vertices that no face uses are in no mesh file: they follow from the coefficients.
         rotation, translation = np.array(step["rotation"]), np.array(step["translation"])
         shape = model.shape(identity, expression[i])
-        vertices[i] = entry["scale"] * shape @ rotation.T + translation
+        with np.errstate(over="ignore"):
+            vertices[i] = entry["scale"] * shape @ rotation.T + translation
+        if not np.isfinite(vertices[i]).all():
+            raise ValueError(f"timestep {step['timestep']}: found a pose that is out of all bounds")
         stored = _read_mesh(folder / "geometry" / f"{step['timestep']:04d}.ply", mesh)
         vertices[i, mesh.origin] = stored["vertices"]
         vertex_albedo[mesh.origin] = stored["albedo"]

@@ -1,0 +1,154 @@
+"""Every command line in the README, the docs and the scenes: taken by the parser, and run in a reduced size."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import cv2
+import pytest
+
+from mifit.capture import Capture
+from mifit.capture.colmap import write_colmap
+from mifit.capture.stereo import write_stereo
+from mifit.cli import build_parser, main
+from mifit.core.image import to_8_bit
+from mifit.output.sequence import write_video
+from mifit.plan import load_plan
+from mifit.schema import read_toml
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES += [ROOT / "scenes" / "README.md", *sorted((ROOT / "scenes").glob("*/experiment.toml"))]
+COMMAND = re.compile(r"^(?:#\s+|\s*)((?:mifit|make|python -m|pip install|\.venv/bin/\S+) .*?)(?:\s{2,}#.*)?$")
+SMALL = '[reflectance]\ntexture_size = 32\nshading = "prefiltered"\nexponent = 50\nmax_iterations = 3\n'
+SIZES = ["--model", "builtin:coarse", "--width", "96", "--height", "72", "--spp", "2"]
+
+
+def commands() -> list[tuple[str, str]]:
+    """(page, command line) of every code block and of the heads of experiment files, in order."""
+    found = []
+    for page in PAGES:
+        fenced = ""
+        for line in page.read_text(encoding="utf-8").splitlines():
+            if line.startswith("```"):
+                fenced = "" if fenced else (line[3:] or "text")
+                continue
+            code = (
+                fenced in ("text", "sh", "bash") or (not fenced and line.startswith("    ")) or page.suffix == ".toml"
+            )
+            match = COMMAND.match(line)
+            if code and match:
+                found.append((str(page.relative_to(ROOT)), match.group(1).strip()))
+    return found
+
+
+COMMANDS = commands()
+
+
+def test_enough_commands_are_found():
+    """The patterns above still find them: fewer than were there would mean that pages changed their form."""
+    kinds = Counter(command.split()[0] for _, command in COMMANDS)
+    assert kinds["mifit"] >= 25 and kinds["make"] >= 6 and len(COMMANDS) >= 35, kinds
+
+
+@pytest.mark.parametrize(("page", "command"), COMMANDS)
+def test_a_documented_command_is_understood(page: str, command: str) -> None:
+    words = shlex.split(command.replace(".venv/bin/", ""))
+    if words[0] == "mifit":
+        build_parser().parse_args(words[1:])  # ends the process with usage where it isn't
+    elif words[0] == "make":
+        assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    elif words[:2] == ["python", "-m"]:
+        assert importlib.util.find_spec(words[2]) is not None
+    else:
+        assert words[:2] == ["pip", "install"]
+        extras = read_toml(ROOT / "pyproject.toml")["project"]["optional-dependencies"]
+        assert all(extra in extras for extra in re.findall(r"\[(\w+)\]", command))
+
+
+@pytest.fixture(scope="module")
+def workspace(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with all that the commands name: footage, calibrations, environments, a result."""
+    folder = tmp_path_factory.mktemp("commands")
+    (folder / "small.toml").write_text(SMALL)
+    head = folder / "footage"
+    assert main(["synth", "--out", str(head), "--timesteps", "5", *SIZES, "--quiet"]) == 0
+    capture = Capture.load(head)
+    for name in ("left", "right"):
+        frames = [to_8_bit(capture.frame(name, t).image) for t in capture.timesteps]
+        write_video(folder / f"{name}.mp4", frames * 8, 25.0)
+        (folder / name).mkdir()
+        for t, frame in enumerate(frames):
+            cv2.imwrite(str(folder / name / f"{t:04d}.png"), frame[..., ::-1])
+    write_stereo(folder / "stereo.yml", capture.camera("left"), capture.camera("right"))
+    write_colmap(folder / "sparse" / "0", [(capture.camera(n), f"{n}/0000.png") for n in ("left", "right")])
+    shutil.copytree(head, folder / "scene")
+    shutil.copytree(head, folder / "CAPTURE")
+    shutil.copy(ROOT / "scenes" / "relighting" / "studio.hdr", folder)
+    fit = ["fit", "CAPTURE", "--out", "RESULT", "--cameras", "left,right", "--timesteps", "0-3", "--quiet"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert main([*fit, "--model", "builtin:coarse", "--config", "small.toml"]) == 0
+    shutil.copytree(folder / "RESULT", folder / "out" / "face")
+    shutil.copytree(head, folder / "out" / "head")
+    return folder
+
+
+NOT_HERE = {
+    "landmarks": "needs a detector and its networks",
+    "view": "serves until it is stopped: tests/output/test_live_view.py",
+    "demo": "make demo, and every part of it above",
+}
+"""Commands that are understood, but not run."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", sorted({page for page, command in COMMANDS if command.startswith("mifit ")}))
+def test_documented_commands_run(page: str, workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(workspace)
+    for _, command in (c for c in COMMANDS if c[0] == page):
+        words = shlex.split(command)[1:]
+        if not command.startswith("mifit ") or words[0] in NOT_HERE or "--install" in words:
+            continue
+        out = Path(words[words.index("--out") + 1]) if "--out" in words else None
+        if words[0] in ("import", "synth", "fit") and out is not None:
+            shutil.rmtree(out, ignore_errors=True)
+        if words[0] == "synth":
+            words += SIZES
+        if words[0] == "fit":
+            words += ["--model", "builtin:coarse", "--config", "small.toml"]
+        if words[0] == "run":
+            words = reduced(words, workspace)
+        assert main([*words, "--quiet"]) == 0, command
+        assert out is None or out.exists(), command
+        if words[0] == "import":  # the films are a few frames again and again: go on with the capture that they show
+            shutil.rmtree(out)
+            shutil.copytree(workspace / "footage", out)
+
+
+def reduced(words: list[str], workspace: Path) -> list[str]:
+    """An experiment's command with one small run in place of its sweep."""
+    path = ROOT / words[1]
+    assert load_plan(path).runs  # as it stands, every run of the sweep
+    kept = ["--set", f"fit.capture={workspace / 'CAPTURE'}"] if "fit.capture=" in " ".join(words) else []
+    changes = ["sweep={}", "outputs.report=false"]
+    document = read_toml(path)
+    if "fit" in document:
+        changes += [
+            "fit.model=builtin:coarse",
+            "fit.reflectance.texture_size=32",
+            "fit.reflectance.shading=prefiltered",
+        ]
+        changes += ["fit.reflectance.max_iterations=3", "fit.reflectance.exponent=50"]
+        synth = {"timesteps": 2, "width": 96, "height": 72, "spp": 2, "model": '"builtin:coarse"'}
+        if not kept:
+            changes += [f"fit.synth.{key}={value}" for key, value in synth.items()]
+    else:
+        changes += ["render.spp=1", "reference.spp=4", "render.parameters.width=32", "render.parameters.height=24"]
+    options = [option for change in changes for option in ("--set", change)]
+    return ["run", str(path), *options, *kept, "--out", str(workspace / "runs" / path.parent.name)]
