@@ -53,7 +53,7 @@ def another(section, name, value):
     """The settings of one section with one of them changed to something else that is allowed."""
     allowed = {
         "objective": "paper", "solver": "adam", "shading": "paper", "rounds": value + 1 if name == "rounds" else 0,
-        "exponent": 77.0, "subdivisions": 1, "bands": 5,
+        "exponent": 77.0, "subdivisions": 1, "bands": 5, "camera_gains": "always",
     }  # fmt: skip
     if name in allowed:
         changed = allowed[name]
