@@ -16,6 +16,7 @@ from mifit.result import METHODS, Method, Result
 
 if TYPE_CHECKING:
     from mifit.output.relight import Lighting
+    from mifit.output.scene import Skin
 
 
 class Reconstruction(Result):
@@ -112,6 +113,7 @@ class Reconstruction(Result):
         cameras: Sequence[Camera] | None = None,
         method: Method = "full",
         samples: int = 16,
+        skin: Skin | None = None,
     ) -> Any:
         """A loaded Mitsuba scene of one timestep, to render and to differentiate.
 
@@ -128,6 +130,10 @@ class Reconstruction(Result):
             As in `render`.
         samples : int
             Samples per pixel where ``mi.render`` is given none.
+        skin : callable, optional
+            Another BSDF for the face: a function that is given a dictionary of textures, ``diffuse`` (S, S, 3),
+            ``specular`` (S, S), ``slopes`` (S, S, 3; normals as `blinnphong` corrects them) and ``normal`` (S, S, 3;
+            the same for Mitsuba's ``normalmap``), and returns the BSDF as ``mi.load_dict`` takes it.
 
         Returns
         -------
@@ -150,7 +156,7 @@ class Reconstruction(Result):
         self.index(timestep)
         self._check(method)
         return load_result_scene(
-            self, timestep, integrator, self.cameras if cameras is None else cameras, method, samples
+            self, timestep, integrator, self.cameras if cameras is None else cameras, method, samples, skin
         )
 
     def orbit(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,11 +25,15 @@ from mifit.core.split_mesh import SplitMesh, part_of, split_at_seams
 from mifit.core.uv import rasterize_uv
 from mifit.output.deferred import visible_surface
 from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
-from mifit.render.description import Parameter, to_xml
+from mifit.render.description import Parameter, to_mitsuba, to_xml
 from mifit.render.sensor import sensor_description
 
 if TYPE_CHECKING:
     from mifit.result import Method, Result
+
+SAMPLES = Parameter("spp", 64)
+Skin = Callable[[Mapping[str, dict[str, Any]]], Mapping[str, Any]]
+"""Makes a BSDF's dictionary of those of the maps' textures."""
 
 STEEPEST = 4.0
 """Largest slope of a normal correction: 76 degrees."""
@@ -41,7 +45,6 @@ def write_scene(
     timestep: int,
     cameras: Sequence[Camera] | None = None,
     method: Method = "full",
-    integrator: Mapping[str, Any] | None = None,
 ) -> None:
     """Write ``NAME.xml`` with mifit's plugins, ``NAME_stock.xml`` for plain Mitsuba, and their files.
 
@@ -65,8 +68,6 @@ def write_scene(
         Sensors in this order; default: the fitted cameras.
     method : {"full", "diffuse", "pca"}
         What to leave out, see `Reconstruction.render`.
-    integrator : dict, optional
-        Of ``NAME.xml``, as ``mi.load_dict`` takes it; default: ``path``.
 
     Raises
     ------
@@ -77,10 +78,10 @@ def write_scene(
     cameras = reconstruction.cameras if cameras is None else cameras
     files = path.with_name(re.sub(r"[^\w.-]", "_", path.stem) + "_files")
     scenes = [
-        (name, scene_description(reconstruction, cameras, method, stock, files.name, chosen), needs)
-        for name, stock, needs, chosen in (
-            (path, False, "Needs mifit.register_plugins().", integrator),
-            (path.with_name(f"{path.stem}_stock.xml"), True, "Plain Mitsuba renders this.", None),
+        (name, scene_description(reconstruction, cameras, method, stock, files.name), needs)
+        for name, stock, needs in (
+            (path, False, "Needs mifit.register_plugins()."),
+            (path.with_name(f"{path.stem}_stock.xml"), True, "Plain Mitsuba renders this."),
         )
     ]
     _write_files(reconstruction, files, timestep, method)
@@ -185,25 +186,27 @@ def load_result_scene(
     cameras: Sequence[Camera],
     method: Method,
     samples: int,
+    skin: Skin | None,
 ) -> Any:
     """A loaded ``mi.Scene`` of one timestep; see `Reconstruction.scene`."""
     from mifit.render.scene import load_scene
 
+    chosen = {"type": integrator} if isinstance(integrator, str) else dict(integrator)
+    if chosen.get("type") == "shdirect":
+        # What it shades is the smooth light, whatever an environment has beside it.
+        reconstruction = replace(reconstruction, environment=None, environment_rotation=None)
+        fitted = None if method == "pca" else reconstruction.reflectance
+        ambient = reconstruction.geometry.ambient if fitted is None else fitted.illumination.ambient
+        model = "prefiltered" if fitted is None else fitted.shading_model
+        chosen = {"model": model, "ambient": float(ambient)} | chosen
+    chosen = {"hide_emitters": True} | chosen
     with tempfile.TemporaryDirectory(prefix="mifit-scene-") as folder:
-        path = Path(folder) / "scene.xml"
-        chosen = {"type": integrator} if isinstance(integrator, str) else dict(integrator)
-        if chosen["type"] == "shdirect":
-            # What it shades is the smooth light, whatever an environment has beside it.
-            reconstruction = replace(reconstruction, environment=None, environment_rotation=None)
-            full = method != "pca" and reconstruction.reflectance is not None
-            light = reconstruction.illumination
-            chosen = {
-                "type": "shdirect",
-                "model": reconstruction.reflectance.shading_model if full else "prefiltered",
-                "ambient": float(light.ambient if full else reconstruction.geometry.ambient),
-            } | chosen
-        write_scene(reconstruction, path, timestep, cameras, method, {"hide_emitters": True} | chosen)
-        return load_scene(path, spp=samples)
+        _write_files(reconstruction, Path(folder), timestep, method)
+        scene = scene_description(reconstruction, cameras, method, False, folder, chosen, samples)
+        if skin is not None:
+            names = {"diffuse": False, "specular": True, "slopes": True, "normal": True}
+            scene["skin"] = dict(skin({name: _texture(f"{folder}/{name}.exr", raw) for name, raw in names.items()}))
+        return load_scene(to_mitsuba(scene))
 
 
 def scene_description(
@@ -213,6 +216,7 @@ def scene_description(
     stock: bool,
     files: str,
     integrator: Mapping[str, Any] | None = None,
+    samples: int | Parameter = SAMPLES,
 ) -> dict[str, Any]:
     """The scene of `write_scene` as a plain dictionary (`render.description`), its files in the folder ``files``.
 
@@ -224,7 +228,7 @@ def scene_description(
     path = {"type": "path", "max_depth": Parameter("max_depth", 5), "hide_emitters": True}
     scene: dict[str, Any] = {"type": "scene", "integrator": path if integrator is None else dict(integrator)}
     for name, camera in zip(sensor_ids(cameras), cameras, strict=True):
-        scene[name] = sensor_description(camera.with_square_pixels() if stock else camera, Parameter("spp", 64))
+        scene[name] = sensor_description(camera.with_square_pixels() if stock else camera, samples)
     scene["skin"] = _skin(reconstruction, files, stock)
     scene["face"] = _shape(f"{files}/face.ply", {"type": "ref", "id": "skin"})
     if not mapped_faces(reconstruction).all():

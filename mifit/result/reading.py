@@ -19,6 +19,7 @@ from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate,
 from mifit.core.files import read_text
 from mifit.core.image import read_image
 from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_PIXELS
+from mifit.core.npz import read_npz
 from mifit.core.ply import read_ply
 from mifit.core.split_mesh import SplitMesh, split_at_seams
 from mifit.core.subdivision import split_faces
@@ -139,7 +140,6 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
     mesh = split_at_seams(model)
     vertices = np.empty((n, len(model.mean), 3), dtype=np.float32)
     vertex_albedo = model.albedo(albedo).astype(np.float32)
-    displacement = np.zeros((len(model.mean), 3))
     for i, step in enumerate(steps):
         # Vertices that no face uses are in no mesh file: they follow from the coefficients.
         rotation, translation = np.array(step["rotation"]), np.array(step["translation"])
@@ -151,7 +151,6 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
         stored = _read_mesh(folder / "geometry" / f"{step['timestep']:04d}.ply", mesh)
         vertices[i, mesh.origin] = stored["vertices"]
         vertex_albedo[mesh.origin] = stored["albedo"]
-        displacement += ((vertices[i] - translation) @ rotation / entry["scale"] - shape) / n
     return GeometryEstimate(
         timesteps=tuple(int(s["timestep"]) for s in steps),
         identity=identity,
@@ -169,8 +168,17 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
             name: tuple(_array(gain, (3,), f"gain of {name}").tolist())
             for name, gain in document["capture"].get("gains", {}).items()
         },
-        displacement=displacement.astype(np.float32) if entry.get("displaced") else None,
+        displacement=_displacement(folder, len(model.mean)) if entry.get("displaced") else None,
     )
+
+
+def _displacement(folder: Path, count: int) -> NDArray[np.float32]:
+    """(V, 3) displacement from the model, object space."""
+    path = folder / "geometry" / "displacement.npz"
+    found = read_npz(path, ["displacement"]).get("displacement", np.zeros(0))
+    if found.shape != (count, 3) or found.dtype.kind != "f" or not np.isfinite(found).all():
+        raise InputError(f"{path}: found shape {found.shape}, expected ({count}, 3) finite numbers; fit again")
+    return found.astype(np.float32)
 
 
 def _read_mesh(path: Path, mesh: SplitMesh) -> dict[str, NDArray]:

@@ -42,6 +42,8 @@ def save(result: Result, folder: Path, write_scene: Callable[[Path], None], forc
             for name in ("diffuse", "specular", "confidence"):
                 write_image(new / "maps" / f"{name}.exr", getattr(result.reflectance, name))
             write_image(new / "lighting.exr", result.lighting.to_latlong())
+        if result.geometry.displacement is not None:
+            np.savez(new / "geometry" / "displacement.npz", displacement=result.geometry.displacement)
         write_scene(new / "scene.xml")
         _write_document(result, new)
 

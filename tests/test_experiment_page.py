@@ -1,0 +1,59 @@
+"""The code of docs/experiment.md runs from top to bottom, and does what the page says."""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mifit
+
+PAGE = Path(mifit.__file__).resolve().parents[1] / "docs" / "experiment.md"
+
+
+def run_page(folder: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, str]) -> tuple[dict, dict[str, float]]:
+    """Execute the page's blocks in one namespace; returns it, and the seconds of each block by its first heading."""
+    monkeypatch.chdir(folder)
+    names: dict = {}
+    seconds: dict[str, float] = {}
+    for section in PAGE.read_text(encoding="utf-8").split("\n## ")[1:]:
+        for block in re.findall(r"^```python\n(.*?)^```", section, flags=re.S | re.M):
+            for before, after in changes.items():
+                block = block.replace(before, after)
+            started = time.perf_counter()
+            exec(compile(block, str(PAGE), "exec"), names)
+            seconds[section.splitlines()[0]] = time.perf_counter() - started
+    return names, seconds
+
+
+def check(names: dict) -> None:
+    result, losses = names["result"], names["losses"]
+    assert mifit.Reconstruction.load("out/gloss") == result
+    assert names["tanned"] != result and names["image"].shape[2] == 4
+    assert len(names["frames"]) == 36
+    assert len({frame[frame[..., 3] == 1][:, 0].mean().round(5) for frame in names["frames"]}) > 30
+    assert len(losses) == 30 and losses[-1] < 0.95 * losses[0] and np.argmin(losses) > 20
+    assert names["better"] != result
+    height, width = names["camera"].height, names["camera"].width
+    assert names["picture"].shape == (height, width, 4) and names["picture"][..., :3].max() > 0.1
+
+
+@pytest.mark.slow
+def test_the_page_runs(variant, tiny_capture, tmp_path, monkeypatch):
+    (tmp_path / "captures").mkdir()
+    (tmp_path / "captures" / "gloss").symlink_to(tiny_capture)
+    small = {'"builtin"': '"builtin:coarse"', "texture_size=256": "texture_size=64", '"auto"': '"llvm_ad_rgb"'}
+    names, _ = run_page(tmp_path, monkeypatch, small)
+    check(names)
+
+
+@pytest.mark.slow
+def test_the_page_runs_on_gloss(variant, shared, tmp_path, monkeypatch):
+    (tmp_path / "captures").mkdir()
+    (tmp_path / "captures" / "gloss").symlink_to(shared / "captures" / "gloss")
+    names, seconds = run_page(tmp_path, monkeypatch, {'"auto"': '"llvm_ad_rgb"'})
+    check(names)
+    print({name: round(value, 1) for name, value in seconds.items()}, names["losses"][0], names["losses"][-1])
