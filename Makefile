@@ -23,7 +23,7 @@ demo:
 test:
 	@.ci/setup test
 	$(BIN)/ruff check .
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 quick:
 	@.ci/setup test

@@ -30,7 +30,8 @@ ARRAY, RECORD, LIGHT = "$array", "$record", "$light"
 
 def digest(value: Any) -> str:
     """Hex digest of a JSON value or a dataclass of JSON values."""
-    plain = dataclasses.asdict(value) if dataclasses.is_dataclass(value) else value  # type: ignore[call-overload]
+    record = dataclasses.is_dataclass(value) and not isinstance(value, type)
+    plain = dataclasses.asdict(value) if record else value
     return hashlib.sha256(json.dumps(plain, sort_keys=True, default=str).encode()).hexdigest()
 
 

@@ -342,8 +342,9 @@ def _resolved(experiment: Experiment, folder: Path, where: str) -> Experiment:
         if relight.capture is not None:
             relight = dataclasses.replace(relight, capture=absolute(relight.capture))
         if relight.synth is not None:
-            relight = dataclasses.replace(relight, synth=synthetic(relight.synth))
-            if relight.capture is not None or relight.synth.env != relight.env:
+            made = synthetic(relight.synth)
+            relight = dataclasses.replace(relight, synth=made)
+            if relight.capture is not None or made.env != relight.env:
                 raise InputError(f"{where}: relight.synth: expected its 'env' to be relight.env, and no 'capture'")
         e = dataclasses.replace(e, relight=relight)
     return e

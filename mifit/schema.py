@@ -37,7 +37,7 @@ def number(
     most: float | None = None,
 ) -> Any:
     """A field with a number between bounds, in a unit."""
-    field = {"ge": least, "gt": above, "le": most, "strict": True, "json_schema_extra": {"unit": unit}}
+    field: dict[str, Any] = {"ge": least, "gt": above, "le": most, "strict": True, "json_schema_extra": {"unit": unit}}
     return pydantic.Field(default, description=meaning, **{k: v for k, v in field.items() if v is not None})
 
 

@@ -33,9 +33,20 @@ def form_image(ambient: Any, albedo: Any, diffuse: Any, specular_albedo: Any, sp
 class Reflectance(Protocol):
     """What `Appearance.of` reads of stage 2's estimate."""
 
-    illumination: Illumination
-    lobe: Lobe
-    shading_model: str
+    @property
+    def illumination(self) -> Illumination:
+        """The light."""
+        ...
+
+    @property
+    def lobe(self) -> Lobe:
+        """The specular lobe."""
+        ...
+
+    @property
+    def shading_model(self) -> str:
+        """Name of the shading model."""
+        ...
 
 
 @dataclass(frozen=True)

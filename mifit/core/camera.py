@@ -94,11 +94,12 @@ class Camera:
         """
         if not 0.0 < fov < 180.0:
             raise InputError(f"fov: found {fov}, expected degrees above 0 and below 180")
-        start, forward = np.asarray(eye, dtype=np.float64), np.asarray(target, dtype=np.float64) - eye
+        start = np.asarray(eye, dtype=np.float64)
+        forward = np.asarray(target, dtype=np.float64) - start
         right = np.cross(forward, np.asarray(up, dtype=np.float64))
         lengths = np.linalg.norm(forward), np.linalg.norm(right)
         if not min(lengths) > 1e-9 * max(1.0, *np.abs(start)):
-            raise InputError(f"look_at: found eye {eye}, target {target}, up {up}, expected three that give a view")
+            raise InputError(f"look_at: found eye {eye!r}, target {target!r}, up {up!r}, expected a view")
         forward, right = forward / lengths[0], right / lengths[1]
         pose = np.eye(4)
         pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])

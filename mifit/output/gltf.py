@@ -127,7 +127,7 @@ def write_glb(
         pose[:3, :3], pose[:3, 3] = rotation, geometry.translation[i] * metre
         head["matrix"] = pose.T.ravel().tolist()
     nodes: list[dict[str, Any]] = [head]
-    cameras = []
+    cameras: list[dict[str, Any]] = []
     for camera in reconstruction.cameras:
         nodes.append(_camera_node(camera, len(cameras), metre))
         cameras.append(_camera(camera))

@@ -199,6 +199,7 @@ class LiveView:
         shown = gui.add_dropdown("Show", tuple(parts), initial_value=LABELS[self._shown.method])
         shown.on_update(lambda _: self._show(method=parts[shown.value]))
         self._play: Any = None
+        self._step: Any = None
         if len(self._steps) > 1:
             self._step = gui.add_slider("Timestep", self._steps[0], self._steps[-1], 1, self._steps[0])
             self._step.on_update(

@@ -50,8 +50,8 @@ def orbit_camera(
     front = normalize(front - (front @ up) * up)
     reach = float(np.mean([np.linalg.norm(c.position - centre) for c in reconstruction.cameras]))
     facing = Camera.look_at(centre + reach * front, centre, up)
-    middle = {"cx": first.width / 2, "cy": first.height / 2}
-    camera = replace(first, world_to_camera=facing.world_to_camera, distortion=(), **middle)
+    cx, cy = first.width / 2, first.height / 2
+    camera = replace(first, world_to_camera=facing.world_to_camera, distortion=(), cx=cx, cy=cy)
     name = f"orbit{degrees:+g}" + (f"{pitch:+g}" if pitch else "")
     return camera.orbit(degrees, pitch, centre, up, distance, name)
 

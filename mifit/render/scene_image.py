@@ -34,4 +34,5 @@ def render_scene(
     from mifit.render.scene import load_scene
 
     scene = load_scene(path, **parameters)
-    return np.array(mi.render(scene, sensor=sensor, spp=spp, seed=seed), dtype=np.float32)
+    image = mi.render(scene, sensor=sensor, spp=spp, seed=seed)  # type: ignore[arg-type]
+    return np.array(image, dtype=np.float32)

@@ -78,7 +78,7 @@ def draw_motion(
     phase, speed = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.5, 1.1, 6)
     swing = np.array([9.0, 5.0, 3.0, 0.8, 0.5, 0.5])  # degrees of yaw, pitch, roll; centimetres
     bounds = np.asarray(model.expression_bounds, dtype=np.float64)
-    free = ~np.isfinite(bounds).all(axis=1)
+    free = np.isinf(bounds).any(axis=1)
     active = rng.permutation(model.n_expression)[:6]
     strength = np.where(free[active], rng.uniform(-0.9, 0.9, len(active)), rng.uniform(0.15, 0.55, len(active)))
     poses = []
@@ -112,7 +112,7 @@ def _sequence(
         wave = 0.5 - 0.5 * np.cos(phase[1, : len(talking)] + 2 * np.pi * np.outer(seconds, rate))
         breath = np.clip(1.5 * np.sin(2 * np.pi * seconds / 1.7 + phase[1, 0]) + 0.9, 0.0, 1.0)  # words and pauses
         bounds = np.asarray(model.expression_bounds, dtype=np.float64)
-        free = ~np.isfinite(bounds).all(axis=1)[talking]
+        free = np.isinf(bounds).any(axis=1)[talking]
         strength = np.where(free, rng.choice([-1.0, 1.0], len(talking)) * 0.9, rng.uniform(0.2, 0.5, len(talking)))
         expression[:, talking] = strength * wave * breath[:, None]
         expression = np.clip(expression, bounds[:, 0], bounds[:, 1])

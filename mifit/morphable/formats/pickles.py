@@ -55,7 +55,7 @@ class Dtype:
         order = state[1] if isinstance(state, tuple) and len(state) >= 5 else None
         if type(order) is not str or order not in "<>|=" or any(part is not None for part in state[2:5]):
             raise InputError("an array's type has fields or no byte order, expected plain numbers")
-        self.dtype = self.dtype.newbyteorder(order)
+        self.dtype = self.dtype.newbyteorder(order)  # type: ignore[arg-type]
 
 
 class Array:
