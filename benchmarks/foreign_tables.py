@@ -64,6 +64,7 @@ RELIT: Columns = {
         ("refitted", "refit"),
         ("paper's settings", "paper"),
     )
+    if how == "local" or row in ("full", "refit")
 }
 
 

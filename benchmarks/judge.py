@@ -23,6 +23,8 @@ from mifit.output.baseline import image_based
 
 MARGIN = 48
 """Pixels around the landmarks that are rendered: more than any window of a measure reaches beyond the face."""
+TRACED = ("full", "refit")
+"""Rows whose relit views are path traced as well."""
 Image = NDArray[np.uint8]
 
 
@@ -238,7 +240,7 @@ def judge_relit(
         truth = np.array(mi.Bitmap(str(path)), np.float64)[..., :3][at.box] * exposure
         for label, (result, method) in rows.items():
             lit = result.relight(str(light))
-            for integrator in integrators:
+            for integrator in integrators if label in TRACED else ("local",):
                 count = samples if integrator == "path" else None
                 image = lit.render(at.camera, timestep, method, integrator, count)  # type: ignore[arg-type]
                 key = f"{label}, {integrator}"
