@@ -256,6 +256,7 @@ def main() -> int:
     parser.add_argument("--judge", type=Path, help="a result folder to judge in place of fitting")
     parser.add_argument("--relit-samples", type=int, default=RELIT_SAMPLES)
     parser.add_argument("--pictures", type=Path, help="folder for one strip of images per case")
+    parser.add_argument("--record", action="store_true", help="write the tables whatever the options; they say which")
     parser.add_argument("--jobs", type=int, default=2, help="cases at a time, each in a process of its own")
     parser.add_argument("--json", type=Path, help="write the figures to a file of one's own")
     a = parser.parse_args()
@@ -266,7 +267,9 @@ def main() -> int:
     started = time.perf_counter()
     for text in skipped:
         print(f"left out: {text}", file=sys.stderr, flush=True)
-    whole = all(getattr(a, k) == parser.get_default(k) for k in vars(a) if k not in ("pictures", "json", "jobs"))
+    whole = all(
+        getattr(a, k) == parser.get_default(k) for k in vars(a) if k not in ("pictures", "json", "jobs", "record")
+    )
     found: list[dict[str, Any]] = []
     with ProcessPoolExecutor(a.jobs, multiprocessing.get_context("spawn")) as pool:
         waiting = [pool.submit(run_case, case, a, config) for case in cases]
@@ -275,15 +278,18 @@ def main() -> int:
             text = json.dumps({k: v for k, v in found[-1].items() if k != "fits"})
             print(f"{case.label}: {found[-1].get('seconds', 0):.0f} s\n{text}", file=sys.stderr, flush=True)
             out = {
+                "settings": {"texels": a.size, "fits": a.rows, "parts": a.parts, "relit_samples": a.relit_samples},
                 "cases": found,
                 "left_out": [*skipped, *(f"{c.label}: the run was broken off" for c in cases[len(found) :])],
                 "seconds": round(time.perf_counter() - started, 1),
                 "jobs": a.jobs,
                 "conditions": {"before": before, "after": conditions()},
             }
-            if whole and not skipped:  # after each case, so that a run that is broken off leaves what it measured
+            if a.record or (
+                whole and not skipped
+            ):  # after each case, so that a run that is broken off leaves what it measured
                 record("foreign", out, seeds=SEED)
-                write_text(RESULTS / "foreign.md", foreign_tables.markdown(found))
+                write_text(RESULTS / "foreign.md", foreign_tables.markdown(found, out))
                 write_text(RESULTS / "foreign_short.md", foreign_tables.short(found))
     if a.json:
         write_text(a.json, json.dumps(out, indent=2) + "\n")

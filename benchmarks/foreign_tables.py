@@ -80,9 +80,10 @@ def _table(cases: list[Case], columns: Columns, first: str = "capture (model), f
     return lines
 
 
-def markdown(cases: list[Case]) -> str:
-    """Three tables: held-out views, the surface, relit views."""
+def markdown(cases: list[Case], run: dict[str, Any] | None = None) -> str:
+    """Three tables: held-out views, the surface, relit views; ``run`` says how and under which load they were made."""
     lines = [
+        *(_conditions(run) if run else []),
         "Held-out views, PSNR in dB of 8-bit sRGB over skin (the hull of the landmarks without eyes and inner mouth,",
         "where a fitted view sees the scan), the same pixels in every column but the last two:",
         "",
@@ -101,6 +102,18 @@ def markdown(cases: list[Case]) -> str:
             *_table(lit, RELIT),
         ]
     return "\n".join(lines) + "\n"
+
+
+def _conditions(run: dict[str, Any]) -> list[str]:
+    load = run["conditions"]["before"]["load_average"][0], run["conditions"]["after"]["load_average"][0]
+    minutes, cpu = run["seconds"] / 60, sum(case.get("cpu_seconds", 0) for case in run["cases"]) / 60
+    texels, samples = run["settings"]["texels"], run["settings"]["relit_samples"]
+    lines = [
+        f"Maps of {texels} texels a side, {samples} samples per pixel of relit views; "
+        f"{minutes:.0f} minutes, {cpu:.0f} of processor time, at load averages of {load[0]:.1f} to {load[1]:.1f}.",
+    ]
+    lines += [f"Left out: {text}." for text in run["left_out"]]
+    return [*lines, ""]
 
 
 def short(cases: list[Case]) -> str:

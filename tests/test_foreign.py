@@ -149,6 +149,19 @@ def test_tables_say_what_failed_and_what_did_not_converge():
     assert "| b | failed: no / light |" in text and "full: geometry" in text and "0.50 / 1.25 / 3.00" in text
     assert "| 21.3 |" in text and "| 18.0 |" in text and "15.0" in text
     assert "| a | 21.3 | - |" in foreign_tables.short([case])
+    load = {"before": {"load_average": [1.0]}, "after": {"load_average": [2.5]}}
+    run = {
+        "settings": {"texels": 256, "relit_samples": 32},
+        "conditions": load,
+        "seconds": 120,
+        "cases": [case],
+        "left_out": ["c"],
+    }
+    assert (
+        "256 texels" in (said := foreign_tables.markdown([case], run))
+        and "1.0 to 2.5" in said
+        and "Left out: c." in said
+    )
     rows = [line for line in text.splitlines() if line.startswith("|")]
     for table in (rows[:4], rows[4:8]):
         assert len({line.count("|") for line in table}) == 1
