@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 import mifit
 from mifit.capture import Capture
-from mifit.capture.face_mesh import FaceMesh
+from mifit.capture.face_mesh import FaceMesh, mirrored_points
 from mifit.core.files import write_text
 from mifit.core.image import load_image, to_8_bit
 from mifit.morphable import MorphableModel
@@ -77,7 +77,8 @@ def main() -> None:
             seen += observe(out, model, detector)
             print(f"{i + 1} of {arguments.subjects} subjects, {len(seen)} images", flush=True)
     index, weight = fit_table(seen)
-    write_text(arguments.out, json.dumps({"index": index.tolist(), "weight": np.round(weight, 5).tolist()}) + "\n")
+    table = {"index": index.tolist(), "weight": np.round(weight, 5).tolist(), "mirror": mirrored_points().tolist()}
+    write_text(arguments.out, json.dumps(table) + "\n")
 
 
 if __name__ == "__main__":

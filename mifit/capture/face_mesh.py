@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 
@@ -40,6 +40,8 @@ UPRIGHT = np.radians(30.0)
 finds something else."""
 ROUNDS = 3
 """Runs of the mesh network, each about the points of the last."""
+JITTER = (-0.2, 0.0, 0.2)
+"""Radians by which the last square is turned."""
 STRIDE = 4
 """Pixels between the finder's anchors."""
 EYE_CORNERS = ((33, 133), (263, 362))
@@ -64,6 +66,13 @@ def landmark_map() -> NDArray[np.float64]:
     for row, (index, weight) in enumerate(zip(table["index"], table["weight"], strict=True)):
         weights[row, index] = weight
     return weights
+
+
+@cache
+def mirrored_points() -> NDArray[np.int64]:
+    """(468,) for each mesh point the one that a mirror image of the face has in its place."""
+    text = (resources.files("mifit.capture") / "face_mesh_68.json").read_text(encoding="utf-8")
+    return np.array(json.loads(text)["mirror"], dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -254,19 +263,32 @@ class FaceMesh:
         return found
 
     def _settle(self, image: NDArray, square: _Square) -> Face | None:
-        """The mesh about a square, and again about its own points; None where it isn't a face."""
-        for _ in range(ROUNDS):
-            size = self._mesh.size
-            out = self._mesh(square.cut(image, size))
-            presence = float(1.0 / (1.0 + np.exp(-np.clip(out[1][0], -80, 80))))
+        """The mesh about a square, and again about its own points; None where it isn't a face.
+
+        The last round is a mean over the square a little turned and mirrored: the network's error is partly one of how
+        the face lies in its input.
+        """
+        for _ in range(ROUNDS - 1):
+            points, presence = self._look(image, square)
             if presence < PRESENCE:
                 return None
-            raw = out[3 * POINTS].reshape(-1, 3).astype(np.float64) / size
-            step = square.to_image()
-            flat = raw[:, :2] @ step[:, :2].T + step[:, 2]
-            points = np.column_stack([flat, raw[:, 2] * square.side])
-            square = _Square.about(flat, flat[EYE_CORNERS[0][0]], flat[EYE_CORNERS[1][0]], MARGIN)
-        return Face(self._with_eyes(image, points), presence)
+            square = _Square.about(points[:, :2], points[EYE_CORNERS[0][0], :2], points[EYE_CORNERS[1][0], :2], MARGIN)
+        turned = [replace(square, angle=square.angle + turn) for turn in JITTER]
+        looks = [self._look(image, one, mirrored) for one in turned for mirrored in (False, True)]
+        mean = np.mean([points for points, _ in looks], axis=0)
+        return Face(self._with_eyes(image, mean), min(presence for _, presence in looks))
+
+    def _look(self, image: NDArray, square: _Square, mirrored: bool = False) -> tuple[NDArray[np.float64], float]:
+        """(468, 3) mesh points of a square, in pixels of the image, and the probability that it shows a face."""
+        size = self._mesh.size
+        out = self._mesh(square.cut(image, size, mirrored))
+        raw = out[3 * POINTS].reshape(-1, 3).astype(np.float64) / size
+        if mirrored:
+            raw[:, 0] = 1.0 - raw[:, 0]
+            raw = raw[mirrored_points()]
+        step = square.to_image()
+        points = np.column_stack([raw[:, :2] @ step[:, :2].T + step[:, 2], raw[:, 2] * square.side])
+        return points, float(1.0 / (1.0 + np.exp(-np.clip(out[1][0], -80, 80))))
 
     def _with_eyes(self, image: NDArray, points: NDArray) -> NDArray[np.float64]:
         """Mesh points with the rims of the eyes as the iris network has them, and the irises after them."""
