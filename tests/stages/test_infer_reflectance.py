@@ -10,10 +10,11 @@ from stages.reflectance_scene import EXPONENT, SIZE, render, turning_dome
 
 from mifit.config import ReflectanceConfig
 from mifit.errors import InputError
+from mifit.solve import Outcome
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.lighting import SPECULAR_LIMIT, expected_specular, specular_pull
-from mifit.stages.reflectance.maps import Smoothness, TexelSystems, laplacian, solve_maps
+from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, laplacian, solve_maps
 
 CONFIG = ReflectanceConfig(texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
 
@@ -232,6 +233,25 @@ def test_admm_reaches_the_minimum_of_the_l1_problem():
     for _ in range(200):
         step = rng.normal(0, 1e-2, found.shape) * (rng.random(found.shape) < 0.1)
         assert energy(np.clip(found + step, 0, 1)) > best - 1e-3
+
+
+def test_splits_go_on_where_the_last_solve_stopped():
+    size, rng = 16, np.random.default_rng(4)
+    n = size * size
+    ones = np.ones((n, 3), np.float32)
+    target = rng.uniform(-0.2, 1.2, (n, 4)).astype(np.float32)
+    systems = TexelSystems(ones, 0.3 * ones, target[:, :3].copy(), ones[:, 0], target[:, 3].copy())
+    given = systems, np.arange(n), np.zeros((size, size, 4), np.float32), Smoothness(0.02, 0.05)
+    best = solve_maps(*given, iterations=2000, tolerance=1e-7)
+    splits = Splits()
+    for count in (15, 15):
+        chained = solve_maps(*given, iterations=count, tolerance=0.0, splits=splits)
+        assert splits.outcome is Outcome.MAX_ITERATIONS and splits.iterations == count
+    np.testing.assert_array_equal(chained, solve_maps(*given, iterations=30, tolerance=0.0))
+    apart = solve_maps(*given, solve_maps(*given, iterations=15), iterations=15)
+    assert np.abs(chained - best).mean() < np.abs(apart - best).mean()
+    solve_maps(*given, iterations=2000, tolerance=1e-5, splits=splits)
+    assert splits.outcome is Outcome.CONVERGED and splits.iterations < 2000
 
 
 def test_weights_ignore_the_map_size(dome):

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 
+from mifit.solve import Outcome
+
 SPLIT = 0.5
 """Weight of ADMM's splits relative to the median curvature of the blocks."""
 
@@ -75,26 +77,86 @@ class TexelSystems:
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
     def solve(self, x0: NDArray, y0: NDArray, px: NDArray | float, py: NDArray | float) -> tuple[NDArray, NDArray]:
-        """Minimise each block plus ``px |x - x0|^2 + py (y - y0)^2`` within 0..1, in closed form.
+        """Minimise each block plus ``px |x - x0|^2 + py (y - y0)^2`` within 0..1: x (N, 3) and y (N,)."""
+        blocks = _Blocks(self, np.broadcast_to(px, 3).astype(self.dd.dtype)[:, None], py)
+        x, y = blocks.solve(np.broadcast_to(x0, self.dd.shape).T, np.broadcast_to(y0, self.sr.shape))
+        return x.T, y
+
+
+class _Blocks:
+    """`TexelSystems` with the pulls of ADMM's splits, which are the same in all iterations, worked in.
+
+    Channels come first here, (3, N): sums over three neighbours in memory are slow.
+    """
+
+    def __init__(self, systems: TexelSystems, px: NDArray, py: NDArray | float) -> None:
+        self.px, self.py = px, py
+        self.ds, self.dr = (np.ascontiguousarray(a.T) for a in (systems.ds, systems.dr))
+        self.sr = systems.sr
+        self.inverse = 1.0 / (systems.dd.T + px)
+        self.slope = self.ds * self.inverse
+        self.removed = self.ds * self.slope  # what eliminating each x takes from the curvature of y
+        self.curvature = systems.ss + py
+        self.eliminated = np.maximum(self.curvature - _over_channels(self.removed), 1e-12)
+
+    def solve(self, x0: NDArray, y0: NDArray) -> tuple[NDArray, NDArray]:
+        """x (3, N) and y (N,) in closed form.
 
         y is found with x eliminated; where that drives a diffuse value out of the box, the value is held at the bound
         and y found anew with the others.
         """
-        dd = self.dd + px
-        dr = self.dr + px * x0
-        slope, offset = self.ds / dd, dr / dd
-        y = self._specular(np.ones_like(dd), slope, offset, py, y0)
-        x = offset - slope * y[:, None]
-        free = ((x >= 0.0) & (x <= 1.0)).astype(dd.dtype)
-        held = np.clip(x, 0.0, 1.0)
-        y = self._specular(free, slope, np.where(free > 0, offset, held), py, y0)
-        return np.clip(offset - slope * y[:, None], 0.0, 1.0), y
+        offset = (self.dr + self.px * x0) * self.inverse
+        pull = self.sr + self.py * y0
+        y = np.clip((pull - _over_channels(self.ds * offset)) / self.eliminated, 0.0, 1.0)
+        x = offset - self.slope * y
+        rows = np.flatnonzero(((x < 0.0) | (x > 1.0)).any(axis=0))
+        if len(rows):
+            bound, free = x[:, rows], (x[:, rows] >= 0.0) & (x[:, rows] <= 1.0)
+            shifted = np.where(free, offset[:, rows], np.clip(bound, 0.0, 1.0))
+            curvature = self.curvature[rows] - _over_channels(np.where(free, self.removed[:, rows], 0.0))
+            right = pull[rows] - _over_channels(self.ds[:, rows] * shifted)
+            y[rows] = np.clip(right / np.maximum(curvature, 1e-12), 0.0, 1.0)
+            x[:, rows] = np.clip(offset[:, rows] - self.slope[:, rows] * y[rows], 0.0, 1.0)
+        return x, y
 
-    def _specular(self, free: NDArray, slope: NDArray, offset: NDArray, py: NDArray | float, y0: NDArray) -> NDArray:
-        """y for x = offset - slope y where free, x = offset elsewhere."""
-        ss = self.ss + py - (free * self.ds * slope).sum(1)
-        sr = self.sr + py * y0 - (self.ds * offset).sum(1)
-        return np.clip(sr / np.maximum(ss, 1e-12), 0.0, 1.0)
+
+def _over_channels(values: NDArray) -> NDArray:
+    """Sum of (3, N) over the channels."""
+    return values[0] + values[1] + values[2]
+
+
+@dataclass
+class Splits:
+    """ADMM's copies and multipliers, planes (4, S, S): handed on, they make the next solve a short one.
+
+    Attributes
+    ----------
+    smooth, bent : smooth copy of the maps without their base, and its Laplacian
+    u, v : multipliers of the two splits
+    outcome : Outcome
+        Of the solve that left them.
+    iterations : int
+    """
+
+    smooth: NDArray[np.float32] | None = None
+    bent: NDArray[np.float32] | None = None
+    u: NDArray[np.float32] | None = None
+    v: NDArray[np.float32] | None = None
+    outcome: Outcome = Outcome.MAX_ITERATIONS
+    iterations: int = 0
+
+
+def plane_laplacian(planes: NDArray) -> NDArray:
+    """Five-point Laplacian of planes (C, S, S) with mirrored borders."""
+    out = -4.0 * planes
+    for axis in (1, 2):
+        low, high = ((slice(None),) * axis + (part,) for part in (slice(None, -1), slice(1, None)))
+        out[high] += planes[low]
+        out[low] += planes[high]
+        first, last = ((slice(None),) * axis + (part,) for part in (slice(0, 1), slice(-1, None)))
+        out[first] += planes[first]
+        out[last] += planes[last]
+    return out
 
 
 def laplacian(image: NDArray) -> NDArray:
@@ -133,6 +195,7 @@ def solve_maps(
     specular_pull: float = 0.0,
     iterations: int = 60,
     tolerance: float = 1e-4,
+    splits: Splits | None = None,
 ) -> NDArray[np.float32]:
     """Minimise the texels' blocks + lambda_H (|Laplacian delta C_d|_1 + |Laplacian C_s|_1) within 0..1.
 
@@ -154,44 +217,54 @@ def solve_maps(
     iterations : int
     tolerance : float
         Stop when no map moves by more than this.
+    splits : Splits, optional
+        Those of an earlier solve with nearly the same blocks, to go on from instead of from ``start``; they take those
+        of this one, and say how it ended.
 
     Returns
     -------
     (S, S, 4) float32
         Diffuse albedo and specular albedo.
     """
-    prior = prior.astype(np.float32)
+    size = prior.shape[0]
+    prior = np.ascontiguousarray(prior.transpose(2, 0, 1), dtype=np.float32)
     base = prior.copy()
-    base[..., 3] = 0.0  # the paper smooths the offset from the model's albedo, and C_s itself
+    base[3] = 0.0  # the paper smooths the offset from the model's albedo, and C_s itself
     scale = np.array([float(np.median(systems.dd))] * 3 + [float(np.median(systems.ss))], dtype=np.float32)
     scale = np.maximum(scale, 1e-6)
     pull = prior_weight * scale
     pull[3] = max(pull[3], specular_pull)
     # Splitting weights near the blocks' own curvature let both sides of a split move at the same pace.
-    rho = SPLIT * scale
-    threshold = np.array([smoothness.diffuse] * 3 + [smoothness.specular], dtype=np.float32) / rho
-    eigenvalues = laplacian_eigenvalues(prior.shape[0])[..., None]
-    inverse = 1.0 / (1.0 + eigenvalues**2)
-    smooth = (prior if start is None else start.astype(np.float32)) - base
-    bent = laplacian(smooth)
-    u, v = np.zeros_like(smooth), np.zeros_like(smooth)
-    texel = prior
+    rho = (SPLIT * scale)[:, None, None]
+    threshold = np.array([smoothness.diffuse] * 3 + [smoothness.specular], dtype=np.float32)[:, None, None] / rho
+    weak = pull[:, None, None]
+    inverse = 1.0 / (1.0 + laplacian_eigenvalues(size) ** 2)
+    splits = Splits() if splits is None else splits
+    smooth, bent, u, v = splits.smooth, splits.bent, splits.u, splits.v
+    if smooth is None or bent is None or u is None or v is None:
+        smooth = (prior if start is None else start.transpose(2, 0, 1).astype(np.float32)) - base
+        bent, u, v = plane_laplacian(smooth), np.zeros_like(smooth), np.zeros_like(smooth)
+    total = 0.5 * rho + weak
+    blocks = _Blocks(systems, total[:3, :, 0], float(total[3, 0, 0]))
+    share, drawn = 0.5 * rho / total, weak / total * prior
+    texel, splits.outcome, splits.iterations = prior, Outcome.MAX_ITERATIONS, 0
     for _ in range(iterations):
-        wanted = 0.5 * rho * (base + smooth - u) + pull * prior
-        wanted /= 0.5 * rho + pull
-        texel = wanted.reshape(-1, 4)
-        texel[index, :3], texel[index, 3] = systems.solve(
-            texel[index, :3], texel[index, 3], (0.5 * rho + pull)[:3], (0.5 * rho + pull)[3]
-        )
-        texel = np.clip(texel, 0.0, 1.0).reshape(prior.shape)
+        splits.iterations += 1
+        texel = share * (base + smooth - u) + drawn
+        flat = texel.reshape(4, -1)
+        x, y = blocks.solve(flat[:3, index], flat[3, index])
+        flat[:3, index], flat[3, index] = x, y
+        np.clip(texel, 0.0, 1.0, out=texel)
         shifted = bent - v
-        z = np.sign(shifted) * np.maximum(np.abs(shifted) - threshold, 0.0)
-        right = texel - base + u + laplacian(z + v)
+        z = shifted - np.clip(shifted, -threshold, threshold)  # soft threshold
+        right = texel - base + u + plane_laplacian(z + v)
         previous = smooth
-        smooth = idctn(dctn(right, axes=(0, 1), type=2) * inverse, axes=(0, 1), type=2)
-        bent = laplacian(smooth)
+        smooth = idctn(dctn(right, axes=(1, 2), type=2, workers=-1) * inverse, axes=(1, 2), type=2, workers=-1)
+        bent = plane_laplacian(smooth)
         u = u + texel - base - smooth
         v = v + z - bent
         if np.abs(smooth - previous).max() < tolerance:
+            splits.outcome = Outcome.CONVERGED
             break
-    return texel.astype(np.float32)
+    splits.smooth, splits.bent, splits.u, splits.v = smooth, bent, u, v
+    return np.ascontiguousarray(texel.transpose(1, 2, 0), dtype=np.float32)
