@@ -16,6 +16,7 @@ _EXPORTS = {
     "Camera": "mifit.core.camera",
     "SHLighting": "mifit.core.sh",
     "Illumination": "mifit.appearance.illumination",
+    "DistantLight": "mifit.appearance.illumination",
     "FitConfig": "mifit.config",
     "GeometryConfig": "mifit.config",
     "ReflectanceConfig": "mifit.config",
@@ -39,6 +40,11 @@ _EXPORTS = {
     "refine_mesh": "mifit.stages.normals.mesh_refinement",
     "refine_shape": "mifit.stages.refine_shape",
     "Reconstruction": "mifit.reconstruction",
+    "evaluate": "mifit.output.evaluate",
+    "export": "mifit.output.export",
+    "synthesize": "mifit.synth",
+    "linear_to_srgb": "mifit.core.image",
+    "srgb_to_linear": "mifit.core.image",
 }
 
 __all__ = ["__version__", *_EXPORTS]

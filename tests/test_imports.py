@@ -171,3 +171,11 @@ def test_every_public_name_loads():
     code = "import mifit\nfor n in mifit.__all__: getattr(mifit, n)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_api_page_has_every_public_name():
+    page = (PACKAGE.parent / "docs" / "api.md").read_text(encoding="utf-8")
+    listed = {line.removeprefix("::: ").strip() for line in page.splitlines() if line.startswith("::: ")}
+    for name in set(mifit.__all__) - {"__version__"}:
+        value = getattr(mifit, name)
+        assert {f"{value.__module__}.{value.__qualname__}", value.__module__} & listed, name
