@@ -40,7 +40,7 @@ def variant(request: pytest.FixtureRequest) -> str:
     target, threads = request.config.getoption("--llvm-target"), request.config.getoption("--threads")
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1))
     if workers > 1 and not threads:  # share the processors: threads that wait for one another cost more than they bring
-        threads = max(1, (os.cpu_count() or 1) // workers)
+        threads = max(2, (os.cpu_count() or 1) // workers)
     if target:
         cpu, width = target.split(":")
         compile_for(cpu, int(width))

@@ -70,3 +70,17 @@ def test_doctor_reports_what_works(variant: str) -> None:
     checks = {check["check"]: check for check in module.doctor()}
     assert checks["llvm"]["ok"] and checks["mitsuba"]["ok"]
     assert all(check["fix"] for check in checks.values() if not check["ok"])
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs sched_setaffinity")
+def test_one_processor_is_enough(tmp_path):
+    """Mitsuba waits for ever for a second thread when it writes EXR; `mifit.set_variant` sees to one."""
+    code = (
+        "import os, sys; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "import mifit, numpy as np; mifit.set_variant('llvm_ad_rgb')\n"
+        "import mitsuba as mi; mi.Bitmap(np.ones((64, 64, 3), np.float32)).write(sys.argv[1])\n"
+        "assert np.allclose(np.array(mi.Bitmap(sys.argv[1])), 1)"
+    )
+    path = tmp_path / "x.exr"
+    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, timeout=60, check=False)
+    assert done.returncode == 0 and path.stat().st_size > 0, done.stderr
