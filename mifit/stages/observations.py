@@ -21,7 +21,7 @@ from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, bilinear, rasterize_uv
 from mifit.errors import InputError
-from mifit.stages.trust import agreement, elsewhere, outline_distance
+from mifit.stages.trust import agreement, background, elsewhere, outline_distance
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -183,6 +183,9 @@ class Surface:
                 covered, edge, outline = _face_pixels(self.scenes[i], self.vertices[i], model.faces, shown, camera)
                 colour = frame.image / geometry.gain(name)
                 unusable = edge | ~covered | ~frame.valid | ~np.isfinite(frame.image).all(-1)
+                if whole:
+                    facial = _face_pixels(self.scenes[i], self.vertices[i], model.faces, model.face_mask, camera)[0]
+                    unusable |= background(frame.image, outline > 0, facial)
                 self._images.append(
                     _Image(
                         i,

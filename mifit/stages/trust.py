@@ -12,6 +12,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 OUTLINE_MM = 3.0
 """Distance inside the fitted outline over which the odds of seeing past the real one fall by e: fitted meshes lie 1 to
@@ -28,6 +29,10 @@ RANGE = 4.0
 DARKEST = 0.004
 """Linear colour below which ratios are noise."""
 ROUNDS = 4
+BESIDE = 3
+"""Pixels beside the fitted outline that are left out of the background."""
+ALIKE = 0.15
+"""Part of its colour by which the background changes from the outline inwards."""
 
 
 def outline_distance(depth: NDArray[np.float32], step: float) -> NDArray[np.float32]:
@@ -54,6 +59,31 @@ def outline_distance(depth: NDArray[np.float32], step: float) -> NDArray[np.floa
     inside = (hit & ~jump).astype(np.uint8)
     # A camera that sees nothing but surface has no outline.
     return cv2.distanceTransform(inside, cv2.DIST_L2, 5) if not inside.all() else np.full(depth.shape, 1e6, np.float32)
+
+
+def background(image: NDArray, hit: NDArray[np.bool_], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels on a mesh that show what lies beside it: alike to the nearest pixels off the mesh and joined to them.
+
+    Scalp and neck of a fitted head are the model's, not the person's, and may stand centimetres wide of theirs.
+
+    Parameters
+    ----------
+    image : (H, W, 3)
+        Linear colour.
+    hit : (H, W) bool
+        Pixels that the mesh covers.
+    kept : (H, W) bool
+        Pixels that are never background: the face area, whose outline is fitted.
+    """
+    off = ~cv2.dilate(hit.astype(np.uint8), np.ones((2 * BESIDE + 1,) * 2, np.uint8)).astype(bool)
+    if not off.any() or not hit.any():
+        return np.zeros_like(hit)
+    smooth = cv2.GaussianBlur(np.nan_to_num(image).astype(np.float32), (0, 0), 1.5)
+    row, column = distance_transform_edt(~off, return_distances=False, return_indices=True)
+    there = smooth[row, column]
+    alike = (np.abs(smooth - there) < ALIKE * there + 5.0 * DARKEST).all(axis=-1) & ~kept
+    _, piece = cv2.connectedComponents((alike | off).astype(np.uint8))
+    return hit & alike & np.isin(piece, np.unique(piece[off]))
 
 
 def elsewhere(cosine: NDArray, millimetres: NDArray) -> NDArray[np.float32]:

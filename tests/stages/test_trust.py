@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mifit.stages.trust import LEAST, agreement, elsewhere, outline_distance
+from mifit.stages.trust import LEAST, agreement, background, elsewhere, outline_distance
 
 SKIN, BACKGROUND = (0.5, 0.3, 0.25), (0.02, 0.02, 0.03)
 
@@ -60,3 +60,24 @@ def test_outlines_are_steps_of_depth_not_slopes() -> None:
     assert distance[10, 10] == pytest.approx(4.0, abs=0.3) and distance[10, 25] > 8
     assert (outline_distance(np.full((4, 4), np.inf, np.float32), 1.0) == 0).all()
     assert (outline_distance(np.ones((4, 4), np.float32), 1.0) > 1e3).all()
+
+
+def test_background_over_a_head_that_is_too_wide_is_found_and_the_face_is_not() -> None:
+    image = np.full((60, 80, 3), 0.02)
+    image[15:, 25:60] = SKIN
+    hit = np.zeros((60, 80), bool)
+    hit[5:, 20:65] = True  # the mesh is wider than the head
+    face = np.zeros_like(hit)
+    face[30:, 20:50] = True
+    found = background(image, hit, face)
+    truth = np.zeros_like(hit)
+    truth[5:11, 20:65] = truth[5:, 62:65] = True  # three pixels off the head's edge
+    assert not (found & face).any()
+    inner = np.zeros_like(hit)
+    inner[18:, 28:57] = True
+    assert not (found & inner).any()
+    assert found[truth].mean() > 0.8
+    dark = image.copy()
+    dark[25:35, 35:45] = 0.02  # as dark as the background, but joined to nothing of it
+    assert not background(dark, hit, face)[27:33, 37:43].any()
+    assert not background(image, np.ones_like(hit), face).any()
