@@ -21,7 +21,7 @@ demo:
 	$(BIN)/mifit demo --out $(OUT)
 
 test:
-	@.ci/setup test
+	@.ci/setup test cluster view
 	$(BIN)/ruff check .
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
