@@ -95,6 +95,10 @@ class SurfaceConfig:
         above=0,
         most=WEIGHT,
     )
+    refit: bool = flag(
+        True,
+        "where landmarks are biased, fit the model once more, to the surface found first, before the displacements",
+    )
     finest: int = number(0, "times that the images are halved at the finest level", least=0, most=6)
 
 

@@ -114,7 +114,7 @@ def steps(config: FitConfig, until: Stage = "normals") -> list[Step]:
     """The steps of a fit with these settings, in order."""
     found = [Step("geometry", "geometry", (), (config.geometry,), _fit_geometry)]
     if config.surface.enabled:
-        found.append(Step("surface", "geometry", ("geometry",), (config.surface,), _find_surface))
+        found.append(Step("surface", "geometry", ("geometry",), (config.surface, config.geometry), _find_surface))
     if until == "geometry":
         return found
     found.append(Step("reflectance", "reflectance", ("geometry",), (config.reflectance,), _infer_reflectance))
@@ -190,11 +190,13 @@ def _fit_geometry(source: Source, inputs: Inputs, progress: Progress, config: Ge
     return behind_lids(source.model, found)
 
 
-def _find_surface(source: Source, inputs: Inputs, progress: Progress, config: SurfaceConfig) -> Any:
+def _find_surface(
+    source: Source, inputs: Inputs, progress: Progress, config: SurfaceConfig, geometry: GeometryConfig
+) -> Any:
     from mifit.stages.eyes import behind_lids
     from mifit.stages.find_surface import find_surface
 
-    found = find_surface(source.capture, source.model, inputs["geometry"], source.cameras, config, progress)
+    found = find_surface(source.capture, source.model, inputs["geometry"], source.cameras, config, progress, geometry)
     return behind_lids(source.model, found)
 
 

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.config import SurfaceConfig
+from mifit.config import GeometryConfig, SurfaceConfig
 from mifit.core.estimate import GeometryEstimate, Report
-from mifit.core.mesh import normalize
+from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.progress import Progress, silent
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.geometry.points import corner_matrix
 from mifit.stages.surface.displace import Plate, solve_displacement
+from mifit.stages.surface.model_fit import FoundSurface, fit_model, landmarks_are_biased
 from mifit.stages.surface.sweep import sweep
 from mifit.stages.surface.views import Resolution, pose_texels, texture_size
 
@@ -44,6 +45,8 @@ CONTACT_MM = 1.5
 THIN = 2
 START, STIFFEST = 20.0, 5000.0
 """Stiffness at the start, and the largest."""
+FITTED = ("identity", "expression", "rotation", "translation", "vertices")
+"""What the fit of the model to the found surface renews."""
 NARROWEST = 0.03
 """Least parallax; below it, about 2 degrees between the views, depth isn't measured."""
 
@@ -55,6 +58,7 @@ def find_surface(
     cameras: Sequence[str],
     config: SurfaceConfig | None = None,
     progress: Progress = silent,
+    geometry_config: GeometryConfig | None = None,
 ) -> GeometryEstimate:
     """Displace a fitted surface to where all views agree.
 
@@ -68,6 +72,8 @@ def find_surface(
         Cameras to read; no other camera of the capture is touched.
     config : SurfaceConfig, optional
     progress : Progress
+    geometry_config : GeometryConfig, optional
+        Stage 1's, whose texture, landmark and prior terms go on where the model is refitted.
 
     Returns
     -------
@@ -90,50 +96,24 @@ def find_surface(
     resolution = Resolution.of(views, world[0].mean(axis=0), pairs)
     if resolution.parallax < NARROWEST:
         return _unchanged(geometry, "views from nearly one place: the surface stays in the model's span", began)
-    neutral = model.shape(geometry.identity).astype(np.float64)
-    plate = Plate.of(neutral, model.faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm)
-    scene = SurfaceScene(world[0], model.faces)
-    displacement = np.zeros_like(neutral)
-    stiffness = START
     levels = sweeps(resolution, config, capture.unit_mm)
-    matched = 0.0
-    for number, (level, half) in enumerate(levels):
-        progress("find surface", number, len(levels))
-        pixel = resolution.pixel * 2.0**level
-        texels = rasterize_uv(
-            model.uv, model.faces_uv, texture_size(model, world[0], pixel, LARGEST_MAP), model.face_mask
-        )
-        posed = []
-        for vertices, timestep in zip(world, geometry.timesteps, strict=True):
-            scene.update(vertices)
-            posed.append(pose_texels(capture, scene, vertices, model.faces, texels, cameras, timestep, 0.5**level))
-        step = STEP_PIXELS * pixel / resolution.parallax
-        found = sweep(texels, posed, step * np.arange(-half, half + 1), WINDOW, pairs)
-        matched = float((found.precision > 0).mean())
-        objects = [p.normal @ rotation for p, rotation in zip(posed, geometry.rotation, strict=True)]
-        some = thinned(texels)
-        solved = solve_displacement(
-            plate,
-            corner_matrix(model.faces, texels.face[some], texels.weights[some], len(neutral)),
-            normalize(np.mean(objects, axis=0))[some],
-            found.offset[some] / geometry.scale,
-            found.precision[some] * (THIN * geometry.scale) ** 2,
-            displacement,
-            stiffness,
-            ROBUST_STEPS * step / geometry.scale,
-        )
-        displacement = solved.displacement
-        stiffness = solved.likely_stiffness(config.stiffness, STIFFEST)
-        world = geometry.vertices + geometry.scale * displacement @ geometry.rotation.transpose(0, 2, 1)
-    progress("find surface", len(levels), len(levels))
+    # Landmarks that agree with the fit say more of a face within the model's span than a first, rough surface does.
+    rough = levels[: max(1, len(levels) - 1)] if config.refit and landmarks_are_biased(geometry) else []
+    search = _Search(capture, model, cameras, resolution, pairs, config, progress, len(rough) + len(levels))
+    if rough:
+        first = search.descend(geometry, rough)
+        refitted = fit_model(capture, model, geometry, cameras, first.surfaces, geometry_config or GeometryConfig())
+        geometry = replace(geometry, **{name: getattr(refitted, name) for name in FITTED})
+    last = search.descend(geometry, levels)
+    displacement, world = last.displacement, last.world
     seconds = time.perf_counter() - began
     moved = np.linalg.norm(displacement, axis=1)[np.unique(model.faces[model.face_mask])] * model.unit_mm
     phase = {
         "name": "surface",
         "outcome": "converged",
         "levels": [level for level, _ in levels],
-        "matched": matched,
-        "stiffness": stiffness,
+        "matched": last.matched,
+        "stiffness": last.stiffness,
         "displacement_mm": float(np.sqrt(np.mean(moved**2))),
         "seconds": seconds,
     }
@@ -143,6 +123,91 @@ def find_surface(
         displacement=displacement.astype(np.float32),
         report=_extended(geometry.report, seconds, phase),
     )
+
+
+@dataclass(frozen=True)
+class _Descent:
+    """Where a run of sweeps ended."""
+
+    displacement: NDArray[np.float64]
+    world: NDArray[np.float64]
+    surfaces: list[FoundSurface]
+    stiffness: float
+    matched: float
+
+
+class _Search:
+    """Sweeps, coarse to fine, from a fit of the model."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        model: MorphableModel,
+        cameras: Sequence[str],
+        resolution: Resolution,
+        pairs: Sequence[tuple[int, int]],
+        config: SurfaceConfig,
+        progress: Progress,
+        total: int,
+    ) -> None:
+        self._capture, self._model, self._cameras, self._pairs = capture, model, cameras, pairs
+        self._resolution, self._config, self._progress = resolution, config, progress
+        self._done, self._total = 0, total
+        progress("find surface", 0, total)
+
+    def descend(self, geometry: GeometryEstimate, levels: Sequence[tuple[int, int]]) -> _Descent:
+        """Displace a fitted model's surface; levels as of `sweeps`."""
+        model, scale = self._model, float(geometry.scale)
+        neutral = model.shape(geometry.identity).astype(np.float64)
+        plate = Plate.of(neutral, model.faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm)
+        world = geometry.vertices.astype(np.float64)
+        scene = SurfaceScene(world[0], model.faces)
+        displacement, stiffness, surfaces, matched = np.zeros_like(neutral), START, [], 0.0
+        for level, half in levels:
+            pixel = self._resolution.pixel * 2.0**level
+            size = texture_size(model, world[0], pixel, LARGEST_MAP)
+            texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+            posed = []
+            for vertices, timestep in zip(world, geometry.timesteps, strict=True):
+                scene.update(vertices)
+                posed.append(
+                    pose_texels(
+                        self._capture, scene, vertices, model.faces, texels, self._cameras, timestep, 0.5**level
+                    )
+                )
+            step = STEP_PIXELS * pixel / self._resolution.parallax
+            found = sweep(texels, posed, step * np.arange(-half, half + 1), WINDOW, self._pairs)
+            matched = float((found.precision > 0).mean())
+            objects = [p.normal @ rotation for p, rotation in zip(posed, geometry.rotation, strict=True)]
+            some = thinned(texels)
+            solved = solve_displacement(
+                plate,
+                corner_matrix(model.faces, texels.face[some], texels.weights[some], len(neutral)),
+                normalize(np.mean(objects, axis=0))[some],
+                found.offset[some] / scale,
+                found.precision[some] * (THIN * scale) ** 2,
+                displacement,
+                stiffness,
+                ROBUST_STEPS * step / scale,
+            )
+            displacement = solved.displacement
+            stiffness = solved.likely_stiffness(self._config.stiffness, STIFFEST)
+            world = geometry.vertices + scale * displacement @ geometry.rotation.transpose(0, 2, 1)
+            measured = np.flatnonzero(found.precision > 0)
+            trust = found.precision[measured]
+            trust = np.minimum(1.0, trust / max(float(np.median(trust)), 1e-30)) if len(trust) else trust
+            corners = model.faces, texels.face[measured], texels.weights[measured]
+            surfaces = [
+                FoundSurface(
+                    interpolate(vertices, *corners),
+                    normalize(interpolate(vertex_normals(vertices, model.faces), *corners)),
+                    trust,
+                )
+                for vertices in world
+            ]
+            self._done += 1
+            self._progress("find surface", self._done, self._total)
+        return _Descent(displacement, world, surfaces, stiffness, matched)
 
 
 def thinned(texels: TexelMap) -> NDArray[np.intp]:

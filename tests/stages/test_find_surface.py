@@ -16,7 +16,12 @@ from mifit.stages.eyes import eyeballs
 from mifit.stages.find_surface import find_surface
 from mifit.stages.fit_geometry import fit_geometry, fit_pose_expression
 from mifit.stages.geometry.displaced import displaced
+from mifit.stages.geometry.normal import NormalEquations
+from mifit.stages.geometry.parameters import Frames, Layout, exponential
+from mifit.stages.geometry.points import PointBasis
+from mifit.stages.geometry.visibility import spread_points
 from mifit.stages.surface.displace import Plate, solve_displacement
+from mifit.stages.surface.model_fit import PlaneTerm, landmarks_are_biased
 from tests.morphable.intersections import intersections
 
 QUICK = GeometryConfig(rounds=1, surface_points=800, pixels=400, max_iterations=15)
@@ -186,3 +191,37 @@ def test_noise_stiffens_and_a_signal_softens():
         found.append((stiffness, np.abs(solved.displacement[:, 2] - height * wave).mean()))
     (still, error_still), (moved, error_moved) = found
     assert still > 30 * moved and error_still < 0.05 and error_moved < 0.1
+
+
+def test_the_jacobian_of_the_planes_is_that_of_finite_differences(model):
+    rng = np.random.default_rng(2)
+    layout = Layout(2, model.n_identity, model.n_expression, log_scale=1)
+    frames = Frames(np.stack([exponential(rng.normal(size=3)) for _ in range(2)]), 1.1)
+    points = spread_points(model, 40, 0)
+    basis = PointBasis(*(getattr(points.basis, n).astype(np.float64) for n in ("mean", "identity", "expression")))
+    normal = rng.normal(size=(2, 40, 3))
+    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+    touched, weight = 5.0 * rng.normal(size=(2, 40, 3)), rng.uniform(0.1, 1.0, (2, 40))
+    # without robustness the energy is a sum of squares, whose gradient is 2 J^T W r
+    term = PlaneTerm(basis, touched, normal, weight, np.inf)
+    x = 0.1 * rng.normal(size=layout.size)
+    equations = NormalEquations(layout)
+    term.accumulate(equations, layout, frames, x)
+    gradient = 2.0 * equations.system().gradient
+    for name in ("identity", "expression", "rotation", "translation", "log_scale"):
+        for i in range(*layout.at(name).indices(layout.size))[:4]:
+            step = np.zeros(layout.size)
+            step[i] = 1e-5
+            high, low = (term.energy(layout, frames, x + sign * step) for sign in (1, -1))
+            assert np.isclose(gradient[i], (high - low) / 2e-5, rtol=1e-4, atol=1e-4 * np.abs(gradient).max()), name
+
+
+def test_biased_landmarks_bend_the_shape_less(model, bumpy):
+    """Landmarks that are off the same way in every image: the surface that all views see sets them right."""
+    rng = np.random.default_rng(3)
+    offset = 4.0 * rng.normal(size=(68, 2))
+    biased = bumpy.changed(lambda name, t, frame: replace(frame, landmarks=frame.landmarks + offset))
+    start = fitted_to(model, biased)
+    assert landmarks_are_biased(start)
+    found = find_surface(biased, model, start, BOTH, geometry_config=QUICK)
+    assert off_mm(model, bumpy, found).mean() < 0.7 * off_mm(model, bumpy, start).mean()
