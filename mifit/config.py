@@ -96,8 +96,8 @@ class SurfaceConfig:
         most=WEIGHT,
     )
     refit: bool = flag(
-        True,
-        "where landmarks are biased, fit the model once more, to the surface found first, before the displacements",
+        False,
+        "where landmarks are biased, fit the model first to a rough surface that all views see",
     )
     finest: int = number(0, "times that the images are halved at the finest level", least=0, most=6)
 
