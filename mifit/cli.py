@@ -174,6 +174,21 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--count", type=_at_least(1), help="number of frames to keep")
     p.add_argument("--out", type=_path, required=True, help="capture folder to write")
 
+    p = add("calibrate", "cameras from a calibration board, or of an uncalibrated capture from the heads in it")
+    p.add_argument("capture", type=_path, nargs="?", help="uncalibrated capture; the cameras are written into it")
+    p.add_argument("--video", type=_path, action="append", default=[], help="one camera's video of the board; repeat")
+    p.add_argument("--images", type=_path, action="append", default=[], help="one camera's folder of images; repeat")
+    p.add_argument(
+        "--board",
+        help="charuco:9x6:30:22, chessboard:10x7:25 or apriltag:6x4:34:9: columns, rows and lengths in millimetres; "
+        "without videos and images it is written for printing",
+    )
+    p.add_argument("--units", default="cm", help="unit of length of the calibration: mm, cm or m (default: cm)")
+    p.add_argument("--model", default="builtin", help="of a capture: morphable model, a path or builtin (default)")
+    p.add_argument("--cameras", type=_names, help="of a capture: cameras that decide; default: the first two")
+    p.add_argument("--timesteps", type=_timesteps, help="of a capture: timesteps to use; default: the first four")
+    p.add_argument("--out", type=_path, help="of a board: folder to write")
+
     p = add("landmarks", "detect 68 landmarks in every image and write them into the capture")
     p.add_argument("capture", type=_path)
     p.add_argument("--detector", help="mediapipe, face-alignment or lbf:FOLDER; default: the first that is there")

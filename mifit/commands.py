@@ -200,6 +200,55 @@ def import_(arguments: Namespace) -> None:
     print(f"Capture: {arguments.out}")
 
 
+def calibrate(arguments: Namespace) -> None:
+    """Cameras from a board, or from the heads of an uncalibrated capture."""
+    if (arguments.capture is None) == (arguments.board is None):
+        raise InputError("expected one of CAPTURE and --board")
+    if arguments.capture is not None:
+        _calibrate_from_heads(arguments)
+        return
+    from mifit.capture.board_calibration import calibrate_boards, write_calibration
+    from mifit.capture.boards import Board
+    from mifit.capture.sources import open_sources
+
+    out: Path | None = arguments.out
+    board = Board.parse(arguments.board)
+    if out is None:
+        raise InputError("--board needs --out, the folder to write")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"--out {out}: is there already and not empty; name another folder")
+    if not arguments.video and not arguments.images:
+        for path in board.write(out):
+            print(f"Board: {path}")
+        print("Print it at 100 per cent, glue it onto something flat, and measure a square.")
+        return
+    calibration = calibrate_boards(
+        open_sources(arguments.video, arguments.images), board, arguments.units, console_progress(arguments.quiet)
+    )
+    write_calibration(calibration, out, arguments.units)
+    print(calibration.summary())
+    print(f"Calibration: {out}")
+
+
+def _calibrate_from_heads(arguments: Namespace) -> None:
+    import mifit
+    from mifit.capture.place import calibrate_others, write_cameras
+    from mifit.pipeline import calibrated, choose
+
+    capture = mifit.Capture.load(arguments.capture)
+    if capture.calibrated:
+        raise InputError(f"{arguments.capture}: is calibrated already; nothing to do")
+    cameras = choose("camera", capture.cameras, arguments.cameras, 2)
+    timesteps = choose("timestep", capture.timesteps, arguments.timesteps, 4)
+    capture = calibrated(capture, mifit.MorphableModel.load(arguments.model), cameras, timesteps)
+    found = calibrate_others(capture, cameras, timesteps)
+    write_cameras(arguments.capture, capture, [camera for camera, _ in found.values()])
+    for name, (camera, error) in found.items():
+        role = "decided" if name in cameras else "placed"
+        print(f"{name}: {role}, focal length {camera.fx:.0f} pixels, landmarks {error:.1f} pixels beside the others'")
+    print(f"Capture: {arguments.capture}; its scale is the model's, its cameras are estimates")
+
+
 def landmarks(arguments: Namespace) -> None:
     """Detect landmarks and write them into the capture."""
     from mifit.capture import detect_landmarks

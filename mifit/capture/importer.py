@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from mifit.capture.capture import Capture
 from mifit.capture.colmap import read_colmap
 from mifit.capture.landmark_files import read_landmarks, write_landmarks
-from mifit.capture.sources import ImageFiles, Source, Video, check_synchronous
+from mifit.capture.sources import ImageFiles, Source, check_synchronous, open_sources
 from mifit.capture.stereo import read_stereo
 from mifit.capture.transforms import UNITS_MM, Shot, Transforms, View, read_transforms, write_transforms
 from mifit.core.files import file_name, read_bytes, replacing_folder, write_bytes
@@ -103,10 +102,8 @@ def import_capture(
 def _sources(
     videos: Sequence[str | Path], images: Sequence[str | Path], colmap: str | Path | None, scene: Transforms | None
 ) -> list[Source]:
-    if videos:
-        return [Video.open(path, name) for path, name in _named([Path(v) for v in videos], stems=True)]
-    if images:
-        return [ImageFiles.folder(path, name) for path, name in _named([Path(v) for v in images], stems=False)]
+    if videos or images:
+        return open_sources(videos, images)
     if colmap is not None:
         return _colmap_sources(Path(colmap))
     if scene is not None:
@@ -115,17 +112,6 @@ def _sources(
             for view in scene.views
         ]
     raise InputError("nothing to import: expected videos, folders of images, a COLMAP model or a transforms.json")
-
-
-def _named(paths: list[Path], stems: bool) -> list[tuple[Path, str]]:
-    """Camera names: the files' stems (folders' names), or their parents' where those coincide."""
-    for names in (
-        [path.stem if stems else Path(os.path.abspath(path)).name for path in paths],
-        [Path(os.path.abspath(path)).parent.name for path in paths],
-    ):
-        if len(set(names)) == len(names) and all(names):
-            return list(zip(paths, names, strict=True))
-    raise InputError(f"found {', '.join(map(str, paths))}, expected files or folders with different names")
 
 
 def _colmap_sources(folder: Path) -> list[Source]:

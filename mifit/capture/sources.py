@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -129,6 +130,32 @@ def _reader(path: Path) -> Iterator[cv2.VideoCapture]:
         yield reader
     finally:
         reader.release()
+
+
+def open_sources(videos: Sequence[str | Path], images: Sequence[str | Path]) -> list[Source]:
+    """One camera for each video, or else for each folder of images, named after it.
+
+    Raises
+    ------
+    InputError
+        Both or none of them, a file or folder that can't be read, or names that don't tell the cameras apart.
+    """
+    if bool(videos) == bool(images):
+        raise InputError("expected videos or folders of images, one kind")
+    if videos:
+        return [Video.open(path, name) for path, name in _named([Path(v) for v in videos], stems=True)]
+    return [ImageFiles.folder(path, name) for path, name in _named([Path(v) for v in images], stems=False)]
+
+
+def _named(paths: list[Path], stems: bool) -> list[tuple[Path, str]]:
+    """Camera names: the files' stems (folders' names), or their parents' where those coincide."""
+    for names in (
+        [path.stem if stems else Path(os.path.abspath(path)).name for path in paths],
+        [Path(os.path.abspath(path)).parent.name for path in paths],
+    ):
+        if len(set(names)) == len(names) and all(names):
+            return list(zip(paths, names, strict=True))
+    raise InputError(f"found {', '.join(map(str, paths))}, expected files or folders with different names")
 
 
 def check_synchronous(sources: Sequence[Source]) -> None:

@@ -1,0 +1,238 @@
+"""Calibration boards: ChArUco, chessboard and AprilTag grid, printed and found in images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.files import replacing
+from mifit.errors import InputError
+
+FORMS = "charuco:COLUMNSxROWS:SQUARE:MARKER, chessboard:COLUMNSxROWS:SQUARE or apriltag:COLUMNSxROWS:TAG:GAP"
+DICTIONARIES = {"charuco": "DICT_5X5_250", "apriltag": "DICT_APRILTAG_36h11"}
+PRINT_DPI = 300
+
+
+@dataclass(frozen=True)
+class BoardPoints:
+    """Points of a board in one image.
+
+    Attributes
+    ----------
+    ids : (N,) int
+        Which points of the board, ascending.
+    pixels : (N, 2) float64
+        Where they are, the first pixel's centre at (0.5, 0.5).
+    """
+
+    ids: NDArray[np.int64]
+    pixels: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat board with points that can be told apart.
+
+    Attributes
+    ----------
+    kind : str
+        ``charuco``, ``chessboard`` or ``apriltag``.
+    columns, rows : int
+        Squares of the first two, tags of the third.
+    size, other : float
+        Millimetres: side of a square and of the marker in it; side of a tag and the gap between two.
+    dictionary : str
+        OpenCV's name of the set of markers; empty for a chessboard.
+    """
+
+    kind: str
+    columns: int
+    rows: int
+    size: float
+    other: float = 0.0
+    dictionary: str = ""
+
+    @classmethod
+    def parse(cls, text: str) -> Board:
+        """Read ``charuco:9x6:30:22``, ``chessboard:10x7:25``, ``apriltag:6x6:24:7``, a dictionary's name behind it.
+
+        Raises
+        ------
+        InputError
+            Another form, or sizes that no board has.
+        """
+        kind, *rest = text.split(":")
+        counts = {"charuco": 2, "chessboard": 1, "apriltag": 2}
+        form = f"--board: found {text[:80]!r}, expected {FORMS}, lengths in millimetres"
+        if kind not in counts or not counts[kind] < len(rest) + (kind == "chessboard") - 0 <= counts[kind] + 2:
+            raise InputError(form)
+        try:
+            columns, rows = (int(n) for n in rest[0].split("x"))
+            size, *others = (float(n) for n in rest[1 : 1 + counts[kind]])
+        except ValueError:
+            raise InputError(form) from None
+        other = others[0] if others else 0.0
+        names = rest[1 + counts[kind] :]
+        name = names[0] if names else DICTIONARIES.get(kind, "")
+        least = 1 if kind == "apriltag" else 3
+        if not (least <= columns <= 50 and least <= rows <= 50 and 0.1 <= size <= 10_000):
+            raise InputError(f"{form}; {least} to 50 columns and rows")
+        if (kind == "charuco" and not 0 < other < size) or (kind == "apriltag" and not 0 < other <= 10 * size):
+            raise InputError(f"{form}; a marker smaller than its square, a gap above 0")
+        if name and (kind == "chessboard" or not (name.startswith("DICT_") and hasattr(cv2.aruco, name))):
+            raise InputError(
+                f"--board: found dictionary {name[:40]!r}, expected a name of OpenCV's such as DICT_5X5_250"
+            )
+        board = cls(kind, columns, rows, size, other, name)
+        try:
+            board._aruco  # noqa: B018 - OpenCV refuses what doesn't go together
+        except cv2.error:
+            raise InputError(f"--board {text}: needs more markers than dictionary {name} has") from None
+        return board
+
+    @cached_property
+    def _aruco(self) -> Any:
+        if self.kind == "chessboard":
+            return None
+        markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        needed = self.columns * self.rows if self.kind == "apriltag" else self.columns * self.rows // 2
+        if needed > len(markers.bytesList):
+            raise cv2.error(f"{needed} markers")
+        shape = (self.columns, self.rows)
+        if self.kind == "apriltag":
+            return cv2.aruco.GridBoard(shape, self.size, self.other, markers)
+        return cv2.aruco.CharucoBoard(shape, self.size, self.other, markers)
+
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """(P, 3) points in millimetres by their ids, z = 0."""
+        if self.kind == "charuco":
+            return np.asarray(self._aruco.getChessboardCorners(), dtype=np.float64)
+        if self.kind == "apriltag":
+            return np.concatenate([np.asarray(p, dtype=np.float64) for p in self._aruco.getObjPoints()])
+        x, y = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
+        return self.size * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height of the pattern in millimetres."""
+        if self.kind == "apriltag":
+            return tuple(n * self.size + (n - 1) * self.other for n in (self.columns, self.rows))  # type: ignore[return-value]
+        return self.columns * self.size, self.rows * self.size
+
+    @property
+    def turns_into_itself(self) -> bool:
+        """Whether a half turn changes nothing, so that two cameras may see it differently."""
+        return self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0
+
+    def image(self, pixels_per_mm: float) -> NDArray[np.uint8]:
+        """The pattern without a margin, 8-bit grey."""
+        width, height = (round(side * pixels_per_mm) for side in self.extent)
+        if self.kind == "chessboard":
+            x = (np.arange(width) / width * self.columns).astype(int)
+            y = (np.arange(height) / height * self.rows).astype(int)
+            return np.where((x[None] + y[:, None]) % 2 == 0, 0, 255).astype(np.uint8)
+        return np.asarray(self._aruco.generateImage((width, height), marginSize=0, borderBits=1))
+
+    def write(self, folder: Path) -> list[Path]:
+        """Write ``board.png`` and ``board.pdf`` to print at 100 per cent, with a white margin of 10 mm."""
+        from PIL import Image as Pillow
+
+        scale = PRINT_DPI / 25.4
+        page = np.pad(self.image(scale), round(10 * scale), constant_values=255)
+        paths = [folder / "board.png", folder / "board.pdf"]
+        for path in paths:
+            with replacing(path) as temporary:
+                options = {"dpi": (PRINT_DPI, PRINT_DPI)} if path.suffix == ".png" else {"resolution": PRINT_DPI}
+                Pillow.fromarray(page).save(temporary, **options)
+        return paths
+
+    def find(self, grey: NDArray[np.uint8]) -> BoardPoints:
+        """Points of the board in an 8-bit grey image (H, W); none when it isn't seen."""
+        find = {"charuco": self._find_charuco, "apriltag": self._find_tags, "chessboard": self._find_chessboard}
+        ids, pixels = find[self.kind](grey)
+        order = np.argsort(ids)
+        return BoardPoints(ids[order], pixels[order] + 0.5)
+
+    def _find_charuco(self, grey: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+        corners, ids, *_ = cv2.aruco.CharucoDetector(self._aruco, detectorParams=parameters).detectBoard(grey)
+        if ids is None or len(ids) == 0:
+            return _NONE
+        pixels = corners.reshape(-1, 1, 2).astype(np.float32)
+        window = int(np.clip(0.2 * _spacing(pixels.reshape(-1, 2)), 2, 8))
+        criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
+        pixels = cv2.cornerSubPix(grey, pixels, (window, window), (-1, -1), criteria)
+        return ids.ravel().astype(np.int64), pixels.reshape(-1, 2).astype(np.float64)
+
+    def _find_tags(self, grey: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
+        corners, tags, _ = cv2.aruco.ArucoDetector(self._aruco.getDictionary(), parameters).detectMarkers(grey)
+        known = {int(tag): i for i, tag in enumerate(self._aruco.getIds())}
+        seen = [
+            (known[int(t)], c.reshape(4, 2))
+            for c, t in zip(corners, () if tags is None else tags.ravel(), strict=True)
+            if int(t) in known
+        ]
+        if not seen:
+            return _NONE
+        ids = np.concatenate([4 * i + np.arange(4) for i, _ in seen])
+        return ids, np.concatenate([c for _, c in seen]).astype(np.float64)
+
+    def _find_chessboard(self, grey: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
+        shape = (self.columns - 1, self.rows - 1)
+        ok, corners = cv2.findChessboardCornersSB(
+            grey, shape, flags=cv2.CALIB_CB_NORMALIZE_IMAGE + cv2.CALIB_CB_ACCURACY
+        )
+        if not ok:
+            return _NONE
+        pixels = corners.reshape(shape[1], shape[0], 2).astype(np.float64)
+        across, down = pixels[0, -1] - pixels[0, 0], pixels[-1, 0] - pixels[0, 0]
+        if across[0] * down[1] - across[1] * down[0] < 0:  # seen from its front, rows go down where columns go right
+            pixels = pixels[:, ::-1]
+        if not self.turns_into_itself and _first_square(grey, pixels) > _first_square(grey, pixels[::-1, ::-1]):
+            pixels = pixels[::-1, ::-1]  # the square at the first corner is black
+        return np.arange(shape[0] * shape[1]), pixels.reshape(-1, 2)
+
+
+_NONE = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+
+
+def _spacing(pixels: NDArray) -> float:
+    """Median distance of a point to its nearest neighbour."""
+    if len(pixels) < 2:
+        return 10.0
+    distance = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
+    np.fill_diagonal(distance, np.inf)
+    return float(np.median(distance.min(axis=1)))
+
+
+def _first_square(grey: NDArray[np.uint8], pixels: NDArray) -> float:
+    """Brightness of the square beyond the first inner corner."""
+    centre = pixels[0, 0] - 0.5 * ((pixels[0, 1] - pixels[0, 0]) + (pixels[1, 0] - pixels[0, 0]))
+    x, y = np.clip(np.round(centre).astype(int), 0, np.array(grey.shape[::-1]) - 1)
+    return float(grey[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].mean())
+
+
+def edge_width(grey: NDArray[np.uint8], found: BoardPoints) -> float:
+    """Width of the edges at a board's points in pixels: contrast over steepest slope, the median of all points."""
+    image = grey.astype(np.float32)
+    slope = np.hypot(cv2.Sobel(image, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(image, cv2.CV_32F, 0, 1, scale=1 / 8))
+    reach = int(np.clip(0.35 * _spacing(found.pixels), 3, 25))
+    widths = []
+    for x, y in np.round(found.pixels - 0.5).astype(int):
+        window = (slice(max(y - reach, 0), y + reach + 1), slice(max(x - reach, 0), x + reach + 1))
+        low, high = np.percentile(image[window], (5, 95)) if image[window].size else (0, 0)
+        widths.append((high - low) / max(float(slope[window].max()), 1e-3) if image[window].size else np.inf)
+    return float(np.median(widths))

@@ -1,0 +1,162 @@
+"""Cameras of an uncalibrated capture that took no part in its calibration: placed by their landmarks, and all written.
+
+The cameras that decide (`mifit.capture.calibrate`) give every landmark a place in space; another camera is the one that
+sees them where its own landmarks are. So a held-out camera moves none of the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from mifit.capture.capture import Capture
+from mifit.capture.landmark_files import COUNT, MIN_VISIBLE
+from mifit.capture.transforms import update_frames
+from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
+from mifit.errors import InputError
+
+JAW = 17
+"""The first landmarks lie on the jaw's outline, which slides over the head as it turns: they count less."""
+JAW_WEIGHT = 0.3
+NOISE = 0.004
+"""Standard deviation of a landmark as a part of the image's longer side."""
+FOCAL_DEVIATION = 0.02, 0.5
+"""Deviation of the logarithm of an unknown focal length from the others', for images of their size and not."""
+
+
+def landmark_places(
+    capture: Capture, cameras: Sequence[str], timesteps: Sequence[int]
+) -> dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Landmarks in world space by timestep, as (indices, points (N, 3)): those that two of the cameras see."""
+    found = {}
+    for timestep in timesteps:
+        rows = np.zeros((COUNT, 4, 4))
+        count = np.zeros(COUNT, dtype=int)
+        for name in cameras:
+            marks, camera = capture.landmarks(name, timestep), capture.camera(name)
+            if marks is None:
+                continue
+            projection = camera.matrix @ camera.world_to_camera[:3]
+            for axis in (0, 1):
+                line = marks.points[:, axis, None] * projection[2] - projection[axis]
+                line = line / np.linalg.norm(line[:, :3], axis=1, keepdims=True) * marks.visible[:, None]
+                rows += line[:, :, None] * line[:, None, :]
+            count += marks.visible
+        seen = np.flatnonzero(count >= 2)
+        if len(seen) >= MIN_VISIBLE:
+            points = np.linalg.solve(rows[seen, :3, :3], -rows[seen, :3, 3:])[..., 0]
+            found[timestep] = seen, points
+    return found
+
+
+def place_camera(
+    capture: Capture,
+    name: str,
+    places: dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]],
+    focal: float,
+    same: bool,
+) -> tuple[Camera, float]:
+    """The camera that sees landmarks of known places where its own are, and its root-mean-square error in pixels.
+
+    Parameters
+    ----------
+    capture : Capture
+    name : str
+    places : dict
+        From `landmark_places`.
+    focal : float
+        Expected focal length in multiples of the image's longer side, where the capture gives none.
+    same : bool
+        Whether its images have the size of those that ``focal`` is from.
+
+    Raises
+    ------
+    InputError
+        Too few of its landmarks are visible.
+    """
+    view = capture.views[name]
+    side = max(view.width, view.height)
+    points, pixels, weights = [], [], []
+    for timestep, (seen, world) in places.items():
+        marks = capture.landmarks(name, timestep)
+        if marks is not None:
+            both = marks.visible[seen]
+            points.append(world[both])
+            pixels.append(marks.points[seen[both]])
+            weights.append(np.where(seen[both] < JAW, JAW_WEIGHT, 1.0))
+    if sum(map(len, points)) < MIN_VISIBLE:
+        raise InputError(
+            f"camera {name!r}: found fewer than {MIN_VISIBLE} landmarks that the others see too, expected enough to "
+            "place it; run mifit landmarks, or leave the camera uncalibrated with --cameras"
+        )
+    world, where, weight = np.concatenate(points), np.concatenate(pixels), np.concatenate(weights)
+    fx, fy, cx, cy = view.intrinsics or (focal * side, focal * side, view.width / 2, view.height / 2)
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    found, turn, shift = cv2.solvePnP(world, where, matrix, np.zeros(4), flags=cv2.SOLVEPNP_SQPNP)
+    if not found:
+        raise InputError(f"camera {name!r}: no place explains its landmarks; check their order (iBUG-68)")
+
+    def project(x: NDArray) -> NDArray:
+        p = world @ Rotation.from_rotvec(x[:3]).as_matrix().T + x[3:6]
+        zoom = np.exp(x[6]) if view.intrinsics is None else 1.0
+        return zoom * np.array((fx, fy)) * p[:, :2] / np.maximum(p[:, 2:], 1e-6) + (cx, cy)
+
+    def residuals(x: NDArray) -> NDArray:
+        error = (project(x) - where) * (weight / (NOISE * side))[:, None]
+        return np.append(error.ravel(), x[6] / FOCAL_DEVIATION[not same])
+
+    start = np.concatenate([turn.ravel(), shift.ravel(), [0.0]])
+    x = least_squares(residuals, start, loss="soft_l1", x_scale="jac", max_nfev=200).x
+    zoom = float(np.exp(x[6])) if view.intrinsics is None else 1.0
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(x[:3]).as_matrix(), x[3:6]
+    error = float(np.sqrt(np.mean(np.sum((project(x) - where)[weight == 1.0] ** 2, axis=1))))
+    return Camera(name, view.width, view.height, zoom * fx, zoom * fy, cx, cy, pose), error
+
+
+def calibrate_others(
+    capture: Capture, decided: Sequence[str], timesteps: Sequence[int]
+) -> dict[str, tuple[Camera, float]]:
+    """All cameras of a capture whose ``decided`` ones are estimated, each with its error in pixels.
+
+    Raises
+    ------
+    InputError
+        A single camera has decided, which gives nothing a place; or a camera can't be placed.
+    """
+    places = landmark_places(capture, decided, timesteps)
+    others = [name for name in capture.cameras if name not in decided]
+    if others and not places:
+        raise InputError(
+            f"{capture.path}: {', '.join(decided)} give no landmark a place in space; expected two cameras"
+        )
+    sides = {name: max(capture.views[name].width, capture.views[name].height) for name in capture.cameras}
+    focal = float(np.median([capture.camera(name).fx / sides[name] for name in decided]))
+    sizes = {(capture.views[name].width, capture.views[name].height) for name in decided}
+    found = {}
+    for name in capture.cameras:
+        camera, error = place_camera(
+            capture, name, places, focal, (capture.views[name].width, capture.views[name].height) in sizes
+        )
+        found[name] = (capture.camera(name) if name in decided else camera), error
+    return found
+
+
+def write_cameras(path: str | Path, capture: Capture, cameras: Sequence[Camera]) -> None:
+    """Write intrinsics and poses into the entries of a capture's ``transforms.json``; all else in it stays."""
+    by_name = {camera.name: camera for camera in cameras}
+    changes: dict[tuple[str, int], dict[str, Any]] = {}
+    for key in capture.shots:
+        camera = by_name[key[0]]
+        inverse = np.linalg.inv(camera.world_to_camera) @ OPENGL_FROM_OPENCV
+        numbers = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+        changes[key] = {k: float(v) for k, v in numbers.items()} | {"transform_matrix": inverse.tolist()}
+    file = Path(path) if Path(path).is_file() else Path(path) / "transforms.json"
+    update_frames(file, changes)
