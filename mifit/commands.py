@@ -437,11 +437,19 @@ def view(arguments: Namespace) -> None:
 def relight(arguments: Namespace) -> None:
     """Write views under another environment."""
     result = _result_and_variant(arguments)
-    from mifit.output.relight import write_relit
+    from mifit.output.relight import AGREEMENT, write_relit
     from mifit.output.sequence import write_sequence
 
     progress = console_progress(arguments.quiet)
-    write_relit(result, arguments.env, arguments.out, rotate=arguments.rotate, seed=arguments.seed, progress=progress)
+    found = write_relit(
+        result, arguments.env, arguments.out, rotate=arguments.rotate, seed=arguments.seed, progress=progress
+    )
+    print(f"Fast against path-traced views: {found['psnr']:.1f} dB")
+    if found["psnr"] < AGREEMENT:
+        print(
+            f"mifit: warning: fast and path-traced views agree to less than {AGREEMENT:g} dB; use the latter",
+            file=sys.stderr,
+        )
     if arguments.sequence:
         lit = result.relight(arguments.env, rotate=arguments.rotate)
         write_sequence(lit, arguments.out / "sequence.mp4", fps=arguments.fps, progress=progress)

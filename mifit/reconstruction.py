@@ -218,8 +218,9 @@ class Reconstruction(Result):
         Returns
         -------
         Reconstruction, or a list of one for each of ``rotations``
-            The same face; its `render` uses the environment's spherical harmonics (``local``), or all of it
-            (``path``). The ambient term grows with the mean radiance, but for `Illumination`, which has its own.
+            The same face; its `render` uses all of the environment, without tracing paths (``local``,
+            `appearance.environment`) or with (``path``).
+            The ambient term grows with the mean radiance, but for `Illumination`, which has its own.
 
         Raises
         ------

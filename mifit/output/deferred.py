@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.environment import EnvironmentLight
 from mifit.appearance.formation import Appearance, form_image
 from mifit.appearance.occlusion import MeshPoints, OccludingMesh
 from mifit.core.camera import Camera
@@ -174,13 +175,31 @@ def shade_methods(
         base = _mesh_normals(reconstruction, surface, timestep)
         appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: _look_up(model, surface, m)))
         points = MeshPoints(surface.points, base, surface.face, surface.weights)
-        occlusion = appearance.trace(OccludingMesh(SurfaceScene(vertices, model.faces)), points)
-        shaded = appearance.shade_bent(material.normal, base, surface.view, occlusion, surface.points)
+        scene = SurfaceScene(vertices, model.faces)
+        if reconstruction.environment is not None and appearance.lobe.fresnel is not None:
+            turn = reconstruction.environment_rotation
+            light = EnvironmentLight(reconstruction.environment, np.eye(3) if turn is None else turn)
+            albedo = _vertex_albedo(reconstruction)
+            shaded = light.shade(scene, points, material.normal, surface.view, appearance.lobe, albedo)
+        else:
+            occlusion = appearance.trace(OccludingMesh(scene), points)
+            shaded = appearance.shade_bent(material.normal, base, surface.view, occlusion, surface.points)
         ambient = np.float32(reflectance.illumination.ambient)
         for method in finer:
             specular = material.specular[:, None] if method == "full" else np.float32(0.0)
             out[method] = surface.image(form_image(ambient, material.diffuse, shaded[0], specular, shaded[1]))
     return {m: out[m] for m in methods}
+
+
+def _vertex_albedo(reconstruction: Result) -> NDArray[np.float32]:
+    """(V, 3) diffuse albedo at the vertices: the map's in the face area, the fitted model's elsewhere."""
+    model, reflectance = reconstruction.model, reconstruction.reflectance
+    assert reflectance is not None
+    albedo = np.clip(reconstruction.geometry.vertex_albedo, 0.0, 1.0).astype(np.float32)
+    inside = model.face_mask
+    uv = model.uv[model.faces_uv[inside].ravel()]
+    albedo[model.faces[inside].ravel()] = sample_map(reflectance.diffuse, uv)
+    return albedo
 
 
 def _look_up(model: MorphableModel, surface: VisibleSurface, image: NDArray) -> NDArray:

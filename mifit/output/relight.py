@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from mifit.core.camera import Camera
     from mifit.result import Method, Result
 
+AGREEMENT = 30.0
+"""PSNR in dB between fast and path-traced views below which a person is warned. Five measured environments gave 31.6 to
+36.9 dB on a fitted head, the least under a bare lamp at 256 samples a pixel."""
 MAP_ROWS = 512
 """Rows to which an environment is reduced; finer light than 0.35 degrees makes no difference on skin."""
 
@@ -117,7 +120,8 @@ def write_relit(
     """Write views under a measured environment: the fast path, the path-traced one, and their difference.
 
     The first timestep is shown from every fitted camera. ``NAME_fast.png`` shades the visible surface under the
-    environment's spherical harmonics; ``NAME_path.png`` traces paths under the whole environment, with shadows and
+    environment without tracing paths (``appearance.environment``); ``NAME_path.png``
+    traces paths under the whole environment, with shadows and
     interreflection; ``NAME_difference.png`` is the error between them; ``relight.png`` shows all in rows, and
     ``relight.json`` holds exposure and figures.
 

@@ -1,0 +1,361 @@
+"""A face under a whole environment map: nothing is band limited, so nothing rings and nothing is negative.
+
+What is far brighter than the mean, such as the sun or a lamp, becomes a few dozen distant lights, whose cosine, lobe
+and shadows each point has of its own. The rest is soft:
+
+*Diffuse*: the environment is cut into regions of equal power (median cut, Debevec 2005), each a distant light with the
+region's whole radiance. Their shadows are traced from the mesh's vertices, and light that the mesh throws on itself is
+gathered there, so this is paid for once per mesh and light; points interpolate it.
+
+*Specular*: a few directions of each point's lobe look up the environment blurred to the spacing of the directions
+(filtered importance sampling, Křivánek and Colbert 2008). A direction that the mesh blocks shows the mesh.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.appearance.arrays import aligned, on_device, stored
+from mifit.appearance.kernels import fresnel_factor, light_transfer, normalization, prepare_exponent
+from mifit.appearance.lobe import Lobe
+from mifit.core.mesh import interpolate, vertex_normals
+from mifit.core.sh import LUMINANCE, latlong_directions, latlong_solid_angles
+
+if TYPE_CHECKING:
+    from mifit.appearance.occlusion import MeshPoints
+    from mifit.render.gbuffer import SurfaceScene
+
+REGIONS, LAMPS = 256, 32
+"""Lights that the soft part is cut into, and the bright one."""
+BRIGHT = 8.0
+"""Radiance over its mean from which light counts as bright."""
+BOUNCES = 2
+GATHERS = 64
+"""Directions in which a vertex looks for light from the mesh."""
+LOOKS = 16
+"""Directions of the lobe."""
+ROWS = 128
+"""Rows of the environment that the lobe looks at."""
+OFFSET = 1e-3
+"""Distance by which rays start off the surface, relative to the mesh's diagonal."""
+
+
+def cut(image: NDArray, count: int = REGIONS) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Cut a lat-long environment into regions of equal power.
+
+    Parameters
+    ----------
+    image : (H, W, 3)
+        Linear radiance, not negative; axes of ``core.sh.latlong_directions``.
+    count : int
+        Regions at the most; there are fewer where all are single pixels.
+
+    Returns
+    -------
+    directions : (R, 3)
+        Unit, towards the middle of each region's power.
+    power : (R, 3)
+        Radiance times solid angle.
+    """
+    height, width = image.shape[:2]
+    angles = np.broadcast_to(np.reshape(latlong_solid_angles(height, width), (height, -1)), (height, width))
+    colour = image.astype(np.float64) * angles[..., None]
+    weight = colour @ LUMINANCE + 1e-9 * float((colour @ LUMINANCE).mean())
+    sums = np.pad(weight.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+
+    def entry(top: int, bottom: int, left: int, right: int) -> tuple[float, int, int, int, int]:
+        inside = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+        whole = bottom - top == 1 and right - left == 1  # a single pixel can't be cut
+        return (np.inf if whole else -float(inside), top, bottom, left, right)
+
+    regions = [entry(0, height, 0, width)]
+    while len(regions) < count and regions[0][0] < 0:  # the most powerful region that can be cut
+        _, top, bottom, left, right = heapq.heappop(regions)
+        tall, wide = bottom - top, (right - left) * np.cos(np.pi * (0.5 * (top + bottom) / height - 0.5))
+        if right - left > 1 and (wide >= tall or tall == 1):
+            middle = left + _halfway(sums[bottom, left : right + 1] - sums[top, left : right + 1])
+            halves = entry(top, bottom, left, middle), entry(top, bottom, middle, right)
+        else:
+            middle = top + _halfway(sums[top : bottom + 1, right] - sums[top : bottom + 1, left])
+            halves = entry(top, middle, left, right), entry(middle, bottom, left, right)
+        for half in halves:
+            heapq.heappush(regions, half)
+    toward = latlong_directions(height, width)
+    directions, power = np.empty((len(regions), 3)), np.empty((len(regions), 3))
+    for i, (_, top, bottom, left, right) in enumerate(regions):
+        part = np.s_[top:bottom, left:right]
+        mean = np.tensordot(weight[part], toward[part], axes=2)
+        directions[i] = mean / max(float(np.linalg.norm(mean)), 1e-300)
+        power[i] = colour[part].sum((0, 1))
+    return directions, power
+
+
+def _halfway(along: NDArray) -> int:
+    """Where a cumulative sum is nearest to half of its range, neither first nor last."""
+    target = 0.5 * (along[0] + along[-1])
+    return int(np.clip(np.abs(along - target).argmin(), 1, len(along) - 2))
+
+
+@dataclass(frozen=True)
+class EnvironmentLight:
+    """A lat-long environment turned by a rotation: what came from d comes from R d.
+
+    Attributes
+    ----------
+    image : (H, W, 3)
+        Linear radiance.
+    rotation : (3, 3)
+    """
+
+    image: NDArray[np.float32]
+    rotation: NDArray[np.float64]
+
+    def parts(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The soft and the bright part of the image; they add up to it."""
+        height, width = self.image.shape[:2]
+        luminance = self.image @ LUMINANCE
+        mean = float((luminance.mean(1) * np.ravel(latlong_solid_angles(height, width))).sum()) * width / (4.0 * np.pi)
+        share = np.minimum(1.0, BRIGHT * mean / np.maximum(luminance, 1e-30))[..., None]
+        soft = (self.image * share).astype(np.float32)
+        return soft, self.image - soft
+
+    def at_vertices(self, scene: SurfaceScene, albedo: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(V, 3) irradiance at a mesh's vertices with its own shadows and what it throws on itself.
+
+        Parameters
+        ----------
+        scene : SurfaceScene
+        albedo : (V, 3)
+            Of the vertices.
+
+        Returns
+        -------
+        soft, whole : (V, 3)
+            Without and with what comes from the bright part directly.
+        """
+        vertices = np.asarray(scene.vertices, dtype=np.float64)
+        normals = vertex_normals(vertices, scene.faces)
+        soft, lamps = self.parts()
+        shaded = self._direct(scene, vertices, normals, soft, REGIONS)
+        direct = shaded + self._direct(scene, vertices, normals, lamps, LAMPS)
+        bounced = np.zeros_like(direct)
+        for _ in range(BOUNCES):
+            bounced = _gathered(scene, vertices, normals, (direct + bounced) * albedo / np.float32(np.pi))
+        return shaded + bounced, direct + bounced
+
+    def _direct(
+        self, scene: SurfaceScene, points: NDArray, normals: NDArray, image: NDArray, count: int
+    ) -> NDArray[np.float32]:
+        directions, power = self._lights(image, count)
+        out = np.zeros((len(points), 3), np.float32)
+        for start in range(0, len(directions), 32):
+            part = directions[start : start + 32]
+            bits = scene.open_towards(points, normals, part)
+            seen = (bits[:, None] >> np.arange(len(part), dtype=np.uint32)) & 1
+            out += ((np.maximum(normals @ part.T, 0.0) * seen) @ power[start : start + 32]).astype(np.float32)
+        return out
+
+    def _lights(self, image: NDArray, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """World directions and powers that stand for a part of the image; none for a black one."""
+        if not image.any():
+            return np.zeros((0, 3)), np.zeros((0, 3))
+        directions, power = cut(image, count)
+        return directions @ self.rotation.T, power
+
+    def lamps(
+        self, scene: SurfaceScene, points: MeshPoints, normals: NDArray, view: NDArray, lobe: Lobe
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Diffuse and specular radiance (N, 3) at unit albedo from the bright part; parameters as in `shade`."""
+        import drjit as dr
+        import mitsuba as mi
+
+        directions, power = self._lights(self.parts()[1], LAMPS)
+        count = len(normals)
+        if not len(directions) or not count:
+            return np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
+        bits = mi.UInt(scene.open_towards(points.position, points.normal, directions))
+        n, v = (on_device(mi.Vector3f, x) for x in (normals, view))
+        exponent = mi.Float(aligned(np.broadcast_to(np.asarray(lobe.exponent, np.float32), (count,))))
+        prepared = prepare_exponent(exponent, 1, lobe.normalized, lobe.fresnel)
+        toward = [mi.Vector3f(*map(float, d)) for d in directions]
+        colours = [mi.Color3f(*map(float, c)) for c in power]
+        dr.make_opaque(toward, colours)
+        matt, glossy = mi.Color3f(0.0), mi.Color3f(0.0)
+        for number, (d, colour) in enumerate(zip(toward, colours, strict=True)):
+            diffuse, specular = light_transfer(n, v, prepared, [d], 1.0, (bits >> number) & 1)
+            matt, glossy = matt + diffuse * colour, glossy + specular * colour
+        both = stored([matt.x, matt.y, matt.z, glossy.x, glossy.y, glossy.z], count)
+        return both[:, :3], both[:, 3:]
+
+    def unshadowed(self, normals: NDArray) -> NDArray[np.float32]:
+        """(N, 3) irradiance at normals (N, 3) that see all of the soft part."""
+        rows = 32
+        small = cv2.resize(self.parts()[0], (2 * rows, rows), interpolation=cv2.INTER_AREA).astype(np.float64)
+        angles = np.reshape(latlong_solid_angles(rows, 2 * rows), (rows, -1))
+        power = (small * angles[..., None]).reshape(-1, 3)
+        toward = latlong_directions(rows, 2 * rows).reshape(-1, 3)
+        table = np.maximum(toward @ toward.T, 0.0) @ power  # normals on the same grid
+        return _look(table.reshape(rows, 2 * rows, 3).astype(np.float32), normals @ self.rotation)
+
+    def specular(
+        self, scene: SurfaceScene, points: MeshPoints, normals: NDArray, view: NDArray, lobe: Lobe, radiosity: NDArray
+    ) -> NDArray[np.float32]:
+        """(N, 3) specular radiance at unit specular albedo from the soft part.
+
+        Parameters
+        ----------
+        scene : SurfaceScene
+        points : MeshPoints
+        normals, view : (N, 3)
+            Unit; the normals may be bent away from the mesh's.
+        lobe : Lobe
+            With a Fresnel factor: the lobe about the mirror direction.
+        radiosity : (V, 3)
+            Radiance that the mesh's vertices reflect, seen where it blocks the environment.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        count = len(normals)
+        if not count:
+            return np.zeros((0, 3), np.float32)
+        spacing = 8.0 * np.pi / ((lobe.typical + 2.0) * LOOKS)  # solid angle of a look at the lobe's peak
+        table = mi.Texture2f(
+            mi.TensorXf(blurred(self.parts()[0], spacing)),
+            wrap_mode=dr.WrapMode.Repeat,
+            filter_mode=dr.FilterMode.Linear,
+        )
+        n, v, base = (on_device(mi.Vector3f, x) for x in (normals, view, points.normal))
+        exponent = mi.Float(aligned(np.broadcast_to(np.asarray(lobe.exponent, np.float32), (count,))))
+        origin = on_device(mi.Point3f, points.position) + OFFSET * _diagonal(scene) * base
+        cosine = dr.dot(n, v)
+        mirror = dr.normalize(2.0 * cosine * n - v)
+        frame = mi.Frame3f(mirror)
+        peak = normalization(exponent) if lobe.normalized else mi.Float(1.0 / np.pi)
+        back = [[float(x) for x in row] for row in self.rotation.T]
+        colours, indices = mi.Float(aligned(radiosity).ravel()), mi.UInt(aligned(scene.faces, np.uint32).ravel())
+        total = mi.Color3f(0.0)
+        for k in range(LOOKS):
+            # The density ((1 + c) / 2)^(m / 2) about the mirror direction, inverted; a golden spiral around it.
+            c = 2.0 * dr.power((k + 0.5) / LOOKS, 2.0 / (exponent + 2.0)) - 1.0
+            turn = k * float(np.pi * (3.0 - np.sqrt(5.0)))
+            sine = dr.safe_sqrt(1.0 - c * c)
+            d = frame.to_world(mi.Vector3f(sine * float(np.cos(turn)), sine * float(np.sin(turn)), c))
+            above = (dr.dot(d, base) > 0.0) & (c > 0.0)
+            hit = scene.rays.ray_intersect_preliminary(mi.Ray3f(origin, d), active=above)
+            blocked = above & hit.is_valid()
+            local = mi.Vector3f(*(row[0] * d.x + row[1] * d.y + row[2] * d.z for row in back))
+            sky = mi.Color3f(table.eval(_coordinates(local), above)[:3])
+            seen = dr.select(blocked, _interpolated(hit, indices, colours, blocked), sky)
+            total += dr.select(above, seen * dr.maximum(c, 0.0), 0.0)
+        scale = peak * (8.0 * np.pi) / ((exponent + 2.0) * LOOKS)
+        if lobe.fresnel is not None:
+            scale = scale * fresnel_factor(cosine, lobe.fresnel)
+        total *= scale
+        return stored([total.x, total.y, total.z], count)
+
+    def shade(
+        self, scene: SurfaceScene, points: MeshPoints, normals: NDArray, view: NDArray, lobe: Lobe, albedo: NDArray
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Diffuse and specular radiance (N, 3) of points at unit albedo; ``albedo`` (V, 3) is that of the vertices.
+
+        Shadows belong to the mesh; bent normals change what an open surface would receive.
+        """
+        soft, whole = self.at_vertices(scene, albedo)
+        diffuse = interpolate(soft, scene.faces, points.face, points.barycentric) / np.float32(np.pi)
+        bend = self.unshadowed(normals) / np.maximum(self.unshadowed(points.normal), 1e-12)
+        specular = self.specular(scene, points, normals, view, lobe, whole * albedo / np.float32(np.pi))
+        matt, glossy = self.lamps(scene, points, normals, view, lobe)
+        return (diffuse * bend + matt).astype(np.float32), specular + glossy
+
+
+def blurred(image: NDArray, solid_angle: float) -> NDArray[np.float32]:
+    """The environment at `ROWS` rows, each pixel the mean over a round spot of a solid angle."""
+    rows = ROWS
+    small = cv2.resize(image, (2 * rows, rows), interpolation=cv2.INTER_AREA).astype(np.float32)
+    angles = np.reshape(latlong_solid_angles(rows, 2 * rows), (rows, -1))[:, 0]
+    deviation = np.sqrt(solid_angle / (4.0 * np.pi))  # of a Gaussian with that equivalent area, radians
+    pixel = np.pi / rows
+    # Along the rows at their own scale, then across; weights by solid angle keep the poles from counting twice.
+    out = np.empty_like(small)
+    for row in range(rows):
+        sine = max(np.sin(np.pi * (row + 0.5) / rows), 0.5 * pixel)
+        frequency = np.fft.rfftfreq(2 * rows) * 2.0 * np.pi
+        damp = np.exp(-0.5 * (min(deviation / (pixel * sine), rows) * frequency) ** 2)
+        out[row] = np.fft.irfft(np.fft.rfft(small[row], axis=0) * damp[:, None], 2 * rows, axis=0)
+    whole = np.concatenate([np.roll(out[::-1], rows, axis=1), out, np.roll(out[::-1], rows, axis=1)])
+    weight = np.tile(np.concatenate([angles[::-1], angles, angles[::-1]])[:, None, None], (1, 2 * rows, 1))
+    size = 2 * int(np.ceil(3.0 * deviation / pixel)) + 1
+    kernel = cv2.getGaussianKernel(min(size, 2 * rows - 1), deviation / pixel)
+    top = cv2.sepFilter2D((whole * weight).astype(np.float32), -1, np.ones(1), kernel)
+    bottom = cv2.sepFilter2D(weight.astype(np.float32), -1, np.ones(1), kernel)
+    bottom = bottom.reshape(len(whole), 2 * rows, 1)
+    return np.maximum((top / np.maximum(bottom, 1e-12))[rows : 2 * rows], 0.0).astype(np.float32)
+
+
+def _coordinates(d: Any) -> Any:
+    """Texture coordinates of directions: axes of ``core.sh.latlong_directions``."""
+    import drjit as dr
+    import mitsuba as mi
+
+    across = dr.atan2(d.x, -d.z) * float(0.5 / np.pi)
+    return mi.Point2f(across - dr.floor(across), dr.safe_acos(d.y) * float(1.0 / np.pi))
+
+
+def _look(table: NDArray, directions: NDArray) -> NDArray[np.float32]:
+    """A lat-long table at directions (N, 3), bilinear."""
+    rows, columns = table.shape[:2]
+    across = np.arctan2(directions[:, 0], -directions[:, 2]) / (2.0 * np.pi) % 1.0
+    down = np.arccos(np.clip(directions[:, 1], -1.0, 1.0)) / np.pi
+    x, y = across * columns - 0.5, np.clip(down * rows - 0.5, 0.0, rows - 1.0)
+    x0, y0 = np.floor(x).astype(int), np.minimum(np.floor(y).astype(int), rows - 2)
+    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
+    left, right = x0 % columns, (x0 + 1) % columns
+    top = table[y0, left] * (1 - fx) + table[y0, right] * fx
+    return (top * (1 - fy) + (table[y0 + 1, left] * (1 - fx) + table[y0 + 1, right] * fx) * fy).astype(np.float32)
+
+
+def _diagonal(scene: SurfaceScene) -> float:
+    return float(np.linalg.norm(np.ptp(np.asarray(scene.vertices), axis=0)))
+
+
+def _interpolated(hit: Any, indices: Any, colours: Any, active: Any) -> Any:
+    """Vertex colours at a hit."""
+    import drjit as dr
+    import mitsuba as mi
+
+    weights = (1.0 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
+    total = mi.Color3f(0.0)
+    for k, w in enumerate(weights):
+        corner = dr.gather(mi.UInt, indices, hit.prim_index * 3 + k, active)
+        total += w * mi.Color3f(*(dr.gather(mi.Float, colours, 3 * corner + c, active) for c in range(3)))
+    return total
+
+
+def _gathered(scene: SurfaceScene, vertices: NDArray, normals: NDArray, radiosity: NDArray) -> NDArray[np.float32]:
+    """(V, 3) irradiance that vertices receive from the mesh, whose vertices reflect a radiance (V, 3)."""
+    import drjit as dr
+    import mitsuba as mi
+
+    n = on_device(mi.Vector3f, normals)
+    origin = mi.Point3f(on_device(mi.Vector3f, vertices) + OFFSET * _diagonal(scene) * n)
+    frame = mi.Frame3f(n)
+    colours, indices = mi.Float(aligned(radiosity).ravel()), mi.UInt(aligned(scene.faces, np.uint32).ravel())
+
+    def body(i: Any, total: Any) -> tuple[Any, Any]:
+        u, v = dr.fma(mi.Float(i), 0.7548776662466927, 0.5), dr.fma(mi.Float(i), 0.5698402909980532, 0.5)
+        d = frame.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u - dr.floor(u), v - dr.floor(v))))
+        hit = scene.rays.ray_intersect_preliminary(mi.Ray3f(origin, d))
+        blocked = hit.is_valid()
+        return i + 1, total + dr.select(blocked, _interpolated(hit, indices, colours, blocked), 0.0)
+
+    start = (mi.UInt(0), dr.zeros(mi.Color3f, len(vertices)))
+    _, total = dr.while_loop(state=start, cond=lambda i, total: i < GATHERS, body=body)
+    total *= float(np.pi / GATHERS)
+    return stored([total.x, total.y, total.z], len(vertices))
