@@ -100,6 +100,7 @@ def infer_reflectance(
         "texels": int(surface.facial.sum()),
         "texels_of_head": len(surface),
         "images": surface.image_count,
+        "maps_outcome": fitted.maps_outcome.value,
     }
     if config.solver == "adam" or not config.robust:
         forward = Forward(fitted.appearance, surface.meshes)

@@ -44,6 +44,9 @@ class Fitted:
         Robust standard deviation of the residuals in linear colour.
     energies : dict of str to list of float
     outcome : Outcome
+        Of the lighting, or of the whole objective where that is minimised.
+    maps_outcome : Outcome
+        Of the last solve for the maps.
     """
 
     appearance: Appearance
@@ -51,6 +54,7 @@ class Fitted:
     sigma: float
     energies: dict[str, list[float]]
     outcome: Outcome
+    maps_outcome: Outcome
 
 
 def fit_maps(
@@ -61,8 +65,8 @@ def fit_maps(
     config: ReflectanceConfig,
     progress: Progress,
     start: NDArray | None = None,
-) -> tuple[NDArray[np.float32], dict[str, list[float]], float]:
-    """Maps for a lighting: (S, S, 4), energies per pass, robust standard deviation of the residuals."""
+) -> tuple[NDArray[np.float32], dict[str, list[float]], float, Outcome]:
+    """Maps for a lighting: (S, S, 4), energies per pass, robust standard deviation of the residuals, how they ended."""
     chunks = surface.chunks()
     pairs = surface.pairs
     index = surface.texels.index
@@ -112,7 +116,7 @@ def fit_maps(
         )
     progress("Reflectance maps", passes * len(chunks), passes * len(chunks))
     assert maps is not None
-    return maps, energy, sigma
+    return maps, energy, sigma, splits.outcome
 
 
 def fit_als(
@@ -135,11 +139,15 @@ def fit_als(
     prior[surface.texels.index, :3] = albedo
     prior[:, 3] = expected_specular(found.specular, seen.weight > 0)
     prior = prior.reshape(surface.texels.size, surface.texels.size, 4)
-    maps, energy, sigma = fit_maps(surface, forward, found, prior, config, progress)
+    maps, energy, sigma, maps_outcome = fit_maps(surface, forward, found, prior, config, progress)
     if not config.robust:
         found, maps, energy = alternate(surface, forward, found, maps, prior, albedo, config, progress)
     energy = {"lighting": found.energy} if config.robust else energy
-    return Fitted(forward.under(found.light, found.ambient), maps, sigma, energy, found.outcome), choice, ()
+    return (
+        Fitted(forward.under(found.light, found.ambient), maps, sigma, energy, found.outcome, maps_outcome),
+        choice,
+        (),
+    )
 
 
 def alternate(
@@ -166,7 +174,7 @@ def alternate(
         for length in (3.0, 1.0, 0.3, 0.1):  # alternation creeps: the longer step is right more often than not
             mixed = found.light + length * (light - found.light)
             trial = replace(found, light=mixed, ambient=found.ambient + length * (ambient - found.ambient))
-            trial_maps, _, _ = fit_maps(surface, forward, trial, prior, config, progress, start=maps)
+            trial_maps, *_ = fit_maps(surface, forward, trial, prior, config, progress, start=maps)
             trial_terms = energies(surface, forward, mixed, trial.ambient, trial_maps, albedo, config)
             if sum(trial_terms.values()) < before:
                 break

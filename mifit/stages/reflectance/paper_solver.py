@@ -69,6 +69,7 @@ def fit_adam(
         sigma,
         result.history,
         outcome,
+        outcome,
     )
     why = "as configured" if config.shading != "auto" else "the paper's model: it is the paper's solver"
     return fitted, {"chosen": name, "why": why, "exponent": forward.lobe.typical}, ()
