@@ -111,8 +111,9 @@ def adjust(
             moved[1][used] -= _STEP
             change = (residuals(moved[0]) - residuals(moved[1])) / (2 * _STEP)
             for row, block in zip(rows, blocks, strict=True):
-                if columns[block[which]] >= 0:
-                    out[row, columns[block[which]]] = change[row]
+                column = columns[block[:2][which]]  # camera or board
+                if column >= 0:
+                    out[row, column] = change[row]
         return out
 
     solution = least_squares(residuals, start / scale, jac=jacobian, method="lm", xtol=1e-12, ftol=1e-12, max_nfev=60)

@@ -236,7 +236,7 @@ def _look(
         progress("Looking for the board", done + k, total)
         i = k * every
         codes = to_8_bit(decode_image(content, f"{source.name}: frame {i}").pixels)
-        grey = cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY)
+        grey = np.asarray(cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         seen = board.find(grey)
         wanted = max(6, round(LEAST_PART * len(board.points)))
         if len(seen) >= wanted:
@@ -330,7 +330,11 @@ def _solve(
     images = [(f.pixels - 0.5).astype(np.float32) for f in used.values()]
     try:
         _, matrix, distortion, _, _, deviations, _, errors = cv2.calibrateCameraExtended(
-            objects, images, size, None, None
+            objects,
+            images,
+            size,
+            None,
+            None,  # type: ignore[call-overload]  # the stubs know no start of None
         )
     except cv2.error as error:
         raise InputError(f"the board's views allow no calibration ({' '.join(str(error).split())[-100:]})") from None
@@ -384,7 +388,7 @@ def _pair(a: Watched, b: Watched, board: Board) -> tuple[NDArray, NDArray, float
     ]
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-9)
     error, *_, turn, shift, _, _ = cv2.stereoCalibrate(
-        objects, *images, a.matrix, np.array(a.distortion), b.matrix, np.array(b.distortion), a.size,
+        objects, images[0], images[1], a.matrix, np.array(a.distortion), b.matrix, np.array(b.distortion), a.size,
         flags=cv2.CALIB_FIX_INTRINSIC, criteria=criteria,
     )  # fmt: skip
     return turn, shift.ravel(), float(error)

@@ -119,8 +119,8 @@ class Board:
             return np.asarray(self._aruco.getChessboardCorners(), dtype=np.float64)
         if self.kind == "apriltag":
             return np.concatenate([np.asarray(p, dtype=np.float64) for p in self._aruco.getObjPoints()])
-        x, y = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
-        return self.size * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+        x, y = np.meshgrid(np.arange(1.0, self.columns), np.arange(1.0, self.rows))
+        return np.asarray(self.size * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1), dtype=np.float64)
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -169,7 +169,7 @@ class Board:
         corners, ids, *_ = cv2.aruco.CharucoDetector(self._aruco, detectorParams=parameters).detectBoard(grey)
         if ids is None or len(ids) == 0:
             return _NONE
-        pixels = corners.reshape(-1, 1, 2).astype(np.float32)
+        pixels: NDArray = corners.reshape(-1, 1, 2).astype(np.float32)
         window = int(np.clip(0.2 * _spacing(pixels.reshape(-1, 2)), 2, 8))
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
         pixels = cv2.cornerSubPix(grey, pixels, (window, window), (-1, -1), criteria)

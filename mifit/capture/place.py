@@ -35,7 +35,7 @@ def landmark_places(
     capture: Capture, cameras: Sequence[str], timesteps: Sequence[int]
 ) -> dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]:
     """Landmarks in world space by timestep, as (indices, points (N, 3)): those that two of the cameras see."""
-    found = {}
+    found: dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]] = {}
     for timestep in timesteps:
         rows = np.zeros((COUNT, 4, 4))
         count = np.zeros(COUNT, dtype=int)
@@ -52,7 +52,7 @@ def landmark_places(
         seen = np.flatnonzero(count >= 2)
         if len(seen) >= MIN_VISIBLE:
             points = np.linalg.solve(rows[seen, :3, :3], -rows[seen, :3, 3:])[..., 0]
-            found[timestep] = seen, points
+            found[timestep] = seen.astype(np.int64), np.asarray(points, dtype=np.float64)
     return found
 
 
@@ -140,7 +140,7 @@ def calibrate_others(
     sides = {name: max(capture.views[name].width, capture.views[name].height) for name in capture.cameras}
     focal = float(np.median([capture.camera(name).fx / sides[name] for name in decided]))
     sizes = {(capture.views[name].width, capture.views[name].height) for name in decided}
-    found = {}
+    found: dict[str, tuple[Camera, float]] = {}
     for name in capture.cameras:
         camera, error = place_camera(
             capture, name, places, focal, (capture.views[name].width, capture.views[name].height) in sizes

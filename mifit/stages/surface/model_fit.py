@@ -195,7 +195,9 @@ def fit_model(
     low, high = bounds(state.layout, model.expression_bounds)
     for _ in range(ROUNDS):
         state = state.recentred()
-        touched, normals, trust = [], [], []
+        touched: list[NDArray] = []
+        normals: list[NDArray] = []
+        trust: list[NDArray] = []
         for vertices, surface in zip(visibility.world(state), found, strict=True):
             corners = model.faces, points.face, points.weights
             own = normalize(interpolate(vertex_normals(vertices, model.faces), *corners))
