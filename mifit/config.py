@@ -30,7 +30,9 @@ class GeometryConfig:
         0.0, "standard deviation of the model's log scale; 0: the units are trusted", least=0, most=10
     )
     camera_gains: Literal["auto", "always", "never"] = one_of(
-        "auto", "find each camera's exposure and white balance relative to the first one's; auto: where they differ"
+        "auto",
+        "find each camera's exposure and white balance relative to the first one's; auto: where they differ and more "
+        "than one timestep tells",
     )
     landmark_weight: float = number(10.0, "objective paper: weight of the landmarks", least=0, most=WEIGHT)
     prior_weight: float = number(5e-5, "objective paper: weight of the model's prior", least=0, most=WEIGHT)

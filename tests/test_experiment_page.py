@@ -28,12 +28,12 @@ def run_page(folder: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, s
     return names, seconds
 
 
-def check(names: dict) -> None:
+def check(names: dict, frames: int = 36) -> None:
     result, losses = names["result"], names["losses"]
     assert mifit.Reconstruction.load("out/gloss") == result
     assert names["tanned"] != result and names["image"].shape[2] == 4
-    assert len(names["frames"]) == 36
-    assert len({frame[frame[..., 3] == 1][:, 0].mean().round(5) for frame in names["frames"]}) > 30
+    assert len(names["frames"]) == frames
+    assert len({frame[frame[..., 3] == 1][:, 0].mean().round(5) for frame in names["frames"]}) > 0.8 * frames
     assert len(losses) == 30 and losses[-1] < losses[0]
     assert names["better"] != result
     height, width = names["camera"].height, names["camera"].width
@@ -54,7 +54,9 @@ def test_the_page_runs(variant, tiny_capture, tmp_path, monkeypatch):
 def test_the_page_runs_on_gloss(variant, shared, tmp_path, monkeypatch):
     (tmp_path / "captures").mkdir()
     (tmp_path / "captures" / "gloss").symlink_to(shared / "captures" / "gloss")
-    names, seconds = run_page(tmp_path, monkeypatch, {'"auto"': '"llvm_ad_rgb"'})
-    check(names)
+    # The 36 rotations are tested on the small capture; here three show that they work at full size.
+    changes = {'"auto"': '"llvm_ad_rgb"', "range(0, 360, 10)": "range(0, 360, 120)"}
+    names, seconds = run_page(tmp_path, monkeypatch, changes)
+    check(names, 3)
     assert min(names["losses"]) < 0.98 * names["losses"][0]  # a good fit leaves less to gain
     print({name: round(value, 1) for name, value in seconds.items()}, names["losses"][0], names["losses"][-1])

@@ -177,7 +177,7 @@ class Board:
 
     def _find_tags(self, grey: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
         parameters = cv2.aruco.DetectorParameters()
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         corners, tags, _ = cv2.aruco.ArucoDetector(self._aruco.getDictionary(), parameters).detectMarkers(grey)
         known = {int(tag): i for i, tag in enumerate(self._aruco.getIds())}
         seen = [

@@ -91,7 +91,9 @@ def fit_geometry(
         )
 
     found = refine({})
-    if config.camera_gains == "never" or (config.camera_gains == "auto" and len(cameras) == 1):
+    # Where a head stands still, skin that shines towards one camera looks like a camera that is brighter.
+    too_few = len(cameras) == 1 or len(timesteps) == 1
+    if config.camera_gains == "never" or (config.camera_gains == "auto" and too_few):
         return found
     gains = estimate_gains(capture, model, found, cameras, seed, progress)
     if config.camera_gains == "auto" and not differ(gains):

@@ -78,7 +78,8 @@ def background(image: NDArray, hit: NDArray[np.bool_], kept: NDArray[np.bool_]) 
     off = ~cv2.dilate(hit.astype(np.uint8), np.ones((2 * BESIDE + 1,) * 2, np.uint8)).astype(bool)
     if not off.any() or not hit.any():
         return np.zeros_like(hit)
-    smooth = cv2.GaussianBlur(np.nan_to_num(image).astype(np.float32), (0, 0), 1.5)
+    finite = np.nan_to_num(image, nan=0.0, posinf=1.0, neginf=0.0).astype(np.float32)
+    smooth = cv2.GaussianBlur(finite, (0, 0), 1.5)
     row, column = distance_transform_edt(~off, return_distances=False, return_indices=True)
     there = smooth[row, column]
     alike = (np.abs(smooth - there) < ALIKE * there + 5.0 * DARKEST).all(axis=-1) & ~kept

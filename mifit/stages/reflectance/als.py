@@ -23,9 +23,10 @@ LIGHTING_TEXELS = 6000
 """Texels that determine the lighting; a few hundred unknowns against 24 values of eight images each."""
 MAP_PASSES = 3
 """Passes over the maps: each takes new robust weights from the residuals of the last."""
-MAP_ITERATIONS = 60, 30
-"""ADMM iterations of the first pass, and of the others, which go on from the splits of the pass before: nearer to the
-minimum than sixty of each from the maps alone (0.0009 against 0.0011 in albedo)."""
+MAP_ITERATIONS = 60
+"""ADMM iterations of a pass. Every pass starts from its maps alone: going on from the multipliers of the pass before
+saves half of them, but carries over what the last weights took an outlier for (a hand before one camera left 0.016
+instead of less than 0.01 in the albedo under it)."""
 ROUNDS = 20
 """Rounds of `alternate` at the most."""
 
@@ -72,7 +73,6 @@ def fit_maps(
     index = surface.texels.index
     smoothness = Smoothness(config.smoothness_weight, config.smoothness_weight * config.specular_smoothness)
     maps: NDArray[np.float32] | None = start
-    splits = Splits()
     energy: dict[str, list[float]] = {"data": []}
     passes = MAP_PASSES if config.robust else 1
     kept: tuple[Observations, NDArray, NDArray] | None = None
@@ -109,10 +109,10 @@ def fit_maps(
             energy["data"].append(data)
             sigma = float(np.median(sigmas))
         pull = specular_pull(float(prior[0, 0, 3]), sigma) if config.robust else 0.0
-        iterations = MAP_ITERATIONS[0] if number == 0 else MAP_ITERATIONS[1]
+        splits = Splits()
         joined = TexelSystems.join(systems)
         maps = solve_maps(
-            joined, index, prior, smoothness, maps, specular_pull=pull, iterations=iterations, splits=splits
+            joined, index, prior, smoothness, maps, specular_pull=pull, iterations=MAP_ITERATIONS, splits=splits
         )
     progress("Reflectance maps", passes * len(chunks), passes * len(chunks))
     assert maps is not None

@@ -15,7 +15,7 @@ from mifit.core.sh import LUMINANCE
 from mifit.progress import Progress
 from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.key import TEXELS, Candidates, find_light
+from mifit.stages.reflectance.key import RADII, STEPS, TEXELS, Candidates, find_lights, search
 from mifit.stages.reflectance.lighting import LightingProblem, LightingSolution, solve_lighting
 from mifit.stages.reflectance.priors import EXPONENT, NORMAL_REFLECTANCE
 
@@ -138,20 +138,20 @@ def _with_light(
     step = max(1, len(seen.texel) // TEXELS)
     part, expected = seen.take(slice(0, None, step)), albedo[::step]
     found = replace(found, diffuse=found.diffuse[::step], specular=found.specular[::step])
-    for again in (False, True):
-        problem = lighting_problem(part, forward, found.light, expected, config.robust)
-        start = forward.lights[0] if forward.lights else None
-        light = find_light(Candidates.about(part, forward, problem, found), start)
-        if light is None:
-            return None
-        forward = forward.with_lights((light,))
-        if not again:
-            found = fit_lighting(part, forward, expected, config, 8)
-            mean = np.sqrt(np.pi) / 2.0 * found.light[0]  # irradiance from everywhere, pi times the mean radiance
-            (irradiance,) = (light.colour for light in forward.under(found.light).illumination.lights)
-            if irradiance @ LUMINANCE < FAINT * mean @ LUMINANCE:
-                return None
-    return forward
+    problem = lighting_problem(part, forward, found.light, expected, config.robust)
+    for light in find_lights(Candidates.about(part, forward, problem, found)):
+        lit = forward.with_lights((light,))
+        fitted = fit_lighting(part, lit, expected, config, 8)
+        mean = np.sqrt(np.pi) / 2.0 * fitted.light[0]  # irradiance from everywhere, pi times the mean radiance
+        (irradiance,) = (light.colour for light in lit.under(fitted.light).illumination.lights)
+        if irradiance @ LUMINANCE < FAINT * mean @ LUMINANCE:
+            continue
+        problem = lighting_problem(part, lit, fitted.light, expected, config.robust)
+        candidates = Candidates.about(part, lit, problem, fitted)
+        _, light = search(candidates, light.direction, light.radius, 0.25 * STEPS[0])
+        if light.radius < RADII[1]:
+            return forward.with_lights((light,))
+    return None
 
 
 def noise_weight(colour: NDArray, robust: bool) -> NDArray[np.float32]:

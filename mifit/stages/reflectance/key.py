@@ -30,6 +30,8 @@ SPACING, WIDE = np.radians([12.0, 8.0])
 """First search: between directions all over the sphere, and angular radius; wide penumbras lead the way."""
 LEAST = 0.05
 """Part of the texels that a light must reach to be looked at."""
+STARTS, APART = 3, np.radians(30.0)
+"""Second searches, and the least angle between their starts."""
 STEPS = np.radians([4.0, 0.2])
 """Second search: from the first step to the last one."""
 RADII = np.radians([0.25, 10.0])
@@ -137,42 +139,52 @@ class Candidates:
         return float(2 * right @ irradiance - irradiance @ system @ irradiance)
 
 
-def scan(candidates: Candidates) -> tuple[NDArray[np.float64], float]:
-    """The direction, among some all over the sphere, of the wide light that explains most, and how much.
+def scan(candidates: Candidates) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Directions (M, 3), all over the sphere, of wide lights, and how much each explains (M,).
 
     All directions' shadows are traced first, a ray for each direction.
     """
     directions = fibonacci_sphere(round(4.0 * np.pi / SPACING**2))
-    best, most = directions[0], 0.0
+    gains = np.zeros(len(directions))
     for start in range(0, len(directions), 32):
         part = directions[start : start + 32]
         bits = candidates.forward.open_towards(candidates.seen, part)
         for number, direction in enumerate(part):
             visible = (bits >> np.uint32(number)) & 1
             if visible.mean() > LEAST:
-                gain = candidates.explained(direction, WIDE, np.where(visible, np.uint32(0xFFFFFFFF), np.uint32(0)))
-                if gain > most:
-                    best, most = direction, gain
-    return best, most
+                bit = np.where(visible, np.uint32(0xFFFFFFFF), np.uint32(0))
+                gains[start + number] = candidates.explained(direction, WIDE, bit)
+    return directions, gains
 
 
-def find_light(candidates: Candidates, start: DistantLight | None = None) -> DistantLight | None:
-    """Search for the compact light that explains most of what is left; None where none is worth a trial.
+def starts(candidates: Candidates) -> list[NDArray[np.float64]]:
+    """Directions from which a search is worth a trial, the most promising first, `APART` from one another.
 
-    Parameters
-    ----------
-    candidates : Candidates
-    start : DistantLight, optional
-        Search around this one only.
+    A wide light in a wrong place may explain as much as one in the right place: only the narrow ones that the searches
+    end with tell them apart.
     """
-    if start is None:
-        energy = float((candidates.weight * candidates.residual**2).sum())
-        direction, most = scan(candidates)
-        if not most > WORTH * energy:
-            return None
-        radius, step = WIDE, STEPS[0]
-    else:
-        direction, radius, step = start.direction, start.radius, 0.25 * STEPS[0]
+    directions, gains = scan(candidates)
+    energy = float((candidates.weight * candidates.residual**2).sum())
+    found: list[NDArray[np.float64]] = []
+    for number in np.argsort(-gains):
+        if len(found) == STARTS or not gains[number] > WORTH * energy:
+            break
+        if all(direction @ directions[number] < np.cos(APART) for direction in found):
+            found.append(directions[number])
+    return found
+
+
+def find_lights(candidates: Candidates) -> list[DistantLight]:
+    """Compact lights, each the best about one of `starts`, the one that explains most first; none where none does."""
+    found = [search(candidates, direction, WIDE, STEPS[0]) for direction in starts(candidates)]
+    compact = [(gain, light) for gain, light in found if light.radius < RADII[1]]
+    return [light for _, light in sorted(compact, key=lambda pair: -pair[0])]
+
+
+def search(
+    candidates: Candidates, direction: NDArray[np.float64], radius: float, step: float
+) -> tuple[float, DistantLight]:
+    """The light near a direction and an angular radius that explains most, and how much; `step` is the first one."""
     gain = candidates.explained(direction, radius)
     widen = 1.5
     while step > STEPS[1]:
@@ -184,7 +196,7 @@ def find_light(candidates: Candidates, start: DistantLight | None = None) -> Dis
             (direction, radius), gain = around[best], gains[best]
         else:
             step, widen = 0.5 * step, np.sqrt(widen)
-    return DistantLight(direction, float(radius), np.zeros(3)) if radius < RADII[1] else None
+    return gain, DistantLight(direction, float(radius), np.zeros(3))
 
 
 def _ring(direction: NDArray, angle: float, count: int = 6) -> NDArray[np.float64]:
