@@ -21,7 +21,7 @@ demo:
 	$(BIN)/mifit demo --out $(OUT)
 
 test:
-	@.ci/setup test cluster view
+	@.ci/setup test cluster view bench
 	$(BIN)/ruff check .
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
