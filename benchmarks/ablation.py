@@ -15,14 +15,12 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
-
-import numpy as np
 
 import mifit
+from benchmarks.matt import infer_matt
 from benchmarks.measure import conditions, measured
 from benchmarks.record import RESULTS, SHARED, record
 from benchmarks.third_view import Error, ThirdView, pooled_psnr
@@ -31,37 +29,11 @@ from mifit.config import SHADINGS, FitConfig, GeometryConfig, NormalsConfig, Ref
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
 from mifit.core.files import write_text
 from mifit.errors import ConvergenceError, InputError
-from mifit.progress import Progress
-from mifit.stages.observations import Observations, Surface
-from mifit.stages.reflectance.choice import choose_lighting, fit_lighting
-from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.lighting import LightingSolution
 
 MODEL = SHARED / "models" / "ict_facekit" / "ict_facekit_head.npz"
 CAMERAS = ("left", "right")
 TIMESTEPS = (0, 1, 2, 3)
 GEOMETRY = GeometryConfig()
-
-
-class Diffuse(Forward):
-    """A shading model without its specular reflection."""
-
-    def transfers(self, seen: Observations, light: Any) -> tuple[Any, Any]:
-        diffuse, specular = super().transfers(seen, light)
-        return diffuse, np.zeros_like(specular)
-
-    def shade(self, seen: Observations, light: Any) -> tuple[Any, Any]:
-        shade, glint = super().shade(seen, light)
-        return shade, np.zeros_like(glint)
-
-
-def choose_diffuse_lighting(
-    surface: Surface, seen: Observations, albedo: Any, config: ReflectanceConfig, progress: Progress
-) -> tuple[Forward, LightingSolution, dict]:
-    """The model that stage 2 chooses, and the lighting that explains the images best without its specular part."""
-    forward, _, choice = choose_lighting(surface, seen, albedo, config, progress)
-    diffuse = Diffuse(**{f.name: getattr(forward, f.name) for f in fields(forward)})
-    return diffuse, fit_lighting(seen, diffuse, albedo, config, config.max_iterations, 0.0), choice
 
 
 @dataclass(frozen=True)
@@ -100,9 +72,7 @@ class Scene:
 
     def diffuse_only(self, geometry: GeometryEstimate, config: ReflectanceConfig) -> ReflectanceEstimate:
         """Stage 2 by the fast solver without any specular reflection: lighting and diffuse map fitted anew."""
-        with patch("mifit.stages.reflectance.als.choose_lighting", choose_diffuse_lighting):
-            found = self.reflectance(geometry, config)
-        return replace(found, specular=np.zeros_like(found.specular))
+        return infer_matt(self.capture, self.model, geometry, CAMERAS, config)
 
 
 Fitted = tuple[GeometryEstimate, ReflectanceEstimate, NormalsEstimate | None]

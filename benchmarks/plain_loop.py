@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mifit
+from benchmarks.figure import figure
 from benchmarks.record import SHARED, record
 from benchmarks.truth import true_geometry, true_maps
 from mifit import Capture, MorphableModel
@@ -292,24 +293,15 @@ def _model_albedo(task: Task, size: int) -> NDArray[np.float32]:
 
 
 def plot(figures: dict[str, Any], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    plt.rcParams["svg.hashsalt"] = "mifit"
-    figure, axis = plt.subplots(figsize=(6.4, 4.2))
-    for label, curve in figures["curves"].items():
-        t, error = np.array(curve).T
-        whole = label in ("als", "adam")
-        axis.plot(t, error, "o" if whole else "-", label=label + (", a whole run each" if whole else ""))
-    axis.axhline(figures["error_of_the_models_albedo"], color="0.6", lw=1, ls=":", label="the model's mean albedo")
-    axis.set(xscale="log", yscale="log", xlabel="seconds", ylabel="RMSE of the diffuse albedo")
-    axis.grid(alpha=0.3, which="both")
-    axis.legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(path, metadata={"Date": None})
-    plt.close(figure)
+    with figure(path, (6.4, 4.2)) as axis:
+        for label, curve in figures["curves"].items():
+            t, error = np.array(curve).T
+            whole = label in ("als", "adam")
+            axis.plot(t, error, "o" if whole else "-", label=label + (", a whole run each" if whole else ""))
+        axis.axhline(figures["error_of_the_models_albedo"], color="0.6", lw=1, ls=":", label="the model's mean albedo")
+        axis.set(xscale="log", yscale="log", xlabel="seconds", ylabel="RMSE of the diffuse albedo")
+        axis.grid(alpha=0.3, which="both")
+        axis.legend(fontsize=7)
 
 
 def main() -> int:

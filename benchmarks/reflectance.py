@@ -13,9 +13,11 @@ import argparse
 import json
 import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import mifit
+from benchmarks.figure import figure
 from benchmarks.record import RESULTS, SHARED, record
 from benchmarks.truth import map_errors, true_geometry
 from mifit import Capture, MorphableModel, Reconstruction
@@ -48,24 +50,16 @@ def run(name: str, config: ReflectanceConfig, model: MorphableModel) -> dict[str
     }
 
 
-def plot(rows: dict[str, dict[str, Any]], path: Any) -> None:
+def plot(rows: dict[str, dict[str, Any]], path: Path) -> None:
     """Held-out PSNR against seconds."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(7, 4.5))
-    for name in dict.fromkeys(key.split("/")[0] for key in rows):
-        part = {k: r for k, r in rows.items() if k.startswith(name + "/")}
-        axes.scatter([r["seconds"] for r in part.values()], [r["full_db"] for r in part.values()], label=name)
-        for key, row in part.items():
-            axes.annotate(key.split("/", 1)[1], (row["seconds"], row["full_db"]), fontsize=7)
-    axes.set(xlabel="seconds", ylabel="held-out view, PSNR (dB)", xscale="log")
-    axes.legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    with figure(path, (7, 4.5)) as axes:
+        for name in dict.fromkeys(key.split("/")[0] for key in rows):
+            part = {k: r for k, r in rows.items() if k.startswith(name + "/")}
+            axes.scatter([r["seconds"] for r in part.values()], [r["full_db"] for r in part.values()], label=name)
+            for key, row in part.items():
+                axes.annotate(key.split("/", 1)[1], (row["seconds"], row["full_db"]), fontsize=7)
+        axes.set(xlabel="seconds", ylabel="held-out view, PSNR (dB)", xscale="log")
+        axes.legend()
 
 
 def markdown(rows: dict[str, dict[str, Any]]) -> str:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import mifit
+from benchmarks.figure import figure
 from benchmarks.plain_loop import CAMERAS, MODEL, TIMESTEPS, Scenes, Views, _half_camera, _half_frame
 from benchmarks.record import RESULTS, SHARED, record
 from benchmarks.truth import true_geometry
@@ -323,22 +324,13 @@ def markdown(curve: list[dict[str, Any]], fast: dict[str, Any], part: float) -> 
 
 
 def plot(curve: list[dict[str, Any]], fast: dict[str, Any], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    plt.rcParams["svg.hashsalt"] = "mifit"
-    figure, axes = plt.subplots(1, 2, figsize=(8.0, 3.4))
-    for axis, key, title in zip(axes, ("third_db", "mesh_mm"), ("third view, dB", "mesh, mm"), strict=True):
-        axis.plot([r["seconds"] for r in curve], [r[key] for r in curve], label="prb + Adam, a rival's schedule")
-        axis.plot(fast["seconds"], fast[key], "o", label="mifit.fit, a whole run")
-        axis.set(xscale="log", xlabel="seconds", ylabel=title)
-        axis.grid(alpha=0.3, which="both")
-    axes[0].legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(path, metadata={"Date": None})
-    plt.close(figure)
+    with figure(path, (8.0, 3.4), columns=2) as axes:
+        for axis, key, title in zip(axes, ("third_db", "mesh_mm"), ("third view, dB", "mesh, mm"), strict=True):
+            axis.plot([r["seconds"] for r in curve], [r[key] for r in curve], label="prb + Adam, a rival's schedule")
+            axis.plot(fast["seconds"], fast[key], "o", label="mifit.fit, a whole run")
+            axis.set(xscale="log", xlabel="seconds", ylabel=title)
+            axis.grid(alpha=0.3, which="both")
+        axes[0].legend(fontsize=7)
 
 
 def main() -> int:

@@ -7,11 +7,12 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+from benchmarks.figure import figure
+
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
 STYLE = {
-    "svg.hashsalt": "mifit",
     "svg.fonttype": "none",
     "font.family": "sans-serif",
     "font.size": 10,
@@ -28,25 +29,14 @@ Row = dict[str, Any]
 
 def draw(figures: Row, folder: Path = IMAGES) -> list[Path]:
     """SVG plots of the parts that are there."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     out = []
     plots = {"geometry": _geometry, "reflectance": _reflectance, "normals": _normals, "growth": _growth}
-    with plt.rc_context(STYLE):
-        for name, plot in plots.items():
-            if name not in figures:
-                continue
-            figure, axes = plt.subplots(figsize=(9, 4.2) if name == "growth" else (7, 4.2))
-            plot(axes, figures)
-            _plain_ticks(axes)
-            figure.tight_layout()
+    for name, plot in plots.items():
+        if name in figures:
             out.append(folder / f"speed_{name}.svg")
-            folder.mkdir(parents=True, exist_ok=True)
-            figure.savefig(out[-1], metadata={"Date": None})
-            plt.close(figure)
+            with figure(out[-1], (9, 4.2) if name == "growth" else (7, 4.2), style=STYLE) as axes:
+                plot(axes, figures)
+                _plain_ticks(axes)
     return out
 
 

@@ -25,8 +25,11 @@ import time
 from pathlib import Path
 
 from tests.hostile.cases import Case, all_cases, make_base
+from tests.hostile.child import run_command
 
 SECONDS, MEMORY, FILE_SIZE = 20, 3 << 30, 64 << 20
+USERS = "here"
+"""The working folder of a case, inside its scratch home."""
 WATCHED = {
     "os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.symlink", "os.link", "os.truncate", "os.chmod", "os.chown",
     "os.utime", "shutil.rmtree",
@@ -81,7 +84,7 @@ def snapshot(folder: Path) -> dict[str, tuple]:
 
 def run_case(case: Case, base: Path, folder: Path) -> tuple[str, str]:
     """Prepare, run and judge one case; returns what it ended with and what is wrong with that ('' for nothing)."""
-    work = folder / "home" / "work"
+    work = folder / "home" / USERS
     work.mkdir(parents=True)
     (folder / "home" / "tmp").mkdir()
     for name in case.needs:
@@ -116,7 +119,7 @@ def run_case(case: Case, base: Path, folder: Path) -> tuple[str, str]:
     new = [
         n
         for n, key in after.items()
-        if n not in before and key[0] != stat.S_IFDIR and not (code == 0 and case.writes(n[len("home/work/") :]))
+        if n not in before and key[0] != stat.S_IFDIR and not (code == 0 and case.writes(n[len(f"home/{USERS}/") :]))
     ]
     if new:
         problems.append(f"left behind {new[:5]}")
@@ -142,15 +145,11 @@ def _wait(process: int) -> tuple[int | None, float]:
 
 def _child(case: Case, folder: Path) -> None:
     """Never returns."""
-    code = 99
-    try:
+
+    def prepare() -> None:
         home = folder / "home"
-        for name, descriptor in (("stdout", 1), ("stderr", 2)):
-            opened = os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-            os.dup2(opened, descriptor)
-            os.close(opened)
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-        os.chdir(home / "work")
+        os.chdir(home / USERS)
         for variable in ("MIFIT_CACHE", "XDG_CACHE_HOME", "PYTHONPATH"):
             os.environ.pop(variable, None)
         os.environ |= {"HOME": str(home), "TMPDIR": str(home / "tmp")}
@@ -164,22 +163,8 @@ def _child(case: Case, folder: Path) -> None:
         ):
             resource.setrlimit(limit, (value, value))
         _watch(folder)
-        sys.argv = ["mifit", *case.arguments]
-        from mifit.cli import main
 
-        try:
-            code = main()
-        except SystemExit as stop:
-            code = stop.code if isinstance(stop.code, int) else 1
-        sys.stdout.flush()
-        sys.stderr.flush()
-    except BaseException:
-        import traceback
-
-        traceback.print_exc()
-        sys.stderr.flush()
-    finally:
-        os._exit(code)
+    run_command(folder, case.arguments, prepare)
 
 
 def _watch(folder: Path) -> None:

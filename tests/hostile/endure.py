@@ -30,6 +30,7 @@ from pathlib import Path
 
 from mifit.result.ownership import finish as finish_writing
 from tests.hostile.attack import preload
+from tests.hostile.child import run_command
 
 CHANGES = {"os.remove", "os.rename", "os.mkdir", "os.rmdir", "shutil.rmtree"}
 FIT = ("fit", "capture", "--model", "builtin:coarse", "--timesteps", "0", "--config", "fit.toml", "--quiet")
@@ -81,13 +82,10 @@ def run(
 
 def _child(work: Path, arguments: tuple[str, ...], counted: Path, after: int | None, room: int | None) -> None:
     """Never returns."""
-    code = 99
-    try:
-        os.setsid()
-        for name, descriptor in (("stdout", 1), ("stderr", 2)):
-            os.dup2(os.open(work.parent / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), descriptor)
+    os.setsid()
+
+    def prepare() -> None:
         os.chdir(work)
-        sys.argv = ["mifit", *arguments]
         count, descriptor = 0, os.open(counted, os.O_WRONLY)
 
         def hook(event: str, values: tuple) -> None:
@@ -102,21 +100,8 @@ def _child(work: Path, arguments: tuple[str, ...], counted: Path, after: int | N
         sys.addaudithook(hook)
         if room is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
-        from mifit.cli import main
 
-        try:
-            code = main()
-        except SystemExit as stop:
-            code = stop.code if isinstance(stop.code, int) else 1
-        sys.stdout.flush()
-        sys.stderr.flush()
-    except BaseException:
-        import traceback
-
-        traceback.print_exc()
-        sys.stderr.flush()
-    finally:
-        os._exit(code)
+    run_command(work.parent, arguments, prepare)
 
 
 def content(place: Path) -> dict[str, bytes]:
