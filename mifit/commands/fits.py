@@ -1,0 +1,168 @@
+"""Commands that fit. Arguments are parsed; bad input raises InputError."""
+
+from __future__ import annotations
+
+import shutil
+from argparse import Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mifit.commands.common import say, use_variant
+from mifit.commands.results import evaluate
+from mifit.config import PRESETS, FitConfig, NormalsConfig, from_mapping
+from mifit.console import console_progress
+from mifit.core.files import check_file
+from mifit.core.limits import MAX_SETTINGS_BYTES
+from mifit.errors import InputError
+
+if TYPE_CHECKING:
+    pass
+
+
+DEMO = {"model": "builtin:coarse", "width": 340, "height": 240, "spp": 32, "timesteps": 3}
+"""Size of the capture that ``mifit demo`` makes: small enough for seconds, large enough to show a face."""
+
+
+def demo(arguments: Namespace) -> None:
+    """Synthesise, fit, evaluate, report."""
+    out = arguments.out
+    capture = out / "capture"
+    progress = console_progress(arguments.quiet)
+    use_variant(arguments)
+    from mifit.result.ownership import MARK, check_ours, claim, clear, remember
+    from mifit.synth import synthesize
+
+    check_ours(out)
+    if (out / "result.json").exists() and not (capture / MARK).is_dir():
+        raise InputError(f"--out {out}: holds a result that isn't the demo's; name another folder")
+    clear(capture)
+    claim(out)
+    say(arguments, "Rendering a capture: two cameras to fit, a third to judge by")
+    made = out / MARK / "capture"
+    shutil.rmtree(made, ignore_errors=True)  # of a demo that was killed
+    synthesize(made, seed=arguments.seed, progress=progress, **DEMO)  # type: ignore[arg-type]
+    claim(made, force=True)
+    remember(
+        made, [p.relative_to(made).as_posix() for p in made.rglob("*") if p.is_file() and MARK not in p.parts[-2:]]
+    )
+    made.rename(capture)
+    common = {
+        "quiet": arguments.quiet,
+        "debug": arguments.debug,
+        "variant": arguments.variant,
+        "seed": arguments.seed,
+    }
+    fit(
+        Namespace(
+            **common,
+            capture=capture,
+            out=out,
+            config=None,
+            preset=None,
+            model=DEMO["model"],
+            cameras=["left", "right"],
+            timesteps=None,
+            until="normals",
+            resume=False,
+            force=True,
+        )
+    )
+    evaluate(
+        Namespace(
+            **common,
+            result=out,
+            capture=capture,
+            camera="third",
+            timesteps=None,
+            region="model",
+            baseline=True,
+            json=out / "third.json",
+        )
+    )
+    print(f"Report: {out / 'report.html'}")
+
+
+def fit(arguments: Namespace) -> None:
+    """Run the stages and write the result folder."""
+    import mifit
+    from mifit.result.ownership import check_ours
+
+    out: Path = arguments.out
+    check_ours(out, arguments.force)
+    if arguments.config:
+        check_file(arguments.config, MAX_SETTINGS_BYTES, "configuration file")
+    if arguments.config and arguments.preset:
+        raise InputError(
+            f"--preset {arguments.preset}: found with --config {arguments.config}, expected one of the two"
+        )
+    config = FitConfig.load(arguments.config) if arguments.config else PRESETS[arguments.preset or "default"]()
+    capture = mifit.Capture.load(arguments.capture)
+    model = mifit.MorphableModel.load(arguments.model)
+    use_variant(arguments)
+    from mifit.fitting import fit_into
+    from mifit.output.report import write_report
+
+    result = fit_into(
+        out,
+        capture,
+        model,
+        cameras=arguments.cameras,
+        timesteps=arguments.timesteps,
+        config=config,
+        until=arguments.until,
+        seed=arguments.seed,
+        progress=console_progress(arguments.quiet),
+        resume=arguments.resume,
+        force=arguments.force,
+    )
+    write_report(out, result, capture)
+    print(f"Result: {out}")
+
+
+def track(arguments: Namespace) -> None:
+    """Extend a result by further timesteps."""
+    import mifit
+    from mifit.pipeline import choose
+
+    result = mifit.Reconstruction.load(arguments.result)
+    capture = mifit.Capture.load(arguments.capture)
+    use_variant(arguments)
+    from mifit.output.sequence import write_moving_pictures
+    from mifit.result.ownership import remember
+    from mifit.tracking import sequence_left, track_into
+
+    for name in arguments.overlay or ():
+        capture.with_fitted(result.cameras).camera(name)  # an unknown one is refused now, not after the work
+    timesteps = sequence_left(result, capture, arguments.resume)
+    if arguments.timesteps:
+        timesteps = choose("timestep", capture.timesteps, arguments.timesteps, 0)
+    progress = console_progress(arguments.quiet)
+    result = track_into(
+        arguments.result,
+        result,
+        capture,
+        timesteps,
+        config=from_mapping(NormalsConfig, result.config.get("normals", {}), "result.json: config: normals"),
+        seed=arguments.seed,
+        resume=arguments.resume,
+        progress=progress,
+    )
+    written = write_moving_pictures(arguments.result, result, capture, arguments.overlay, arguments.fps, progress)
+    remember(arguments.result, [path.name for path in written])
+    print(f"Result: {arguments.result}")
+
+
+def run(arguments: Namespace) -> None:
+    """Run an experiment or a sweep."""
+    from mifit.experiment import run_experiment
+
+    summary = run_experiment(
+        arguments.experiment,
+        overrides=arguments.overrides,
+        out=arguments.out,
+        dask=arguments.dask,
+        variant=arguments.variant,
+        seed=arguments.seed,
+        progress=console_progress(arguments.quiet),
+    )
+    print(summary)

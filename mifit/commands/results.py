@@ -1,0 +1,163 @@
+"""Commands about a result folder. Arguments are parsed; bad input raises InputError."""
+
+from __future__ import annotations
+
+import json
+import sys
+from argparse import Namespace
+from typing import TYPE_CHECKING
+
+from mifit.commands.common import say, use_variant
+from mifit.console import console_progress
+from mifit.core.files import write_text
+from mifit.errors import InputError
+
+if TYPE_CHECKING:
+    from mifit.reconstruction import Reconstruction
+
+
+def evaluate(arguments: Namespace) -> None:
+    """Error on a held-out view: a table on stdout, JSON on request, the report renewed."""
+    import mifit
+
+    result = mifit.Reconstruction.load(arguments.result)
+    capture = mifit.Capture.load(arguments.capture)
+    use_variant(arguments)
+    from mifit.output.evaluate import evaluate
+    from mifit.output.report import write_report
+    from mifit.pipeline import fitted_to
+
+    found = evaluate(
+        result,
+        capture,
+        arguments.camera,
+        timesteps=arguments.timesteps,
+        region=arguments.region,
+        progress=console_progress(arguments.quiet),
+        baseline=arguments.baseline,
+    )
+    if not fitted_to(result, capture):
+        say(arguments, f"mifit: warning: {arguments.capture}: isn't the capture that was fitted, or has changed since")
+    if arguments.camera in [camera.name for camera in result.cameras]:
+        say(arguments, f"mifit: warning: camera {arguments.camera!r} was fitted, so this is no held-out error")
+    if arguments.json:
+        write_text(arguments.json, json.dumps(found, indent=2) + "\n")
+    print(f"camera {found['camera']}, timesteps {found['timesteps']}, {found['region_pixels']} pixels")
+    if "resected" in found:
+        print(
+            f"camera {found['camera']} is not calibrated: placed from its landmarks against the fitted head, "
+            f"{found['resected']['landmark_pixels']:.1f} pixels beside them"
+        )
+    _print_measures(found["methods"])
+    if "baseline" in found:
+        print(f"image-based rendering on the same mesh, {found['baseline']['region_pixels']} pixels that it can fill")
+        _print_measures(found["baseline"]["methods"])
+    write_report(arguments.result, result, capture, evaluation=found)
+
+
+def _print_measures(methods: dict[str, dict[str, float]]) -> None:
+    print(f"{'method':<12}{'PSNR dB':>9}{'RMSE':>8}{'SSIM':>8}{'FLIP':>8}")
+    for method, f in methods.items():
+        print(f"{method:<12}{f['psnr']:>9.2f}{f['rmse']:>8.2f}{f['ssim']:>8.4f}{f['flip']:>8.4f}")
+
+
+def render(arguments: Namespace) -> None:
+    """Render one timestep from a camera of the capture."""
+    import mifit
+    from mifit.core.image import write_image
+
+    turned = {name: getattr(arguments, name) for name in ("yaw", "pitch", "distance")}
+    turned = {name: value for name, value in turned.items() if value is not None}
+    if arguments.camera and turned:
+        raise InputError(f"--camera {arguments.camera}: found --{next(iter(turned))} beside it, expected one of both")
+    result = mifit.Reconstruction.load(arguments.result)
+    timestep = result.timesteps[0] if arguments.timestep is None else arguments.timestep
+    if not arguments.camera:
+        camera = result.orbit(**turned, timestep=timestep)
+    elif arguments.capture:
+        camera = mifit.Capture.load(arguments.capture).with_fitted(result.cameras).camera(arguments.camera)
+    else:
+        camera = result.camera(arguments.camera)
+    use_variant(arguments)
+    image = result.render(camera, timestep, method=arguments.method, integrator=arguments.integrator)
+    write_image(arguments.out, image)
+    print(f"Image: {arguments.out}")
+
+
+def _result_and_variant(arguments: Namespace) -> Reconstruction:
+    import mifit
+
+    result = mifit.Reconstruction.load(arguments.result)
+    use_variant(arguments)
+    return result
+
+
+def turntable(arguments: Namespace) -> None:
+    """Write novel views about the vertical axis."""
+    result = _result_and_variant(arguments)
+    from mifit.output.sequence import write_sequence
+    from mifit.output.turntable import write_turntable
+
+    progress = console_progress(arguments.quiet)
+    if arguments.sequence:
+        path, methods = arguments.out / "sequence.mp4", result.methods[:0:-1] or result.methods
+        write_sequence(
+            result, path, arguments.start, arguments.stop, methods=methods, fps=arguments.fps, progress=progress
+        )
+    else:
+        write_turntable(result, arguments.out, arguments.start, arguments.stop, arguments.steps, progress=progress)
+    print(f"Views: {arguments.out}")
+
+
+def view(arguments: Namespace) -> None:
+    """Show a result in the browser until the user ends it."""
+    result = _result_and_variant(arguments)
+    from mifit.output.live_view import LiveView
+
+    live = LiveView(result, arguments.host, arguments.port)
+    print(f"View: {live.address} (end with Ctrl+C)", flush=True)
+    try:
+        live.run()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        live.close()
+
+
+def relight(arguments: Namespace) -> None:
+    """Write views under another environment."""
+    result = _result_and_variant(arguments)
+    from mifit.output.relight import AGREEMENT, write_relit
+    from mifit.output.sequence import write_sequence
+
+    progress = console_progress(arguments.quiet)
+    found = write_relit(
+        result, arguments.env, arguments.out, rotate=arguments.rotate, seed=arguments.seed, progress=progress
+    )
+    print(f"Fast against path-traced views: {found['psnr']:.1f} dB")
+    if found["psnr"] < AGREEMENT:
+        print(
+            f"mifit: warning: fast and path-traced views agree to less than {AGREEMENT:g} dB; use the latter",
+            file=sys.stderr,
+        )
+    if arguments.sequence:
+        lit = result.relight(arguments.env, rotate=arguments.rotate)
+        write_sequence(lit, arguments.out / "sequence.mp4", fps=arguments.fps, progress=progress)
+    print(f"Views: {arguments.out}")
+
+
+def export(arguments: Namespace) -> None:
+    """Write geometry and maps for another program."""
+    result = _result_and_variant(arguments)
+    from mifit.output.export import export
+
+    export(
+        result,
+        arguments.format,
+        arguments.out,
+        arguments.timestep,
+        mesh=arguments.mesh,
+        animate=arguments.animate,
+        fps=arguments.fps,
+    )
+    print(f"Export: {arguments.out}")
