@@ -17,6 +17,7 @@ from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.progress import Progress, silent
 from mifit.render.gbuffer import SurfaceScene
+from mifit.solve import Outcome
 from mifit.stages.geometry.points import corner_matrix
 from mifit.stages.surface.displace import Plate, solve_displacement
 from mifit.stages.surface.model_fit import FoundSurface, fit_model, landmarks_are_biased
@@ -42,6 +43,8 @@ FORGET_MM = 150.0
 """Wavelength above which displacements fall back to the model where nothing is measured."""
 CONTACT_MM = 1.5
 """Gap below which opposed parts of the surface, such as closed lips, move together."""
+SETTLED = 0.25
+"""Part of the last sweep's step below which the surface counts as settled."""
 THIN = 2
 START, STIFFEST = 20.0, 5000.0
 """Stiffness at the start, and the largest."""
@@ -110,7 +113,8 @@ def find_surface(
     moved = np.linalg.norm(displacement, axis=1)[np.unique(model.faces[model.face_mask])] * model.unit_mm
     phase = {
         "name": "surface",
-        "outcome": "converged",
+        "outcome": last.outcome.value,
+        "moved_last_mm": last.moved * capture.unit_mm,
         "levels": [level for level, _ in levels],
         "matched": last.matched,
         "stiffness": last.stiffness,
@@ -134,6 +138,9 @@ class _Descent:
     surfaces: list[FoundSurface]
     stiffness: float
     matched: float
+    moved: float
+    """Root mean square of what the last sweep moved the measured texels by along their normals, world length."""
+    outcome: Outcome
 
 
 class _Search:
@@ -163,6 +170,7 @@ class _Search:
         world = geometry.vertices.astype(np.float64)
         scene = SurfaceScene(world[0], model.faces)
         displacement, stiffness, surfaces, matched = np.zeros_like(neutral), START, [], 0.0
+        moved, step = 0.0, 0.0
         for level, half in levels:
             pixel = self._resolution.pixel * 2.0**level
             size = texture_size(model, world[0], pixel, LARGEST_MAP)
@@ -190,10 +198,16 @@ class _Search:
                 stiffness,
                 ROBUST_STEPS * step / scale,
             )
+            change = scale * solved.displacement - scale * displacement
             displacement = solved.displacement
             stiffness = solved.likely_stiffness(self._config.stiffness, STIFFEST)
             world = geometry.vertices + scale * displacement @ geometry.rotation.transpose(0, 2, 1)
             measured = np.flatnonzero(found.precision > 0)
+            along = np.einsum(
+                "tvc,tvc->tv", change @ geometry.rotation.transpose(0, 2, 1), _normals(world, model.faces)
+            )
+            seen = np.unique(model.faces[texels.face[measured]])
+            moved = float(np.sqrt(np.mean(along[:, seen] ** 2))) if len(seen) else 0.0
             trust = found.precision[measured]
             trust = np.minimum(1.0, trust / max(float(np.median(trust)), 1e-30)) if len(trust) else trust
             corners = model.faces, texels.face[measured], texels.weights[measured]
@@ -207,7 +221,14 @@ class _Search:
             ]
             self._done += 1
             self._progress("find surface", self._done, self._total)
-        return _Descent(displacement, world, surfaces, stiffness, matched)
+        # A sweep tells offsets to a part of its step: where the last one moved the surface by less, it has settled.
+        outcome = Outcome.CONVERGED if moved < SETTLED * step else Outcome.MAX_ITERATIONS
+        return _Descent(displacement, world, surfaces, stiffness, matched, moved, outcome)
+
+
+def _normals(world: NDArray, faces: NDArray) -> NDArray[np.float64]:
+    """(T, V, 3) unit normals of the vertices of each timestep."""
+    return np.stack([vertex_normals(vertices, faces) for vertices in world])
 
 
 def thinned(texels: TexelMap) -> NDArray[np.intp]:
