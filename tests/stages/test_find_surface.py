@@ -225,3 +225,13 @@ def test_biased_landmarks_bend_the_shape_less(model, bumpy):
     assert landmarks_are_biased(start)
     found = find_surface(biased, model, start, BOTH, SurfaceConfig(refit=True), geometry_config=QUICK)
     assert off_mm(model, bumpy, found).mean() < 0.7 * off_mm(model, bumpy, start).mean()
+
+
+def test_the_outcome_tells_whether_the_last_sweep_still_moved_the_surface(model, bumpy, start, monkeypatch):
+    """One sweep is only a start; at the level that it started at, further ones settle."""
+    ends = []
+    for count in (1, 5):
+        monkeypatch.setattr("mifit.stages.find_surface.sweeps", lambda *_, count=count: [(0, 6)] * count)
+        ends.append(find_surface(bumpy, model, start, BOTH).report.details["phases"][-1])
+    assert [end["outcome"] for end in ends] == ["max_iterations", "converged"]
+    assert ends[1]["moved_last_mm"] < 0.3 * ends[0]["moved_last_mm"]
