@@ -1,4 +1,4 @@
-"""COLMAP text models: ``cameras.txt`` and ``images.txt``.
+"""COLMAP models: ``cameras.txt`` and ``images.txt``, or ``cameras.bin`` and ``images.bin``.
 
 COLMAP's pixels are ours (the first centre at 0.5, 0.5), its camera axes OpenCV's, its poses world to camera.
 """
@@ -6,12 +6,13 @@ COLMAP's pixels are ours (the first centre at 0.5, 0.5), its camera axes OpenCV'
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mifit.capture.colmap_binary import CameraEntry, ImageEntry, read_binary_cameras, read_binary_images
+from mifit.capture.photos import MAX_NUMBER, Photo, local, view_name
 from mifit.capture.transforms import View
 from mifit.core.camera import Camera
 from mifit.core.files import read_text, write_text
@@ -28,16 +29,8 @@ _MODELS = {  # where fx, fy, cx, cy and OpenCV's distortion coefficients are amo
 }
 
 
-@dataclass(frozen=True)
-class ColmapImage:
-    """One registered image: its name in the model and its camera."""
-
-    name: str
-    view: View
-
-
-def read_colmap(folder: str | Path) -> tuple[ColmapImage, ...]:
-    """Read a text model.
+def read_colmap(folder: str | Path) -> tuple[Photo, ...]:
+    """Read a text model, or where there is none a binary one.
 
     Each view is named after the image: its folder (``left/0000.png`` -> ``left``), or its stem when it has none.
 
@@ -47,55 +40,73 @@ def read_colmap(folder: str | Path) -> tuple[ColmapImage, ...]:
         A missing or malformed file, an unknown camera model, or a pose that isn't one.
     """
     folder = Path(folder)
-    cameras: dict[str, tuple[int, int, tuple[float, ...], tuple[float, ...]]] = {}
-    for where, words in _lines(folder / "cameras.txt"):
-        if len(words) < 5 or words[1] not in _MODELS:
-            found = words[1] if len(words) > 1 else " ".join(words)
-            raise InputError(f"{where}: found camera model {found!r}, expected one of {', '.join(_MODELS)}")
-        pinhole, lens = _MODELS[words[1]]
-        values = _floats(words[2:], where)
-        width, height, *parameters = values
-        if not (width >= 1 and height >= 1 and width * height <= MAX_PIXELS and width % 1 == height % 1 == 0):
-            raise InputError(
-                f"{where}: found {width:g} x {height:g} pixels, expected whole numbers of at most "
-                f"{MAX_PIXELS // 10**6} megapixels"
-            )
-        if len(parameters) != max((*pinhole, *lens)) + 1:
-            raise InputError(
-                f"{where}: found {len(parameters)} parameters, expected {max((*pinhole, *lens)) + 1} of {words[1]}"
-            )
-        intrinsics = tuple(parameters[i] for i in pinhole)
-        if not (min(intrinsics[:2]) > 0):
-            raise InputError(f"{where}: found focal length {min(intrinsics[:2]):g}, expected a positive one")
-        distortion = tuple(parameters[i] for i in lens)
-        if len(distortion) in (1, 2):
-            distortion = (*distortion, 0.0, 0.0, 0.0)[:4]
-        cameras[words[0]] = (int(width), int(height), intrinsics, distortion if any(distortion) else ())
-    images = []
-    for where, words in _lines(folder / "images.txt", every=2):
-        if len(words) < 10:
-            raise InputError(f"{where}: found {len(words)} fields, expected ID, QW QX QY QZ, TX TY TZ, CAMERA_ID, NAME")
-        pose = _floats(words[1:8], where)
-        if words[8] not in cameras:
-            raise InputError(f"{where}: camera {words[8]} is not in cameras.txt")
+    if not (folder / "cameras.txt").exists() and (folder / "cameras.bin").exists():
+        source = "cameras.bin"
+        entries = read_binary_cameras(folder / "cameras.bin"), read_binary_images(folder / "images.bin")
+    else:
+        source = "cameras.txt"
+        entries = _text_cameras(folder / "cameras.txt"), _text_images(folder / "images.txt")
+    cameras = {key: _camera(where, model, numbers) for where, key, model, numbers in entries[0]}
+    photos = []
+    for where, pose, key, name in entries[1]:
+        if key not in cameras:
+            raise InputError(f"{where}: camera {key} is not in {source}")
+        if not (np.isfinite(pose).all() and max(map(abs, pose)) < MAX_NUMBER):
+            raise InputError(f"{where}: found a NaN or a number beyond {MAX_NUMBER:g}, expected a pose")
         length = float(np.linalg.norm(pose[:4]))
         if abs(length - 1.0) > 1e-3:
             raise InputError(f"{where}: found a quaternion of length {length:.4g}, expected 1")
         matrix = np.eye(4)
         matrix[:3, :3] = Rotation.from_quat([*pose[1:4], pose[0]]).as_matrix()
         matrix[:3, 3] = pose[4:]
-        columns, rows, (fx, fy, cx, cy), distortion = cameras[words[8]]
-        name = " ".join(words[9:])
-        images.append(ColmapImage(name, View(view_name(name), columns, rows, (fx, fy, cx, cy), distortion, matrix)))
-    if not images:
-        raise InputError(f"{folder / 'images.txt'}: found no image, expected at least one")
-    return tuple(images)
+        columns, rows, intrinsics, distortion = cameras[key]
+        photos.append(Photo(name, View(view_name(name), columns, rows, intrinsics, distortion, matrix)))
+    return local(photos, str(folder))
 
 
-def view_name(image_name: str) -> str:
-    """Camera name of an image: its innermost folder, or its stem."""
-    path = PurePosixPath(image_name.replace("\\", "/"))
-    return path.parent.name or path.stem
+_Camera = tuple[int, int, tuple[float, float, float, float], tuple[float, ...]]
+
+
+def _camera(where: str, model: str, numbers: tuple[float, ...]) -> _Camera:
+    """Width, height, intrinsics and OpenCV's distortion of one camera entry: width, height and its parameters."""
+    if model not in _MODELS:
+        raise InputError(f"{where}: found camera model {model!r}, expected one of {', '.join(_MODELS)}")
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{where}: found a NaN or infinite value, expected finite numbers")
+    pinhole, lens = _MODELS[model]
+    width, height, *parameters = numbers
+    if not (width >= 1 and height >= 1 and width * height <= MAX_PIXELS and width % 1 == height % 1 == 0):
+        raise InputError(
+            f"{where}: found {width:g} x {height:g} pixels, expected whole numbers of at most "
+            f"{MAX_PIXELS // 10**6} megapixels"
+        )
+    if len(parameters) != max((*pinhole, *lens)) + 1:
+        raise InputError(
+            f"{where}: found {len(parameters)} parameters, expected {max((*pinhole, *lens)) + 1} of {model}"
+        )
+    fx, fy, cx, cy = (parameters[i] for i in pinhole)
+    if not (min(fx, fy) > 0):
+        raise InputError(f"{where}: found focal length {min(fx, fy):g}, expected a positive one")
+    distortion = tuple(parameters[i] for i in lens)
+    if len(distortion) in (1, 2):
+        distortion = (*distortion, 0.0, 0.0, 0.0)[:4]
+    return int(width), int(height), (fx, fy, cx, cy), distortion if any(distortion) else ()
+
+
+def _text_cameras(path: Path) -> Iterator[CameraEntry]:
+    for where, words in _lines(path):
+        if len(words) < 5:
+            raise InputError(f"{where}: found {len(words)} fields, expected CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS")
+        if words[1] not in _MODELS:
+            raise InputError(f"{where}: found camera model {words[1]!r}, expected one of {', '.join(_MODELS)}")
+        yield where, words[0], words[1], _floats(words[2:], where)
+
+
+def _text_images(path: Path) -> Iterator[ImageEntry]:
+    for where, words in _lines(path, every=2):
+        if len(words) < 10:
+            raise InputError(f"{where}: found {len(words)} fields, expected ID, QW QX QY QZ, TX TY TZ, CAMERA_ID, NAME")
+        yield where, _floats(words[1:8], where), words[8], " ".join(words[9:])
 
 
 def write_colmap(folder: str | Path, cameras: Iterable[tuple[Camera, str]]) -> None:
@@ -123,7 +134,9 @@ def _text(values: Iterable[float]) -> str:
 def _lines(path: Path, every: int = 1) -> Iterator[tuple[str, list[str]]]:
     """Every N-th line that is no comment, with its place for messages; blank lines count where N > 1."""
     if not path.exists():
-        raise InputError(f"{path}: no such file; expected a COLMAP text model (cameras.txt, images.txt)")
+        raise InputError(
+            f"{path}: no such file; expected a COLMAP text model (cameras.txt, images.txt) or a binary one"
+        )
     text = read_text(path, MAX_DOCUMENT_BYTES, "text file")
     kept = [(i, line) for i, line in enumerate(text.splitlines(), start=1) if not line.startswith("#")]
     if every == 1:

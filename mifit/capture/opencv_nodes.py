@@ -7,12 +7,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from mifit.capture.xml_text import parse_xml
 from mifit.core.files import read_text
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
@@ -76,12 +76,7 @@ def _yaml(text: str, path: Path) -> Iterator[Entry]:
 
 
 def _xml(text: str, path: Path) -> Iterator[Entry]:
-    if "<!DOCTYPE" in text:  # entities expand; OpenCV writes none
-        raise _unreadable(path, "a document type, which OpenCV never writes")
-    try:
-        root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError) as error:
-        raise _unreadable(path, str(error)) from None
+    root = parse_xml(text, f"{path}: not a readable OpenCV YAML or XML file")
     for node in root:
         data = node.findtext("data")
         fields = ((node.findtext(name) or "").strip() for name in _FIELDS)

@@ -26,6 +26,8 @@ from mifit.errors import InputError
 
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0}
 MIN_SIDE = 16
+MASK_KEYS = ("mask_path", "fg_mask_path")
+"""Ours and nerfstudio's, VHAP's."""
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's order of distortion coefficients; k4 to k6 are its rational model."""
 
@@ -96,8 +98,14 @@ class Transforms:
     units: str
 
 
-def read_transforms(path: str | Path) -> Transforms:
+def read_transforms(path: str | Path, units: str = "cm") -> Transforms:
     """Read and check a ``transforms.json``; file names in it are taken relative to its folder.
+
+    Parameters
+    ----------
+    path : path
+    units : str
+        Unit of length of a file that doesn't say its own.
 
     Raises
     ------
@@ -106,7 +114,7 @@ def read_transforms(path: str | Path) -> Transforms:
     """
     path = Path(path)
     document = _load(path)
-    units = document.get("units", "cm")
+    units = document.get("units", units)
     if not isinstance(units, str) or units not in UNITS_MM:
         raise InputError(f"{path}: units: found {_short(units)}, expected one of {', '.join(UNITS_MM)}")
     model = document.get("camera_model", "OPENCV")
@@ -277,7 +285,7 @@ def _shot(entry: _Entry, folder: Path) -> Shot:
         camera,
         timestep,
         image,
-        folder / entry.text("mask_path") if "mask_path" in entry else None,
+        next((folder / entry.text(key) for key in MASK_KEYS if key in entry), None),
         folder / entry.text("landmark_path") if "landmark_path" in entry else None,
     )
 

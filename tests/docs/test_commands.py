@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
 import shlex
 import shutil
@@ -20,6 +21,7 @@ from mifit.core.image import to_8_bit
 from mifit.output.sequence import write_video
 from mifit.plan import load_plan
 from mifit.schema import read_toml
+from tests.capture import photogrammetry
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -87,6 +89,7 @@ def workspace(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
             cv2.imwrite(str(folder / name / f"{t:04d}.png"), frame[..., ::-1])
     write_stereo(folder / "stereo.yml", capture.camera("left"), capture.camera("right"))
     write_colmap(folder / "sparse" / "0", [(capture.camera(n), f"{n}/0000.png") for n in ("left", "right")])
+    _photogrammetry(folder, head, capture)
     shutil.copytree(head, folder / "scene")
     shutil.copytree(head, folder / "CAPTURE")
     shutil.copy(ROOT / "scenes" / "relighting" / "studio.hdr", folder)
@@ -97,6 +100,23 @@ def workspace(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(folder / "RESULT", folder / "out" / "face")
     shutil.copytree(head, folder / "out" / "head")
     return folder
+
+
+def _photogrammetry(folder: Path, head: Path, capture: Capture) -> None:
+    """The first timestep as photographs of other programs, and all of them as data sets."""
+    (folder / "photos").mkdir()
+    for name in ("left", "right"):
+        shutil.copy(folder / name / "0000.png", folder / "photos" / f"{name}.png")
+    photos = [(capture.camera(name), f"{name}.png") for name in ("left", "right")]
+    photogrammetry.write_metashape(folder / "cameras.xml", photos)
+    photogrammetry.write_xmp(folder / "photos", photos)
+    photogrammetry.write_vhap(folder / "export" / "074", head)
+    images = folder / "074" / "sequences" / "EMO-1" / "images"
+    for name in ("left", "right"):
+        shutil.copytree(folder / name, images / f"cam_{name}")
+    (folder / "074" / "calibration").mkdir()
+    parameters = photogrammetry.nersemble_parameters([camera for camera, _ in photos], 1.0)
+    (folder / "074" / "calibration" / "camera_params.json").write_text(json.dumps(parameters))
 
 
 NOT_HERE = {
