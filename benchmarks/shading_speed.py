@@ -4,7 +4,8 @@
 
 One iteration: eight images of 680 x 480, their squared distance from targets, and its gradients by both 512 x 512
 albedo maps, the normal correction map and the lighting. Reference: the same scene, plugins and gradients through
-``mi.render`` with ``prb`` at 4 samples per pixel. Also how the sorted gradient of look-ups compares with a scattered
+``mi.render`` with ``prb`` at 4 samples per pixel; and what users of the public path have, ``mi.render`` with
+``shdirect``. Also how the sorted gradient of look-ups compares with a scattered
 one, and what each shading model costs. Ratios are of medians within one run. Uses the ICT-FaceKit head of the data
 folder where it is present, else a ball. Writes ``benchmarks/results/shading_speed.json``.
 """
@@ -138,8 +139,10 @@ class Cached:
         return [np.array(g) for g in gradients] + [np.array(loss)]
 
 
-def path_replay(views: list[Camera], mesh: tuple, size: int, light: np.ndarray) -> Callable[[], object]:
-    """The same iteration through ``mi.render`` with ``prb`` at 4 samples per pixel."""
+def rendered(
+    views: list[Camera], mesh: tuple, size: int, light: np.ndarray, integrator: dict[str, object], spp: int
+) -> Callable[[], object]:
+    """The same iteration through ``mi.render`` with an integrator."""
     import drjit as dr
     import mitsuba as mi
 
@@ -172,8 +175,8 @@ def path_replay(views: list[Camera], mesh: tuple, size: int, light: np.ndarray) 
     )
     emitter = {"type": "shenv", "coefficients": mi.TensorXf(light.astype(np.float32))}
     scene = mifit.load_scene({"type": "scene", "mesh": surface, "light": emitter})
-    sensors = [make_sensor(camera, 4) for camera in views]
-    integrator = mi.load_dict({"type": "prb", "max_depth": 2, "hide_emitters": True})
+    sensors = [make_sensor(camera, spp) for camera in views]
+    chosen = mi.load_dict({**integrator, "hide_emitters": True})
     parameters = mi.traverse(scene)
     keys = [k for k in parameters.keys() if k.endswith(("reflectance.data", "correction.data", "coefficients"))]
     assert len(keys) == 4, keys
@@ -184,7 +187,7 @@ def path_replay(views: list[Camera], mesh: tuple, size: int, light: np.ndarray) 
             dr.set_grad(parameters[key], 0.0)
         parameters.update()
         for seed, sensor in enumerate(sensors):
-            image = mi.render(scene, parameters, sensor=sensor, integrator=integrator, spp=4, seed=seed)
+            image = mi.render(scene, parameters, sensor=sensor, integrator=chosen, spp=spp, seed=seed)
             dr.backward(dr.mean(dr.square(image[..., :3] - 0.5), axis=None))
         dr.eval([dr.grad(parameters[key]) for key in keys])
         dr.sync_thread()
@@ -212,7 +215,11 @@ def main() -> None:
         model: median_seconds(lambda m=model: cached.iterate(m), 9) for model in ("paper", "prefiltered", "shadowed")
     }
     seconds["prefiltered, scattered gradients"] = median_seconds(lambda: cached.iterate(scattered=True), 9)
-    seconds["prb, 4 spp"] = median_seconds(path_replay(views, tuple(mesh), size, light), 2 if not quick else 1)
+    closed = rendered(views, tuple(mesh), size, light, {"type": "shdirect"}, 1)
+    seconds["mi.render, shdirect"] = median_seconds(closed, 9)
+    replay = rendered(views, tuple(mesh), size, light, {"type": "prb", "max_depth": 2}, 4)
+    seconds["prb, 4 spp"] = median_seconds(replay, 2 if not quick else 1)
+    seconds["mi.render, shdirect, again"] = median_seconds(closed, 9)
     again = {
         model: median_seconds(lambda m=model: cached.iterate(m), 9) for model in ("paper", "prefiltered", "shadowed")
     }
@@ -226,6 +233,9 @@ def main() -> None:
         "points": cached.count,
         "seconds": {**seconds, **{f"{model}, again": value for model, value in again.items()}},
         "ratios": {
+            "prb over mi.render with shdirect": 2.0
+            * seconds["prb, 4 spp"]
+            / (seconds["mi.render, shdirect"] + seconds["mi.render, shdirect, again"]),
             "prb over prefiltered": seconds["prb, 4 spp"] / both["prefiltered"],
             "prb over paper": seconds["prb, 4 spp"] / both["paper"],
             "prb over shadowed": seconds["prb, 4 spp"] / both["shadowed"],

@@ -16,6 +16,7 @@ MESH_POSITIONS = "vertex_positions"
 MESH_FACES = "faces"
 MESH_TEXCOORDS = "vertex_texcoords"
 MESH_NORMALS = "vertex_normals"
+MESH_BUFFERS = (MESH_POSITIONS, MESH_FACES, MESH_TEXCOORDS, MESH_NORMALS)
 
 SHADOW_EPSILON = 1e-3
 """Part of a ray's far end, relative to the scene's diagonal, in which hits count as the surface point itself."""

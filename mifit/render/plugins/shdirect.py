@@ -11,6 +11,8 @@ from mifit.errors import InputError
 
 LIGHT_SAMPLES = 16
 """Points of a compact light that has an extent."""
+KEPT_BYTES, RAY_BYTES = 2**30, 260
+"""Of first hits at most, and of one of them with its ray and its point: a dozen views of 680 x 480."""
 
 
 def make() -> type:
@@ -22,7 +24,7 @@ def make() -> type:
     from mifit.appearance import kernels, models
     from mifit.appearance.formation import form_image
     from mifit.appearance.occlusion import trace_transfer
-    from mifit.render.gbuffer import MESH_FACES, MESH_POSITIONS, SurfaceScene
+    from mifit.render.gbuffer import MESH_BUFFERS, MESH_FACES, MESH_POSITIONS, SurfaceScene
 
     class Nested(mi.TraversalCallback):
         """Collects what an object exposes: parameters and objects inside it."""
@@ -33,6 +35,73 @@ def make() -> type:
 
         def put(self, name: str, value: Any, flags: Any) -> None:
             self.found.append(value)
+
+    def buffers_of(mesh: Any) -> list[Any]:
+        """What a point on a mesh is made of: positions, faces, normals and UVs, as far as there are any."""
+        parameters = mi.traverse(mesh)
+        return [parameters[key] for key in MESH_BUFFERS if key in parameters]
+
+    class FirstHits:
+        """What primary rays meet, kept for as long as neither they nor the meshes move.
+
+        Optimisers of light and skin look from the same few cameras at the same surface again and again. Rays are
+        compared one by one, which costs a fiftieth of tracing them. Hits hold no derivatives; the point that is made
+        of them does.
+        """
+
+        def __init__(self) -> None:
+            self.sensor: Any = None
+            self.kept: dict[tuple[int, int], dict[str, Any]] = {}
+
+        def find(self, scene: Any, ray: Any, active: Any) -> tuple[Any, Any]:
+            """The points that a sensor's rays meet, and the numbers of their rays; None where each ray has an entry."""
+            shapes = scene.shapes()
+            plain = dr.is_jit_v(mi.Float) and all(shape.is_mesh() for shape in shapes)
+            recording = dr.flag(dr.JitFlag.SymbolicScope) or dr.flag(dr.JitFlag.FreezingScope)
+            if not plain or recording or self.sensor is None:
+                return None, scene.ray_intersect(ray, active)
+            with dr.suspend_grad():
+                still = mi.Ray3f(dr.detach(ray))
+                buffers = [value for shape in shapes for value in buffers_of(shape)]
+                moved = (id(scene), *(buffer.index for buffer in buffers))
+                name = int(np.array(dr.reinterpret_array(mi.UInt32, mi.SensorPtr(self.sensor)))[0]), dr.width(still.d)
+                kept = self.kept.get(name)
+                if kept is None or kept["moved"] != moved or not same(kept["ray"], still):
+                    hits = scene.ray_intersect_preliminary(still, coherent=True)
+                    index = dr.compress(hits.is_valid())
+                    kept = {"ray": still, "moved": moved, "index": index}
+                    if dr.width(index) > 0:
+                        kept["hits"] = dr.gather(type(hits), hits, index)
+                        kept["si"] = kept["hits"].compute_surface_interaction(dr.gather(mi.Ray3f, still, index))
+                    dr.eval(kept)
+                    # While scene and buffers are kept, no other one can have their name.
+                    kept["alive"] = scene, buffers
+                    self.kept.pop(name, None)
+                    self.kept[name] = kept
+                    while sum(RAY_BYTES * rays for _, rays in self.kept) > KEPT_BYTES and len(self.kept) > 1:
+                        self.kept.pop(next(iter(self.kept)))
+            index = kept["index"]
+            if dr.width(index) == 0:
+                return None, dr.zeros(mi.SurfaceInteraction3f, dr.width(still.d))
+            if dr.grad_enabled(ray, buffers):
+                return index, kept["hits"].compute_surface_interaction(dr.gather(mi.Ray3f, mi.Ray3f(ray), index))
+            return index, mi.SurfaceInteraction3f(kept["si"])
+
+        def hit(self, index: Any, si: Any, ray: Any) -> Any:
+            """Which rays meet something, given what `find` found."""
+            if index is None:
+                return si.is_valid()
+            met = dr.zeros(mi.Bool, dr.width(ray))
+            dr.scatter(met, mi.Bool(True), index, mode=dr.ReduceMode.Permute)
+            return met
+
+    def same(one: Any, other: Any) -> bool:
+        """Are two sets of rays equal, each ray and number of them?"""
+        pairs = ((one.o, other.o), (one.d, other.d), (one.maxt, other.maxt))
+        equal = mi.Bool(True)
+        for a, b in pairs:
+            equal &= dr.all(a == b) if dr.depth_v(a) > 1 else a == b
+        return bool(dr.all(equal))
 
     class SHDirect(ADIntegrator):
         r"""
@@ -76,6 +145,7 @@ def make() -> type:
             self.bounce_albedo = float(props.get("bounce_albedo", 0.0))
             self.hide = bool(props.get("hide_emitters", False))
             self._traced: dict[str, Any] = {}
+            self._hits = FirstHits()
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             if dr.is_jit_v(mi.Float):
@@ -86,6 +156,7 @@ def make() -> type:
             film = sensor.film()
             size = film.crop_size()
             spp = sampler.sample_count()
+            self._hits.sensor = sensor
             index = dr.arange(mi.UInt32, size[0] * size[1] * spp)
             pixel, k = index // dr.opaque(mi.UInt32, spp), mi.Float(index % dr.opaque(mi.UInt32, spp))
             corner = mi.Vector2f(pixel % size[0], pixel // size[0])
@@ -101,20 +172,64 @@ def make() -> type:
             position = corner + mi.Vector2f(film.crop_offset())
             return ray, weight, position if film.rfilter().is_box_filter() else position + inside
 
+        def render_backward(
+            self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
+        ) -> None:
+            """Gradients of all parameters, given those of the image.
+
+            Under a box filter a pixel is the mean of its samples, so each sample's gradient is its pixel's, divided:
+            the image itself, which Mitsuba's way forms once more, is not needed. Other filters go that way.
+            """
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            film = sensor.film()
+            special = dr.all(mi.has_flag(film.flags(), mi.FilmFlags.Special))
+            if special or grad_in.shape[2] < 3 or not film.rfilter().is_box_filter():
+                super().render_backward(scene, params, grad_in, sensor, seed, spp)
+                return
+            with dr.suspend_grad():
+                sampler, spp = self.prepare(sensor, seed, spp, self.aov_names())
+                ray, weight, pos = self.sample_rays(scene, sensor, sampler)
+                corner = mi.Vector2u(pos - mi.Vector2f(film.crop_offset()))
+                at = (corner.y * film.crop_size()[0] + corner.x) * grad_in.shape[2]
+                found = mi.Color3f(*(dr.gather(mi.Float, grad_in.array, at + k) for k in range(3))) * weight / spp
+                with dr.resume_grad():
+                    index, si = self._hits.find(scene, ray, mi.Bool(True))
+                    values = [(self._shade(scene, si), found if index is None else dr.gather(mi.Color3f, found, index))]
+                    if not self.hide:
+                        behind = self._emitters(scene)[0].radiance(ray.d)
+                        values.append((dr.select(self._hits.hit(index, si, ray), 0.0, behind), found))
+                    values = [(value, given) for value, given in values if dr.grad_enabled(value)]
+                    for value, given in values:
+                        dr.set_grad(value, given)
+                        dr.enqueue(dr.ADMode.Backward, value)
+                    if values:
+                        dr.traverse(dr.ADMode.Backward)
+                dr.eval()
+
         def sample(
             self, mode: Any, scene: Any, sampler: Any, ray: Any, active: Any = True, **_: Any
         ) -> tuple[Any, Any, list[Any], Any]:
             """Radiance along primary rays; plain automatic differentiation in every mode."""
+            index, si = self._hits.find(scene, ray, active)
+            value = self._shade(scene, si)
+            hit = self._hits.hit(index, si, ray)
+            if index is not None:
+                radiance = dr.zeros(mi.Color3f, dr.width(ray))
+                dr.scatter(radiance, value, index, mode=dr.ReduceMode.Permute)
+                value = radiance
+            if not self.hide:
+                value = dr.select(hit, value, self._emitters(scene)[0].radiance(ray.d))
+            return value, hit | (not self.hide), [], None
+
+        def _shade(self, scene: Any, si: Any) -> Any:
+            """Radiance that leaves points of surfaces towards the camera; nothing where there is none."""
             emitter, compact = self._emitters(scene)
             flat = emitter.project()
             order = round((dr.width(flat) // 3) ** 0.5)
-            coefficients = kernels.colours(flat, order, dr.width(ray))
-            si = scene.ray_intersect(ray, active)
-            hit = active & si.is_valid()
+            coefficients = kernels.colours(flat, order, dr.width(si) if dr.grad_enabled(flat) else 1)
+            hit, view = si.is_valid(), si.to_world(si.wi)
             radiance = mi.Color3f(0.0)
-            if not self.hide:
-                radiance = dr.select(hit, 0.0, emitter.radiance(ray.d))
-            pointers = si.bsdf(ray)
+            pointers = si.bsdf()
             traced = self._transfer(scene, si, hit, order) if self.model.needs_shadows else None
             for bsdf, pointer, two_sided in self._bsdfs(scene):
                 own = hit & (pointers == pointer)
@@ -133,12 +248,12 @@ def make() -> type:
                     specular = bsdf.at_angle(diffuse, specular, fresnel, cosine) / factor
                 n.z = dr.select(flipped, -n.z, n.z)
                 normal = mi.Vector3f(si.sh_frame.to_world(n))
-                shaded = self.model.shade(normal, -ray.d, lobe, coefficients, traced)
+                shaded = self.model.shade(normal, view, lobe, coefficients, traced)
                 image = form_image(self.ambient, diffuse, shaded[0], specular, shaded[1])
                 radiance = dr.select(front, image, radiance)
             for light in compact:
                 radiance += self._direct(scene, light, si, hit)
-            return radiance, si.is_valid() | (not self.hide), [], None
+            return radiance
 
         def _emitters(self, scene: Any) -> tuple[Any, list[Any]]:
             """The scene's `shenv`, of which there is one, and its other emitters, none of them an environment."""

@@ -1,0 +1,160 @@
+"""What `shdirect` keeps between images of a camera: nothing that has moved since, and no gradient but the true one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import mifit
+from tests.render.test_shdirect import ball, bitmap, make_scene, positive_light
+
+KEYS = (
+    "mesh.bsdf.diffuse_reflectance.data",
+    "mesh.bsdf.specular_reflectance.data",
+    "mesh.bsdf.normal_correction.data",
+    "light.coefficients",
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plugins(variant: str) -> None:
+    mifit.register_plugins()
+
+
+def textured(hide: bool = False, **options):
+    rng = np.random.default_rng(5)
+    bsdf = {
+        "type": "blinnphong",
+        "diffuse_reflectance": bitmap(rng.uniform(0.2, 0.8, (16, 16, 3))),
+        "specular_reflectance": bitmap(rng.uniform(0.1, 0.4, (16, 16, 1))),
+        "normal_correction": bitmap(rng.uniform(-0.1, 0.1, (16, 16, 3))),
+        "exponent": 20.0,
+    }
+    return make_scene(ball(), bsdf, positive_light(), hide_emitters=hide, **options)
+
+
+def image_of(scene, integrator=None) -> np.ndarray:
+    import mitsuba as mi
+
+    return np.array(mi.render(scene, integrator=integrator or scene.integrator(), spp=1))
+
+
+def change(scene, what: str) -> None:
+    import mitsuba as mi
+
+    params = mi.traverse(scene)
+    if what == "sensor":
+        turned = mi.ScalarTransform4f().look_at([1.0, 0.5, 4], [0, 0, 0], [0, 1, 0])
+        params["sensor.to_world"] = mi.Transform4f(turned)
+    elif what == "uv":
+        params["mesh.vertex_texcoords"] = params["mesh.vertex_texcoords"] * 0.5
+    elif what == "normals":
+        params["mesh.vertex_normals"] = -params["mesh.vertex_normals"]
+    elif what == "positions":
+        params["mesh.vertex_positions"] = params["mesh.vertex_positions"] * 0.8
+    elif what == "faces":
+        faces = np.array(params["mesh.faces"]).reshape(-1, 3)
+        faces[: len(faces) // 2] = faces[len(faces) // 2 :]
+        params["mesh.faces"] = mi.UInt32(faces.ravel())
+    elif what == "albedo":
+        params["mesh.bsdf.diffuse_reflectance.data"] = params["mesh.bsdf.diffuse_reflectance.data"] * 0.5
+    params.update()
+
+
+@pytest.mark.parametrize("what", ["sensor", "uv", "normals", "positions", "faces", "albedo"])
+def test_what_moves_is_looked_at_again(what: str) -> None:
+    import mitsuba as mi
+
+    scene = textured()
+    before = image_of(scene)
+    change(scene, what)
+    after = image_of(scene)
+    fresh = image_of(scene, mi.load_dict({"type": "shdirect"}))
+    np.testing.assert_array_equal(after, fresh)
+    assert np.isfinite(after).all()
+    assert np.abs(after - before).max() > 0.01
+
+
+def test_a_second_image_traces_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    import mitsuba as mi
+
+    scene, traced = textured(), []
+    find = mi.Scene.ray_intersect_preliminary
+    monkeypatch.setattr(
+        mi.Scene, "ray_intersect_preliminary", lambda *a, **k: traced.append(1) or find(*a, **k), raising=True
+    )
+    first, second = image_of(scene), image_of(scene)
+    assert len(traced) == 1
+    np.testing.assert_array_equal(first, second)
+
+
+def test_views_share_an_integrator_and_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    import mitsuba as mi
+
+    from mifit.render.plugins import shdirect
+
+    monkeypatch.setattr(shdirect, "KEPT_BYTES", 3 * 32 * 32 * shdirect.RAY_BYTES)
+    scene = textured()
+    integrator = scene.integrator()
+    for k in range(6):
+        sensor = mi.load_dict(
+            {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": mi.ScalarTransform4f().look_at([k - 2.0, 0, 4], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}},
+            }
+        )
+        seen = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=1))
+        fresh = np.array(mi.render(scene, sensor=sensor, integrator=mi.load_dict({"type": "shdirect"}), spp=1))
+        np.testing.assert_array_equal(seen, fresh)
+        assert len(integrator._hits.kept) <= 3
+
+
+@pytest.mark.parametrize("hide", [False, True])
+@pytest.mark.parametrize("spp", [1, 4])
+def test_gradients_are_those_of_the_image_that_mitsuba_forms(hide: bool, spp: int) -> None:
+    import drjit as dr
+    import mitsuba as mi
+    from mitsuba.python.ad.integrators.common import ADIntegrator
+
+    scene = textured(hide)
+    target = mi.TensorXf(np.random.default_rng(1).uniform(0, 1, (32, 32, 3)).astype(np.float32))
+
+    def gradients(keys: tuple[str, ...], general: bool) -> list[np.ndarray]:
+        params = mi.traverse(scene)
+        for key in keys:
+            dr.enable_grad(params[key])
+            dr.set_grad(params[key], 0.0)
+        params.update()
+        integrator = mi.load_dict({"type": "shdirect", "hide_emitters": hide})
+        if general:
+            integrator.render_backward(scene, params, target, scene.sensors()[0], 0, spp)
+        else:
+            ADIntegrator.render_backward(integrator, scene, params, target, scene.sensors()[0], 0, spp)
+        found = [np.array(dr.grad(params[key])) for key in keys]
+        for key in keys:
+            dr.disable_grad(params[key])
+        return found
+
+    for keys in (KEYS, ("mesh.vertex_positions",), ("light.coefficients",)):
+        for ours, theirs in zip(gradients(keys, True), gradients(keys, False), strict=True):
+            assert np.abs(theirs).max() > 0
+            np.testing.assert_allclose(ours, theirs, rtol=2e-4, atol=2e-5 * np.abs(theirs).max())
+
+
+def test_a_view_past_everything_is_empty() -> None:
+    import drjit as dr
+    import mitsuba as mi
+
+    scene = textured(hide=True)
+    params = mi.traverse(scene)
+    params["mesh.vertex_positions"] = params["mesh.vertex_positions"] + 100.0
+    params.update()
+    key = KEYS[0]
+    dr.enable_grad(params[key])
+    params.update()
+    image = mi.render(scene, params, spp=1)
+    dr.backward(dr.mean(image, axis=None))
+    assert not np.array(image)[..., :3].any()
+    assert not np.array(dr.grad(params[key])).any()
