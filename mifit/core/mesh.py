@@ -55,4 +55,8 @@ def normalize(v: NDArray) -> NDArray:
 
 def interpolate(values: NDArray, faces: NDArray, face: NDArray, weights: NDArray) -> NDArray:
     """Vertex values (V, C) at points given by face index (N,) and barycentric weights (N, 3) -> (N, C)."""
-    return np.einsum("nk,nkc->nc", weights, values[faces[face]])
+    # As one sparse product: the corners' values are added up on the fly instead of being gathered first.
+    corners = faces[face]
+    rows = np.arange(0, corners.size + 1, 3, dtype=corners.dtype)
+    mixing = sp.csr_array((weights.ravel(), corners.ravel(), rows), shape=(len(corners), len(values)))
+    return mixing @ values

@@ -6,6 +6,8 @@ optimisers share.
 
 from __future__ import annotations
 
+import hashlib
+from collections import OrderedDict
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -24,6 +26,33 @@ from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
     from mifit.result import Method, Result
+
+
+KEPT_MESHES = 8
+"""Meshes whose shadows are remembered: the timesteps of a result whose views are drawn one after the other."""
+_kept: OrderedDict[bytes, OccludingMesh] = OrderedDict()
+
+
+def occluding_mesh(vertices: NDArray, faces: NDArray) -> OccludingMesh:
+    """A mesh to send rays at and its traced shadows; the same one for equal arrays, as long as it is among the last.
+
+    Reports, evaluations and turning lights draw the same few meshes again and again, and their shadows cost
+    more than all else in a picture.
+    """
+    import mitsuba as mi
+
+    from mifit.render.gbuffer import SurfaceScene
+
+    digest = hashlib.blake2b((mi.variant() or "").encode())
+    for array in (vertices, faces):
+        digest.update(f"{array.shape}{array.dtype}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    key = digest.digest()
+    mesh = _kept.pop(key, None) or OccludingMesh(SurfaceScene(np.array(vertices), np.array(faces)))
+    _kept[key] = mesh
+    while len(_kept) > KEPT_MESHES:
+        _kept.popitem(last=False)
+    return mesh
 
 
 @dataclass(frozen=True)
@@ -78,8 +107,6 @@ def trace_mesh(vertices: NDArray, faces: NDArray, camera: Camera, oversampling: 
 
     A sample whose nearest surface shows its back (the inside of the head through an eye opening) is not covered.
     """
-    from mifit.render.gbuffer import SurfaceScene
-
     k = oversampling
     fine = replace(
         camera,
@@ -90,7 +117,7 @@ def trace_mesh(vertices: NDArray, faces: NDArray, camera: Camera, oversampling: 
         cx=camera.cx * k,
         cy=camera.cy * k,
     )
-    buffer = SurfaceScene(vertices, faces).gbuffer(fine)
+    buffer = occluding_mesh(vertices, faces).scene.gbuffer(fine)
     index = np.flatnonzero(buffer.face.ravel() >= 0)
     face = buffer.face.ravel()[index]
     weights = buffer.weights.reshape(-1, 3)[index]
@@ -166,8 +193,6 @@ def shade_methods(
         out["pca"] = surface.image(_shade_stage_1(reconstruction, surface, timestep))
     finer = [m for m in methods if m != "pca"]
     if finer:
-        from mifit.render.gbuffer import SurfaceScene
-
         reflectance = reconstruction.reflectance
         assert reflectance is not None
         model, vertices = reconstruction.model, reconstruction.geometry.vertices[reconstruction.index(timestep)]
@@ -175,14 +200,14 @@ def shade_methods(
         base = _mesh_normals(reconstruction, surface, timestep)
         appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: _look_up(model, surface, m)))
         points = MeshPoints(surface.points, base, surface.face, surface.weights)
-        scene = SurfaceScene(vertices, model.faces)
+        mesh = occluding_mesh(vertices, model.faces)
         if reconstruction.environment is not None and appearance.lobe.fresnel is not None:
             turn = reconstruction.environment_rotation
             light = EnvironmentLight(reconstruction.environment, np.eye(3) if turn is None else turn)
             albedo = _vertex_albedo(reconstruction)
-            shaded = light.shade(scene, points, material.normal, surface.view, appearance.lobe, albedo)
+            shaded = light.shade(mesh.scene, points, material.normal, surface.view, appearance.lobe, albedo)
         else:
-            occlusion = appearance.trace(OccludingMesh(scene), points)
+            occlusion = appearance.trace(mesh, points)
             shaded = appearance.shade_bent(material.normal, base, surface.view, occlusion, surface.points)
         ambient = np.float32(reflectance.illumination.ambient)
         for method in finer:
