@@ -8,6 +8,8 @@ map is inverted at once by cosine transforms.
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -18,6 +20,8 @@ from mifit.solve import Outcome
 
 SPLIT = 0.5
 """Weight of ADMM's splits relative to the median curvature of the blocks."""
+CHUNK = 32768
+"""Texels whose blocks are solved at once: what they need stays in a core's cache."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,10 @@ class TexelSystems:
         if len(parts) == 1:
             return parts[0]
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
+
+    def take(self, rows: slice) -> TexelSystems:
+        """Blocks of some of the texels."""
+        return TexelSystems(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def solve(self, x0: NDArray, y0: NDArray, px: NDArray | float, py: NDArray | float) -> tuple[NDArray, NDArray]:
         """Minimise each block plus ``px |x - x0|^2 + py (y - y0)^2`` within 0..1: x (N, 3) and y (N,)."""
@@ -147,9 +155,9 @@ class Splits:
 
 
 def plane_laplacian(planes: NDArray) -> NDArray:
-    """Five-point Laplacian of planes (C, S, S) with mirrored borders."""
+    """Five-point Laplacian of planes (..., S, S) with mirrored borders."""
     out = -4.0 * planes
-    for axis in (1, 2):
+    for axis in (planes.ndim - 2, planes.ndim - 1):
         low, high = ((slice(None),) * axis + (part,) for part in (slice(None, -1), slice(1, None)))
         out[high] += planes[low]
         out[low] += planes[high]
@@ -245,26 +253,42 @@ def solve_maps(
         smooth = (prior if start is None else start.transpose(2, 0, 1).astype(np.float32)) - base
         bent, u, v = plane_laplacian(smooth), np.zeros_like(smooth), np.zeros_like(smooth)
     total = 0.5 * rho + weak
-    blocks = _Blocks(systems, total[:3, :, 0], float(total[3, 0, 0]))
+    rows = [slice(at, at + CHUNK) for at in range(0, len(index), CHUNK)]
+    parts = [(_Blocks(systems.take(r), total[:3, :, 0], float(total[3, 0, 0])), index[r]) for r in rows]
     share, drawn = 0.5 * rho / total, weak / total * prior
-    texel, splits.outcome, splits.iterations = prior, Outcome.MAX_ITERATIONS, 0
-    for _ in range(iterations):
-        splits.iterations += 1
-        texel = share * (base + smooth - u) + drawn
+    texel, splits.outcome, splits.iterations = prior.copy(), Outcome.MAX_ITERATIONS, 0
+
+    def pull_texels(k: int) -> None:
+        """Where the blocks are drawn to, and what texels without a block take."""
+        texel[k] = share[k] * (base[k] + smooth[k] - u[k]) + drawn[k]
+
+    def solve_blocks(part: tuple[_Blocks, NDArray[np.int64]]) -> None:
+        block, rows = part
         flat = texel.reshape(4, -1)
-        x, y = blocks.solve(flat[:3, index], flat[3, index])
-        flat[:3, index], flat[3, index] = x, y
-        np.clip(texel, 0.0, 1.0, out=texel)
-        shifted = bent - v
-        z = shifted - np.clip(shifted, -threshold, threshold)  # soft threshold
-        right = texel - base + u + plane_laplacian(z + v)
-        previous = smooth
-        smooth = idctn(dctn(right, axes=(1, 2), type=2, workers=-1) * inverse, axes=(1, 2), type=2, workers=-1)
-        bent = plane_laplacian(smooth)
-        u = u + texel - base - smooth
-        v = v + z - bent
-        if np.abs(smooth - previous).max() < tolerance:
-            splits.outcome = Outcome.CONVERGED
-            break
+        x, y = block.solve(flat[:3, rows], flat[3, rows])
+        flat[:3, rows], flat[3, rows] = x, y
+
+    def smooth_plane(k: int) -> float:
+        """One plane's smooth copy and multipliers; the largest change of the copy."""
+        np.clip(texel[k], 0.0, 1.0, out=texel[k])
+        shifted = bent[k] - v[k]
+        z = shifted - np.clip(shifted, -threshold[k], threshold[k])  # soft threshold
+        right = texel[k] - base[k] + u[k] + plane_laplacian(z + v[k])
+        found = idctn(dctn(right, type=2) * inverse, type=2)
+        moved = float(np.abs(found - smooth[k]).max())
+        smooth[k], bent[k] = found, plane_laplacian(found)
+        u[k] += texel[k] - base[k] - found
+        v[k] += z - bent[k]
+        return moved
+
+    # Planes are independent but for the blocks, and those of each other; NumPy and SciPy let go of the interpreter.
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        for _ in range(iterations):
+            splits.iterations += 1
+            list(pool.map(pull_texels, range(4)))
+            list(pool.map(solve_blocks, parts))
+            if max(pool.map(smooth_plane, range(4))) < tolerance:
+                splits.outcome = Outcome.CONVERGED
+                break
     splits.smooth, splits.bent, splits.u, splits.v = smooth, bent, u, v
     return np.ascontiguousarray(texel.transpose(1, 2, 0), dtype=np.float32)
