@@ -307,9 +307,11 @@ def main() -> int:
     parser.add_argument("--part", type=int, default=1, help="an N-th of the kills and full disks")
     parser.add_argument("--only", default="", help="commands whose names hold this text")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, help="write the counts to a file")
     arguments = parser.parse_args()
     preload()
-    wrong, total = 0, [0, 0]
+    wrong: dict[str, str] = {}
+    counts: dict[str, dict[str, int]] = {}
     with tempfile.TemporaryDirectory(prefix="endure-") as name:
         root = Path(name)
         make_base(root / "base")
@@ -319,17 +321,20 @@ def main() -> int:
             kills, fulls = (-(-n // arguments.part) for n in (scenario.kills, scenario.fulls))
             start = time.monotonic()
             try:
-                counts = endure(
-                    scenario, root / "case", kills, fulls, random.Random(f"{arguments.seed} {scenario.name}")
-                )
-                total = [a + b for a, b in zip(total, counts, strict=True)]
+                chance = random.Random(f"{arguments.seed} {scenario.name}")
+                done = endure(scenario, root / "case", kills, fulls, chance)
+                counts[scenario.name] = {"kills": done[0], "full_disks": done[1]}
                 seconds = time.monotonic() - start
-                print(f"{scenario.name:<16}{counts[0]:>4} kills{counts[1]:>4} full disks  {seconds:.0f} s", flush=True)
+                print(f"{scenario.name:<16}{done[0]:>4} kills{done[1]:>4} full disks  {seconds:.0f} s", flush=True)
             except Broken as error:
-                wrong += 1
+                wrong[scenario.name] = str(error)
                 print(f"WRONG {scenario.name}: {error}", flush=True)
                 print("      " + " ".join(sorted(content(root / "case" / "work")))[:2000], flush=True)
-    print(f"{total[0]} kills, {total[1]} full disks; {wrong} commands wrong")
+    total = {key: sum(found[key] for found in counts.values()) for key in ("kills", "full_disks")}
+    print(f"{total['kills']} kills, {total['full_disks']} full disks; {len(wrong)} commands wrong")
+    if arguments.json:
+        summary = {**total, "seed": arguments.seed, "commands": counts, "wrong": wrong}
+        arguments.json.write_text(json.dumps(summary, indent=1) + "\n")
     return bool(wrong)
 
 
