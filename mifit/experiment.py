@@ -27,6 +27,7 @@ from mifit.errors import InputError, MifitError
 from mifit.plan import Experiment, Plan, Run, SynthRun, load_plan
 from mifit.progress import Progress, silent
 from mifit.render.variant import set_fitting_variant
+from mifit.study import draw, over_subjects, subjects_table
 
 FORMAT_VERSION = 1
 
@@ -187,8 +188,6 @@ def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: 
     assert fit is not None
     source = fit.capture or _synthetic_capture(fit.synth, experiment_folder, variant)  # type: ignore[arg-type]
     capture = mifit.Capture.load(source)
-    # Runs that differ only in what comes after the fit share it.
-    key = checkpoint.digest(dataclasses.asdict(fit))
     result = mifit.fit(
         capture,
         mifit.MorphableModel.load(fit.model),
@@ -197,7 +196,8 @@ def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: 
         config=fit.config,
         until=fit.until,
         seed=fit.seed,
-        checkpoints=experiment_folder / "fits" / key[:10],
+        checkpoints=experiment_folder / "stages",
+        shared=True,
     )
     metrics = {"fit_seconds": result.seconds}
     evaluation = None
@@ -261,13 +261,16 @@ def _execute_render(e: Experiment, folder: Path, experiment_folder: Path, varian
 
 
 def _summary(plan: Plan, folder: Path) -> str:
-    """Markdown table of all finished runs in the order of the sweep; also writes ``summary.json``."""
+    """Markdown tables of all finished runs in the order of the sweep; also writes ``summary.json`` and plots."""
     rows = []
     for run in plan.runs:
         record = finished(folder / "runs" / run.folder, run)
         if record is not None:
             rows.append({"run": run.folder, "swept": run.swept, "metrics": record["metrics"]})
-    write_text(folder / "summary.json", json.dumps({"name": plan.name, "runs": rows}, indent=1) + "\n")
+    groups = over_subjects(rows)
+    document = {"name": plan.name, "runs": rows, "over_subjects": [dataclasses.asdict(group) for group in groups]}
+    write_text(folder / "summary.json", json.dumps(document, indent=1) + "\n")
+    draw(folder / "plots", rows, groups)
     swept = list(dict.fromkeys(key for row in rows for key in row["swept"]))
     metrics = list(dict.fromkeys(key for row in rows for key in row["metrics"]))
     lines = [f"# {plan.name}: {len(rows)} of {len(plan.runs)} runs", ""]
@@ -278,4 +281,5 @@ def _summary(plan: Plan, folder: Path) -> str:
         cells = [str(row["swept"].get(key, "")) for key in swept]
         cells += [f"{row['metrics'][key]:.4g}" if key in row["metrics"] else "" for key in metrics]
         lines.append("| " + " | ".join(cells) + " |")
+    lines += subjects_table(groups)
     return "\n".join(lines)

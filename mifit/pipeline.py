@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from mifit.config import FitConfig
 from mifit.core.estimate import GeometryEstimate
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
-from mifit.steps import STAGES, Source, Stage, run_steps, steps
+from mifit.steps import STAGES, Part, Source, Stage, run_steps, steps
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -43,6 +43,8 @@ def fit(
     seed: int = 0,
     progress: Progress = silent,
     checkpoints: str | Path | None = None,
+    shared: bool = False,
+    watch: Callable[[Reconstruction], None] | None = None,
 ) -> Reconstruction:
     """Recover geometry, reflectance, lighting and normals of a face from a capture.
 
@@ -66,6 +68,10 @@ def fit(
         Called as work advances.
     checkpoints : path, optional
         Folder for finished stages. A stage found there, computed from the same inputs, isn't run again.
+    shared : bool
+        Whether fits with other settings use that folder too: the stages that they have in common run once.
+    watch : callable, optional
+        Called after each step with the result so far.
 
     Returns
     -------
@@ -98,23 +104,34 @@ def fit(
     if not known_cameras:
         capture = calibrated(capture, model, cameras, timesteps)
     source = Source(capture, digest, model, cameras, timesteps, seed)
+
+    def result(estimates: Mapping[Part, Any], seconds: float = 0.0) -> Reconstruction:
+        return Reconstruction(
+            model=model,
+            **cast(dict, estimates),
+            config={**dataclasses.asdict(config), "seed": seed},
+            cameras=tuple(capture.camera(name) for name in cameras),
+            capture_digest=digest,
+            model_source=model.source,
+            units=capture.units,
+            unit_mm=capture.unit_mm,
+            warnings=(
+                *(() if known_cameras else (ESTIMATED_CAMERAS,)),
+                *one_place(capture, cameras, estimates["geometry"]),
+            ),
+            seconds=seconds,
+            peak_memory=peak_memory(),
+        )
+
     estimates, seconds = run_steps(
-        steps(config, until), source, progress, None if checkpoints is None else Path(checkpoints)
+        steps(config, until),
+        source,
+        progress,
+        None if checkpoints is None else Path(checkpoints),
+        shared,
+        None if watch is None else lambda so_far: watch(result(so_far)),
     )
-    geometry = estimates["geometry"]
-    return Reconstruction(
-        model=model,
-        **estimates,
-        config={**dataclasses.asdict(config), "seed": seed},
-        cameras=tuple(capture.camera(name) for name in cameras),
-        capture_digest=digest,
-        model_source=model.source,
-        units=capture.units,
-        unit_mm=capture.unit_mm,
-        warnings=(*(() if known_cameras else (ESTIMATED_CAMERAS,)), *one_place(capture, cameras, geometry)),
-        seconds=seconds,
-        peak_memory=peak_memory(),
-    )
+    return result(estimates, seconds)
 
 
 def calibrated(capture: Capture, model: MorphableModel, cameras: Sequence[str], timesteps: Sequence[int]) -> Capture:

@@ -222,7 +222,7 @@ def load_plan(path: str | Path, overrides: Sequence[str] = (), seed: int = 0) ->
     jobs = from_mapping(Jobs, {"jobs": document.pop("jobs", 1)}, str(path)).jobs
     document.setdefault("name", path.stem)
     points = []
-    for swept in _points(sweep, str(path)):
+    for swept in _points(_with_captures(sweep, path), str(path)):
         point = copy.deepcopy(document)
         where = f"{path}: sweep {swept}" if swept else str(path)
         for key, value in swept.items():
@@ -285,6 +285,21 @@ def _points(sweep: Any, where: str) -> Iterator[dict[str, Any]]:
         yield from (dict(_flatten(p)) for p in points)
     else:
         yield {}
+
+
+def _with_captures(sweep: Any, path: Path) -> Any:
+    """A sweep in whose grid a folder of captures stands for the list of them."""
+    if not isinstance(sweep, dict) or not isinstance(sweep.get("grid"), dict):
+        return sweep
+    grid = dict(_flatten(sweep["grid"]))
+    for key in ("fit.capture", "relight.capture"):
+        if isinstance(grid.get(key), str):
+            folder = grid[key]
+            found = sorted(p.parent.name for p in (path.parent / folder).glob("*/transforms.json"))
+            if not found:
+                raise InputError(f"{path}: sweep.grid: {key}: found no capture in {folder!r}, expected folders of them")
+            grid[key] = [os.path.join(folder, name) for name in found]
+    return {**sweep, "grid": grid}
 
 
 def _check_count(count: int, where: str) -> None:

@@ -10,11 +10,14 @@ To add a step, write ``_name(source, inputs, progress, *settings)`` and put a `S
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+
+import filelock
 
 import mifit
 from mifit import checkpoint
@@ -152,9 +155,27 @@ def keys(listed: Sequence[Step], source: Source) -> dict[str, str]:
 
 
 def run_steps(
-    listed: Sequence[Step], source: Source, progress: Progress, folder: Path | None = None
+    listed: Sequence[Step],
+    source: Source,
+    progress: Progress,
+    folder: Path | None = None,
+    shared: bool = False,
+    watch: Callable[[Mapping[Part, Any]], None] | None = None,
 ) -> tuple[dict[Part, Any], float]:
     """Run steps, or read their checkpoints from the folder where these were made of the same.
+
+    Parameters
+    ----------
+    listed : sequence of Step
+    source : Source
+    progress : Progress
+    folder : path, optional
+        For checkpoints.
+    shared : bool
+        Whether fits with other settings use the folder too, at the same time perhaps: a checkpoint is then named after
+        its key, and who needs a step that another is busy with waits for it.
+    watch : callable, optional
+        Called with the estimates after each step.
 
     Returns
     -------
@@ -168,16 +189,26 @@ def run_steps(
     made = keys(listed, source)
     for step in listed:
         key = made[step.name]
-        done = checkpoint.load(folder, step.name, PARTS[step.part], key) if folder else None
-        if done is None:
-            inputs = {part: estimates[part] for part in step.inputs}
-            done = step.run(source, inputs, progress, *step.settings)
-            if folder:
-                checkpoint.save(folder, step.name, done, key)
+        name = f"{step.name}_{key[:16]}" if shared else step.name
+        with _alone(folder / f"{name}.lock") if folder and shared else contextlib.nullcontext():
+            done = checkpoint.load(folder, name, PARTS[step.part], key) if folder else None
+            if done is None:
+                inputs = {part: estimates[part] for part in step.inputs}
+                done = step.run(source, inputs, progress, *step.settings)
+                if folder:
+                    checkpoint.save(folder, name, done, key)
         if step.part in estimates and step.part not in step.inputs:
             before += estimates[step.part].report.seconds  # one that goes on from another counts its time
         estimates[step.part] = done
+        if watch:
+            watch(estimates)
     return estimates, before + sum(estimate.report.seconds for estimate in estimates.values())
+
+
+def _alone(path: Path) -> contextlib.AbstractContextManager:
+    """A lock between processes, which the system takes back from one that is killed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return filelock.FileLock(path)
 
 
 def _fit_geometry(source: Source, inputs: Inputs, progress: Progress, config: GeometryConfig) -> Any:

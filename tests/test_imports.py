@@ -38,7 +38,10 @@ MAY_IMPORT = {
     "pipeline": DATA | {"morphable", "capture", "render", "steps", "reconstruction"},
     "fitting": DATA | {"morphable", "capture", "result", "reconstruction", "steps", "pipeline"},
     "plan": DATA | {"schema", "morphable", "capture", "checkpoint", "pipeline"},
-    "experiment": DATA | FORMATION | {"morphable", "capture", "checkpoint", "pipeline", "plan", "synth", "output"},
+    "study": DATA,
+    "experiment": DATA
+    | FORMATION
+    | {"morphable", "capture", "checkpoint", "pipeline", "plan", "synth", "output", "study"},
     "console": BASE | {"core"},
 }
 TOP = {"commands", "cli", "__main__", "__init__"}  # may import everything

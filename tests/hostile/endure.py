@@ -35,9 +35,27 @@ from tests.hostile.child import run_command
 CHANGES = {"os.remove", "os.rename", "os.mkdir", "os.rmdir", "shutil.rmtree"}
 FIT = ("fit", "capture", "--model", "builtin:coarse", "--timesteps", "0", "--config", "fit.toml", "--quiet")
 SCENE = ("--format", "mitsuba")
-CONFIG = "[reflectance]\ntexture_size = 32\n"
+CONFIG = """
+[geometry]
+rounds = 1
+max_iterations = 2
+pixels = 200
+surface_points = 300
+[surface]
+enabled = false
+[reflectance]
+texture_size = 16
+bands = 3
+shading = "prefiltered"
+exponent = 20.0
+max_iterations = 2
+[normals]
+max_iterations = 2
+"""
+"""A fit that takes two seconds: what is tested is files."""
 EXPERIMENT = (
     'name = "e"\n[fit]\ncapture = "capture"\nmodel = "builtin:coarse"\ntimesteps = [0]\nuntil = "geometry"\n'
+    '[fit.geometry]\nrounds = 1\nmax_iterations = 2\n[fit.surface]\nenabled = false\n'
     '[evaluate]\ncamera = "third"\n[sweep.grid]\n"fit.seed" = [0, 1]\n'
 )
 
