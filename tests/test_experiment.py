@@ -206,3 +206,62 @@ def test_examples_are_valid(path):
         assert np.isfinite((path.parent / "studio.hdr").stat().st_size)
     plan = load_plan(path, overrides)
     assert plan.runs and plan.name == path.parent.name
+
+
+FITS = """
+name = "study"
+[fit]
+model = "builtin:coarse"
+timesteps = [0]
+[fit.surface]
+enabled = false
+[fit.geometry]
+rounds = 1
+[fit.reflectance]
+texture_size = 32
+[evaluate]
+camera = "third"
+[outputs]
+result = false
+[sweep.grid]
+"fit.capture" = "people"
+"fit.reflectance.exponent" = [5, 20]
+"""
+
+
+@pytest.mark.slow
+def test_a_study_over_a_folder_of_captures_shares_stages_and_gives_intervals(variant, tmp_path):
+    from scipy import stats
+
+    from mifit.synth import synthesize
+
+    for seed in (1, 2):
+        folder = tmp_path / "people" / f"p{seed}"
+        synthesize(folder, timesteps=1, model="builtin:coarse", width=120, height=90, spp=2, seed=seed)
+    path = tmp_path / "study.toml"
+    path.write_text(FITS)
+    text = run_experiment(path, out=tmp_path / "out", variant="llvm_ad_rgb")
+    kept = [p.name.partition("_")[0] for p in (tmp_path / "out" / "stages").glob("*.npz")]
+    assert {name: kept.count(name) for name in kept} == {"geometry": 2, "reflectance": 4, "normals": 4, "mesh": 4}
+    document = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [group["settings"] for group in document["over_subjects"]] == [
+        {"fit.reflectance.exponent": 5},
+        {"fit.reflectance.exponent": 20},
+    ]
+    for group in document["over_subjects"]:
+        exponent = group["settings"]["fit.reflectance.exponent"]
+        rows = [r for r in document["runs"] if r["swept"]["fit.reflectance.exponent"] == exponent]
+        values = np.array([r["metrics"]["psnr_full"] for r in rows])
+        mean, half = group["metrics"]["psnr_full"]
+        low, high = stats.t.interval(0.95, 1, loc=values.mean(), scale=stats.sem(values))
+        assert group["subjects"] == 2 and (mean - half, mean + half) == pytest.approx((low, high))
+    assert "95% confidence interval over subjects" in text and text.count(" ± ") >= 4
+    pytest.importorskip("matplotlib")
+    assert (tmp_path / "out" / "plots" / "psnr_full.svg").read_text().startswith("<?xml")
+
+
+def test_a_folder_without_captures_is_no_axis(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(FITS)
+    with pytest.raises(InputError, match=r"fit\.capture: found no capture in 'people'"):
+        load_plan(path)
