@@ -23,7 +23,7 @@ LIGHTING_TEXELS = 6000
 """Texels that determine the lighting; a few hundred unknowns against 24 values of eight images each."""
 MAP_PASSES = 3
 """Passes over the maps: each takes new robust weights from the residuals of the last."""
-MAP_ITERATIONS = 60
+MAP_ITERATIONS = 40
 """ADMM iterations of a pass. Every pass starts from its maps alone: going on from the multipliers of the pass before
 saves half of them, but carries over what the last weights took an outlier for (a hand before one camera left 0.016
 instead of less than 0.01 in the albedo under it)."""
