@@ -21,7 +21,7 @@ from mifit.solve import Outcome
 SPLIT = 0.5
 """Weight of ADMM's splits relative to the median curvature of the blocks."""
 RELAX = 1.7
-"""Over-relaxation of both splits (Boyd et al. 2011, section 3.4.3): 40 iterations end nearer the minimum than 60 did."""
+"""Over-relaxation of both splits (Boyd et al. 2011, section 3.4.3): 40 iterations end nearer to it than 60 did."""
 CHUNK = 32768
 """Texels whose blocks are solved at once: what they need stays in a core's cache."""
 
