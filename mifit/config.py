@@ -134,6 +134,9 @@ class ReflectanceConfig:
         "give outliers less weight, and weight by a noise model (als); false: als minimises the paper's objective "
         "as it stands",
     )
+    segment: bool = flag(
+        True, "leave out what hides the face in an image: hair, cloth, glasses, a hand; with robust alone"
+    )
     symmetric_fill: bool = flag(
         False, "fill what no image shows from the opposite half of the face, where that was seen"
     )

@@ -46,6 +46,8 @@ class Frame:
         Landmarks to be trusted; all False without landmarks.
     deviation : float
         What the errors of the detector amount to, see `Landmarks`; 0 where it isn't known.
+    masked : bool
+        Whether a mask file says what is valid.
     """
 
     image: NDArray[np.float32]
@@ -54,6 +56,7 @@ class Frame:
     landmarks: NDArray[np.float64] | None
     visible: NDArray[np.bool_]
     deviation: float = 0.0
+    masked: bool = False
 
     @property
     def nbytes(self) -> int:
@@ -288,10 +291,10 @@ class Capture:
             image[~valid] = 0.0
         for array in (image, valid, clipped):
             array.setflags(write=False)
-        landmarks = self.landmarks(shot.camera, shot.timestep)
+        landmarks, masked = self.landmarks(shot.camera, shot.timestep), shot.mask is not None
         if landmarks is None:
-            return Frame(image, valid, clipped, None, np.zeros(COUNT, dtype=bool))
-        return Frame(image, valid, clipped, landmarks.points, landmarks.visible, landmarks.deviation)
+            return Frame(image, valid, clipped, None, np.zeros(COUNT, dtype=bool), masked=masked)
+        return Frame(image, valid, clipped, landmarks.points, landmarks.visible, landmarks.deviation, masked)
 
 
 def _lens_camera(view: View) -> Camera:

@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.capture.photos import Photo, lens, local, parse_numbers, view_name
+from mifit.capture.photos import Photo, local, opencv_lens, parse_numbers, view_name
 from mifit.capture.transforms import View, invert_pose
 from mifit.capture.xml_text import parse_xml
 from mifit.core.files import read_text
@@ -109,7 +109,7 @@ def _sensor(node: Element, where: str) -> _Sensor | None:
         "p4": abs(v["p4"]) * corner**4 * tangent,
     }
     radial = (v["k1"], v["k2"], v["k3"], v["k4"])
-    distortion = lens(where, (width, height), v["f"], radial, (v["p2"], v["p1"]), others)
+    distortion = opencv_lens(where, (width, height), v["f"], radial, (v["p2"], v["p1"]), others)
     intrinsics = (v["f"] + v["b1"], v["f"], 0.5 * width + v["cx"], 0.5 * height + v["cy"])
     return width, height, intrinsics, distortion
 

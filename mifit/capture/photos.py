@@ -94,7 +94,7 @@ def parse_numbers(words: Sequence[str], count: int, where: str) -> NDArray[np.fl
     return values
 
 
-def lens(
+def opencv_lens(
     where: str,
     view: tuple[int, int],
     focal: float,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mifit.capture.photos import Photo, lens, local, parse_numbers, view_name
+from mifit.capture.photos import Photo, local, opencv_lens, parse_numbers, view_name
 from mifit.capture.transforms import View, invert_pose, nearest_rotation
 from mifit.capture.xml_text import parse_xml
 from mifit.core.camera import OPENGL_FROM_OPENCV
@@ -137,7 +137,7 @@ def _photo(
     longer = max(width, height)
     fx = length / FILM * longer
     k1, k2, k3, k4, t1, t2 = map(float, brown)
-    distortion = lens(
+    distortion = opencv_lens(
         where, (width, height), fx, (k1, k2, k3, k4), (t2, t1), {"the skew": 0.5 * abs(skew) * height * aspect}
     )
     intrinsics = fx, fx * aspect, 0.5 * width + centre[0] * longer, 0.5 * height + centre[1] * longer

@@ -127,6 +127,10 @@ class ReflectanceEstimate:
         Exponent, Fresnel factor and normalisation of the specular lobe.
     shading_model : str
         How maps and lighting make an image: a name of ``appearance.models``.
+    labels : tuple of (H, W) uint8
+        What each image of the fit shows (`core.labels.Label`); empty where that wasn't looked for.
+    labelled : tuple of (camera, timestep)
+        Of which image each of ``labels`` is.
     """
 
     diffuse: NDArray
@@ -136,6 +140,13 @@ class ReflectanceEstimate:
     lobe: Lobe
     shading_model: str
     report: Report
+    labels: tuple[NDArray, ...] = ()
+    labelled: tuple[tuple[str, int], ...] = ()
+
+    def label(self, camera: str, timestep: int) -> NDArray | None:
+        """The labels of one image; None where there are none."""
+        key = (camera, timestep)
+        return self.labels[self.labelled.index(key)] if key in self.labelled else None
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from mifit.output.face_mask import face_mask
 from mifit.output.figures import (
     CLIPPED_TINT,
     HEAT_LIMIT,
+    LABEL_TINTS,
     UNEXPLAINED_TINT,
     bounding_box,
     draw_landmarks,
@@ -238,14 +239,20 @@ def _inputs(result: Result, capture: Capture, timesteps: tuple[int, ...]) -> str
             )
             mask = face_mask(result, capture, camera, timestep, linear)
             caption = f"{label}: {mask.part(mask.clipped):.1%} clipped, {mask.part(mask.unexplained):.1%} unexplained"
-            tinted = tint(photograph, (mask.clipped, CLIPPED_TINT), (mask.unexplained, UNEXPLAINED_TINT))
+            labels = None if result.reflectance is None else result.reflectance.label(camera, timestep)
+            kinds = [] if labels is None else [(labels == kind, colour) for kind, colour, _ in LABEL_TINTS]
+            tinted = tint(photograph, (mask.clipped, CLIPPED_TINT), (mask.unexplained, UNEXPLAINED_TINT), *kinds)
             figures.append(_figure(jpeg_uri(tinted[box]), caption, f"face mask of {label}"))
         parts.append(f'<h3>Timestep {timestep}</h3><div class="grid">{"".join(figures)}</div>')
     rest = len(result.timesteps) - len(timesteps)
     more = f'<p class="soft">{rest} more timesteps are in the result but not on this page.</p>' if rest else ""
     swatches = "".join(
         f'<span><i style="background:rgb{colour};height:12px"></i>{name}</span>'
-        for colour, name in ((CLIPPED_TINT, "clipped"), (UNEXPLAINED_TINT, "explained by no lighting and albedo"))
+        for colour, name in (
+            (CLIPPED_TINT, "clipped"),
+            (UNEXPLAINED_TINT, "explained by no lighting and albedo"),
+            *((colour, name) for _, colour, name in LABEL_TINTS),
+        )
     )
     key = (
         '<p class="soft">Cyan rings: detected landmarks. Orange dots: the fitted model\'s.</p>'

@@ -17,7 +17,7 @@ from mifit.config import MeshConfig
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.files import read_text
-from mifit.core.image import read_image
+from mifit.core.image import read_image, to_8_bit
 from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_PIXELS
 from mifit.core.npz import read_npz
 from mifit.core.ply import read_ply
@@ -27,7 +27,7 @@ from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.result.ownership import finish
 from mifit.result.record import R
-from mifit.result.writing import FORMAT_VERSION
+from mifit.result.writing import FORMAT_VERSION, label_file
 
 
 def load(cls: type[R], folder: Path, model: MorphableModel | None = None) -> R:
@@ -223,6 +223,7 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
     )
     radiance = _array(lighting["radiance"], (order * order, 3), "radiance")
     diffuse = _read_map(folder / "maps" / "diffuse.exr", 3)
+    labels = _labels(folder, document)
     return ReflectanceEstimate(
         diffuse=diffuse,
         specular=_read_map(folder / "maps" / "specular.exr", 1, len(diffuse)),
@@ -231,7 +232,25 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
         lobe=lobe,
         shading_model=model.name,
         report=_report(document, "reflectance"),
+        labels=tuple(labels.values()),
+        labelled=tuple(labels),
     )
+
+
+def _labels(folder: Path, document: dict[str, Any]) -> dict[tuple[str, int], NDArray[np.uint8]]:
+    """What images show, by camera and timestep: of those that the result keeps it of."""
+    found = {}
+    for camera in map(_camera, document["capture"]["cameras"]):
+        for timestep in (int(entry["timestep"]) for entry in document["timesteps"]):
+            path = folder / label_file(camera.name, timestep)
+            if path.is_file():
+                image = to_8_bit(read_image(path)[..., 0])
+                if image.shape != (camera.height, camera.width):
+                    raise InputError(
+                        f"{path}: found {image.shape}, expected {(camera.height, camera.width)}; fit again"
+                    )
+                found[camera.name, timestep] = image
+    return found
 
 
 def _normals(folder: Path, document: dict[str, Any]) -> NormalsEstimate | None:

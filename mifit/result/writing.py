@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import mifit
 from mifit.core.camera import Camera
 from mifit.core.estimate import Report
-from mifit.core.files import replacing, write_text
+from mifit.core.files import file_name, replacing, write_bytes, write_text
 from mifit.core.image import encode_png, write_image
 from mifit.core.mesh import vertex_normals
 from mifit.core.ply import write_ply
@@ -25,6 +25,11 @@ from mifit.result.ownership import claim, replacing_files
 from mifit.result.record import Result
 
 FORMAT_VERSION = 1
+
+
+def label_file(camera: str, timestep: int) -> Path:
+    """Where a result keeps what an image shows, relative to its folder: grey values of `core.labels.Label`."""
+    return Path("masks") / f"{file_name(camera)}_{timestep:04d}.png"
 
 
 def save(result: Result, folder: Path, write_scene: Callable[[Path], None], force: bool = False) -> None:
@@ -42,6 +47,8 @@ def save(result: Result, folder: Path, write_scene: Callable[[Path], None], forc
             for name in ("diffuse", "specular", "confidence"):
                 write_image(new / "maps" / f"{name}.exr", getattr(result.reflectance, name))
             write_image(new / "lighting.exr", result.lighting.to_latlong())
+            for (camera, timestep), labels in zip(result.reflectance.labelled, result.reflectance.labels, strict=True):
+                write_bytes(new / label_file(camera, timestep), encode_png(labels))
         if result.geometry.displacement is not None:
             np.savez(new / "geometry" / "displacement.npz", displacement=result.geometry.displacement)
         write_scene(new / "scene.xml")

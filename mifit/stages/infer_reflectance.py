@@ -10,6 +10,7 @@ import numpy as np
 
 from mifit.config import ReflectanceConfig
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
+from mifit.core.labels import hidden
 from mifit.core.mesh import interpolate
 from mifit.errors import ConvergenceError
 from mifit.progress import Progress, silent
@@ -22,6 +23,7 @@ from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.objective import energies
 from mifit.stages.reflectance.paper_solver import fit_adam
 from mifit.stages.reflectance.priors import levelled
+from mifit.stages.segment import segment
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -75,6 +77,10 @@ def infer_reflectance(
     started = time.perf_counter()
     config = config or ReflectanceConfig()
     surface = Surface(capture, model, geometry, cameras, config.texture_size, config.robust, whole=config.robust)
+    labels: tuple = ()
+    if config.robust and config.segment:
+        labels = segment(surface, capture, model, seed)
+        surface = surface.without([hidden(image) for image in labels])
     mirrored = mirrored_coordinates(model, surface.texels) if config.symmetric_fill else None
     albedo = interpolate(geometry.vertex_albedo, model.faces, surface.texels.face, surface.texels.weights)
     # Albedos of a lobe that isn't normalised, such as the paper's, have no physical level: stage 1's is taken as it is.
@@ -101,6 +107,7 @@ def infer_reflectance(
         "texels_of_head": len(surface),
         "images": surface.image_count,
         "maps_outcome": fitted.maps_outcome.value,
+        "hidden": [float(hidden(image).sum() / max(int((image > 0).sum()), 1)) for image in labels],
     }
     if config.solver == "adam" or not config.robust:
         forward = Forward(fitted.appearance, surface.meshes)
@@ -115,4 +122,6 @@ def infer_reflectance(
         lobe=fitted.appearance.lobe,
         shading_model=fitted.appearance.model.name,
         report=Report(fitted.outcome.value, fitted.energies, time.perf_counter() - started, warnings, details),
+        labels=labels,
+        labelled=tuple((c, t) for t in geometry.timesteps for c in cameras) if labels else (),
     )

@@ -8,8 +8,9 @@ no more than the probability that it shows the point (`stages.trust`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+import copy
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -125,6 +126,18 @@ class _Image:
     outline: NDArray[np.float32]  # (H, W) pixels to the nearest outline times millimetres per unit of length
 
 
+@dataclass(frozen=True)
+class Seen:
+    """One image's camera, its timestep's mesh, and what each pixel shows of it (``face`` -1: nothing; ``weights``)."""
+
+    camera: Camera
+    timestep: int
+    vertices: NDArray[np.float64]
+    normals: NDArray
+    face: NDArray[np.int32]
+    weights: NDArray[np.float32]
+
+
 class Surface:
     """The images of a capture, read at the surface points of a map.
 
@@ -201,6 +214,27 @@ class Surface:
 
     def __len__(self) -> int:
         return len(self.texels.index)
+
+    def views(self) -> Iterator[Seen]:
+        """Every image's camera and mesh, in the order of the images."""
+        for image in self._images:
+            i, buffer = image.step, self.scenes[image.step].gbuffer(image.camera)
+            timestep = self.geometry.timesteps[i]
+            yield Seen(image.camera, timestep, self.vertices[i], self.normals[i], buffer.face, buffer.weights)
+
+    def without(self, hidden: Sequence[NDArray[np.bool_]]) -> Surface:
+        """The same surface with pixels (H, W) of every image left out."""
+        less = copy.copy(self)
+        less._kept = None
+        less._images = [
+            replace(
+                image,
+                colour=np.where(left_out[..., None], np.float32(0), image.colour),
+                unusable=np.maximum(image.unusable, left_out.astype(np.float32)),
+            )
+            for image, left_out in zip(self._images, hidden, strict=True)
+        ]
+        return less
 
     @property
     def image_count(self) -> int:
