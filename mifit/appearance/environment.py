@@ -1,11 +1,10 @@
 """A face under a whole environment map: nothing is band limited, so nothing rings and nothing is negative.
 
-What is far brighter than the mean, such as the sun or a lamp, becomes a few dozen distant lights, whose cosine, lobe
-and shadows each point has of its own. The rest is soft:
+What is far brighter than the mean, such as the sun or a lamp, is cut into a few dozen distant lights of equal power
+(median cut, Debevec 2005), whose cosine, lobe and shadows each point has of its own. The rest is soft:
 
-*Diffuse*: the environment is cut into regions of equal power (median cut, Debevec 2005), each a distant light with the
-region's whole radiance. Their shadows are traced from the mesh's vertices, and light that the mesh throws on itself is
-gathered there, so this is paid for once per mesh and light; points interpolate it.
+*Diffuse*: what a mesh's vertices see of the sky and of one another (`reception`) is traced once per mesh and serves all
+lights and rotations; points interpolate what the vertices receive.
 
 *Specular*: a few directions of each point's lobe look up the environment blurred to the spacing of the directions
 (filtered importance sampling, Křivánek and Colbert 2008). A direction that the mesh blocks shows the mesh.
@@ -24,20 +23,21 @@ from numpy.typing import NDArray
 from mifit.appearance.arrays import aligned, on_device, stored
 from mifit.appearance.kernels import fresnel_factor, light_transfer, normalization, prepare_exponent
 from mifit.appearance.lobe import Lobe
-from mifit.core.mesh import interpolate, vertex_normals
+from mifit.appearance.reception import reception
+from mifit.core.mesh import interpolate
 from mifit.core.sh import LUMINANCE, latlong_directions, latlong_solid_angles
 
 if TYPE_CHECKING:
     from mifit.appearance.occlusion import MeshPoints
     from mifit.render.gbuffer import SurfaceScene
 
-REGIONS, LAMPS = 256, 32
-"""Lights that the soft part is cut into, and the bright one."""
+LAMPS = 32
+"""Lights that the bright part is cut into."""
+SKY_ROWS = 64
+"""Rows of the environment from which the soft part lights the mesh."""
 BRIGHT = 8.0
 """Radiance over its mean from which light counts as bright."""
 BOUNCES = 2
-GATHERS = 64
-"""Directions in which a vertex looks for light from the mesh."""
 LOOKS = 16
 """Directions of the lobe."""
 ROWS = 128
@@ -46,7 +46,7 @@ OFFSET = 1e-3
 """Distance by which rays start off the surface, relative to the mesh's diagonal."""
 
 
-def cut(image: NDArray, count: int = REGIONS) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def cut(image: NDArray, count: int = LAMPS) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Cut a lat-long environment into regions of equal power.
 
     Parameters
@@ -139,20 +139,25 @@ class EnvironmentLight:
         soft, whole : (V, 3)
             Without and with what comes from the bright part directly.
         """
-        vertices = np.asarray(scene.vertices, dtype=np.float64)
-        normals = vertex_normals(vertices, scene.faces)
-        soft, lamps = self.parts()
-        shaded = self._direct(scene, vertices, normals, soft, REGIONS)
-        direct = shaded + self._direct(scene, vertices, normals, lamps, LAMPS)
+        mesh = reception(scene)
+        toward, power = self._soft(SKY_ROWS)
+        shaded = mesh.from_sky(toward @ self.rotation.T, power)
+        direct = shaded + self._from_lamps(scene, mesh.normals)
         bounced = np.zeros_like(direct)
         for _ in range(BOUNCES):
-            bounced = _gathered(scene, vertices, normals, (direct + bounced) * albedo / np.float32(np.pi))
+            bounced = mesh.from_mesh((direct + bounced) * albedo / np.float32(np.pi))
         return shaded + bounced, direct + bounced
 
-    def _direct(
-        self, scene: SurfaceScene, points: NDArray, normals: NDArray, image: NDArray, count: int
-    ) -> NDArray[np.float32]:
-        directions, power = self._lights(image, count)
+    def _soft(self, rows: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Directions (M, 3) in the image's own axes, and power (M, 3), of the soft part at so many rows."""
+        small = cv2.resize(self.parts()[0], (2 * rows, rows), interpolation=cv2.INTER_AREA).astype(np.float64)
+        angles = np.reshape(latlong_solid_angles(rows, 2 * rows), (rows, -1))
+        return latlong_directions(rows, 2 * rows).reshape(-1, 3), (small * angles[..., None]).reshape(-1, 3)
+
+    def _from_lamps(self, scene: SurfaceScene, normals: NDArray) -> NDArray[np.float32]:
+        """(V, 3) irradiance of the vertices by the bright part, with its shadows."""
+        points = np.asarray(scene.vertices, dtype=np.float64)
+        directions, power = self._lights(self.parts()[1], LAMPS)
         out = np.zeros((len(points), 3), np.float32)
         for start in range(0, len(directions), 32):
             part = directions[start : start + 32]
@@ -193,15 +198,13 @@ class EnvironmentLight:
         both = stored([matt.x, matt.y, matt.z, glossy.x, glossy.y, glossy.z], count)
         return both[:, :3], both[:, 3:]
 
-    def unshadowed(self, normals: NDArray) -> NDArray[np.float32]:
-        """(N, 3) irradiance at normals (N, 3) that see all of the soft part."""
+    def bend(self, normals: NDArray, base: NDArray) -> NDArray[np.float32]:
+        """(N, 3) irradiance at normals (N, 3) over that at others, where all of the soft part is seen."""
         rows = 32
-        small = cv2.resize(self.parts()[0], (2 * rows, rows), interpolation=cv2.INTER_AREA).astype(np.float64)
-        angles = np.reshape(latlong_solid_angles(rows, 2 * rows), (rows, -1))
-        power = (small * angles[..., None]).reshape(-1, 3)
-        toward = latlong_directions(rows, 2 * rows).reshape(-1, 3)
-        table = np.maximum(toward @ toward.T, 0.0) @ power  # normals on the same grid
-        return _look(table.reshape(rows, 2 * rows, 3).astype(np.float32), normals @ self.rotation)
+        toward, power = self._soft(rows)
+        table = (np.maximum(toward @ toward.T, 0.0) @ power).reshape(rows, 2 * rows, 3)  # normals on the same grid
+        bent, flat = (_look(table.astype(np.float32), n @ self.rotation) for n in (normals, base))
+        return bent / np.maximum(flat, 1e-12)
 
     def specular(
         self, scene: SurfaceScene, points: MeshPoints, normals: NDArray, view: NDArray, lobe: Lobe, radiosity: NDArray
@@ -269,10 +272,9 @@ class EnvironmentLight:
         """
         soft, whole = self.at_vertices(scene, albedo)
         diffuse = interpolate(soft, scene.faces, points.face, points.barycentric) / np.float32(np.pi)
-        bend = self.unshadowed(normals) / np.maximum(self.unshadowed(points.normal), 1e-12)
         specular = self.specular(scene, points, normals, view, lobe, whole * albedo / np.float32(np.pi))
         matt, glossy = self.lamps(scene, points, normals, view, lobe)
-        return (diffuse * bend + matt).astype(np.float32), specular + glossy
+        return (diffuse * self.bend(normals, points.normal) + matt).astype(np.float32), specular + glossy
 
 
 def blurred(image: NDArray, solid_angle: float) -> NDArray[np.float32]:
@@ -336,26 +338,3 @@ def _interpolated(hit: Any, indices: Any, colours: Any, active: Any) -> Any:
         corner = dr.gather(mi.UInt, indices, hit.prim_index * 3 + k, active)
         total += w * mi.Color3f(*(dr.gather(mi.Float, colours, 3 * corner + c, active) for c in range(3)))
     return total
-
-
-def _gathered(scene: SurfaceScene, vertices: NDArray, normals: NDArray, radiosity: NDArray) -> NDArray[np.float32]:
-    """(V, 3) irradiance that vertices receive from the mesh, whose vertices reflect a radiance (V, 3)."""
-    import drjit as dr
-    import mitsuba as mi
-
-    n = on_device(mi.Vector3f, normals)
-    origin = mi.Point3f(on_device(mi.Vector3f, vertices) + OFFSET * _diagonal(scene) * n)
-    frame = mi.Frame3f(n)
-    colours, indices = mi.Float(aligned(radiosity).ravel()), mi.UInt(aligned(scene.faces, np.uint32).ravel())
-
-    def body(i: Any, total: Any) -> tuple[Any, Any]:
-        u, v = dr.fma(mi.Float(i), 0.7548776662466927, 0.5), dr.fma(mi.Float(i), 0.5698402909980532, 0.5)
-        d = frame.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u - dr.floor(u), v - dr.floor(v))))
-        hit = scene.rays.ray_intersect_preliminary(mi.Ray3f(origin, d))
-        blocked = hit.is_valid()
-        return i + 1, total + dr.select(blocked, _interpolated(hit, indices, colours, blocked), 0.0)
-
-    start = (mi.UInt(0), dr.zeros(mi.Color3f, len(vertices)))
-    _, total = dr.while_loop(state=start, cond=lambda i, total: i < GATHERS, body=body)
-    total *= float(np.pi / GATHERS)
-    return stored([total.x, total.y, total.z], len(vertices))

@@ -12,6 +12,7 @@ from mifit.appearance.illumination import Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import get
 from mifit.appearance.occlusion import MeshPoints
+from mifit.appearance.reception import _reception, reception
 from mifit.core import sh
 from mifit.render.gbuffer import SurfaceScene
 
@@ -92,3 +93,28 @@ def test_a_lamp_is_as_sharp_as_it_is_and_nothing_is_negative(ball) -> None:
 def sh_rotation(angle: float) -> np.ndarray:
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def test_inside_a_ball_the_mesh_is_all_that_is_seen(variant) -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=3)
+    scene = SurfaceScene(mesh.vertices, np.asarray(mesh.faces)[:, ::-1])  # seen from within
+    found = reception(scene)
+    count = len(scene.vertices)
+    one_ray = 1.1 / 64  # of a vertex, may slip through between facets
+    np.testing.assert_allclose(found.from_mesh(np.full((count, 3), 0.5)), 0.5 * np.pi, rtol=one_ray)
+    assert not found.from_sky(np.array([[0.0, 0.0, 1.0]]), np.ones((1, 3))).any()
+
+
+def test_a_mesh_is_traced_once_for_all_rotations(ball) -> None:
+    scene = ball[0]
+    image = np.tile(np.linspace(0.0, 1.0, 64, dtype=np.float32)[:, None], (32, 1, 3))  # darker on one side
+    albedo = np.zeros((len(scene.vertices), 3))
+    _reception.cache_clear()
+    lit = [EnvironmentLight(image, sh_rotation(a)).at_vertices(scene, albedo)[1] for a in (0.0, 0.5)]
+    assert _reception.cache_info().misses == 1
+    vertices = np.asarray(scene.vertices, dtype=np.float64)
+    turned = SurfaceScene(vertices @ sh_rotation(0.5).T, scene.faces)
+    again = EnvironmentLight(image, sh_rotation(0.5)).at_vertices(turned, albedo)[1]
+    assert _reception.cache_info().misses == 2  # another mesh
+    assert np.abs(lit[1] - lit[0]).max() > 0.1
+    np.testing.assert_allclose(again, lit[0], rtol=0.05)  # light and mesh turned alike

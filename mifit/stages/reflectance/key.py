@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from mifit.appearance.formation import form_image
 from mifit.appearance.illumination import DistantLight
+from mifit.appearance.reception import fibonacci_sphere
 from mifit.stages.observations import Observations
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import (
     LightingProblem,
     LightingSolution,
     bounded_weight,
-    fibonacci_sphere,
     linearize,
 )
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.formation import form_image
+from mifit.appearance.reception import fibonacci_sphere
 from mifit.core.sh import bands, basis
 from mifit.solve import Outcome
 
@@ -412,12 +413,3 @@ class _Normal:
         own_move = np.einsum("nab,nb->na", inverse, left)
         light = move[: size - 1].reshape(3, -1).T
         return _Step(light, float(move[-1]) if with_ambient else 0.0, own_move[:, :3], own_move[:, 3])
-
-
-def fibonacci_sphere(count: int) -> NDArray[np.float64]:
-    """Evenly spread unit directions (Fibonacci lattice)."""
-    i = np.arange(count) + 0.5
-    z = 1.0 - 2.0 * i / count
-    phi = i * np.pi * (3.0 - np.sqrt(5.0))
-    r = np.sqrt(1.0 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)

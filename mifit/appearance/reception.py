@@ -1,0 +1,122 @@
+"""What a mesh's vertices receive from all around: the part of transport that no light changes.
+
+Which directions a vertex sees, and which other parts of the mesh, depends on the mesh alone. It is traced once; after
+that each light, and each rotation of one, costs a product.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+
+from mifit.appearance.arrays import on_device
+from mifit.core.mesh import normalize, vertex_normals
+from mifit.core.sh import LUMINANCE
+
+if TYPE_CHECKING:
+    from mifit.render.gbuffer import SurfaceScene
+
+DIRECTIONS = 512
+"""Directions of the sky, a multiple of 32: 7 degrees apart."""
+GATHERS = 64
+"""Directions in which a vertex looks for light from the mesh."""
+OFFSET = 1e-3
+"""Distance by which rays start off the surface, relative to the mesh's diagonal."""
+KEPT = 8
+"""Meshes whose reception is kept: the timesteps of a sequence, seen from several cameras."""
+
+
+@dataclass(frozen=True)
+class Reception:
+    """What V vertices see of the sky and of one another.
+
+    Attributes
+    ----------
+    directions : (D, 3)
+        Evenly spread over the sphere, world axes.
+    normals : (V, 3)
+    open_sky : (V, D / 32) uint32
+        Which of the directions each vertex sees, a bit each.
+    exchange : (V, V) sparse
+        Irradiance of the vertices per radiance that the vertices reflect.
+    """
+
+    directions: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    open_sky: NDArray[np.uint32]
+    exchange: csr_matrix
+
+    def from_sky(self, toward: NDArray, power: NDArray) -> NDArray[np.float32]:
+        """(V, 3) irradiance from a distant soft light, given as many directions (M, 3) with power (M, 3).
+
+        Each has the shadows of the nearest of `directions`; those of one cell shine from their common middle.
+        """
+        nearest = (toward @ self.directions.T).argmax(axis=1)
+
+        def summed(values: NDArray) -> NDArray[np.float64]:
+            return np.stack([np.bincount(nearest, column, minlength=len(self.directions)) for column in values.T], 1)
+
+        middle = normalize(summed(toward * (power @ LUMINANCE)[:, None]) + 1e-12 * self.directions)
+        seen = np.unpackbits(self.open_sky.view(np.uint8), axis=1, bitorder="little")
+        cosine = np.maximum(self.normals @ middle.T, 0.0).astype(np.float32)
+        return np.asarray((cosine * seen) @ summed(power).astype(np.float32))
+
+    def from_mesh(self, radiance: NDArray) -> NDArray[np.float32]:
+        """(V, 3) irradiance from the mesh, whose vertices reflect a radiance (V, 3)."""
+        return np.asarray(self.exchange @ radiance, dtype=np.float32)
+
+
+def reception(scene: SurfaceScene) -> Reception:
+    """That of a mesh; of the last few meshes it is kept."""
+    vertices, faces = np.asarray(scene.vertices, dtype=np.float64), np.asarray(scene.faces, dtype=np.int64)
+    return _reception(vertices.tobytes(), faces.tobytes())
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _reception(vertices: bytes, faces: bytes) -> Reception:
+    """The mesh itself is the key: nothing that differs is taken for the same."""
+    from mifit.render.gbuffer import SurfaceScene
+
+    positions = np.frombuffer(vertices, dtype=np.float64).reshape(-1, 3)
+    corners = np.frombuffer(faces, dtype=np.int64).reshape(-1, 3)
+    scene, normals = SurfaceScene(positions, corners), vertex_normals(positions, corners)
+    directions = fibonacci_sphere(DIRECTIONS)
+    parts = range(0, DIRECTIONS, 32)
+    bits = [scene.open_towards(positions, normals, directions[start : start + 32]) for start in parts]
+    return Reception(directions, normals, np.stack(bits, axis=1), _exchange(scene, positions, normals))
+
+
+def _exchange(scene: SurfaceScene, positions: NDArray, normals: NDArray) -> csr_matrix:
+    """Cosine-distributed looks of every vertex, as a matrix over the vertices that they meet."""
+    import drjit as dr
+    import mitsuba as mi
+
+    count = len(positions)
+    diagonal = float(np.linalg.norm(np.ptp(positions, axis=0)))
+    number = dr.arange(mi.UInt, count * GATHERS)
+    vertex, look = number // GATHERS, mi.Float(number % GATHERS)
+    n = dr.gather(mi.Vector3f, on_device(mi.Vector3f, normals), vertex)
+    origin = dr.gather(mi.Vector3f, on_device(mi.Vector3f, positions), vertex) + OFFSET * diagonal * n
+    u, v = dr.fma(look, 0.7548776662466927, 0.5), dr.fma(look, 0.5698402909980532, 0.5)
+    d = mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u - dr.floor(u), v - dr.floor(v))))
+    hit = scene.rays.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(origin), d))
+    met = np.flatnonzero(np.asarray(hit.is_valid()))
+    faces = np.asarray(scene.faces)[np.asarray(hit.prim_index)[met]]
+    x, y = (np.asarray(part)[met].astype(np.float64) for part in (hit.prim_uv.x, hit.prim_uv.y))
+    share = np.stack([1.0 - x - y, x, y], axis=1) * (np.pi / GATHERS)
+    rows = np.repeat(met // GATHERS, 3)
+    return csr_matrix((share.ravel().astype(np.float32), (rows, faces.ravel())), shape=(count, count))
+
+
+def fibonacci_sphere(count: int) -> NDArray[np.float64]:
+    """Evenly spread unit directions (Fibonacci lattice), (count, 3)."""
+    i = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * i / count
+    phi = i * np.pi * (3.0 - np.sqrt(5.0))
+    r = np.sqrt(1.0 - z * z)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
