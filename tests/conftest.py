@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.variant import VARIANT
+
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
@@ -33,10 +35,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture(scope="session")
 def variant(request: pytest.FixtureRequest) -> str:
-    """Activate the CPU variant once for the session."""
+    """Activate the variant under test once for the session."""
     import mifit
 
-    name = mifit.set_variant("llvm_ad_rgb")
+    name = mifit.set_variant(VARIANT)
     target, threads = request.config.getoption("--llvm-target"), request.config.getoption("--threads")
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1))
     if workers > 1 and not threads:  # share the processors: threads that wait for one another cost more than they bring

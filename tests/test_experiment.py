@@ -15,6 +15,7 @@ import pytest
 
 from mifit.errors import InputError, MifitError
 from mifit.experiment import finished, load_plan, run_experiment
+from tests.variant import VARIANT
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 SWEEP = """
@@ -50,7 +51,7 @@ def table(folder: Path) -> list:
 def done(tmp_path_factory):
     """A finished sweep of two runs."""
     folder = tmp_path_factory.mktemp("sweep")
-    text = run_experiment(write(folder), out=folder / "out", variant="llvm_ad_rgb")
+    text = run_experiment(write(folder), out=folder / "out", variant=VARIANT)
     return folder, text
 
 
@@ -64,7 +65,7 @@ def test_sweep_writes_records_and_a_table(done):
         record = finished(folder / "out" / "runs" / run.folder, run)
         assert record["swept"] == {"render.parameters.exponent": exponent}
         assert record["settings"]["render"]["parameters"]["exponent"] == exponent
-        assert record["versions"]["variant"] == "llvm_ad_rgb" and "mitsuba" in record["versions"]
+        assert record["versions"]["variant"] == VARIANT and "mitsuba" in record["versions"]
         assert 0 < record["metrics"]["rmse"] < 0.1 and record["metrics"]["psnr"] > 20
     rows = table(folder / "out")
     assert rows[0][1]["rmse"] != rows[1][1]["rmse"]
@@ -76,7 +77,7 @@ def test_finished_runs_are_skipped_and_new_ones_added(done):
     before = {p: p.stat().st_mtime_ns for p in (folder / "out" / "runs").glob("*/run.json")}
     steps = []
     grown = write(folder, exponents=(5, 50, 500), name="grown.toml")
-    run_experiment(grown, out=folder / "out", variant="llvm_ad_rgb", progress=lambda *a: steps.append(a))
+    run_experiment(grown, out=folder / "out", variant=VARIANT, progress=lambda *a: steps.append(a))
     assert steps == [("Runs", 2, 3), ("Runs", 3, 3)]
     after = {p: p.stat().st_mtime_ns for p in (folder / "out" / "runs").glob("*/run.json")}
     assert len(after) == 3 and all(after[p] == t for p, t in before.items())
@@ -90,7 +91,7 @@ def test_killed_sweep_finishes_with_the_same_table(done, tmp_path):
     code = (
         "from mifit.experiment import run_experiment\n"
         f"if __name__ == '__main__': run_experiment({str(path)!r}, overrides=['jobs=1'], out={str(out)!r}, "
-        "variant='llvm_ad_rgb')"
+        f"variant={VARIANT!r})"
     )
     script = tmp_path / "sweep.py"
     script.write_text(code)
@@ -101,7 +102,7 @@ def test_killed_sweep_finishes_with_the_same_table(done, tmp_path):
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     assert len(list(out.glob("runs/*/run.json"))) == 1, "the sweep was to be killed after its first run"
-    run_experiment(path, overrides=["jobs=1"], out=out, variant="llvm_ad_rgb")
+    run_experiment(path, overrides=["jobs=1"], out=out, variant=VARIANT)
     assert table(out) == table(folder / "out")[:2]
 
 
@@ -112,9 +113,7 @@ def test_dask_gives_the_same_figures(done, tmp_path):
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"
     ) as cluster:
-        run_experiment(
-            folder / "sweep.toml", out=tmp_path / "out", variant="llvm_ad_rgb", dask=cluster.scheduler_address
-        )
+        run_experiment(folder / "sweep.toml", out=tmp_path / "out", variant=VARIANT, dask=cluster.scheduler_address)
     assert table(tmp_path / "out") == table(folder / "out")[:2]
 
 
@@ -124,7 +123,7 @@ def test_a_failing_run_is_named_and_the_others_finish(done, tmp_path):
     text = path.read_text().replace('"render.parameters.exponent" = [5, 50]', '"render.spp" = [4, 2]')
     path.write_text(text.replace('integrator = "shdirect"', 'integrator = "shdirect", exponent = "many"'))
     with pytest.raises(MifitError, match="2 of 2 runs failed") as error:
-        run_experiment(path, out=tmp_path / "out", variant="llvm_ad_rgb")
+        run_experiment(path, out=tmp_path / "out", variant=VARIANT)
     assert "many" in str(error.value)
 
 
@@ -240,7 +239,7 @@ def test_a_study_over_a_folder_of_captures_shares_stages_and_gives_intervals(var
         synthesize(folder, timesteps=1, model="builtin:coarse", width=120, height=90, spp=2, seed=seed)
     path = tmp_path / "study.toml"
     path.write_text(FITS)
-    text = run_experiment(path, out=tmp_path / "out", variant="llvm_ad_rgb")
+    text = run_experiment(path, out=tmp_path / "out", variant=VARIANT)
     kept = [p.name.partition("_")[0] for p in (tmp_path / "out" / "stages").glob("*.npz")]
     assert {name: kept.count(name) for name in kept} == {"geometry": 2, "reflectance": 4, "normals": 4, "mesh": 4}
     document = json.loads((tmp_path / "out" / "summary.json").read_text())

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import mifit
+from tests.variant import VARIANT
 
 PAGE = Path(mifit.__file__).resolve().parents[1] / "docs" / "experiment.md"
 
@@ -44,7 +45,7 @@ def check(names: dict, frames: int = 36) -> None:
 def test_the_page_runs(variant, tiny_capture, tmp_path, monkeypatch):
     (tmp_path / "captures").mkdir()
     (tmp_path / "captures" / "gloss").symlink_to(tiny_capture)
-    small = {'"builtin"': '"builtin:coarse"', "texture_size=256": "texture_size=64", '"auto"': '"llvm_ad_rgb"'}
+    small = {'"builtin"': '"builtin:coarse"', "texture_size=256": "texture_size=64", '"auto"': f'"{VARIANT}"'}
     names, _ = run_page(tmp_path, monkeypatch, small)
     check(names)
     assert names["losses"][-1] < 0.95 * names["losses"][0]
@@ -55,7 +56,7 @@ def test_the_page_runs_on_gloss(variant, shared, tmp_path, monkeypatch):
     (tmp_path / "captures").mkdir()
     (tmp_path / "captures" / "gloss").symlink_to(shared / "captures" / "gloss")
     # The 36 rotations are tested on the small capture; here three show that they work at full size.
-    changes = {'"auto"': '"llvm_ad_rgb"', "range(0, 360, 10)": "range(0, 360, 120)"}
+    changes = {'"auto"': f'"{VARIANT}"', "range(0, 360, 10)": "range(0, 360, 120)"}
     names, seconds = run_page(tmp_path, monkeypatch, changes)
     check(names, 3)
     assert min(names["losses"]) < 0.98 * names["losses"][0]  # a good fit leaves less to gain

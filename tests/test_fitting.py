@@ -17,6 +17,7 @@ from mifit.result import ownership
 from tests.output.conftest import ball_result
 from tests.output.test_result_safety import tree
 from tests.test_pipeline import Stages, made_up_capture
+from tests.variant import VARIANT
 
 pytestmark = pytest.mark.usefixtures("variant")
 ALL = ["fit_geometry", "find_surface", "infer_reflectance", "refine_normals", "refine_mesh"]
@@ -137,7 +138,7 @@ def test_the_demo_leaves_the_users_capture_alone(variant, tmp_path, monkeypatch)
     monkeypatch.setattr("mifit.synth.synthesize", synthesize)
     monkeypatch.setattr(commands.fits, "fit", lambda arguments: None)
     monkeypatch.setattr(commands.fits, "evaluate", lambda arguments: None)
-    arguments = SimpleNamespace(out=tmp_path / "out", quiet=True, debug=False, variant="llvm_ad_rgb", seed=0)
+    arguments = SimpleNamespace(out=tmp_path / "out", quiet=True, debug=False, variant=VARIANT, seed=0)
     mine = tmp_path / "out" / "capture" / "images" / "mine.png"
     mine.parent.mkdir(parents=True)
     mine.write_text("mine")

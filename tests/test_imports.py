@@ -183,3 +183,15 @@ def test_the_api_page_has_every_public_name():
     for name in set(mifit.__all__) - {"__version__"}:
         value = getattr(mifit, name)
         assert {f"{value.__module__}.{value.__qualname__}", value.__module__} & listed, name
+
+
+def test_no_module_depends_on_a_backend() -> None:
+    """Which of Dr.Jit's backends runs is the variant's business: code that names one breaks under the other."""
+    tests = Path(__file__).parent
+    knows = {PACKAGE / "render" / "variant.py", tests / "variant.py", tests / "conftest.py", Path(__file__)}
+    knows |= {tests / "render" / "test_variant.py", tests / "render" / "test_blinnphong.py"}
+    knows |= {tests / "hostile" / "test_readers.py"}  # the choice of a backend itself; other variants of plugins
+    words = ("llvm_ad", "cuda_ad", "drjit.llvm", "drjit.cuda", "dr.llvm", "dr.cuda")
+    for path in [*PACKAGE.rglob("*.py"), *tests.rglob("*.py")]:
+        found = [word for word in words if path not in knows and word in path.read_text()]
+        assert not found, f"{path}: names {found[0]}"

@@ -6,8 +6,6 @@ optimisers share.
 
 from __future__ import annotations
 
-import hashlib
-from collections import OrderedDict
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -16,43 +14,17 @@ from numpy.typing import NDArray
 
 from mifit.appearance.environment import EnvironmentLight
 from mifit.appearance.formation import Appearance, form_image
-from mifit.appearance.occlusion import MeshPoints, OccludingMesh
+from mifit.appearance.occlusion import MeshPoints
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.sh import basis
 from mifit.core.uv import sample_map
 from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
+from mifit.render.occluders import occluding_mesh
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
     from mifit.result import Method, Result
-
-
-KEPT_MESHES = 8
-"""Meshes whose shadows are remembered: the timesteps of a result whose views are drawn one after the other."""
-_kept: OrderedDict[bytes, OccludingMesh] = OrderedDict()
-
-
-def occluding_mesh(vertices: NDArray, faces: NDArray) -> OccludingMesh:
-    """A mesh to send rays at and its traced shadows; the same one for equal arrays, as long as it is among the last.
-
-    Reports, evaluations and turning lights draw the same few meshes again and again, and their shadows cost
-    more than all else in a picture.
-    """
-    import mitsuba as mi
-
-    from mifit.render.gbuffer import SurfaceScene
-
-    digest = hashlib.blake2b((mi.variant() or "").encode())
-    for array in (vertices, faces):
-        digest.update(f"{array.shape}{array.dtype}".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    key = digest.digest()
-    mesh = _kept.pop(key, None) or OccludingMesh(SurfaceScene(np.array(vertices), np.array(faces)))
-    _kept[key] = mesh
-    while len(_kept) > KEPT_MESHES:
-        _kept.popitem(last=False)
-    return mesh
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from mifit.errors import InputError
 from mifit.reconstruction import Reconstruction
 from tests.output.conftest import ball_camera
 from tests.output.test_views import smooth_environment
+from tests.variant import VARIANT
 
 
 def test_changed_copies(ball, variant):
@@ -151,7 +152,7 @@ def test_orbit():
 def test_the_command_renders_from_any_side(ball, variant, tmp_path, capsys):
     ball.model.save(tmp_path / "ball.npz")
     replace(ball, model_source=str(tmp_path / "ball.npz")).save(tmp_path / "result")
-    start = ["render", str(tmp_path / "result"), "--quiet", "--variant", "llvm_ad_rgb"]
+    start = ["render", str(tmp_path / "result"), "--quiet", "--variant", VARIANT]
     image = tmp_path / "a.exr"
     assert cli.main([*start, "--yaw", "25", "--pitch", "10", "--distance", "60", "--out", str(image)]) == 0
     expected = ball.render(ball.orbit(25, 10, 60), 0)

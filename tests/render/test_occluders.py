@@ -1,0 +1,39 @@
+"""Meshes that are kept between pictures: the same one for equal arrays, and no more than a few."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from mifit.render import occluders
+
+
+@pytest.fixture(autouse=True)
+def nothing_kept(variant: str) -> None:
+    occluders._kept.clear()
+
+
+def test_equal_arrays_share_a_mesh_and_its_shadows() -> None:
+    ball = trimesh.creation.icosphere(2)
+    first = occluders.occluding_mesh(np.array(ball.vertices), np.array(ball.faces))
+    traced = first.transfer(3)
+    again = occluders.occluding_mesh(np.array(ball.vertices), np.array(ball.faces))
+    assert again is first and again.transfer(3) is traced
+
+
+def test_a_moved_mesh_is_another_one_and_the_callers_array_may_change() -> None:
+    ball = trimesh.creation.icosphere(1)
+    vertices, faces = np.array(ball.vertices), np.array(ball.faces)
+    first = occluders.occluding_mesh(vertices, faces)
+    vertices[0] *= 1.01
+    second = occluders.occluding_mesh(vertices, faces)
+    assert second is not first
+    np.testing.assert_array_equal(first.scene.vertices, ball.vertices)
+
+
+def test_only_the_last_are_kept() -> None:
+    ball = trimesh.creation.icosphere(1)
+    made = [occluders.occluding_mesh(np.array(ball.vertices) * (1 + k), np.array(ball.faces)) for k in range(10)]
+    assert len(occluders._kept) == occluders.KEPT_MESHES
+    assert list(occluders._kept.values()) == made[-occluders.KEPT_MESHES :]
