@@ -60,6 +60,20 @@ def _timesteps(text: str) -> list[int]:
     return found
 
 
+def _timesteps_or_auto(text: str) -> list[int] | int:
+    """As `_timesteps`; ``auto`` -> 4 and ``auto:6`` -> 6, a number of timesteps to choose."""
+    kind, colon, count = text.strip().partition(":")
+    if kind != "auto":
+        return _timesteps(text)
+    try:
+        found = int(count) if colon else 4
+    except ValueError:
+        found = 0
+    if not 1 <= found <= MAX_TIMESTEPS:
+        raise argparse.ArgumentTypeError(f"found {text[:60]!r}, expected auto or a number of timesteps, such as auto:4")
+    return found
+
+
 def _whole(low: int, high: int) -> Callable[[str], int]:
     def parse(text: str) -> int:
         try:
@@ -207,7 +221,11 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--preset", choices=["default", "paper"], help="paper: the paper as written")
     p.add_argument("--model", default="builtin", help="morphable model: a path or builtin (default)")
     p.add_argument("--cameras", type=_names, help="cameras to use, e.g. left,right; default: the first two")
-    p.add_argument("--timesteps", type=_timesteps, help="e.g. 0,1,2,3 or 0-3; default: the first four")
+    p.add_argument(
+        "--timesteps",
+        type=_timesteps_or_auto,
+        help="e.g. 0,1,2,3 or 0-3, or auto (auto:6): the four (six) that tell most; default: the first four",
+    )
     p.add_argument("--until", choices=["geometry", "reflectance", "normals"], default="normals")
     p.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
     p.add_argument("--force", action="store_true", help="replace an existing result")
@@ -217,6 +235,9 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--result", type=_path, required=True, help="result folder of mifit fit; extended in place")
     p.add_argument("--timesteps", type=_timesteps, help="default: all that aren't in the result yet")
     p.add_argument("--resume", action="store_true", help="keep the frames that an earlier run has written")
+    p.add_argument(
+        "--refine", action="store_true", help="also add what the frames show to the maps and normals of the result"
+    )
     p.add_argument("--overlay", type=_names, help="cameras to write overlay videos of; default: the fitted ones")
     add_rate(p)
 

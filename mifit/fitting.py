@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mifit
+from mifit.capture.choose_frames import FrameChoice
 from mifit.config import FitConfig
 from mifit.errors import InputError
-from mifit.pipeline import choose, fit
+from mifit.pipeline import choose, choose_timesteps, fit
 from mifit.progress import Progress, silent
 from mifit.reconstruction import Reconstruction
 from mifit.result.ownership import CHECKPOINTS, check_ours, claim, locked
@@ -29,7 +30,7 @@ def fit_into(
     capture: Capture,
     model: MorphableModel,
     cameras: Sequence[str] | None = None,
-    timesteps: Sequence[int] | None = None,
+    timesteps: Sequence[int] | FrameChoice | None = None,
     config: FitConfig | None = None,
     until: Stage = "normals",
     seed: int = 0,
@@ -92,12 +93,12 @@ def _identity(
     capture: Capture,
     model: MorphableModel,
     cameras: tuple[str, ...],
-    timesteps: Sequence[int] | None,
+    timesteps: Sequence[int] | FrameChoice | None,
     config: FitConfig,
     seed: int,
 ) -> dict[str, Any]:
     """What decides a result, as ``result.json`` tells it."""
-    steps = choose("timestep", capture.timesteps, timesteps, 4)
+    steps = choose_timesteps(capture, timesteps)
     return {
         "version": mifit.__version__,
         "capture": capture.digest(cameras, steps),

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
+from mifit.capture.choose_frames import FrameChoice
 from mifit.config import FitConfig
 from mifit.core.estimate import GeometryEstimate
 from mifit.errors import InputError
@@ -37,7 +38,7 @@ def fit(
     capture: Capture,
     model: MorphableModel,
     cameras: Sequence[str] | None = None,
-    timesteps: Sequence[int] | None = None,
+    timesteps: Sequence[int] | FrameChoice | None = None,
     config: FitConfig | None = None,
     until: Stage = "normals",
     seed: int = 0,
@@ -56,8 +57,9 @@ def fit(
         The face model to fit.
     cameras : sequence of str, optional
         Cameras to use; no other camera's images are read. Default: the capture's first two.
-    timesteps : sequence of int, optional
-        Timesteps to fit jointly; default: the first four.
+    timesteps : sequence of int or FrameChoice, optional
+        Timesteps to fit jointly; default: the first four. A choice (`mifit.choose_frames`) is kept with its reasons in
+        ``geometry.report.details["frames"]``.
     config : FitConfig, optional
         Settings of the stages.
     until : {"geometry", "reflectance", "normals"}
@@ -95,7 +97,8 @@ def fit(
     check_active_variant()
     config = config or FitConfig()
     cameras = choose("camera", capture.cameras, cameras, 2)
-    timesteps = choose("timestep", capture.timesteps, timesteps, 4)
+    choice = timesteps if isinstance(timesteps, FrameChoice) else None
+    timesteps = choose_timesteps(capture, timesteps)
     if until not in STAGES:
         raise InputError(f"until: found {until!r}, expected one of {', '.join(STAGES)}")
     check_images(capture, cameras, timesteps)
@@ -131,6 +134,11 @@ def fit(
         shared,
         None if watch is None else lambda so_far: watch(result(so_far)),
     )
+    if choice is not None:
+        geometry = estimates["geometry"]
+        details = {**geometry.report.details, "frames": choice.document()}
+        report = dataclasses.replace(geometry.report, details=details)
+        estimates["geometry"] = dataclasses.replace(geometry, report=report)
     return result(estimates, seconds)
 
 
@@ -177,6 +185,11 @@ def choose(kind: str, known: Sequence[T], wanted: Sequence[T] | None, default: i
     if not wanted:
         raise InputError(f"no {kind} named; the capture has {', '.join(map(str, known))}")
     return tuple(dict.fromkeys(wanted))
+
+
+def choose_timesteps(capture: Capture, wanted: Sequence[int] | FrameChoice | None) -> tuple[int, ...]:
+    """The timesteps of a fit, checked; the first four when none is named."""
+    return choose("timestep", capture.timesteps, wanted.timesteps if isinstance(wanted, FrameChoice) else wanted, 4)
 
 
 def fitted_to(result: Result, capture: Capture) -> bool:

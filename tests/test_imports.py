@@ -35,6 +35,7 @@ MAY_IMPORT = {
     "reconstruction": DATA | {"morphable", "result", "output"},
     "steps": DATA | {"morphable", "capture", "checkpoint", "stages"},
     "tracking": DATA | {"morphable", "capture", "stages", "result"},
+    "refinement": DATA | {"morphable", "capture", "checkpoint", "stages", "result", "tracking"},
     "pipeline": DATA | {"morphable", "capture", "render", "steps", "reconstruction"},
     "fitting": DATA | {"morphable", "capture", "result", "reconstruction", "steps", "pipeline"},
     "plan": DATA | {"schema", "morphable", "capture", "checkpoint", "pipeline"},
@@ -48,7 +49,8 @@ TOP = {"commands", "cli", "__main__", "__init__"}  # may import everything
 KERNELS = {"render", "appearance"}
 """Parts whose functions may import Mitsuba and Dr.Jit."""
 KERNEL_FILES = {
-    f"stages/{name}.py" for name in ("normals/chart", "normals/problem", "normals/solvers", "reflectance/adam")
+    f"stages/{name}.py"
+    for name in ("absorb/linear", "normals/chart", "normals/problem", "normals/solvers", "reflectance/adam")
 }
 """Further files that may, relative to the package: solvers of stages."""
 
@@ -144,6 +146,7 @@ SAME_MEANING = {
     "turntable": "views around a head", "model": "the morphable model", "doctor": "checking the set-up",
     "save": "writing a stage or a result", "load": "reading a stage or a result",
     "head": "the making of a head",
+    "refine": "making a fit better with all of its images",
     "normalization": "the factor of a lobe, plain and as a kernel",
 }  # fmt: skip
 """Names that several places share because they mean the same there: commands and what they call, and a few more."""

@@ -16,7 +16,10 @@ from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 
 if TYPE_CHECKING:
-    pass
+    from mifit.capture import Capture
+    from mifit.capture.choose_frames import FrameChoice
+    from mifit.progress import Progress
+    from mifit.reconstruction import Reconstruction
 
 
 DEMO = {"model": "builtin:coarse", "width": 340, "height": 240, "spp": 32, "timesteps": 3}
@@ -102,12 +105,15 @@ def fit(arguments: Namespace) -> None:
     from mifit.fitting import fit_into
     from mifit.output.report import write_report
 
+    timesteps = arguments.timesteps
+    if isinstance(timesteps, int):
+        timesteps = _chosen(arguments, capture, timesteps)
     result = fit_into(
         out,
         capture,
         model,
         cameras=arguments.cameras,
-        timesteps=arguments.timesteps,
+        timesteps=timesteps,
         config=config,
         until=arguments.until,
         seed=arguments.seed,
@@ -117,6 +123,19 @@ def fit(arguments: Namespace) -> None:
     )
     write_report(out, result, capture)
     print(f"Result: {out}")
+
+
+def _chosen(arguments: Namespace, capture: Capture, count: int) -> FrameChoice:
+    """The frames that tell most, said on standard error."""
+    from mifit.capture.choose_frames import choose_frames
+    from mifit.pipeline import choose
+
+    found = choose_frames(capture, choose("camera", capture.cameras, arguments.cameras, 2), count)
+    for timestep, why in found.why.items():
+        say(arguments, f"Timestep {timestep}: {why}")
+    for timestep, why in found.left_out.items():
+        say(arguments, f"Timestep {timestep} left out: {why}")
+    return found
 
 
 def track(arguments: Namespace) -> None:
@@ -147,9 +166,27 @@ def track(arguments: Namespace) -> None:
         resume=arguments.resume,
         progress=progress,
     )
+    if arguments.refine:
+        result = _with_refined(arguments, result, capture, progress)
     written = write_moving_pictures(arguments.result, result, capture, arguments.overlay, arguments.fps, progress)
     remember(arguments.result, [path.name for path in written])
     print(f"Result: {arguments.result}")
+
+
+def _with_refined(arguments: Namespace, result: Reconstruction, capture: Capture, progress: Progress) -> Reconstruction:
+    """The result with all of its frames absorbed into its maps and normals, written into its folder."""
+    from mifit.output.report import write_report
+    from mifit.refinement import refine
+    from mifit.result.ownership import CHECKPOINTS, locked
+
+    folder: Path = arguments.result
+    with locked(folder):
+        checkpoints = folder / CHECKPOINTS / "refine"
+        found = refine(result, capture, result.timesteps, arguments.seed, progress, checkpoints)
+        found.save(folder)
+        shutil.rmtree(checkpoints, ignore_errors=True)
+    write_report(folder, found, capture)
+    return found
 
 
 def run(arguments: Namespace) -> None:

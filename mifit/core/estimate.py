@@ -131,6 +131,8 @@ class ReflectanceEstimate:
         What each image of the fit shows (`core.labels.Label`); empty where that wasn't looked for.
     labelled : tuple of (camera, timestep)
         Of which image each of ``labels`` is.
+    frames : (S, S) float32 or None
+        Number of timesteps that showed each texel, where a video was absorbed (`mifit.refine`).
     """
 
     diffuse: NDArray
@@ -142,6 +144,7 @@ class ReflectanceEstimate:
     report: Report
     labels: tuple[NDArray, ...] = ()
     labelled: tuple[tuple[str, int], ...] = ()
+    frames: NDArray | None = None
 
     def label(self, camera: str, timestep: int) -> NDArray | None:
         """The labels of one image; None where there are none."""

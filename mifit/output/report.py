@@ -76,6 +76,7 @@ def write_report(
         ("Result", _summary(reconstruction, evaluation)),
         ("3D view", _view3d(reconstruction, shown[0])),
         ("Inputs and fit", _inputs(reconstruction, capture, shown)),
+        ("Frames", _frames(reconstruction)),
         ("Maps", _maps(reconstruction, shown[0])),
         ("Lighting", _lighting(reconstruction)),
         ("Convergence", _convergence(reconstruction)),
@@ -262,6 +263,20 @@ def _inputs(result: Result, capture: Capture, timesteps: tuple[int, ...]) -> str
     return key + "".join(parts) + more
 
 
+def _frames(result: Result) -> str:
+    """Frames that were chosen, added or left out, and why; nothing where all was as asked for."""
+    chosen = result.geometry.report.details.get("frames", {})
+    refined = {} if result.normals is None else result.normals.report.details.get("refined", {})
+    lines = [f"Timestep {t} was fitted: {why}." for t, why in chosen.get("why", {}).items()]
+    lines += [f"Timestep {t} was not to be chosen: {why}." for t, why in chosen.get("left_out", {}).items()]
+    for camera, offset in chosen.get("camera_offsets_frames", {}).items():
+        lines.append(f"Camera {camera} is {offset:+.2f} frames later than the first one, by its epipolar lines.")
+    if refined:
+        lines.append(f"{len(refined['timesteps'])} frames were added to maps and normals.")
+        lines += [f"Timestep {t} was left out of them: {why}." for t, why in refined["left_out"].items()]
+    return f"<ul>{''.join(f'<li>{html.escape(line)}</li>' for line in lines)}</ul>" if lines else ""
+
+
 def _maps(result: Result, timestep: int) -> str:
     if result.reflectance is None:
         return ""
@@ -271,6 +286,10 @@ def _maps(result: Result, timestep: int) -> str:
         _grey("Specular albedo", reflectance.specular),
         _grey("Confidence: how often and how well each texel was seen", reflectance.confidence, 1.0),
     ]
+    if reflectance.frames is not None:
+        figures.append(
+            _grey("Frames that showed each texel", reflectance.frames, float(reflectance.frames.max()) or 1.0)
+        )
     refined = result.refined_normal(timestep)
     if refined is not None:
         colours = np.where(np.any(refined != 0, axis=-1, keepdims=True), 127.5 * (refined + 1), 0)

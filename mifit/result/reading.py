@@ -224,6 +224,7 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
     radiance = _array(lighting["radiance"], (order * order, 3), "radiance")
     diffuse = _read_map(folder / "maps" / "diffuse.exr", 3)
     labels = _labels(folder, document)
+    frames = folder / "maps" / "frames.exr"
     return ReflectanceEstimate(
         diffuse=diffuse,
         specular=_read_map(folder / "maps" / "specular.exr", 1, len(diffuse)),
@@ -234,6 +235,7 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
         report=_report(document, "reflectance"),
         labels=tuple(labels.values()),
         labelled=tuple(labels),
+        frames=_read_map(frames, 1, len(diffuse)) if frames.exists() else None,
     )
 
 

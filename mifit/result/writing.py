@@ -46,6 +46,8 @@ def save(result: Result, folder: Path, write_scene: Callable[[Path], None], forc
         if result.reflectance is not None:
             for name in ("diffuse", "specular", "confidence"):
                 write_image(new / "maps" / f"{name}.exr", getattr(result.reflectance, name))
+            if result.reflectance.frames is not None:
+                write_image(new / "maps" / "frames.exr", result.reflectance.frames)
             write_image(new / "lighting.exr", result.lighting.to_latlong())
             for (camera, timestep), labels in zip(result.reflectance.labelled, result.reflectance.labels, strict=True):
                 write_bytes(new / label_file(camera, timestep), encode_png(labels))

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.config import GeometryConfig, NormalsConfig
-from mifit.core.bend import bend, tangent_plane, transport, unbend
+from mifit.core.bend import bend, tangent_plane, unbend
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
-from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
 from mifit.stages.fit_geometry import fit_pose_expression
 from mifit.stages.geometry.refine import texture_reference
+from mifit.stages.normals.carried import CarriedTangents
 from mifit.stages.normals.normal_refinement import check_maps, refine_frame
 
 if TYPE_CHECKING:
@@ -110,9 +110,7 @@ def track(
     config, geometry_config = config or NormalsConfig(), geometry_config or GeometryConfig()
     check_timesteps(capture.timesteps, geometry.timesteps, timesteps)
     texels = rasterize_uv(model.uv, model.faces_uv, check_maps(reflectance), model.face_mask)
-    home = geometry.at(geometry.timesteps if fitted is None else fitted)
-    reference = texture_reference(capture, model, home, cameras, geometry_config, seed)
-    last = geometry.at(geometry.timesteps[-1:])
+    follower = Follower(capture, model, geometry, cameras, geometry_config, fitted, seed)
     memory = _Memory(model, texels)
     if normals is not None:
         for timestep in [t for t in geometry.timesteps if t in normals.timesteps][-MEMORY:]:
@@ -123,22 +121,12 @@ def track(
     progress("track", 0, len(timesteps))
     for done, timestep in enumerate(timesteps):
         began = time.perf_counter()
-
-        def fit(start: GeometryEstimate, t: int = timestep) -> GeometryEstimate:
-            return fit_pose_expression(
-                capture, model, start, cameras, t, geometry_config, seed=seed, reference=reference
-            )
-
-        found, refound = _follow(fit, lambda g: landmark_error(capture, model, g, cameras), last, home)
-        warnings = list(found.report.warnings)
-        if refound:
-            warnings.append(f"timestep {timestep}: lost the face and found it again by its landmarks")
+        found, refound, warnings = follower.next(timestep)
         prior = memory.offsets(found)
         frame = refine_frame(capture, model, found, reflectance, cameras, config, texels, prior, seed)
         if frame.measured == 0.0:
             warnings.append(f"timestep {timestep}: no camera measures the face; normals are those of the frames before")
         memory.add(found, frame.normal_object)
-        last = found
         progress("track", done + 1, len(timesteps))
         yield TrackedFrame(
             timestep,
@@ -148,6 +136,66 @@ def track(
             refound,
             tuple(warnings),
         )
+
+
+class Follower:
+    """Pose and expression of further timesteps, each found from where the last one ended.
+
+    Parameters
+    ----------
+    capture, model, geometry, cameras, geometry_config, fitted, seed
+        As in `track`.
+    last : GeometryEstimate, optional
+        Of one timestep, from which the next one starts; default: the last of ``geometry``.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        model: MorphableModel,
+        geometry: GeometryEstimate,
+        cameras: Sequence[str],
+        geometry_config: GeometryConfig,
+        fitted: Sequence[int] | None = None,
+        seed: int = 0,
+        last: GeometryEstimate | None = None,
+    ) -> None:
+        self._capture, self._model, self._cameras = capture, model, tuple(cameras)
+        self._config, self._seed = geometry_config, seed
+        self._home = geometry.at(geometry.timesteps if fitted is None else fitted)
+        self._reference = texture_reference(capture, model, self._home, cameras, geometry_config, seed)
+        self._last = geometry.at(geometry.timesteps[-1:]) if last is None else last
+
+    def next(self, timestep: int) -> tuple[GeometryEstimate, bool, list[str]]:
+        """Geometry of a timestep, whether landmarks had to find the lost face again, and warnings.
+
+        Raises
+        ------
+        ConvergenceError
+            Neither the last pose nor the landmarks find the face.
+        """
+
+        def fit(start: GeometryEstimate) -> GeometryEstimate:
+            return fit_pose_expression(
+                self._capture,
+                self._model,
+                start,
+                self._cameras,
+                timestep,
+                self._config,
+                seed=self._seed,
+                reference=self._reference,
+            )
+
+        def error(found: GeometryEstimate) -> float:
+            return landmark_error(self._capture, self._model, found, self._cameras)
+
+        found, refound = _follow(fit, error, self._last, self._home)
+        warnings = list(found.report.warnings)
+        if refound:
+            warnings.append(f"timestep {timestep}: lost the face and found it again by its landmarks")
+        self._last = found
+        return found, refound, warnings
 
 
 def check_timesteps(known: Sequence[int], fitted: Sequence[int], wanted: Sequence[int]) -> None:
@@ -209,29 +257,17 @@ class _Memory:
     """Corrections of the last frames, in tangent planes that move with the face."""
 
     def __init__(self, model: MorphableModel, texels: TexelMap) -> None:
-        self._model, self._texels = model, texels
-        self._home = self._base(model.mean)
-        self._home_tangents = tangent_plane(self._home)
+        self._carried = CarriedTangents(model, texels)
         self._frames: list[NDArray] = []
 
     def add(self, geometry: GeometryEstimate, normals: NDArray) -> None:
         """Remember refined normals (N, 3) of a timestep, object space."""
-        base, tangents = self._frame(geometry)
-        self._frames = [*self._frames, unbend(base, tangents, normals.astype(np.float64))][-MEMORY:]
+        self._frames = [*self._frames, unbend(*self._carried.frame(geometry), normals.astype(np.float64))][-MEMORY:]
 
     def offsets(self, geometry: GeometryEstimate) -> NDArray | None:
         """(N, 2) mean correction in the tangent planes of `refine_frame` for a new timestep; None without a past."""
         if not self._frames:
             return None
-        base, tangents = self._frame(geometry)
+        base, tangents = self._carried.frame(geometry)
         wanted = bend(base, tangents, np.mean(self._frames, axis=0))
         return unbend(base, tangent_plane(base), wanted)
-
-    def _frame(self, geometry: GeometryEstimate) -> tuple[NDArray, NDArray]:
-        """Base normals of a timestep and the home tangents carried to them."""
-        base = self._base(geometry.vertices[0].astype(np.float64) @ geometry.rotation[0])
-        return base, transport(self._home, self._home_tangents, base)
-
-    def _base(self, vertices: NDArray) -> NDArray:
-        faces, texels = self._model.faces, self._texels
-        return normalize(interpolate(vertex_normals(vertices, faces), faces, texels.face, texels.weights))

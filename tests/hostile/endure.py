@@ -55,7 +55,7 @@ max_iterations = 2
 """A fit that takes two seconds: what is tested is files."""
 EXPERIMENT = (
     'name = "e"\n[fit]\ncapture = "capture"\nmodel = "builtin:coarse"\ntimesteps = [0]\nuntil = "geometry"\n'
-    '[fit.geometry]\nrounds = 1\nmax_iterations = 2\n[fit.surface]\nenabled = false\n'
+    "[fit.geometry]\nrounds = 1\nmax_iterations = 2\n[fit.surface]\nenabled = false\n"
     '[evaluate]\ncamera = "third"\n[sweep.grid]\n"fit.seed" = [0, 1]\n'
 )
 

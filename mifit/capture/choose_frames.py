@@ -1,0 +1,237 @@
+"""Which frames of a long video tell most about a face: different poses, sharp, eyes open, views that agree.
+
+Pose comes from the landmarks alone, so that no model is fitted before the choice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.capture.outliers import fundamental_matrix
+from mifit.errors import InputError
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+
+BLURRED = 0.5
+"""Sharpness below this part of the median."""
+BLINK = 0.6
+"""Opening of the eyes below this part of the median."""
+DISAGREEING = 3.0
+"""Median distance to the epipolar lines above this many times the median of all frames, and above `PIXELS`."""
+PIXELS = 1.0
+SIDE = 128
+"""Pixels across a face at which its sharpness is measured: the same whatever the size of the images."""
+RIGID = (27, 28, 29, 30, 33, 36, 39, 42, 45)
+"""Landmarks that expressions move least: the ridge and base of the nose, the corners of the eyes."""
+EYES = ((37, 41, 38, 40, 36, 39), (43, 47, 44, 46, 42, 45))
+"""Upper and lower lids, twice, and the corners of both eyes."""
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """Frames that were chosen.
+
+    Attributes
+    ----------
+    timesteps : tuple of int
+        Ascending.
+    why : dict of int to str
+        Of the chosen ones.
+    left_out : dict of int to str
+        Frames that could not be chosen, with the reason.
+    offsets : dict of str to float
+        Time by which each camera but the first is late, in frames; of cameras whose views tell.
+    """
+
+    timesteps: tuple[int, ...]
+    why: dict[int, str]
+    left_out: dict[int, str] = field(default_factory=dict)
+    offsets: dict[str, float] = field(default_factory=dict)
+
+    def document(self) -> dict:
+        """JSON values for a report."""
+        return {
+            "why": {str(t): text for t, text in self.why.items()},
+            "left_out": {str(t): text for t, text in self.left_out.items()},
+            "camera_offsets_frames": self.offsets,
+        }
+
+
+def choose_frames(capture: Capture, cameras: Sequence[str], count: int) -> FrameChoice:
+    """Choose the timesteps of a capture that tell most about a face.
+
+    Frames that are blurred, show closed eyes, lack landmarks or whose views disagree are left out. Of the others the
+    first is the one nearest to the middle of all poses, and each next one the farthest from those before it.
+
+    Parameters
+    ----------
+    capture : Capture
+        With landmarks.
+    cameras : sequence of str
+        No other camera is read.
+    count : int
+        How many; fewer come back where there aren't as many.
+
+    Raises
+    ------
+    InputError
+        No camera, or no timestep with landmarks.
+    """
+    if not cameras:
+        raise InputError("choose_frames: found no camera, expected at least one")
+    steps = np.array(capture.timesteps)
+    points = np.stack([_landmarks(capture, name, steps) for name in cameras])  # (C, T, 68, 2)
+    known = np.isfinite(points).all((2, 3))
+    if not known.any():
+        raise InputError(f"{capture.path}: no timestep has landmarks to choose by; run mifit landmarks first")
+    left_out: dict[int, str] = {int(t): "no landmarks" for t in steps[~known.any(0)]}
+    sharp = np.array([_sharpness(capture, cameras, int(t), points[:, i]) for i, t in enumerate(steps)])
+    opening = _eye_opening(points)
+    apart = _disagreement(capture, cameras, points)
+    for i, t in enumerate(int(t) for t in steps):
+        if t in left_out:
+            continue
+        if sharp[i] < BLURRED * np.nanmedian(sharp):
+            left_out[t] = f"blurred: {sharp[i] / np.nanmedian(sharp):.0%} of the usual sharpness"
+        elif opening[i] < BLINK * np.nanmedian(opening):
+            left_out[t] = f"eyes closed: {opening[i] / np.nanmedian(opening):.0%} of the usual opening"
+        elif apart[i] > max(DISAGREEING * float(np.nanmedian(apart)), PIXELS):
+            left_out[t] = f"views disagree: landmarks {apart[i]:.1f} pixels off the other view's lines"
+    good = np.array([i for i, t in enumerate(steps) if int(t) not in left_out])
+    if not len(good):  # better the worst frames than none
+        good = np.flatnonzero(known.any(0))
+    poses = _poses(points[:, good])
+    chosen, why = _spread(poses, sharp[good] / np.nanmedian(sharp), count)
+    found = {int(steps[good[k]]): text for k, text in zip(chosen, why, strict=True)}
+    return FrameChoice(
+        tuple(sorted(found)), dict(sorted(found.items())), left_out, camera_offsets(capture, cameras, points)
+    )
+
+
+def camera_offsets(capture: Capture, cameras: Sequence[str], points: NDArray) -> dict[str, float]:
+    """Frames by which cameras are later than the first one, from how landmarks leave their epipolar lines as they move.
+
+    A point that moves at v pixels a frame, seen d frames late, lies d v.n off its line of normal n. That is one
+    equation per landmark and frame. ``points`` (C, T, 68, 2) are undistorted, of consecutive frames.
+    """
+    found: dict[str, float] = {}
+    if not capture.calibrated or points.shape[1] < 5:
+        return found
+    for k in range(1, len(cameras)):
+        normal, distance = _epipolar(capture, cameras[0], cameras[k], points[0], points[k])
+        speed = np.gradient(points[k], axis=0)
+        across = (speed * normal).sum(-1)
+        # A detector's bias per landmark is no motion.
+        across, distance = (v - np.nanmedian(v, axis=0) for v in (across, distance))
+        ok = np.isfinite(across) & np.isfinite(distance)
+        if ok.sum() < 100 or np.sqrt(np.mean(across[ok] ** 2)) < 0.3:
+            continue
+        offset, weight = 0.0, ok.astype(np.float64)
+        for _ in range(10):
+            residual = np.where(ok, distance - offset * across, 0.0)
+            scale = 1.4826 * np.median(np.abs(residual[ok])) + 1e-6
+            weight = ok / (1.0 + (residual / (2.0 * scale)) ** 2)
+            offset = float(np.nansum(weight * across * distance) / max(np.nansum(weight * across**2), 1e-12))
+        found[cameras[k]] = round(-offset, 3)
+    return found
+
+
+def _landmarks(capture: Capture, camera: str, steps: NDArray) -> NDArray[np.float64]:
+    """(T, 68, 2) undistorted landmarks; NaN where there are none."""
+    out = np.full((len(steps), 68, 2), np.nan)
+    for i, t in enumerate(steps):
+        found = capture.landmarks(camera, int(t))
+        if found is not None:
+            out[i] = found.points
+    return out
+
+
+def _sharpness(capture: Capture, cameras: Sequence[str], timestep: int, points: NDArray) -> float:
+    """Least over the cameras of the share of fine detail in the face's contrast; NaN without landmarks."""
+    found = []
+    for name, p in zip(cameras, points, strict=True):
+        if not np.isfinite(p).all():
+            continue
+        image = capture.frame(name, timestep).image.mean(-1)
+        low, high = np.floor(p.min(0)).astype(int), np.ceil(p.max(0)).astype(int)
+        low, high = np.maximum(low, 0), np.minimum(high, (image.shape[1], image.shape[0]))
+        if (high - low).min() < 8:
+            continue
+        crop = np.sqrt(np.maximum(image[low[1] : high[1], low[0] : high[0]], 0.0)).astype(np.float32)
+        scale = SIDE / max(crop.shape)
+        if scale < 1.0:
+            crop = cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        fine = crop - cv2.GaussianBlur(crop, (0, 0), 1.5)
+        found.append(float(fine.std() / max(float(crop.std()), 1e-6)))
+    return min(found) if found else float("nan")
+
+
+def _eye_opening(points: NDArray) -> NDArray[np.float64]:
+    """(T,) height over width of the more open eye, mean of the cameras."""
+    ratios = []
+    for a, b, c, d, left, right in EYES:
+        height = np.linalg.norm(points[:, :, a] - points[:, :, b], axis=-1)
+        height = height + np.linalg.norm(points[:, :, c] - points[:, :, d], axis=-1)
+        ratios.append(height / np.maximum(np.linalg.norm(points[:, :, left] - points[:, :, right], axis=-1), 1e-6))
+    with np.errstate(all="ignore"):
+        return np.asarray(np.ma.masked_invalid(np.maximum(*ratios)).mean(0).filled(np.nan), dtype=np.float64)
+
+
+def _epipolar(
+    capture: Capture, first: str, second: str, a: NDArray, b: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Unit normals (T, 68, 2) of the lines in the second view, and the signed distances (T, 68) of its landmarks."""
+    matrix = fundamental_matrix(capture.camera(first), capture.camera(second))
+    line = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=2) @ matrix.T
+    length = np.maximum(np.linalg.norm(line[..., :2], axis=2), 1e-12)
+    return line[..., :2] / length[..., None], ((line[..., :2] * b).sum(-1) + line[..., 2]) / length
+
+
+def _disagreement(capture: Capture, cameras: Sequence[str], points: NDArray) -> NDArray[np.float64]:
+    """(T,) largest over the views of the median distance of landmarks from the first view's lines; 0 where unknown."""
+    found = np.zeros(points.shape[1])
+    if not capture.calibrated:
+        return found
+    for k in range(1, len(cameras)):
+        _, distance = _epipolar(capture, cameras[0], cameras[k], points[0], points[k])
+        distance -= np.nan_to_num(np.nanmedian(distance, axis=0)) if np.isfinite(distance).any() else 0.0
+        for i, row in enumerate(np.abs(distance)):
+            if np.isfinite(row).any():
+                found[i] = max(found[i], float(np.nanmedian(row)))
+    return found
+
+
+def _poses(points: NDArray) -> NDArray[np.float64]:
+    """(T, C * 2 * K) places of the landmarks that expressions move least, in widths of the face: they move with pose.
+
+    Frames are compared by the parallax between these points: where the head stands in the image doesn't count, how it
+    is turned does.
+    """
+    rigid = points[:, :, list(RIGID)]
+    size = np.nanmedian(np.linalg.norm(points[:, :, 36] - points[:, :, 45], axis=-1), axis=1)
+    rigid = (rigid - rigid.mean(axis=2, keepdims=True)) / size[:, None, None, None]
+    flat = rigid.transpose(1, 0, 2, 3).reshape(points.shape[1], -1)
+    return np.where(np.isfinite(flat), flat, np.nanmedian(flat, axis=0))
+
+
+def _spread(poses: NDArray, sharpness: NDArray, count: int) -> tuple[list[int], list[str]]:
+    """Rows that lie far from one another, sharper ones preferred, and the reason for each."""
+    middle = np.median(poses, axis=0)
+    away = np.linalg.norm(poses - middle, axis=1)
+    good = np.clip(np.nan_to_num(sharpness, nan=1.0), 0.5, 1.0)
+    first = int(np.argmin(away / good))
+    chosen, why = [first], ["nearest to the middle of all poses"]
+    nearest = np.linalg.norm(poses - poses[first], axis=1)
+    while len(chosen) < min(count, len(poses)):
+        pick = int(np.argmax(np.where(np.isin(np.arange(len(poses)), chosen), -1.0, nearest * good)))
+        why.append(f"farthest in pose from those before, {nearest[pick]:.2f} widths between the eyes")
+        chosen.append(pick)
+        nearest = np.minimum(nearest, np.linalg.norm(poses - poses[pick], axis=1))
+    return chosen, why

@@ -1,0 +1,285 @@
+"""``mifit.refine``: all frames of a video make the maps, the light and the normals of a result sharper.
+
+Every frame is added to sums of a fixed size per texel (`stages.absorb`) and then forgotten: memory doesn't grow with
+the number of frames, and their order doesn't matter.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit import checkpoint
+from mifit.config import GeometryConfig, ReflectanceConfig, from_mapping
+from mifit.core.bend import bend, texel_neighbours
+from mifit.core.estimate import NormalsEstimate, Report
+from mifit.core.mesh import interpolate, normalize
+from mifit.core.uv import TexelMap
+from mifit.errors import ConvergenceError, InputError
+from mifit.progress import Progress, silent
+from mifit.result.record import R
+from mifit.stages.absorb.frame import Absorber, FrameFit, carried_offsets
+from mifit.stages.absorb.information import Information
+from mifit.stages.absorb.solve_sums import Solved, solve_sums
+from mifit.stages.normals.carried import CarriedTangents
+from mifit.stages.observations import Surface
+from mifit.stages.reflectance.fill import blend_unseen
+from mifit.stages.reflectance.maps import Smoothness
+from mifit.stages.track import Follower
+from mifit.tracking import mesh_refiner
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+
+EVERY = 8
+"""Frames between two checkpoints."""
+DISAGREES = 2.0
+"""Residual of a frame, relative to the median of the fitted ones, beyond which it is left out."""
+
+
+def refine(
+    result: R,
+    capture: Capture,
+    timesteps: Sequence[int] | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    checkpoints: str | Path | None = None,
+) -> R:
+    """Add what further frames show to the maps and normals of a result.
+
+    Parameters
+    ----------
+    result : Reconstruction
+        With reflectance. The timesteps that it has geometry for enter as well.
+    capture : Capture
+        The one that was fitted.
+    timesteps : sequence of int, optional
+        Frames to add; default: all of the capture. Those that the result has no geometry for are followed from frame to
+        frame and not kept.
+    seed : int
+        As in `track`.
+    progress : Progress
+        ``done`` counts frames.
+    checkpoints : path, optional
+        Folder in which the sums are kept while frames are added: a run that was stopped goes on from there.
+
+    Returns
+    -------
+    Reconstruction
+        With the timesteps of ``result``. ``reflectance.frames`` tells how many frames showed each texel,
+        ``normals.report.details["refined"]`` which frames were added and which were left out, and why.
+
+    Raises
+    ------
+    InputError
+        A result without reflectance, or a timestep that the capture lacks.
+
+    Notes
+    -----
+    Maps and normals are linearised about the result, and the weights of the observations are those that it gives them;
+    neither depends on the frames added before.
+    """
+    began = time.perf_counter()
+    if result.reflectance is None:
+        raise InputError("refine: found a result without reflectance, expected one of 'mifit fit' with all stages")
+    wanted = sorted({*result.timesteps, *(capture.timesteps if timesteps is None else timesteps)})
+    for timestep in wanted:
+        if timestep not in capture.timesteps:
+            known = ", ".join(map(str, capture.timesteps))
+            raise InputError(f"timestep {timestep}: not in the capture; it has {known}")
+    names = [camera.name for camera in result.cameras]
+    capture = capture.with_fitted(result.cameras)
+    size, model = len(result.reflectance.diffuse), result.model
+    surface = Surface(capture, model, result.geometry.at(result.timesteps[:1]), names, size, whole=True)
+    carried = CarriedTangents(model, surface.texels)
+    offsets = carried_offsets(carried, result.geometry, result.normals, size, surface.texels.index)
+    offsets[~surface.facial] = 0.0
+    absorber = Absorber(capture, model, result.reflectance, offsets, names, surface, seed)
+    key = checkpoint.digest([_digest(result), capture.digest(names, wanted), wanted, seed])
+    sums = _gathered(
+        result, capture, absorber, wanted, seed, progress, None if checkpoints is None else Path(checkpoints), key
+    )
+    found = _solved(result, absorber, sums.information, surface)
+    return _refined(result, absorber, sums, found, time.perf_counter() - began)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """What a checkpoint holds: the sums, how each frame agreed, and where the last one that was followed ended."""
+
+    sums: tuple[NDArray, ...]
+    fits: tuple[Any, ...]
+    pose: tuple[NDArray, ...]
+
+
+POSE = ("expression", "rotation", "translation", "vertices")
+
+
+@dataclass(frozen=True)
+class _Sums:
+    information: Information
+    fits: dict[int, FrameFit]
+    left_out: dict[int, str]
+
+
+def _gathered(
+    result: R,
+    capture: Capture,
+    absorber: Absorber,
+    wanted: Sequence[int],
+    seed: int,
+    progress: Progress,
+    folder: Path | None,
+    key: str,
+) -> _Sums:
+    """The sums of all frames, the result's own ones first: they say how well a frame has to agree."""
+    names = [camera.name for camera in result.cameras]
+    information, fits, left_out = Information.nothing(len(absorber.texels.index)), {}, {}
+    own = _fitted(result)
+    order = [*own, *(t for t in wanted if t not in own)]
+    last = result.geometry.at(result.timesteps[-1:])
+    kept = None if folder is None else checkpoint.load(folder, "refine", _Kept, key)
+    if kept is not None:
+        information = Information(*(np.array(part) for part in kept.sums))
+        fits = {int(t): FrameFit(*values) for t, *values in kept.fits}
+        expression, rotation, translation, vertices = kept.pose
+        last = replace(last, expression=expression, rotation=rotation, translation=translation, vertices=vertices)
+    follower: Follower | None = None
+    for done, timestep in enumerate(order):
+        progress("refine", done, len(order))
+        if timestep in fits:
+            continue
+        if timestep in result.timesteps:
+            geometry = result.geometry.at((timestep,))
+        else:
+            if follower is None:
+                follower = Follower(capture, result.model, result.geometry, names, GeometryConfig(), None, seed, last)
+            try:
+                geometry, _, _ = follower.next(timestep)
+            except ConvergenceError:
+                fits[timestep] = FrameFit(float("inf"), 1.0, 0.0)
+                continue
+            last = geometry
+        limit = np.inf
+        if timestep not in own:
+            limit = DISAGREES * float(np.median([fits[t].residual for t in own]))
+        fits[timestep] = absorber.absorb(information, geometry, limit)
+        if folder is not None and (done + 1) % EVERY == 0:
+            pose = tuple(getattr(last, name) for name in POSE)
+            rows = tuple((t, f.residual, f.outliers, f.measured) for t, f in fits.items())
+            sums = tuple(getattr(information, f.name) for f in fields(information))
+            checkpoint.save(folder, "refine", _Kept(sums, rows, pose), key)
+    progress("refine", len(order), len(order))
+    usual = float(np.median([fits[t].residual for t in own]))
+    for timestep, fit in fits.items():
+        if timestep not in own and not fit.residual <= DISAGREES * usual:
+            left_out[timestep] = (
+                "lost the face"
+                if not np.isfinite(fit.residual)
+                else f"differs {fit.residual / usual:.1f} times as much from what was expected as the fitted frames"
+            )
+    return _Sums(information, fits, left_out)
+
+
+def _fitted(result: R) -> list[int]:
+    """Timesteps that were fitted jointly, not tracked."""
+    tracked = [] if result.normals is None else result.normals.report.details.get("tracked", [])
+    return [t for t in result.timesteps if t not in tracked]
+
+
+def _solved(result: R, absorber: Absorber, information: Information, surface: Surface) -> Solved:
+    """Maps and normals from the sums, by the settings of the fit."""
+    assert result.reflectance is not None
+    settings = from_mapping(ReflectanceConfig, result.config.get("reflectance", {}), "result.json: config: reflectance")
+    texels, model = absorber.texels, result.model
+    albedo = interpolate(result.geometry.vertex_albedo, model.faces, texels.face, texels.weights)
+    maps = np.concatenate([result.reflectance.diffuse, result.reflectance.specular[..., None]], axis=2)
+    seen = (information.frames > 0) & absorber.facial
+    prior = np.zeros((texels.size**2, 4), np.float32)
+    prior[texels.index, :3] = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0)
+    prior[:, 3] = float(np.median(absorber.specular[seen])) if seen.any() else 0.0
+    rows = np.flatnonzero(absorber.facial)
+    patch = TexelMap(texels.size, texels.index[rows], texels.face[rows], texels.weights[rows])
+    smoothness = Smoothness(settings.smoothness_weight, settings.smoothness_weight * settings.specular_smoothness)
+    return solve_sums(
+        information,
+        texels,
+        absorber.facial,
+        texel_neighbours(patch),
+        prior.reshape(texels.size, texels.size, 4),
+        smoothness,
+        maps,
+        absorber.offsets,
+    )
+
+
+def _refined(result: R, absorber: Absorber, sums: _Sums, found: Solved, seconds: float) -> R:
+    """The result with what was found."""
+    assert result.reflectance is not None
+    texels, model, information = absorber.texels, result.model, sums.information
+    added = [t for t in sums.fits if t not in sums.left_out]
+    images = len(added) * len(result.cameras)
+    quality = np.minimum(information.quality / max(1.0, 0.35 * images), 1.0)
+    albedo = interpolate(result.geometry.vertex_albedo, model.faces, texels.face, texels.weights)
+    diffuse, specular, confidence = blend_unseen(model, texels, albedo, found.maps, quality)
+    reflectance = replace(
+        result.reflectance,
+        diffuse=diffuse,
+        specular=specular,
+        confidence=confidence,
+        frames=texels.to_map(information.frames.astype(np.float32)),
+    )
+    shown, facial = [], np.where(absorber.facial[:, None], 1.0, 0.0)
+    for timestep in result.timesteps:
+        normals = normalize(bend(*absorber.carried.frame(result.geometry.at((timestep,))), found.offsets))
+        shown.append(texels.to_map((normals * facial).astype(np.float32)))
+    before = result.normals.report if result.normals is not None else Report("converged")
+    details = {
+        **before.details,
+        "refined": {
+            "timesteps": sorted(added),
+            "left_out": {str(t): why for t, why in sums.left_out.items()},
+            "residual": found.sigma,
+            "seconds": seconds,
+        },
+    }
+    lines = tuple(f"timestep {t}: left out of the refinement, {why}" for t, why in sums.left_out.items())
+    report = replace(before, warnings=(*before.warnings, *lines), details=details)
+    normals_estimate = NormalsEstimate(result.timesteps, np.stack(shown), report)
+    refined = replace(result, reflectance=reflectance, normals=normals_estimate)
+    return replace(refined, mesh=_mesh(refined)) if result.mesh is not None else refined
+
+
+def _mesh(result: R) -> Any:
+    """The refined meshes anew, from new normals."""
+    assert result.mesh is not None and result.normals is not None
+    refiner = mesh_refiner(result)
+    made = [
+        refiner.refine(result.geometry, t, n)[:2]
+        for t, n in zip(result.timesteps, result.normals.normal_object, strict=True)
+    ]
+    return replace(
+        result.mesh,
+        timesteps=result.timesteps,
+        vertices=np.stack([vertices for vertices, _ in made]),
+        displacement=np.stack([height for _, height in made]),
+    )
+
+
+def _digest(result: R) -> str:
+    """Of all that the sums depend on besides images."""
+    import hashlib
+
+    assert result.reflectance is not None
+    state = hashlib.sha256(repr((result.timesteps, result.cameras, result.reflectance.illumination)).encode())
+    arrays = [result.reflectance.diffuse, result.reflectance.specular, result.geometry.vertices]
+    arrays += [] if result.normals is None else [result.normals.normal_object]
+    for array in arrays:
+        state.update(np.ascontiguousarray(array).tobytes())
+    return state.hexdigest()

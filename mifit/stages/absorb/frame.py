@@ -1,0 +1,138 @@
+"""One frame of a video, read at the texels and added to their sums (`absorb.information`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.appearance.formation import Appearance, form_image
+from mifit.appearance.occlusion import MeshPoints
+from mifit.core.bend import unbend
+from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
+from mifit.core.mesh import normalize
+from mifit.stages.absorb.information import Information
+from mifit.stages.absorb.linear import linear_shading
+from mifit.stages.normals.carried import CarriedTangents
+from mifit.stages.observations import Surface
+from mifit.stages.reflectance.choice import noise_weight
+from mifit.stages.reflectance.lighting import active_weight
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+
+
+@dataclass(frozen=True)
+class FrameFit:
+    """How well a frame agrees with what was known before it.
+
+    Attributes
+    ----------
+    residual : float
+        Robust standard deviation of observed from predicted colour over the face, linear.
+    outliers : float
+        Part of the observations beyond three deviations, against those of a normal distribution 0.003.
+    measured : float
+        Part of the face's texels that the frame measures.
+    """
+
+    residual: float
+    outliers: float
+    measured: float
+
+
+class Absorber:
+    """Reads frames about a fixed starting point: maps, light and normals of a result.
+
+    Weights depend on the starting point and the frame alone, so that frames can come in any order.
+
+    Parameters
+    ----------
+    capture, model
+        Images, and the model that was fitted.
+    reflectance : ReflectanceEstimate
+        Maps and light to linearise about.
+    offsets : (N, 2)
+        Corrections of the normals to linearise about, in `CarriedTangents` of the texels.
+    cameras : sequence of str
+        Cameras to read; no other camera of the capture is touched.
+    surface : Surface
+        Any surface of the model with maps of this size: says which texels there are.
+    seed : int
+        Of the tracing of shadows.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        model: MorphableModel,
+        reflectance: ReflectanceEstimate,
+        offsets: NDArray,
+        cameras: Sequence[str],
+        surface: Surface,
+        seed: int = 0,
+    ) -> None:
+        self._capture, self._model, self._cameras, self._seed = capture, model, tuple(cameras), seed
+        self.reflectance, self.offsets = reflectance, offsets
+        self.texels, self.facial = surface.texels, surface.facial
+        self.carried = CarriedTangents(model, self.texels)
+        self.diffuse, self.specular = (self.texels.from_map(m) for m in (reflectance.diffuse, reflectance.specular))
+        lobe = reflectance.lobe.at(lambda m: self.texels.from_map(m))
+        self._appearance = Appearance.of(reflectance, lobe)
+
+    def absorb(self, information: Information, geometry: GeometryEstimate, limit: float = np.inf) -> FrameFit:
+        """Add the frame of a geometry's one timestep to the sums, in place, unless its residual is above a limit."""
+        size = self.texels.size
+        surface = Surface(self._capture, self._model, geometry, self._cameras, size, trust=True, whole=True)
+        seen = surface.observe(np.arange(len(self.texels.index)))
+        rotation = geometry.rotation[0]
+        base, tangents = self.carried.frame(geometry)
+        base, tangents = base @ rotation.T, tangents @ rotation.T
+        points = MeshPoints(seen.point[:, 0], base, seen.face, seen.barycentric)
+        occlusion = self._appearance.trace(surface.meshes[0], points, self._seed)
+        images, residuals = [], []
+        for j in range(len(seen.step)):
+            shade = self._appearance.shader(base, seen.view[:, j], occlusion, points.position)
+            d, s, d_slope, s_slope = linear_shading(shade, base, tangents, self.offsets, seen.view[:, j])
+            target = seen.colour[:, j] - np.float32(self._appearance.illumination.ambient)
+            residuals.append(target - form_image(0.0, self.diffuse, d, self.specular[:, None], s))
+            slope = form_image(0.0, self.diffuse[..., None], d_slope, self.specular[:, None, None], s_slope)
+            slope[~self.facial] = 0.0
+            images.append((target, d, s, slope))
+        weight = seen.weight[..., None] * noise_weight(seen.colour, True)
+        residual = np.stack(residuals, axis=1)
+        robust, sigma = active_weight(weight, seen.clipped, residual, True)
+        shown = (seen.measured > 0) & self.facial[:, None]
+        far = np.abs(residual[shown]) > 3.0 * max(sigma, 1e-6)
+        fit = FrameFit(sigma, float(far.mean()) if far.size else 0.0, float(shown.any(1).sum() / self.facial.sum()))
+        if not sigma <= limit:
+            return fit
+        cosine = np.einsum("njk,njk->nj", seen.image_normal, seen.view)
+        cosine = np.where(seen.measured > 0, np.clip(cosine, 0.0, 1.0) * seen.right, 0.0)
+        for j, (target, d, s, slope) in enumerate(images):
+            # What was linearised about x0 is a function of x itself.
+            shift = np.einsum("nci,ni->nc", slope, self.offsets)
+            information.add(target + shift, robust[:, j], d, s, slope, cosine[:, j])
+        information.frames[:] += (seen.measured > 0).any(1)
+        return fit
+
+
+def carried_offsets(
+    carried: CarriedTangents, geometry: GeometryEstimate, normals: NormalsEstimate | None, size: int, index: NDArray
+) -> NDArray[np.float64]:
+    """(N, 2) mean correction of a result's normals, in tangents that move with the face; 0 where there is none."""
+    total = np.zeros((len(index), 2))
+    count = np.zeros((len(index), 1))
+    for timestep in geometry.timesteps if normals is None else normals.timesteps:
+        if normals is None:
+            break
+        found = normals.normal_object[normals.timesteps.index(timestep)].reshape(size * size, 3)[index]
+        known = np.linalg.norm(found, axis=1) > 0.5
+        offsets = unbend(*carried.frame(geometry.at((timestep,))), normalize(found.astype(np.float64)))
+        total[known] += offsets[known]
+        count[known] += 1
+    return total / np.maximum(count, 1)
