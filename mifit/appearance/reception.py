@@ -6,9 +6,9 @@ that each light, and each rotation of one, costs a product.
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,7 @@ GATHERS = 64
 """Directions in which a vertex looks for light from the mesh."""
 OFFSET = 1e-3
 """Distance by which rays start off the surface, relative to the mesh's diagonal."""
-KEPT = 8
-"""Meshes whose reception is kept: the timesteps of a sequence, seen from several cameras."""
+_kept: WeakKeyDictionary[SurfaceScene, tuple[NDArray, Reception]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -72,19 +71,16 @@ class Reception:
 
 
 def reception(scene: SurfaceScene) -> Reception:
-    """That of a mesh; of the last few meshes it is kept."""
-    vertices, faces = np.asarray(scene.vertices, dtype=np.float64), np.asarray(scene.faces, dtype=np.int64)
-    return _reception(vertices.tobytes(), faces.tobytes())
+    """That of a mesh; kept with it until its vertices move."""
+    kept = _kept.get(scene)
+    if kept is None or kept[0] is not scene.vertices:
+        kept = _kept[scene] = scene.vertices, _trace(scene)
+    return kept[1]
 
 
-@functools.lru_cache(maxsize=KEPT)
-def _reception(vertices: bytes, faces: bytes) -> Reception:
-    """The mesh itself is the key: nothing that differs is taken for the same."""
-    from mifit.render.gbuffer import SurfaceScene
-
-    positions = np.frombuffer(vertices, dtype=np.float64).reshape(-1, 3)
-    corners = np.frombuffer(faces, dtype=np.int64).reshape(-1, 3)
-    scene, normals = SurfaceScene(positions, corners), vertex_normals(positions, corners)
+def _trace(scene: SurfaceScene) -> Reception:
+    positions, corners = np.asarray(scene.vertices, dtype=np.float64), np.asarray(scene.faces, dtype=np.int64)
+    normals = vertex_normals(positions, corners)
     directions = fibonacci_sphere(DIRECTIONS)
     parts = range(0, DIRECTIONS, 32)
     bits = [scene.open_towards(positions, normals, directions[start : start + 32]) for start in parts]

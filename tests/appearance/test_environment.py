@@ -12,7 +12,7 @@ from mifit.appearance.illumination import Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import get
 from mifit.appearance.occlusion import MeshPoints
-from mifit.appearance.reception import _reception, reception
+from mifit.appearance.reception import reception
 from mifit.core import sh
 from mifit.render.gbuffer import SurfaceScene
 
@@ -109,12 +109,22 @@ def test_a_mesh_is_traced_once_for_all_rotations(ball) -> None:
     scene = ball[0]
     image = np.tile(np.linspace(0.0, 1.0, 64, dtype=np.float32)[:, None], (32, 1, 3))  # darker on one side
     albedo = np.zeros((len(scene.vertices), 3))
-    _reception.cache_clear()
+    kept = reception(scene)
     lit = [EnvironmentLight(image, sh_rotation(a)).at_vertices(scene, albedo)[1] for a in (0.0, 0.5)]
-    assert _reception.cache_info().misses == 1
+    assert reception(scene) is kept
     vertices = np.asarray(scene.vertices, dtype=np.float64)
     turned = SurfaceScene(vertices @ sh_rotation(0.5).T, scene.faces)
     again = EnvironmentLight(image, sh_rotation(0.5)).at_vertices(turned, albedo)[1]
-    assert _reception.cache_info().misses == 2  # another mesh
+    assert reception(turned) is not kept
     assert np.abs(lit[1] - lit[0]).max() > 0.1
     np.testing.assert_allclose(again, lit[0], rtol=0.05)  # light and mesh turned alike
+
+
+def test_a_mesh_that_moves_is_traced_again(variant) -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    scene = SurfaceScene(mesh.vertices, np.asarray(mesh.faces))
+    before = reception(scene)
+    scene.update(np.asarray(mesh.vertices) * [1.0, 1.0, 0.3])
+    after = reception(scene)
+    assert after is not before
+    assert np.abs(after.normals - before.normals).max() > 0.1
