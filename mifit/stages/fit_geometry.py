@@ -18,6 +18,7 @@ from mifit.solve import Solution
 from mifit.stages.gains import differ, estimate_gains
 from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.displaced import displaced
+from mifit.stages.geometry.faults import calibration_warnings
 from mifit.stages.geometry.landmarks import LandmarkView
 from mifit.stages.geometry.parameters import Frames, Layout
 from mifit.stages.geometry.refine import Reference, priors_of, refine_by_rendering, refine_by_texture, texture_reference
@@ -84,6 +85,8 @@ def fit_geometry(
     journal.phase("landmarks", _usable(start.solution, "landmarks"))
     config = replace(config, landmark_noise=start.noise)
     used = views if config.as_written else start.views  # the paper's landmarks are fixed vertices
+    for message in calibration_warnings(views, model, state.frames.scale, start.noise):
+        journal.warn(message)
 
     def refine(gains: Mapping[str, Sequence[float]]) -> GeometryEstimate:
         return _refine_and_pack(
