@@ -124,6 +124,7 @@ def build_parser() -> argparse.ArgumentParser:
         default="auto",
         help="Mitsuba variant; auto: CUDA where it works, else LLVM (default: auto)",
     )
+    common.add_argument("--threads", type=_whole(1, 1024), help="processor cores to use; default: all")
     common.add_argument("--seed", type=_whole(0, MAX_SEED), default=0, help="seed of everything random (default: 0)")
 
     parser = _Parser(prog="mifit", description="Facial reflectance and geometry from two views.")
@@ -137,6 +138,12 @@ def build_parser() -> argparse.ArgumentParser:
 
     def add_rate(p: argparse.ArgumentParser) -> None:
         p.add_argument("--fps", type=_rate, default=12.0, help="timesteps per second of what moves (default: 12)")
+
+    def add_address(p: argparse.ArgumentParser) -> None:
+        p.add_argument("--host", default="127.0.0.1", help="of the view: address (default: this machine only)")
+        p.add_argument(
+            "--port", type=_whole(0, 65535), default=8080, help="of the view: 8080 if not given; 0: a free one"
+        )
 
     p = add("doctor", "what of the set-up works, what doesn't, and the command that mends it")
     p.add_argument("--json", action="store_true", help="print JSON")
@@ -229,6 +236,10 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--until", choices=["geometry", "reflectance", "normals"], default="normals")
     p.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
     p.add_argument("--force", action="store_true", help="replace an existing result")
+    p.add_argument(
+        "--view", action="store_true", help="show the fit in the browser while it is being fitted, and after"
+    )
+    add_address(p)
 
     p = add("track", "geometry and normals of further timesteps, reflectance and lighting fixed")
     p.add_argument("capture", type=_path)
@@ -277,8 +288,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     p = add("view", "a live view in the browser: turn the head and the light, switch parts, load an environment")
     p.add_argument("result", type=_path, help="result folder")
-    p.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine only)")
-    p.add_argument("--port", type=_at_least(0), default=8080, help="default: 8080; 0 takes a free one")
+    add_address(p)
 
     p = add("relight", "relit views under a measured environment")
     p.add_argument("result", type=_path)
@@ -333,6 +343,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv is None and not arguments.debug:
         drop_chatter()
     try:
+        if arguments.threads:
+            from mifit.core.threads import set_threads
+
+            set_threads(arguments.threads)
         from mifit import commands
 
         code = _run(getattr(commands, arguments.command.replace("import", "import_")), arguments)

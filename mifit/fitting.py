@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +37,7 @@ def fit_into(
     progress: Progress = silent,
     resume: bool = False,
     force: bool = False,
+    watch: Callable[[Reconstruction], None] | None = None,
 ) -> Reconstruction:
     """Fit, and write the result folder; stages that end are kept in it, so that a killed run goes on.
 
@@ -50,6 +51,8 @@ def fit_into(
         Go on with what an earlier run left. A result that has all that is asked for, and perhaps more, stays as it is.
     force : bool
         Replace an existing result, or write beside files that aren't ours; those are never deleted.
+    watch : callable, optional
+        Called with the result so far, as in `mifit.fit`.
 
     Returns
     -------
@@ -84,6 +87,7 @@ def fit_into(
             seed=seed,
             progress=progress,
             checkpoints=folder / CHECKPOINTS,
+            watch=watch,
         )
         result.save(folder, force)
     return result

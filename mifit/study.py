@@ -102,6 +102,7 @@ def draw(folder: Path, rows: Sequence[dict[str, Any]], groups: Sequence[Group]) 
     if len(points) < 2 or not points[0].settings:
         return []
     try:
+        from matplotlib import rc_context
         from matplotlib.figure import Figure
     except ImportError:
         return []
@@ -129,7 +130,7 @@ def draw(folder: Path, rows: Sequence[dict[str, Any]], groups: Sequence[Group]) 
         if len(series) > 1:
             axes.legend()
         path = folder / f"{metric}.svg"
-        with replacing(path) as temporary:
-            figure.savefig(temporary, format="svg")
+        with replacing(path) as temporary, rc_context({"svg.hashsalt": "mifit"}):  # the same runs, the same file
+            figure.savefig(temporary, format="svg", metadata={"Date": None})
         written.append(path)
     return written

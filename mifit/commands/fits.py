@@ -68,6 +68,7 @@ def demo(arguments: Namespace) -> None:
             until="normals",
             resume=False,
             force=True,
+            view=False,
         )
     )
     evaluate(
@@ -108,6 +109,11 @@ def fit(arguments: Namespace) -> None:
     timesteps = arguments.timesteps
     if isinstance(timesteps, int):
         timesteps = _chosen(arguments, capture, timesteps)
+    progress, view = console_progress(arguments.quiet), None
+    if arguments.view:
+        from mifit.output.live_view import FitView
+
+        view = FitView(progress, lambda address: print(f"View: {address}", flush=True), arguments.host, arguments.port)
     result = fit_into(
         out,
         capture,
@@ -117,12 +123,19 @@ def fit(arguments: Namespace) -> None:
         config=config,
         until=arguments.until,
         seed=arguments.seed,
-        progress=console_progress(arguments.quiet),
+        progress=view.progress if view else progress,
         resume=arguments.resume,
         force=arguments.force,
+        watch=view.watch if view else None,
     )
     write_report(out, result, capture)
-    print(f"Result: {out}")
+    print(f"Result: {out}", flush=True)
+    if view:
+        from mifit.output.live_view import serve
+
+        view.watch(result)  # where nothing had to be fitted it is the first
+        assert view.live is not None
+        serve(view.live)
 
 
 def _chosen(arguments: Namespace, capture: Capture, count: int) -> FrameChoice:

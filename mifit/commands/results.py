@@ -112,16 +112,11 @@ def turntable(arguments: Namespace) -> None:
 def view(arguments: Namespace) -> None:
     """Show a result in the browser until the user ends it."""
     result = _result_and_variant(arguments)
-    from mifit.output.live_view import LiveView
+    from mifit.output.live_view import LiveView, serve
 
     live = LiveView(result, arguments.host, arguments.port)
-    print(f"View: {live.address} (end with Ctrl+C)", flush=True)
-    try:
-        live.run()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        live.close()
+    print(f"View: {live.address}", flush=True)
+    serve(live)
 
 
 def relight(arguments: Namespace) -> None:

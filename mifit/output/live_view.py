@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import sys
 import tempfile
 import threading
 import time
@@ -28,6 +29,7 @@ from mifit.errors import InputError, MifitError
 from mifit.output.deferred import render_local
 from mifit.output.relight import relit
 from mifit.output.turntable import on_backdrop, orbit_camera
+from mifit.progress import Progress
 from mifit.result import METHODS, Method, Result
 
 ROWS = (160, 600)
@@ -66,14 +68,14 @@ class Picture:
     """
 
     def __init__(self, result: Result) -> None:
-        self._result = result
+        self.result = result
         self._lit: tuple[tuple[float, Path | None], Result] = ((0.0, None), result)
 
     def render(self, shown: Shown, camera: Camera) -> NDArray[np.uint8]:
         """(H, W, 3) 8-bit sRGB; raises InputError for an environment that can't be read."""
         key = (shown.turn, shown.environment)
         if self._lit[0] != key:
-            self._lit = (key, under(self._result, *key))
+            self._lit = (key, under(self.result, *key))
         image = render_local(self._lit[1], camera, shown.timestep, shown.method, 1)
         return to_8_bit(on_backdrop(image))
 
@@ -117,7 +119,7 @@ def browser_camera(wxyz: NDArray, position: NDArray, fov: float, aspect: float, 
 
 
 class LiveView:
-    """A server that shows a result; `run` answers requests until it is stopped.
+    """A server that shows a result; `run` answers requests until it is stopped, `poll` those that are waiting.
 
     Parameters
     ----------
@@ -146,6 +148,8 @@ class LiveView:
         self._steps = sorted(result.timesteps)
         self._picture = Picture(result)
         self._shown = Shown(result.methods[-1], self._steps[0])
+        self._newest = result.methods[-1]
+        self._played = self._rested = time.monotonic()
         self._changed: dict[int, float] = {}  # client -> when its picture went out of date
         self._coarse: set[int] = set()  # clients whose last picture was a small one
         self._woken = threading.Event()
@@ -169,24 +173,42 @@ class LiveView:
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
         """Answer requests until ``until`` says so, or for ever."""
-        playing = time.monotonic()
         while not until():
             self._woken.wait(0.05)
-            self._woken.clear()
-            if self._play is not None and self._play.value and time.monotonic() - playing > 0.15:
-                playing = time.monotonic()
-                steps = self._steps
-                self._step.value = steps[(steps.index(self._shown.timestep) + 1) % len(steps)]
-            now = time.monotonic()
-            for client, handle in self._server.get_clients().items():
-                if client in self._changed:
-                    del self._changed[client]
-                    self._coarse.add(client)
-                    self._send(handle, ROWS[0])
-                    self._rested = now
-                elif client in self._coarse and now - self._rested > REST:
-                    self._coarse.discard(client)
-                    self._send(handle, ROWS[1])
+            self.poll()
+
+    def poll(self) -> None:
+        """Answer the requests that are waiting; from the thread that set the variant."""
+        self._woken.clear()
+        if self._play is not None and self._play.value and time.monotonic() - self._played > 0.15:
+            self._played = time.monotonic()
+            steps = self._steps
+            self._step.value = steps[(steps.index(self._shown.timestep) + 1) % len(steps)]
+        now = time.monotonic()
+        for client, handle in self._server.get_clients().items():
+            if client in self._changed:
+                del self._changed[client]
+                self._coarse.add(client)
+                self._send(handle, ROWS[0])
+                self._rested = now
+            elif client in self._coarse and now - self._rested > REST:
+                self._coarse.discard(client)
+                self._send(handle, ROWS[1])
+
+    def replace(self, result: Result) -> None:
+        """Show a later state of the same fit: what it has newly is offered, and shown unless a person chose a part."""
+        new = result.methods[-1] if self._shown.method == self._newest else self._shown.method
+        if result.reflectance is not None and self._picture.result.reflectance is None:
+            self._light_controls()
+        self._newest = result.methods[-1]
+        self._picture = Picture(result)
+        self._parts.options = tuple(LABELS[m] for m in METHODS if m in result.methods)
+        self._parts.value = LABELS[new]
+        self._show(method=new)
+
+    def say(self, text: str) -> None:
+        """Write a line under the controls."""
+        self._message.content = text
 
     def close(self) -> None:
         """Stop the server."""
@@ -195,9 +217,12 @@ class LiveView:
 
     def _controls(self, result: Result) -> None:
         gui = self._server.gui
-        parts = {LABELS[m]: m for m in METHODS if m in result.methods}
-        shown = gui.add_dropdown("Show", tuple(parts), initial_value=LABELS[self._shown.method])
+        parts = {LABELS[m]: m for m in METHODS}
+        shown = gui.add_dropdown(
+            "Show", tuple(LABELS[m] for m in METHODS if m in result.methods), initial_value=LABELS[self._shown.method]
+        )
         shown.on_update(lambda _: self._show(method=parts[shown.value]))
+        self._parts: Any = shown
         self._play: Any = None
         self._step: Any = None
         if len(self._steps) > 1:
@@ -207,14 +232,18 @@ class LiveView:
             )
             self._play = gui.add_checkbox("Play", False)
         if result.reflectance is not None:
-            turn = gui.add_slider("Turn light", -180.0, 180.0, 5.0, 0.0)
-            turn.on_update(lambda _: self._show(turn=float(turn.value)))
-            load = gui.add_upload_button("Load environment (.hdr, .exr)")
-            load.on_upload(lambda _: self._upload(load.value.name, load.value.content))
-            gui.add_button("Recovered light").on_click(lambda _: self._show(environment=None))
+            self._light_controls()
         front = gui.add_button("Look from the front")
         front.on_click(lambda event: self._place(event.client))
         self._message = gui.add_markdown("")
+
+    def _light_controls(self) -> None:
+        gui = self._server.gui
+        turn = gui.add_slider("Turn light", -180.0, 180.0, 5.0, 0.0)
+        turn.on_update(lambda _: self._show(turn=float(turn.value)))
+        load = gui.add_upload_button("Load environment (.hdr, .exr)")
+        load.on_upload(lambda _: self._upload(load.value.name, load.value.content))
+        gui.add_button("Recovered light").on_click(lambda _: self._show(environment=None))
 
     def _show(self, **changes: Any) -> None:
         self._shown = replace(self._shown, **changes)
@@ -256,3 +285,56 @@ class LiveView:
             self._show(environment=None)
             return
         client.scene.set_background_image(image, format="jpeg", jpeg_quality=90)
+
+
+class FitView:
+    """A live view of a fit while it is being fitted: `progress` and `watch` are given to it.
+
+    The first state appears once there is a geometry; the page answers whenever the fit reports progress.
+
+    Parameters
+    ----------
+    progress : Progress
+        Called as well.
+    opened : callable
+        Called with the address once there is something to see.
+    host, port
+        As of `LiveView`.
+    """
+
+    def __init__(self, progress: Progress, opened: Callable[[str], None], host: str, port: int) -> None:
+        self.live: LiveView | None = None
+        self._progress, self._opened, self._where = progress, opened, (host, port)
+        self._thread = threading.get_ident()
+        self._polled = 0.0
+
+    def progress(self, label: str, done: int, total: int) -> None:
+        """As `mifit.progress.Progress`; renders what browsers wait for, ten times a second at most."""
+        self._progress(label, done, total)
+        now = time.monotonic()
+        if self.live is None or threading.get_ident() != self._thread or now - self._polled < 0.1:
+            return
+        self.live.say(f"{label}: {done} of {total}")
+        self.live.poll()
+        self._polled = time.monotonic()
+
+    def watch(self, result: Result) -> None:
+        """Show the result so far."""
+        if self.live is None:
+            self.live = LiveView(result, *self._where)
+            self._opened(self.live.address)
+        else:
+            self.live.replace(result)
+        self.live.poll()
+
+
+def serve(live: LiveView) -> None:
+    """Answer requests until Ctrl+C, then close."""
+    live.say("")
+    print("The view stays until Ctrl+C", file=sys.stderr, flush=True)
+    try:
+        live.run()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        live.close()

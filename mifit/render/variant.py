@@ -17,6 +17,7 @@ import sys
 from dataclasses import dataclass
 from importlib import metadata
 
+from mifit.core.threads import OURS, threads
 from mifit.errors import UnknownVariantError, VariantError
 
 LLVM_SUPPORTED = 19
@@ -181,8 +182,8 @@ def set_variant(name: str = "auto") -> str:
                 f"start a new process, where {llvm.path} will be used"
             )
     mi.set_variant(name)
-    if dr.thread_count() < LEAST_THREADS:
-        dr.set_thread_count(LEAST_THREADS)
+    if dr.thread_count() < LEAST_THREADS or OURS in os.environ:
+        dr.set_thread_count(max(LEAST_THREADS, threads()))
     return name
 
 

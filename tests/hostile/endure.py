@@ -134,6 +134,8 @@ def content(place: Path) -> dict[str, bytes]:
             or name.startswith(".mifit")
             or "/.mifit" in name
             or path.name in ("report.html", "summary.md")
+            or path.parent.name == "stages"  # holds times
+            or "seconds" in path.name
         ):
             continue
         data = path.read_bytes()

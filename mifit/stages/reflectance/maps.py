@@ -8,7 +8,6 @@ map is inverted at once by cosine transforms.
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 
+from mifit.core.threads import threads
 from mifit.solve import Outcome
 
 SPLIT = 0.5
@@ -286,7 +286,7 @@ def solve_maps(
         return moved
 
     # Planes are independent but for the blocks, and those of each other; NumPy and SciPy let go of the interpreter.
-    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(4, threads())) as pool:
         for _ in range(iterations):
             splits.iterations += 1
             list(pool.map(pull_texels, range(4)))

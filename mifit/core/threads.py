@@ -1,0 +1,44 @@
+"""How many processor cores are used: one number for BLAS, OpenCV, Dr.Jit, networks and pools of our own."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from threadpoolctl import threadpool_limits
+
+from mifit.errors import InputError
+
+OURS = "MIFIT_THREADS"
+VARIABLES = (OURS, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+"""Read by libraries when they are loaded, and by processes that this one starts."""
+
+
+def set_threads(count: int) -> None:
+    """Use so many threads; before ``set_variant``, which gives Dr.Jit its number.
+
+    Parameters
+    ----------
+    count : int
+        At least 1. Dr.Jit takes 2 where 1 is asked for: with one it waits for itself when images are read.
+
+    Raises
+    ------
+    InputError
+        A count below 1.
+    """
+    if count < 1:
+        raise InputError(f"threads: found {count}, expected a whole number of at least 1")
+    for name in VARIABLES:
+        os.environ[name] = str(count)
+    threadpool_limits(count)  # of what is loaded already
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(count)
+
+
+def threads() -> int:
+    """Threads to use: as set here or by ``MIFIT_THREADS``, else one for each core that this process may run on."""
+    named = os.environ.get(OURS, "")
+    if named.isdecimal() and int(named) > 0:
+        return int(named)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
