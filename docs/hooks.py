@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import re
 from typing import Any
 
 SETTINGS = "<!-- settings of {name} -->"
@@ -45,3 +47,21 @@ def _toml(value: Any) -> str:
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Fill in a page (mkdocs calls this)."""
     return settings_tables(markdown)
+
+
+FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
+
+
+def with_formulas(page: str) -> str:
+    """Turn the LaTeX of a page's formulas into MathML, which browsers show without scripts or a network."""
+    from latex2mathml.converter import convert
+
+    def made(found: re.Match[str]) -> str:
+        return convert(html.unescape(found[3]), display="block" if found[2] == "[" else "inline")
+
+    return FORMULA.sub(made, page)
+
+
+def on_page_content(content: str, **_: Any) -> str:
+    """Fill in a page that has become HTML (mkdocs calls this)."""
+    return with_formulas(content)
