@@ -21,7 +21,7 @@ from typing import Any
 
 import mifit
 from mifit import checkpoint
-from mifit.core.files import file_name, read_text, replacing, write_text
+from mifit.core.files import FULL, file_name, read_text, replacing, write_text
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError, MifitError
 from mifit.plan import Experiment, Plan, Run, SynthRun, load_plan
@@ -69,22 +69,25 @@ def run_experiment(
     InputError
         Bad file or input, before anything runs.
     MifitError
-        Runs that failed, after all others have finished.
+        Runs that failed, after all others have finished; InputError where inputs or a full disk were the reason of all.
     """
     plan = load_plan(path, overrides, seed)
     folder = Path(out) if out is not None else Path("out") / file_name(plan.name)
     todo = [run for run in plan.runs if finished(folder / "runs" / run.folder, run) is None]
     total = len(plan.runs)
     progress("Runs", total - len(todo), total)
-    failures = []
+    failures: list[str] = []
+    inputs_alone = True
     for done, (run, error) in enumerate(_execute_all(todo, folder, plan.jobs, dask, variant)):
         if error is not None:
-            failures.append(f"{run.folder}: {error}")
+            failures.append(f"{run.folder}: {type(error).__name__}: {' '.join(str(error).split())}")
+            inputs_alone &= isinstance(error, InputError) or (isinstance(error, OSError) and error.errno in FULL)
         progress("Runs", total - len(todo) + done + 1, total)
     summary = _summary(plan, folder)
     write_text(folder / "summary.md", summary + "\n")
     if failures:
-        raise MifitError(f"{len(failures)} of {total} runs failed; the others are in {folder}; " + "; ".join(failures))
+        kind = InputError if inputs_alone else MifitError
+        raise kind(f"{len(failures)} of {total} runs failed; the others are in {folder}; " + "; ".join(failures))
     return summary
 
 
@@ -99,7 +102,7 @@ def finished(folder: Path, run: Run) -> dict[str, Any] | None:
 
 def _execute_all(
     runs: Sequence[Run], folder: Path, jobs: int, dask: str | None, variant: str
-) -> Iterator[tuple[Run, str | None]]:
+) -> Iterator[tuple[Run, BaseException | None]]:
     """Execute runs and yield each with its error, or None, as it ends."""
     if not runs:
         return
@@ -119,10 +122,10 @@ def _execute_all(
         while waiting:
             ended, _ = wait(waiting, return_when=FIRST_COMPLETED)
             for future in ended:
-                yield waiting.pop(future), _error_of(future.exception())
+                yield waiting.pop(future), future.exception()
 
 
-def _execute_on_dask(arguments: Sequence[tuple], address: str) -> Iterator[tuple[Run, str | None]]:
+def _execute_on_dask(arguments: Sequence[tuple], address: str) -> Iterator[tuple[Run, BaseException | None]]:
     try:
         from distributed import Client, as_completed
     except ModuleNotFoundError:
@@ -134,11 +137,7 @@ def _execute_on_dask(arguments: Sequence[tuple], address: str) -> Iterator[tuple
     with client:
         futures = {client.submit(execute, *a, pure=False, key=f"mifit-{a[0].digest}"): a[0] for a in arguments}
         for future in as_completed(list(futures)):
-            yield futures[future], _error_of(future.exception())
-
-
-def _error_of(error: BaseException | None) -> str | None:
-    return None if error is None else " ".join(f"{type(error).__name__}: {error}".split())
+            yield futures[future], future.exception()
 
 
 def _synthetic_capture(synth: SynthRun, folder: Path, variant: str) -> Path:
