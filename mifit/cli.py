@@ -327,6 +327,7 @@ def build_parser() -> argparse.ArgumentParser:
     q.add_argument("source", type=_path)
     q.add_argument("out", type=_path)
     q.add_argument("--kind", help="format of SOURCE; default: recognised by content")
+    q.add_argument("--eyes", action="store_true", help="put simple eyes and a mouth's inside where the model has holes")
     return parser
 
 

@@ -36,6 +36,7 @@ def model(arguments: Namespace) -> None:
     """Inspect or convert a morphable model."""
     import mifit
     from mifit.morphable import describe
+    from mifit.morphable.openings import with_eyes
 
     if arguments.action == "info":
         loaded = mifit.MorphableModel.load(arguments.model)
@@ -45,5 +46,6 @@ def model(arguments: Namespace) -> None:
             print(f"Preview: {arguments.preview}")
     else:
         options: dict[str, Any] = {"kind": arguments.kind} if arguments.kind else {}
-        mifit.MorphableModel.load(arguments.source, **options).save(arguments.out)
+        loaded = mifit.MorphableModel.load(arguments.source, **options)
+        (with_eyes(loaded) if arguments.eyes else loaded).save(arguments.out)
         print(f"Model: {arguments.out}")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mifit.core.files import replacing
 from mifit.errors import InputError
 from mifit.morphable.model import MorphableModel
+from mifit.morphable.openings import lacks_eyes
 from mifit.morphable.sketch import sketch
 
 
@@ -54,6 +55,8 @@ def model_info(model: MorphableModel) -> str:
 def notices(model: MorphableModel) -> list[str]:
     """Things about a valid model that a person should know."""
     out = []
+    if lacks_eyes(model):
+        out.append("its eyes are holes; mifit model convert --eyes puts simple ones there")
     if len(model.degenerate_faces):
         out.append(
             f"{len(model.degenerate_faces)} faces of the mean have no area, the first is {model.degenerate_faces[0]}"

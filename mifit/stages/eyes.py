@@ -9,51 +9,19 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import face_cross, vertex_normals
 from mifit.morphable import MorphableModel
+from mifit.morphable.openings import eyeballs
 
-EYES = (slice(36, 42), slice(42, 48))
-"""iBUG points around each eye."""
 SEARCH_MM = 12.0
 """Depth of an eyeball outside the skin up to which it is found."""
 GAP_MM = 0.5
 """Distance that is left between lid and eyeball."""
 PASSES = 2
 """Vertices that have moved have other normals, along which a few more stand out."""
-SMALLEST = 20
-"""Vertices of an eyeball at the least."""
-
-
-def eyeballs(model: MorphableModel) -> list[NDArray[np.int64]]:
-    """Vertices of each eyeball: pieces of the mesh that are joined to nothing else and lie at an eye.
-
-    Returns
-    -------
-    list of (n,) int64
-        Empty for a model without eyes.
-    """
-    corners = model.faces.astype(np.int64)
-    links = sp.coo_matrix((np.ones(corners.size), (corners.ravel(), np.roll(corners, 1, axis=1).ravel())))
-    links.resize(model.n_vertices, model.n_vertices)
-    piece = sp.csgraph.connected_components(links, directed=False)[1]
-    skin = np.bincount(piece).argmax()
-    found = []
-    for eye in EYES:
-        around = model.mean[model.landmarks[eye]]
-        centre, reach = around.mean(axis=0), np.ptp(around[:, 0])
-        for k in np.unique(piece[model.faces[~model.face_mask].ravel()]):
-            vertices = np.flatnonzero(piece == k)
-            if k == skin or len(vertices) < SMALLEST:
-                continue
-            points = model.mean[vertices]
-            at_eye = np.linalg.norm(0.5 * (points.min(axis=0) + points.max(axis=0)) - centre) < reach
-            if at_eye and np.ptp(points[:, 0]) < 2.5 * reach:
-                found.append(vertices)
-    return found
 
 
 def behind_lids(model: MorphableModel, geometry: GeometryEstimate) -> GeometryEstimate:

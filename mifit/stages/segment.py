@@ -54,6 +54,8 @@ SMALLEST = 0.004
 """Part of the face that an object covers at the least."""
 HIGHLIGHT = 0.5
 """Red over blue of what a highlight adds at the least: a window's is bluish."""
+ABOVE = 0.1
+"""Height above the brows, in multiples of that above the chin, from which on an object is hair."""
 LARGE = 0.02
 """The same of one that covers it in every image: birthmarks are smaller."""
 LEAST_SIZE = 16
@@ -271,7 +273,7 @@ def _highlight(linear: NDArray, predicted: NDArray) -> NDArray[np.bool_]:
 
 
 def _kinds(found: NDArray[np.bool_], marks: NDArray) -> NDArray[np.uint8]:
-    """Labels of objects: hair where one goes on above the brows, cloth below the chin, else an occluder."""
+    """Labels of objects: hair where one reaches well above the brows, cloth where it lies below the chin."""
     kinds = np.full(found.shape, np.uint8(Label.OCCLUDER))
     up = marks[27] - marks[8]  # bridge of the nose from the chin
     if not np.isfinite(marks[[8, 19, 24, 27]]).all():
@@ -279,12 +281,14 @@ def _kinds(found: NDArray[np.bool_], marks: NDArray) -> NDArray[np.uint8]:
     up = up / max(float(np.linalg.norm(up)), 1e-6)
     brows, chin = float((marks[[19, 24]] @ up).mean()), float(marks[8] @ up)
     _, pieces, figures, centres = cv2.connectedComponentsWithStats(found.astype(np.uint8))
+    y, x = np.mgrid[: found.shape[0], : found.shape[1]]
+    height = x * up[0] + y * up[1]
     for piece in range(1, len(figures)):
-        height = float(centres[piece] @ up)
-        if height > brows:
-            kinds[pieces == piece] = Label.HAIR
-        elif height < chin:
-            kinds[pieces == piece] = Label.CLOTH
+        inside = pieces == piece
+        if float(height[inside].max()) > brows + ABOVE * (brows - chin):
+            kinds[inside] = Label.HAIR
+        elif float(centres[piece] @ up) < chin:
+            kinds[inside] = Label.CLOTH
     return kinds
 
 

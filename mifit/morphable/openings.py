@@ -1,0 +1,283 @@
+"""Simple eyes and the inside of the mouth for models that have holes there.
+
+Many head models are skin alone: renders of them look through the eyes. Here each eye gets the front of a ball of an
+eye's size, which lies on the rims of the lids and moves with the corners of the eye, and the mouth gets a dark
+pouch behind the lips. Both have a place in the maps, so that photographs show iris, sclera and teeth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from mifit.core.mesh import face_cross
+from mifit.errors import InputError
+from mifit.morphable.model import MorphableModel
+
+RADIUS_MM = 12.0
+"""Of an eyeball; people differ by less than a millimetre."""
+GAP_MM = 0.3
+"""Between the rims of the lids and the ball."""
+FRONT = np.radians(85.0)
+"""Part of the ball from the optical axis on: the rest is never seen."""
+RINGS, SEGMENTS = 18, 36
+IRIS, PUPIL = np.radians(28.5), np.radians(10.5)
+SCLERA_ALBEDO, IRIS_ALBEDO, PUPIL_ALBEDO = (0.62, 0.58, 0.54), (0.09, 0.055, 0.03), (0.01, 0.01, 0.01)
+POUCH_ALBEDO = (0.12, 0.03, 0.025)
+POUCH_MM, POUCH_LINES, POUCH_TIP = 30.0, 8, 0.35
+"""Depth of the pouch, rings from front to back, and how much narrower it is at the back."""
+CORNER_ALBEDO = (0.4, 0.17, 0.14)
+"""Of the tissue that closes what is open between lids and ball, in the corners of the eye."""
+BEHIND_MM = 0.05
+"""Distance of the pouch's rim behind the lips'."""
+STRIP = 0.09
+"""Height of the strip at the bottom of the maps that holds eyes and pouch; what was there moves up."""
+MARGIN = 0.004
+SMALLEST = 20
+"""Vertices of an eyeball at the least."""
+EYES, CORNERS, INNER_LIPS = (slice(36, 42), slice(42, 48)), ((36, 39), (45, 42)), slice(60, 68)
+"""iBUG points; corners from the outer to the inner one."""
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Vertices (n, 3) with the rows that their modes are means of, faces, texture coordinates, albedo."""
+
+    points: NDArray[np.float64]
+    identity: sp.csr_matrix
+    expression: sp.csr_matrix
+    faces: NDArray[np.int64]
+    uv: NDArray[np.float64]
+    albedo: NDArray[np.float64]
+    mirror: NDArray[np.int64]  # of a vertex in the piece that mirrors this one
+
+
+def holes(model: MorphableModel) -> list[NDArray[np.int64]]:
+    """Vertices of each closed border of the mesh, in order."""
+    edges = np.concatenate([model.faces[:, [0, 1]], model.faces[:, [1, 2]], model.faces[:, [2, 0]]]).astype(np.int64)
+    codes = edges.min(axis=1) * model.n_vertices + edges.max(axis=1)
+    _, first, count = np.unique(codes, return_index=True, return_counts=True)
+    following = dict(edges[first[count == 1]].tolist())
+    found = []
+    while following:
+        start, vertex = next(iter(following.items()))
+        loop = [start]
+        del following[start]
+        while vertex != start and vertex in following:
+            loop.append(vertex)
+            vertex = following.pop(vertex)
+        if vertex == start and len(loop) > 2:
+            found.append(np.array(loop))
+    return found
+
+
+def eyeballs(model: MorphableModel) -> list[NDArray[np.int64]]:
+    """Vertices of each eyeball: pieces of the mesh that are joined to nothing else and lie at an eye.
+
+    Returns
+    -------
+    list of (n,) int64
+        Empty for a model without eyes.
+    """
+    corners = model.faces.astype(np.int64)
+    links = sp.coo_matrix((np.ones(corners.size), (corners.ravel(), np.roll(corners, 1, axis=1).ravel())))
+    links.resize(model.n_vertices, model.n_vertices)
+    piece = sp.csgraph.connected_components(links, directed=False)[1]
+    skin = np.bincount(piece).argmax()
+    found = []
+    for eye in EYES:
+        around = model.mean[model.landmarks[eye]]
+        centre, reach = around.mean(axis=0), np.ptp(around[:, 0])
+        for k in np.unique(piece[model.faces[~model.face_mask].ravel()]):
+            vertices = np.flatnonzero(piece == k)
+            if k == skin or len(vertices) < SMALLEST:
+                continue
+            points = model.mean[vertices]
+            at_eye = np.linalg.norm(0.5 * (points.min(axis=0) + points.max(axis=0)) - centre) < reach
+            if at_eye and np.ptp(points[:, 0]) < 2.5 * reach:
+                found.append(vertices)
+    return found
+
+
+def lacks_eyes(model: MorphableModel) -> bool:
+    """Whether both eyes are holes, without an eyeball behind."""
+    return not eyeballs(model) and len(_openings(model)[0]) == 2
+
+
+def with_eyes(model: MorphableModel) -> MorphableModel:
+    """The model with eyeballs in the holes of its eyes and a pouch in that of its mouth.
+
+    New vertices come after the old ones, whose order, shape and modes stay; texture coordinates move up by a strip.
+
+    Raises
+    ------
+    InputError
+        The model has no hole at an eye.
+    """
+    eyes, mouth = _openings(model) if not eyeballs(model) else ([], None)
+    if len(eyes) < 2:
+        raise InputError(f"{model.name}: found {len(eyes)} eyes that are holes, expected 2; it has eyes, or is no skin")
+    width = STRIP - 2 * MARGIN
+    corners = [_corner(model, loop, np.array([0.7 + k * STRIP, MARGIN]), width) for k, loop in enumerate(eyes)]
+    pieces = [_eyeball(model, loop, k, np.array([MARGIN + k * STRIP, MARGIN]), width) for k, loop in enumerate(eyes)]
+    pieces += corners
+    if mouth is not None:
+        pieces.append(_pouch(model, mouth, np.array([2 * STRIP + MARGIN, MARGIN]), np.array([0.5, width])))
+    uv = model.uv.astype(np.float64) * (1.0, 1.0 - STRIP) + (0.0, STRIP)
+    faces: list[NDArray] = [model.faces]
+    faces_uv: list[NDArray] = [model.faces_uv]
+    uvs, mirror = [uv], []
+    mean: list[NDArray] = [model.mean]
+    albedo: list[NDArray] = [model.mean_albedo]
+    identity, expression = [model.identity], [model.expression]
+    count, textured = model.n_vertices, len(uv)
+    starts = np.cumsum([count, *(len(piece.points) for piece in pieces)])
+    for k, piece in enumerate(pieces):
+        mean.append(piece.points)
+        identity.append(_carried(piece.identity, model.identity))
+        expression.append(_carried(piece.expression, model.expression))
+        faces.append(piece.faces + starts[k])
+        faces_uv.append(piece.faces + textured)
+        textured += len(piece.uv)
+        uvs.append(piece.uv)
+        albedo.append(piece.albedo)
+        mirror.append(piece.mirror + starts[(1, 0, 3, 2, 4)[k]])
+    added = int(starts[-1] - count)
+    symmetry = None if model.symmetry is None else np.concatenate([model.symmetry, *mirror])
+    modes = model.albedo_modes
+    return replace(
+        model,
+        name=f"{model.name} with eyes",
+        mean=np.concatenate(mean),
+        identity=np.concatenate(identity),
+        expression=np.concatenate(expression),
+        faces=np.concatenate(faces),
+        faces_uv=np.concatenate(faces_uv),
+        uv=np.concatenate(uvs),
+        mean_albedo=np.concatenate(albedo),
+        albedo_modes=np.concatenate([modes, np.zeros((added, *modes.shape[1:]), modes.dtype)]),
+        face_mask=np.concatenate([model.face_mask, np.zeros(sum(map(len, faces[1:])), bool)]),
+        symmetry=symmetry,
+        fingerprint="",
+    )
+
+
+def _openings(model: MorphableModel) -> tuple[list[NDArray[np.int64]], NDArray[np.int64] | None]:
+    """Borders around the eyes, at x < 0 and x > 0, and around the mouth."""
+    marks = model.mean[model.landmarks].astype(np.float64)
+    borders = holes(model)
+
+    def at(part: slice) -> NDArray[np.int64] | None:
+        centre, extent = marks[part].mean(axis=0), float(np.ptp(marks[part][:, 0]))
+        for loop in borders:
+            points = model.mean[loop]
+            near = float(np.linalg.norm(points.mean(axis=0) - centre)) < 0.6 * extent
+            if near and float(np.ptp(points[:, 0])) < 2.0 * extent:
+                return loop
+        return None
+
+    eyes = [loop for part in EYES if (loop := at(part)) is not None]
+    return eyes, at(INNER_LIPS)
+
+
+def _eyeball(model: MorphableModel, loop: NDArray, which: int, corner: NDArray, width: float) -> _Piece:
+    unit = 1.0 / model.unit_mm
+    radius, rim = RADIUS_MM * unit, model.mean[loop].astype(np.float64)
+    start = rim.mean(axis=0) - (0.0, 0.0, 0.9 * radius)
+    centre = least_squares(
+        lambda c: np.linalg.norm(rim - c, axis=1) - radius - GAP_MM * unit, start, loss="soft_l1", f_scale=0.5 * unit
+    ).x
+    angle = np.linspace(0.0, FRONT, RINGS + 1)[1:, None]
+    around = np.linspace(0.0, 2.0 * np.pi, SEGMENTS, endpoint=False)[None]
+    across = np.cos(around) * (1 - 2 * which)  # the second eye is numbered as the first in a mirror
+    flat = np.stack([angle * across, angle * np.sin(around)], axis=-1).reshape(-1, 2) / FRONT
+    ring = np.stack(np.broadcast_arrays(np.sin(angle) * across, np.sin(angle) * np.sin(around), np.cos(angle)), axis=-1)
+    points = centre + radius * np.concatenate([[[0.0, 0.0, 1.0]], ring.reshape(-1, 3)])
+    uv = corner + 0.5 * width * (1.0 + np.concatenate([[[0.0, 0.0]], flat]))
+    angles = np.concatenate([[0.0], np.broadcast_to(angle, (RINGS, SEGMENTS)).ravel()])[:, None]
+    albedo = np.where(angles < PUPIL, PUPIL_ALBEDO, np.where(angles < IRIS, IRIS_ALBEDO, SCLERA_ALBEDO))
+    first, turn = np.arange(SEGMENTS) + 1, np.roll(np.arange(SEGMENTS), -1) + 1
+    faces = [np.stack([np.zeros_like(first), first, turn], axis=1)]
+    for k in range(RINGS - 1):
+        a, b = first + k * SEGMENTS, turn + k * SEGMENTS
+        faces += [np.stack([a, a + SEGMENTS, b + SEGMENTS], axis=1), np.stack([a, b + SEGMENTS, b], axis=1)]
+    found = _facing(points, np.concatenate(faces), points - centre)
+    corners = model.landmarks[list(CORNERS[which])]
+    return _Piece(
+        points, _means(loop, len(points), model.n_vertices), _means(corners, len(points), model.n_vertices),
+        found, uv, albedo, np.arange(len(points)),
+    )  # fmt: skip
+
+
+def _corner(model: MorphableModel, loop: NDArray, corner: NDArray, width: float) -> _Piece:
+    """A funnel from the lids' rims into the ball, of fewer vertices than a ball has (`SMALLEST`)."""
+    outer = int(np.argmax(np.abs(model.mean[loop, 0])))
+    rim = np.roll(loop, -outer)
+    if model.mean[rim[len(rim) // 4], 1] < model.mean[rim[0], 1]:  # over the upper lid first, on both sides
+        rim = np.roll(rim[::-1], 1)
+    rim = rim[np.round(np.linspace(0, len(rim), SMALLEST - 2, endpoint=False)).astype(int)]
+    n, unit = len(rim), 1.0 / model.unit_mm
+    points = model.mean[rim].astype(np.float64) - (0.0, 0.0, BEHIND_MM * unit)
+    tip = points.mean(axis=0) - (0.0, 0.0, RADIUS_MM * unit)
+    points = np.concatenate([points, [tip]])
+    own = sp.csr_matrix((np.ones(n), (np.arange(n), rim)), (n, model.n_vertices))
+    rows = sp.vstack([own, _means(loop, 1, model.n_vertices)]).tocsr()
+    around = np.linspace(0.0, 2.0 * np.pi, n, endpoint=False)
+    disc = np.concatenate([np.stack([np.cos(around), np.sin(around)], axis=1), [[0.0, 0.0]]])
+    first = np.arange(n)
+    faces = np.stack([first, np.roll(first, -1), np.full(n, n)], axis=1)
+    forward = np.tile([0.0, 0.0, 1.0], (n + 1, 1))
+    uv, albedo = corner + 0.5 * width * (1.0 + disc), np.tile(CORNER_ALBEDO, (n + 1, 1))
+    return _Piece(points, rows, rows, _facing(points, faces, forward), uv, albedo, np.arange(n + 1))
+
+
+def _pouch(model: MorphableModel, loop: NDArray, corner: NDArray, extent: NDArray) -> _Piece:
+    symmetry = np.arange(model.n_vertices) if model.symmetry is None else model.symmetry
+    loop = np.roll(loop, -int(np.argmax(symmetry[loop] == loop)))
+    rim = np.append(loop, loop[0])  # its texture has two ends, which mirror each other
+    n, unit = len(rim), 1.0 / model.unit_mm
+    points = model.mean[rim].astype(np.float64)
+    middle, depth = points[1:].mean(axis=0), np.linspace(0.0, 1.0, POUCH_LINES)
+    narrow = 1.0 - (1.0 - POUCH_TIP) * depth
+    back = np.array([0.0, 0.0, -unit]) * (BEHIND_MM + (POUCH_MM - BEHIND_MM) * depth)[:, None]
+    lines = (middle + narrow[:, None, None] * (points - middle) + back[:, None]).reshape(-1, 3)
+    lines = np.concatenate([lines, [middle + back[-1]]])
+    own = sp.csr_matrix((np.ones(n), (np.arange(n), rim)), (n, model.n_vertices))
+    rows = sp.kron(narrow[:, None], own) + sp.kron((1.0 - narrow)[:, None], _means(loop, n, model.n_vertices))
+    rows = sp.vstack([rows, _means(loop, 1, model.n_vertices)]).tocsr()
+    place = np.stack(np.broadcast_arrays(np.arange(n)[None] / (n - 1), 0.9 * depth[:, None]), axis=-1).reshape(-1, 2)
+    uv = corner + extent * np.concatenate([place, [[0.5, 1.0]]])
+    first = np.arange(n - 1)
+    faces = [
+        np.stack([(POUCH_LINES - 1) * n + first, (POUCH_LINES - 1) * n + first + 1, 0 * first + len(lines) - 1], 1)
+    ]
+    for k in range(POUCH_LINES - 1):
+        a, b = first + k * n, first + k * n + 1
+        faces += [np.stack([a, a + n, b + n], axis=1), np.stack([a, b + n, b], axis=1)]
+    place_of = {int(vertex): i for i, vertex in enumerate(loop)}
+    mirror = np.array([place_of.get(int(symmetry[vertex]), i) for i, vertex in enumerate(rim)])
+    mirror[[0, -1]] = n - 1, 0
+    mirror = np.append((np.arange(POUCH_LINES)[:, None] * n + mirror).ravel(), len(lines) - 1)
+    albedo = np.tile(POUCH_ALBEDO, (len(lines), 1))
+    return _Piece(lines, rows, rows, _facing(lines, np.concatenate(faces), middle - lines), uv, albedo, mirror)
+
+
+def _carried(rows: sp.csr_matrix, modes: NDArray) -> NDArray:
+    """Modes (n, 3, K) of vertices that move with weighted means (n, V) of others."""
+    return np.asarray(rows @ modes.reshape(len(modes), -1)).reshape(-1, 3, modes.shape[2])
+
+
+def _means(rows: NDArray, count: int, total: int) -> sp.csr_matrix:
+    """(count, total) matrix whose every row is the mean over some rows."""
+    line = sp.csr_matrix((np.full(len(rows), 1.0 / len(rows)), (np.zeros(len(rows), int), rows)), (1, total))
+    return sp.vstack([line] * count).tocsr()
+
+
+def _facing(points: NDArray, faces: NDArray, outward: NDArray) -> NDArray[np.int64]:
+    """The faces turned so that their fronts look along ``outward`` (n, 3) at their first corners."""
+    away = np.einsum("fk,fk->f", face_cross(points, faces), outward[faces[:, 0]]) < 0
+    return np.where(away[:, None], faces[:, ::-1], faces)
