@@ -141,9 +141,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     def add_address(p: argparse.ArgumentParser) -> None:
         p.add_argument("--host", default="127.0.0.1", help="of the view: address (default: this machine only)")
-        p.add_argument(
-            "--port", type=_whole(0, 65535), default=8080, help="of the view: 8080 if not given; 0: a free one"
-        )
+        p.add_argument("--port", type=_whole(0, 65535), default=8080, help="of the view (default: 8080); 0: a free one")
 
     p = add("doctor", "what of the set-up works, what doesn't, and the command that mends it")
     p.add_argument("--json", action="store_true", help="print JSON")
@@ -154,18 +152,23 @@ def build_parser() -> argparse.ArgumentParser:
 
     p = add("synth", "path-traced captures with ground truth")
     p.add_argument("--out", type=_path, required=True, help="capture folder to write")
-    p.add_argument("--subjects", type=_at_least(1), default=1)
-    p.add_argument("--timesteps", type=_at_least(1), default=4)
+    p.add_argument("--subjects", type=_at_least(1), default=1, help="people, a capture each (default: 1)")
+    p.add_argument("--timesteps", type=_at_least(1), default=4, help="moments of a capture (default: 4)")
     p.add_argument("--env", type=_path, help="lat-long HDR environment; default: a procedural studio")
     p.add_argument("--model", default="builtin", help="morphable model: a path or builtin")
-    p.add_argument("--width", type=_whole(16, MAX_RENDERED_PIXELS // 16), default=680)
-    p.add_argument("--height", type=_whole(16, MAX_RENDERED_PIXELS // 16), default=480)
+    p.add_argument("--width", type=_whole(16, MAX_RENDERED_PIXELS // 16), default=680, help="pixels (default: 680)")
+    p.add_argument("--height", type=_whole(16, MAX_RENDERED_PIXELS // 16), default=480, help="pixels (default: 480)")
     p.add_argument("--spp", type=_whole(1, MAX_SAMPLES), default=64, help="samples per pixel (default: 64)")
     p.add_argument("--tone", type=_real, help="skin from 0, fair, to 1, deep; default: drawn for each subject")
     p.add_argument(
-        "--motion", choices=["poses", "talk", "turn"], default="poses", help="talk and turn: 30 timesteps are a second"
+        "--motion",
+        choices=["poses", "talk", "turn"],
+        default="poses",
+        help="default: poses; of talk and turn 30 timesteps are a second",
     )
-    p.add_argument("--outside", type=_real, default=0.5, help="millimetres by which heads leave the model's span")
+    p.add_argument(
+        "--outside", type=_real, default=0.5, help="millimetres by which heads leave the model's span (default: 0.5)"
+    )
     p.add_argument("--landmark-bias", type=_real, default=0.0, help="millimetres; a detector's is about 2 (default: 0)")
     p.add_argument(
         "--head", type=_path, help="a scanned head with texture coordinates (.glb, .obj, .ply), moved rigidly"
@@ -197,8 +200,8 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--units", help="unit of length of the cameras: mm, cm, dm or m (default: as the source has it, or cm)"
     )
-    p.add_argument("--every", type=_at_least(1), default=1, help="keep every N-th frame")
-    p.add_argument("--start", type=_at_least(0), default=0, help="first frame")
+    p.add_argument("--every", type=_at_least(1), default=1, help="keep every N-th frame (default: 1)")
+    p.add_argument("--start", type=_at_least(0), default=0, help="first frame (default: 0)")
     p.add_argument("--count", type=_at_least(1), help="number of frames to keep")
     p.add_argument("--out", type=_path, required=True, help="capture folder to write")
 
@@ -218,11 +221,11 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--out", type=_path, help="of a board: folder to write")
 
     p = add("landmarks", "detect 68 landmarks in every image and write them into the capture")
-    p.add_argument("capture", type=_path)
+    p.add_argument("capture", type=_path, help="capture folder, or its transforms.json")
     p.add_argument("--detector", help="mediapipe, face-alignment or lbf:FOLDER; default: the first that is there")
 
     p = add("fit", "fit geometry, reflectance and normals to a capture")
-    p.add_argument("capture", type=_path)
+    p.add_argument("capture", type=_path, help="capture folder, or its transforms.json")
     p.add_argument("--out", type=_path, required=True, help="result folder to write")
     p.add_argument("--config", type=_path, help="TOML file with tables geometry, reflectance, shape, normals, mesh")
     p.add_argument("--preset", choices=["default", "paper"], help="paper: the paper as written")
@@ -233,7 +236,12 @@ def build_parser() -> argparse.ArgumentParser:
         type=_timesteps_or_auto,
         help="e.g. 0,1,2,3 or 0-3, or auto (auto:6): the four (six) that tell most; default: the first four",
     )
-    p.add_argument("--until", choices=["geometry", "reflectance", "normals"], default="normals")
+    p.add_argument(
+        "--until",
+        choices=["geometry", "reflectance", "normals"],
+        default="normals",
+        help="last stage (default: normals, everything)",
+    )
     p.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
     p.add_argument("--force", action="store_true", help="replace an existing result")
     p.add_argument(
@@ -242,7 +250,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_address(p)
 
     p = add("track", "geometry and normals of further timesteps, reflectance and lighting fixed")
-    p.add_argument("capture", type=_path)
+    p.add_argument("capture", type=_path, help="capture folder, or its transforms.json")
     p.add_argument("--result", type=_path, required=True, help="result folder of mifit fit; extended in place")
     p.add_argument("--timesteps", type=_timesteps, help="default: all that aren't in the result yet")
     p.add_argument("--resume", action="store_true", help="keep the frames that an earlier run has written")
@@ -253,16 +261,18 @@ def build_parser() -> argparse.ArgumentParser:
     add_rate(p)
 
     p = add("evaluate", "error on a held-out view")
-    p.add_argument("result", type=_path)
-    p.add_argument("--capture", type=_path, required=True)
-    p.add_argument("--camera", required=True)
+    p.add_argument("result", type=_path, help="result folder of mifit fit")
+    p.add_argument("--capture", type=_path, required=True, help="capture that has the view")
+    p.add_argument("--camera", required=True, help="camera to judge by, one that was not fitted")
     p.add_argument("--timesteps", type=_timesteps, help="default: all of the result")
-    p.add_argument("--region", choices=["model", "truth"], default="model", help="whose face area counts")
+    p.add_argument(
+        "--region", choices=["model", "truth"], default="model", help="whose face area counts (default: model)"
+    )
     p.add_argument("--baseline", action="store_true", help="compare image-based rendering on the same mesh and pixels")
     p.add_argument("--json", type=_path, help="file to write the figures to")
 
     p = add("render", "render a reconstruction from a camera of the capture, or from any side")
-    p.add_argument("result", type=_path)
+    p.add_argument("result", type=_path, help="result folder of mifit fit")
     p.add_argument("--capture", type=_path, help="capture that --camera is of; default: the fitted cameras")
     p.add_argument("--camera", help="default: a view of the face from --yaw, --pitch and --distance")
     p.add_argument("--yaw", type=_real, help="degrees about the vertical; 0 is the front")
@@ -270,15 +280,22 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--distance", type=_rate, help="from the face, the result's units; default: the fitted cameras'")
     p.add_argument("--timestep", type=_at_least(0), help="default: the first of the result")
     p.add_argument("--out", type=_path, required=True, help="image to write: .png (8-bit sRGB) or .exr (linear)")
-    p.add_argument("--method", choices=["full", "diffuse", "pca"], default="full")
-    p.add_argument("--integrator", choices=["local", "path"], default="local")
+    p.add_argument(
+        "--method",
+        choices=["full", "diffuse", "pca"],
+        default="full",
+        help="everything (default), without specular, the model alone",
+    )
+    p.add_argument(
+        "--integrator", choices=["local", "path"], default="local", help="closed form (default) or path tracing"
+    )
 
     p = add("turntable", "novel views about the vertical axis, with and without specular")
-    p.add_argument("result", type=_path)
-    p.add_argument("--out", type=_path, required=True)
-    p.add_argument("--from", dest="start", type=_real, default=-35.0, help="first angle in degrees")
-    p.add_argument("--to", dest="stop", type=_real, default=35.0, help="last angle in degrees")
-    p.add_argument("--steps", type=_at_least(1), default=7)
+    p.add_argument("result", type=_path, help="result folder of mifit fit")
+    p.add_argument("--out", type=_path, required=True, help="folder to write")
+    p.add_argument("--from", dest="start", type=_real, default=-35.0, help="first angle in degrees (default: -35)")
+    p.add_argument("--to", dest="stop", type=_real, default=35.0, help="last angle in degrees (default: 35)")
+    p.add_argument("--steps", type=_at_least(1), default=7, help="number of views (default: 7)")
     p.add_argument(
         "--sequence",
         action="store_true",
@@ -291,17 +308,19 @@ def build_parser() -> argparse.ArgumentParser:
     add_address(p)
 
     p = add("relight", "relit views under a measured environment")
-    p.add_argument("result", type=_path)
+    p.add_argument("result", type=_path, help="result folder of mifit fit")
     p.add_argument("--env", type=_path, required=True, help="lat-long environment, .hdr or .exr")
-    p.add_argument("--out", type=_path, required=True)
-    p.add_argument("--rotate", type=_real, default=0.0, help="turn the environment about the vertical, degrees")
+    p.add_argument("--out", type=_path, required=True, help="folder to write")
+    p.add_argument(
+        "--rotate", type=_real, default=0.0, help="turn the environment about the vertical, degrees (default: 0)"
+    )
     p.add_argument("--sequence", action="store_true", help="also play the timesteps from the front: sequence.mp4")
     add_rate(p)
 
     p = add("export", "geometry with its maps for other programs")
-    p.add_argument("result", type=_path)
-    p.add_argument("--format", choices=["glb", "obj", "ply", "mitsuba"], required=True)
-    p.add_argument("--out", type=_path, required=True)
+    p.add_argument("result", type=_path, help="result folder of mifit fit")
+    p.add_argument("--format", choices=["glb", "obj", "ply", "mitsuba"], required=True, help="kind of file")
+    p.add_argument("--out", type=_path, required=True, help="file to write")
     p.add_argument("--timestep", type=_at_least(0), help="default: the first of the result")
     p.add_argument("--animate", action="store_true", help="glb: play all timesteps, from --timestep's maps")
     add_rate(p)
@@ -313,9 +332,11 @@ def build_parser() -> argparse.ArgumentParser:
     )
 
     p = add("run", "a scene-file driven experiment or a sweep of them")
-    p.add_argument("experiment", type=_path)
-    p.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
-    p.add_argument("--out", type=_path)
+    p.add_argument("experiment", type=_path, help="experiment file, TOML")
+    p.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="replace a setting; repeat"
+    )
+    p.add_argument("--out", type=_path, help="folder of the runs; default: out/NAME")
     p.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")
 
     p = add("model", "inspect and convert morphable models")
@@ -324,8 +345,8 @@ def build_parser() -> argparse.ArgumentParser:
     q.add_argument("model", help="a path or builtin")
     q.add_argument("--preview", type=_path, help="also write a sheet of the mean and the first modes")
     q = actions.add_parser("convert", help="write a model in mifit's own format", parents=[common])
-    q.add_argument("source", type=_path)
-    q.add_argument("out", type=_path)
+    q.add_argument("source", type=_path, help="file of a model, of any known kind")
+    q.add_argument("out", type=_path, help="file to write, .npz")
     q.add_argument("--kind", help="format of SOURCE; default: recognised by content")
     q.add_argument("--eyes", action="store_true", help="put simple eyes and a mouth's inside where the model has holes")
     return parser

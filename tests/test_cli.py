@@ -1,5 +1,6 @@
 """The command line: exit codes, one-line errors, the whole path from a capture to a figure."""
 
+import argparse
 import json
 import math
 import shutil
@@ -8,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mifit.cli import main
+from mifit.cli import build_parser, main
 
 COMMANDS = (
     "doctor demo synth import landmarks fit track evaluate render turntable view relight export run model".split()
@@ -191,3 +192,25 @@ def test_an_uncalibrated_capture_is_fitted_and_reported(capsys, capture, tmp_pat
     code, table, err = run(capsys, "evaluate", out, "--capture", capture, "--camera", "third", "--quiet")
     assert code == 0, err
     assert "third" in table and "landmarks" in table  # placed by its landmarks, and said so
+
+
+def options(parser, name=""):
+    """(command, option) of every option and argument of a parser and its commands, with its help."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for command, child in action.choices.items():
+                yield from options(child, f"{name} {command}")
+        else:
+            yield f"{name} {'/'.join(action.option_strings) or action.dest}".strip(), action
+
+
+def test_every_option_says_what_it_is_and_what_it_is_by_default():
+    listed = dict(options(build_parser()))
+    assert len(listed) > 150
+    assert [name for name, action in listed.items() if not action.help] == []
+    silent = []
+    for name, action in listed.items():
+        numbers = isinstance(action.default, (int, float)) and not isinstance(action.default, bool)
+        if (numbers or action.choices) and action.default is not None and "default" not in action.help:
+            silent.append(name)
+    assert silent == []

@@ -6,6 +6,7 @@ import re
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import mifit
@@ -37,6 +38,10 @@ def check(names: dict, frames: int = 36) -> None:
     assert len({frame[frame[..., 3] == 1][:, 0].mean().round(5) for frame in names["frames"]}) > 0.8 * frames
     assert len(losses) == 30 and losses[-1] < losses[0]
     assert names["better"] != result
+    fitted, tanned, found = (names[n].reflectance.diffuse for n in ("result", "tanned", "better"))
+    touched = np.abs(found - tanned).max(axis=-1) > 1e-4  # texels that a camera sees
+    away, again = (np.abs((x - fitted)[touched].mean(axis=0)).max() for x in (tanned, found))
+    assert touched.any() and again < 0.5 * away  # the colour of the photographs is found again
     height, width = names["camera"].height, names["camera"].width
     assert names["picture"].shape == (height, width, 4) and names["picture"][..., :3].max() > 0.1
 
@@ -48,7 +53,7 @@ def test_the_page_runs(variant, tiny_capture, tmp_path, monkeypatch):
     small = {'"builtin"': '"builtin:coarse"', "texture_size=256": "texture_size=64", '"auto"': f'"{VARIANT}"'}
     names, _ = run_page(tmp_path, monkeypatch, small)
     check(names)
-    assert names["losses"][-1] < 0.95 * names["losses"][0]
+    assert names["losses"][-1] < 0.6 * names["losses"][0]
 
 
 @pytest.mark.slow
@@ -59,5 +64,5 @@ def test_the_page_runs_on_gloss(variant, shared, tmp_path, monkeypatch):
     changes = {'"auto"': f'"{VARIANT}"', "range(0, 360, 10)": "range(0, 360, 120)"}
     names, seconds = run_page(tmp_path, monkeypatch, changes)
     check(names, 3)
-    assert min(names["losses"]) < 0.98 * names["losses"][0]  # a good fit leaves less to gain
+    assert names["losses"][-1] < 0.6 * names["losses"][0]
     print({name: round(value, 1) for name, value in seconds.items()}, names["losses"][0], names["losses"][-1])
