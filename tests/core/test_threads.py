@@ -21,7 +21,7 @@ import mifit
 from threadpoolctl import threadpool_info
 if sys.argv[1] == "after":
     set_threads(1)
-mifit.set_variant("llvm_ad_rgb")
+mifit.set_variant("auto")
 child = "import os; print(os.environ['OPENBLAS_NUM_THREADS'])"
 import subprocess
 print(threads(), cv2.getNumThreads(), drjit.thread_count(), {p["num_threads"] for p in threadpool_info()},
