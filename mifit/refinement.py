@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from mifit import checkpoint
 from mifit.config import GeometryConfig, ReflectanceConfig, from_mapping
 from mifit.core.bend import bend, texel_neighbours
-from mifit.core.estimate import NormalsEstimate, Report
+from mifit.core.estimate import GeometryEstimate, NormalsEstimate, Report
 from mifit.core.mesh import interpolate, normalize
 from mifit.core.uv import TexelMap
 from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
-from mifit.result.record import R
+from mifit.result.record import R, Result
 from mifit.stages.absorb.frame import Absorber, FrameFit, carried_offsets
 from mifit.stages.absorb.information import Information
 from mifit.stages.absorb.solve_sums import Solved, solve_sums
@@ -37,6 +37,7 @@ from mifit.tracking import mesh_refiner
 if TYPE_CHECKING:
     from mifit.capture import Capture
 
+POSE = ("expression", "rotation", "translation", "vertices")
 EVERY = 8
 """Frames between two checkpoints."""
 DISAGREES = 2.0
@@ -85,28 +86,26 @@ def refine(
     Maps and normals are linearised about the result, and the weights of the observations are those that it gives them;
     neither depends on the frames added before.
     """
-    began = time.perf_counter()
-    if result.reflectance is None:
-        raise InputError("refine: found a result without reflectance, expected one of 'mifit fit' with all stages")
     wanted = sorted({*result.timesteps, *(capture.timesteps if timesteps is None else timesteps)})
     for timestep in wanted:
         if timestep not in capture.timesteps:
             known = ", ".join(map(str, capture.timesteps))
             raise InputError(f"timestep {timestep}: not in the capture; it has {known}")
-    names = [camera.name for camera in result.cameras]
-    capture = capture.with_fitted(result.cameras)
-    size, model = len(result.reflectance.diffuse), result.model
-    surface = Surface(capture, model, result.geometry.at(result.timesteps[:1]), names, size, whole=True)
-    carried = CarriedTangents(model, surface.texels)
-    offsets = carried_offsets(carried, result.geometry, result.normals, size, surface.texels.index)
-    offsets[~surface.facial] = 0.0
-    absorber = Absorber(capture, model, result.reflectance, offsets, names, surface, seed)
-    key = checkpoint.digest([_digest(result), capture.digest(names, wanted), wanted, seed])
-    sums = _gathered(
-        result, capture, absorber, wanted, seed, progress, None if checkpoints is None else Path(checkpoints), key
-    )
-    found = _solved(result, absorber, sums.information, surface)
-    return _refined(result, absorber, sums, found, time.perf_counter() - began)
+    refinement = Refinement(result, capture, seed)
+    order = [*refinement.fitted, *(t for t in wanted if t not in refinement.fitted)]
+    folder, key = None if checkpoints is None else Path(checkpoints), ""
+    if folder is not None:
+        names = [camera.name for camera in result.cameras]
+        key = checkpoint.digest([_digest(result), capture.digest(names, wanted), wanted, seed])
+        refinement.restore(folder, key)
+    for done, timestep in enumerate(order):
+        progress("refine", done, len(order))
+        if timestep not in refinement.fits:
+            refinement.add(timestep)
+            if folder is not None and (done + 1) % EVERY == 0:
+                refinement.keep(folder, key)
+    progress("refine", len(order), len(order))
+    return refinement.refined()
 
 
 @dataclass(frozen=True)
@@ -118,82 +117,157 @@ class _Kept:
     pose: tuple[NDArray, ...]
 
 
-POSE = ("expression", "rotation", "translation", "vertices")
+class Refinement(Generic[R]):
+    """A refinement frame by frame: `add` frames, those of the fit first, and ask for the `refined` result at any time.
 
+    Parameters
+    ----------
+    result, capture, seed
+        As in `refine`.
 
-@dataclass(frozen=True)
-class _Sums:
-    information: Information
-    fits: dict[int, FrameFit]
-    left_out: dict[int, str]
+    Attributes
+    ----------
+    fitted : list of int
+        Timesteps that were fitted jointly. They say how well a frame has to agree, so they come first.
+    fits : dict of int to FrameFit
+        How each frame that was looked at agreed.
+    left_out : dict of int to str
+        Those that were not added, and why.
 
+    Raises
+    ------
+    InputError
+        A result without reflectance.
+    """
 
-def _gathered(
-    result: R,
-    capture: Capture,
-    absorber: Absorber,
-    wanted: Sequence[int],
-    seed: int,
-    progress: Progress,
-    folder: Path | None,
-    key: str,
-) -> _Sums:
-    """The sums of all frames, the result's own ones first: they say how well a frame has to agree."""
-    names = [camera.name for camera in result.cameras]
-    information, fits, left_out = Information.nothing(len(absorber.texels.index)), {}, {}
-    own = _fitted(result)
-    order = [*own, *(t for t in wanted if t not in own)]
-    last = result.geometry.at(result.timesteps[-1:])
-    kept = None if folder is None else checkpoint.load(folder, "refine", _Kept, key)
-    if kept is not None:
-        information = Information(*(np.array(part) for part in kept.sums))
-        fits = {int(t): FrameFit(*values) for t, *values in kept.fits}
+    def __init__(self, result: R, capture: Capture, seed: int = 0) -> None:
+        if result.reflectance is None:
+            raise InputError("refine: found a result without reflectance, expected one of 'mifit fit' with all stages")
+        self._began = time.perf_counter()
+        self._result, self._seed = result, seed
+        self._capture = capture.with_fitted(result.cameras)
+        names = [camera.name for camera in result.cameras]
+        size, model = len(result.reflectance.diffuse), result.model
+        surface = Surface(self._capture, model, result.geometry.at(result.timesteps[:1]), names, size, whole=True)
+        carried = CarriedTangents(model, surface.texels)
+        offsets = carried_offsets(carried, result.geometry, result.normals, size, surface.texels.index)
+        offsets[~surface.facial] = 0.0
+        self._absorber = Absorber(self._capture, model, result.reflectance, offsets, names, surface, seed)
+        self._information = Information.nothing(len(surface))
+        self._last = result.geometry.at(result.timesteps[-1:])
+        self._follower: Follower | None = None
+        self.fitted = _fitted(result)
+        self.fits: dict[int, FrameFit] = {}
+        self.left_out: dict[int, str] = {}
+
+    def add(self, timestep: int) -> FrameFit:
+        """Add a frame, or leave it out where it disagrees with what was known before."""
+        known = [self.fits[t].residual for t in self.fitted if t in self.fits]
+        usual = float(np.median(known)) if known else np.inf
+        limit = np.inf if timestep in self.fitted else DISAGREES * usual
+        try:
+            fit = self._absorber.absorb(self._information, self._geometry(timestep), limit)
+        except ConvergenceError:
+            fit = FrameFit(np.inf, 1.0, 0.0)
+        if not np.isfinite(fit.residual):
+            self.left_out[timestep] = "lost the face"
+        elif fit.residual > limit:
+            times = fit.residual / usual
+            self.left_out[timestep] = f"differs {times:.1f} times as much from what was expected as the fitted frames"
+        self.fits[timestep] = fit
+        return fit
+
+    def refined(self) -> R:
+        """The result with what the frames so far say."""
+        images = (len(self.fits) - len(self.left_out)) * len(self._result.cameras)
+        found = _solved(self._result, self._absorber, self._information, images)
+        return self._with(found)
+
+    def keep(self, folder: Path, key: str) -> None:
+        """Write the sums so far, to be found again by the same key."""
+        pose = tuple(getattr(self._last, name) for name in POSE)
+        rows = tuple((t, f.residual, f.outliers, f.measured, self.left_out.get(t, "")) for t, f in self.fits.items())
+        sums = tuple(getattr(self._information, f.name) for f in fields(self._information))
+        checkpoint.save(folder, "refine", _Kept(sums, rows, pose), key)
+
+    def restore(self, folder: Path, key: str) -> None:
+        """Go on from the sums that `keep` wrote, where there are any of this key."""
+        kept = checkpoint.load(folder, "refine", _Kept, key)
+        if kept is None:
+            return
+        self._information = Information(*(np.array(part) for part in kept.sums))
+        self.fits = {int(t): FrameFit(*values) for t, *values, _ in kept.fits}
+        self.left_out = {int(row[0]): row[-1] for row in kept.fits if row[-1]}
         expression, rotation, translation, vertices = kept.pose
-        last = replace(last, expression=expression, rotation=rotation, translation=translation, vertices=vertices)
-    follower: Follower | None = None
-    for done, timestep in enumerate(order):
-        progress("refine", done, len(order))
-        if timestep in fits:
-            continue
+        self._last = replace(
+            self._last, expression=expression, rotation=rotation, translation=translation, vertices=vertices
+        )
+
+    def _geometry(self, timestep: int) -> GeometryEstimate:
+        """That of the result, or the face followed from the frame before."""
+        result = self._result
         if timestep in result.timesteps:
-            geometry = result.geometry.at((timestep,))
-        else:
-            if follower is None:
-                follower = Follower(capture, result.model, result.geometry, names, GeometryConfig(), None, seed, last)
-            try:
-                geometry, _, _ = follower.next(timestep)
-            except ConvergenceError:
-                fits[timestep] = FrameFit(float("inf"), 1.0, 0.0)
-                continue
-            last = geometry
-        limit = np.inf
-        if timestep not in own:
-            limit = DISAGREES * float(np.median([fits[t].residual for t in own]))
-        fits[timestep] = absorber.absorb(information, geometry, limit)
-        if folder is not None and (done + 1) % EVERY == 0:
-            pose = tuple(getattr(last, name) for name in POSE)
-            rows = tuple((t, f.residual, f.outliers, f.measured) for t, f in fits.items())
-            sums = tuple(getattr(information, f.name) for f in fields(information))
-            checkpoint.save(folder, "refine", _Kept(sums, rows, pose), key)
-    progress("refine", len(order), len(order))
-    usual = float(np.median([fits[t].residual for t in own]))
-    for timestep, fit in fits.items():
-        if timestep not in own and not fit.residual <= DISAGREES * usual:
-            left_out[timestep] = (
-                "lost the face"
-                if not np.isfinite(fit.residual)
-                else f"differs {fit.residual / usual:.1f} times as much from what was expected as the fitted frames"
+            return result.geometry.at((timestep,))
+        if self._follower is None:
+            names = [camera.name for camera in result.cameras]
+            self._follower = Follower(
+                self._capture,
+                result.model,
+                result.geometry.at(self.fitted),
+                names,
+                GeometryConfig(),
+                None,
+                self._seed,
+                self._last,
             )
-    return _Sums(information, fits, left_out)
+        self._last, _, _ = self._follower.next(timestep)
+        return self._last
+
+    def _with(self, found: Solved) -> R:
+        """The result with what was found."""
+        result, absorber, information = self._result, self._absorber, self._information
+        assert result.reflectance is not None
+        texels, model = absorber.texels, result.model
+        added = [t for t in self.fits if t not in self.left_out]
+        images = len(added) * len(result.cameras)
+        quality = np.minimum(information.quality / max(1.0, 0.35 * images), 1.0)
+        albedo = interpolate(result.geometry.vertex_albedo, model.faces, texels.face, texels.weights)
+        diffuse, specular, confidence = blend_unseen(model, texels, albedo, found.maps, quality)
+        reflectance = replace(
+            result.reflectance,
+            diffuse=diffuse,
+            specular=specular,
+            confidence=confidence,
+            frames=texels.to_map(information.frames.astype(np.float32)),
+        )
+        shown, facial = [], np.where(absorber.facial[:, None], 1.0, 0.0)
+        for timestep in result.timesteps:
+            normals = normalize(bend(*absorber.carried.frame(result.geometry.at((timestep,))), found.offsets))
+            shown.append(texels.to_map((normals * facial).astype(np.float32)))
+        before = result.normals.report if result.normals is not None else Report("converged")
+        details = {
+            **before.details,
+            "refined": {
+                "timesteps": sorted(added),
+                "left_out": {str(t): why for t, why in self.left_out.items()},
+                "residual": found.sigma,
+                "seconds": time.perf_counter() - self._began,
+            },
+        }
+        lines = tuple(f"timestep {t}: left out of the refinement, {why}" for t, why in self.left_out.items())
+        report = replace(before, warnings=(*before.warnings, *lines), details=details)
+        normals_estimate = NormalsEstimate(result.timesteps, np.stack(shown), report)
+        refined = replace(result, reflectance=reflectance, normals=normals_estimate)
+        return replace(refined, mesh=_mesh(refined)) if result.mesh is not None else refined
 
 
-def _fitted(result: R) -> list[int]:
+def _fitted(result: Result) -> list[int]:
     """Timesteps that were fitted jointly, not tracked."""
     tracked = [] if result.normals is None else result.normals.report.details.get("tracked", [])
     return [t for t in result.timesteps if t not in tracked]
 
 
-def _solved(result: R, absorber: Absorber, information: Information, surface: Surface) -> Solved:
+def _solved(result: Result, absorber: Absorber, information: Information, images: int) -> Solved:
     """Maps and normals from the sums, by the settings of the fit."""
     assert result.reflectance is not None
     settings = from_mapping(ReflectanceConfig, result.config.get("reflectance", {}), "result.json: config: reflectance")
@@ -216,47 +290,11 @@ def _solved(result: R, absorber: Absorber, information: Information, surface: Su
         smoothness,
         maps,
         absorber.offsets,
+        images,
     )
 
 
-def _refined(result: R, absorber: Absorber, sums: _Sums, found: Solved, seconds: float) -> R:
-    """The result with what was found."""
-    assert result.reflectance is not None
-    texels, model, information = absorber.texels, result.model, sums.information
-    added = [t for t in sums.fits if t not in sums.left_out]
-    images = len(added) * len(result.cameras)
-    quality = np.minimum(information.quality / max(1.0, 0.35 * images), 1.0)
-    albedo = interpolate(result.geometry.vertex_albedo, model.faces, texels.face, texels.weights)
-    diffuse, specular, confidence = blend_unseen(model, texels, albedo, found.maps, quality)
-    reflectance = replace(
-        result.reflectance,
-        diffuse=diffuse,
-        specular=specular,
-        confidence=confidence,
-        frames=texels.to_map(information.frames.astype(np.float32)),
-    )
-    shown, facial = [], np.where(absorber.facial[:, None], 1.0, 0.0)
-    for timestep in result.timesteps:
-        normals = normalize(bend(*absorber.carried.frame(result.geometry.at((timestep,))), found.offsets))
-        shown.append(texels.to_map((normals * facial).astype(np.float32)))
-    before = result.normals.report if result.normals is not None else Report("converged")
-    details = {
-        **before.details,
-        "refined": {
-            "timesteps": sorted(added),
-            "left_out": {str(t): why for t, why in sums.left_out.items()},
-            "residual": found.sigma,
-            "seconds": seconds,
-        },
-    }
-    lines = tuple(f"timestep {t}: left out of the refinement, {why}" for t, why in sums.left_out.items())
-    report = replace(before, warnings=(*before.warnings, *lines), details=details)
-    normals_estimate = NormalsEstimate(result.timesteps, np.stack(shown), report)
-    refined = replace(result, reflectance=reflectance, normals=normals_estimate)
-    return replace(refined, mesh=_mesh(refined)) if result.mesh is not None else refined
-
-
-def _mesh(result: R) -> Any:
+def _mesh(result: Result) -> Any:
     """The refined meshes anew, from new normals."""
     assert result.mesh is not None and result.normals is not None
     refiner = mesh_refiner(result)
@@ -272,7 +310,7 @@ def _mesh(result: R) -> Any:
     )
 
 
-def _digest(result: R) -> str:
+def _digest(result: Result) -> str:
     """Of all that the sums depend on besides images."""
     import hashlib
 

@@ -15,6 +15,9 @@ from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, solv
 
 ROUNDS = 4
 """Of maps and normals in turn."""
+IMAGES = 8.0
+"""Independent images at the most: what further ones add is their poses, not weight against the maps' smoothness, as the
+errors of normals and light are the same in all of them."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,7 @@ def solve_sums(
     smoothness: Smoothness,
     maps: NDArray,
     offsets: NDArray,
+    images: int,
 ) -> Solved:
     """Find maps and normals in turn; in finding the normals, the albedos of a texel give way to them.
 
@@ -61,8 +65,11 @@ def solve_sums(
     smoothness : Smoothness
     maps : (S, S, 4), offsets : (N, 2)
         To start from.
+    images : int
+        How many were added.
     """
     rows, splits = np.flatnonzero(facial), Splits()
+    share = min(1.0, IMAGES / max(images, 1))
     counted = 3.0 * max(float(information.weight.sum()), 1e-12)
     face = take(information, rows)
     noise = 0.0
@@ -74,7 +81,7 @@ def solve_sums(
         offsets[rows] = solve_offsets(system, right, neighbours, texels.size, offsets[rows])
         systems = TexelSystems(
             *(
-                part.astype(np.float32)
+                (share * part).astype(np.float32)
                 for part in (
                     information.dd,
                     information.ds,

@@ -1,0 +1,188 @@
+"""What further frames of a video buy: normals, maps and a held-out view over the number of frames.
+
+    python -m benchmarks.video [--subjects 5] [--frames 40] [--texels 128] [--work out/video]
+
+The first heads of `benchmarks.table1` with more timesteps, at half its image size. Four timesteps are fitted, the
+others are followed and absorbed (`mifit.refine`), and the result is judged on the fitted timesteps every so often.
+Videos, fits and figures stay in the work folder, so that a stopped benchmark goes on. ``--plot`` draws
+``docs/images/video.png`` from the committed figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mifit as mi
+from benchmarks.figure import figure
+from benchmarks.record import RESULTS, SHARED, record
+from benchmarks.scan import nearest
+from benchmarks.table1 import ENVIRONMENTS, LANDMARK_BIAS, SEED, TONES, mifit, outside
+from benchmarks.table1_subject import BUMP_UNIT
+from benchmarks.truth import angle, bumped_normals, truth_errors
+from mifit import Capture, FitConfig, MorphableModel, Reconstruction
+from mifit.core.files import write_text
+from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.uv import rasterize_uv
+from mifit.fitting import fit_into
+from mifit.output.evaluate import evaluate
+from mifit.refinement import Refinement
+
+CAMERAS = ("left", "right")
+FITTED = 4
+JUDGED = (1, 2, 4, 8, 16, 40)
+"""Numbers of frames at which the result is judged."""
+SIZE = {"width": 340, "height": 240, "spp": 16}
+PLOT = Path("docs/images/video.png")
+POINTS = 3000
+"""Points at which the bound of the normals is measured."""
+
+
+def video(subject: int, frames: int, work: Path) -> Path:
+    """Folder of a head's video, rendered once."""
+    folder = work / f"subject_{subject:02d}" / "capture"
+    if not (folder / "transforms.json").exists():
+        environment = SHARED / "hdri" / f"{ENVIRONMENTS[subject % len(ENVIRONMENTS)]}.hdr"
+        light = ["--env", environment] if environment.exists() else []
+        options = [part for key, value in SIZE.items() for part in (f"--{key}", value)]
+        mifit("synth", "--out", folder, "--seed", SEED + subject, "--force", "--tone", TONES[subject % len(TONES)],
+              "--outside", outside(subject), "--landmark-bias", LANDMARK_BIAS, "--timesteps", frames, *options,
+              *light)  # fmt: skip
+    return folder
+
+
+def fitted(capture: Capture, folder: Path, texels: int) -> Reconstruction:
+    """The fit of the first timesteps, made once."""
+    out = folder / f"fit_{texels}"
+    if (out / "result.json").exists():
+        return Reconstruction.load(out)
+    config = FitConfig()
+    config = replace(config, reflectance=replace(config.reflectance, texture_size=texels))
+    return fit_into(out, capture, MorphableModel.load("builtin"), CAMERAS, range(FITTED), config)
+
+
+def judge(result: Reconstruction, capture: Capture) -> dict[str, float]:
+    """Errors against the truth and of the held-out view, on the fitted timesteps."""
+    assert result.reflectance is not None
+    errors = truth_errors(result, Path(capture.path), BUMP_UNIT)
+    view = evaluate(result, capture, "third", range(FITTED), region="truth")["methods"]
+    confidence = result.reflectance.confidence[result.reflectance.diffuse.any(-1)]
+    return {
+        **errors,
+        "third_full_db": round(view["full"]["psnr"], 3),
+        "third_diffuse_db": round(view["diffuse"]["psnr"], 3),
+        "confidence": round(float(confidence.mean()), 4),
+    }
+
+
+def normals_of_what_is_seen(result: Reconstruction, capture: Capture) -> float:
+    """Degrees by which perfect normals of the surface that each texel lies on would differ from the truth at its place.
+
+    A texel of the fit lies on another point of the true face, a millimetre or two along it: landmarks have a bias. No
+    image tells which point it should be.
+    """
+    model, vertices = result.model, result.geometry.vertices[0].astype(np.float64)
+    assert result.reflectance is not None
+    texels = rasterize_uv(model.uv, model.faces_uv, len(result.reflectance.diffuse), model.face_mask)
+    true = bumped_normals(model, Path(capture.path), 0, texels, BUMP_UNIT)
+    with np.load(Path(capture.path) / "truth" / "0000.npz") as stored:
+        surface = stored["vertices"].astype(np.float64)
+    rows = np.random.default_rng(0).choice(len(true), min(POINTS, len(true)), replace=False)
+    points = interpolate(vertices, model.faces, texels.face, texels.weights)[rows]
+    faces = model.faces[model.face_mask]
+    _, face, weights = nearest(points, surface, faces)
+    normals = normalize(interpolate(vertex_normals(surface, model.faces), faces, face, weights))
+    return round(angle(normals, true[rows]), 3)
+
+
+def run_subject(subject: int, frames: int, work: Path, texels: int) -> dict[str, Any]:
+    """Figures of one head; those of a finished one are read."""
+    folder = work / f"subject_{subject:02d}"
+    figures = folder / f"figures_{texels}_{frames}.json"
+    if figures.exists():
+        return dict(json.loads(figures.read_text()))
+    capture = Capture.load(video(subject, frames, work))
+    result = fitted(capture, folder, texels)
+    found: dict[str, Any] = {
+        "subject": subject,
+        "fit": judge(result, capture),
+        "normal_degrees_of_what_is_seen": normals_of_what_is_seen(result, capture),
+        "frames": {},
+    }
+    refinement, seconds = Refinement(result, capture), []
+    for timestep in range(frames):
+        began, cpu = time.perf_counter(), time.process_time()
+        refinement.add(timestep)
+        seconds.append((time.perf_counter() - began, time.process_time() - cpu))
+        if timestep + 1 in JUDGED or timestep + 1 == frames:
+            found["frames"][str(timestep + 1)] = judge(refinement.refined(), capture)
+            print(subject, timestep + 1, found["frames"][str(timestep + 1)], flush=True)
+    followed = np.array(seconds[FITTED:])
+    found["seconds_per_pair"], found["processor_seconds_per_pair"] = np.median(followed, axis=0).round(3).tolist()
+    found["left_out"] = {str(t): why for t, why in refinement.left_out.items()}
+    write_text(figures, json.dumps(found, indent=1) + "\n")
+    return found
+
+
+def means(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Mean of every figure over the heads: of the fit, and by number of frames."""
+    counts = [n for n in rows[0]["frames"] if all(n in row["frames"] for row in rows)]
+    groups = {"fit": [row["fit"] for row in rows]} | {n: [row["frames"][n] for row in rows] for n in counts}
+    return {
+        name: {key: round(statistics.fmean(f[key] for f in figures), 4) for key in figures[0]}
+        for name, figures in groups.items()
+    }
+
+
+def draw(figures: dict[str, Any]) -> None:
+    """Error and confidence over the number of frames, from the committed figures."""
+    titles = {
+        "normal_degrees": "normals, degrees",
+        "diffuse_rmse": "albedo, RMSE",
+        "specular_correlation": "specular albedo, correlation",
+        "third_full_db": "held-out view, dB",
+        "confidence": "confidence",
+    }
+    counts = [n for n in figures["means"] if n != "fit"]
+    with figure(PLOT, (3.0 * len(titles), 2.8), len(titles)) as axes:
+        _curves(axes, figures, titles, counts)
+
+
+def _curves(axes: Any, figures: dict[str, Any], titles: dict[str, str], counts: list[str]) -> None:
+    """One panel per figure: heads in grey, their mean, and the fit of four timesteps as a line."""
+    for axis, (key, title) in zip(axes, titles.items(), strict=True):
+        for row in figures["rows"]:
+            axis.plot([int(n) for n in counts], [row["frames"][n][key] for n in counts], color="0.8", lw=1)
+        axis.plot([int(n) for n in counts], [figures["means"][n][key] for n in counts], "o-", ms=3)
+        axis.axhline(figures["means"]["fit"][key], color="tab:orange", lw=1, ls="--")
+        axis.set(title=title, xlabel="frames", xscale="log")
+        axis.set_xticks([1, 4, 10, 40], ["1", "4", "10", "40"])
+        axis.minorticks_off()
+
+
+def main() -> None:
+    """Run the benchmark, or draw its figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--subjects", type=int, default=5)
+    parser.add_argument("--frames", type=int, default=40)
+    parser.add_argument("--texels", type=int, default=128)
+    parser.add_argument("--work", type=Path, default=Path("out/video"))
+    parser.add_argument("--plot", action="store_true", help="only draw the committed figures")
+    arguments = parser.parse_args()
+    if not arguments.plot:
+        mi.set_variant("auto")
+        rows = [run_subject(i, arguments.frames, arguments.work, arguments.texels) for i in range(arguments.subjects)]
+        figures = {"size": SIZE, "texels": arguments.texels, "rows": rows, "means": means(rows)}
+        record("video", figures, [SEED + row["subject"] for row in rows])
+    draw(json.loads((RESULTS / "video.json").read_text())["figures"])
+
+
+if __name__ == "__main__":
+    main()
