@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -20,6 +20,7 @@ from mifit.render.gbuffer import SurfaceScene
 from mifit.solve import Outcome
 from mifit.stages.geometry.points import corner_matrix
 from mifit.stages.surface.displace import Plate, solve_displacement
+from mifit.stages.surface.epipolar import epipolar_residual
 from mifit.stages.surface.model_fit import FoundSurface, fit_model, landmarks_are_biased
 from mifit.stages.surface.sweep import sweep
 from mifit.stages.surface.views import Resolution, pose_texels, texture_size
@@ -50,6 +51,8 @@ START, STIFFEST = 20.0, 5000.0
 """Stiffness at the start, and the largest."""
 FITTED = ("identity", "expression", "rotation", "translation", "vertices")
 """What the fit of the model to the found surface renews."""
+OFF_PIXELS = 1.0
+"""Median distance from epipolar lines that deserves a warning."""
 NARROWEST = 0.03
 """Least parallax; below it, about 2 degrees between the views, depth isn't measured."""
 
@@ -109,6 +112,7 @@ def find_surface(
         geometry = replace(geometry, **{name: getattr(refitted, name) for name in FITTED})
     last = search.descend(geometry, levels)
     displacement, world = last.displacement, last.world
+    residuals = search.epipolar_residuals(geometry, world, config.finest)
     seconds = time.perf_counter() - began
     moved = np.linalg.norm(displacement, axis=1)[np.unique(model.faces[model.face_mask])] * model.unit_mm
     phase = {
@@ -119,13 +123,14 @@ def find_surface(
         "matched": last.matched,
         "stiffness": last.stiffness,
         "displacement_mm": float(np.sqrt(np.mean(moved**2))),
+        "epipolar_pixels": residuals,
         "seconds": seconds,
     }
     return replace(
         geometry,
         vertices=world.astype(np.float32),
         displacement=displacement.astype(np.float32),
-        report=_extended(geometry.report, seconds, phase),
+        report=_extended(geometry.report, seconds, phase, epipolar_warnings(residuals)),
     )
 
 
@@ -225,6 +230,34 @@ class _Search:
         outcome = Outcome.CONVERGED if moved < SETTLED * step else Outcome.MAX_ITERATIONS
         return _Descent(displacement, world, surfaces, stiffness, matched, moved, outcome)
 
+    def epipolar_residuals(self, geometry: GeometryEstimate, world: NDArray, level: int) -> dict[str, float | None]:
+        """Median distance from one another's epipolar lines for each pair of views, pixels of the images."""
+        model = self._model
+        pixel = self._resolution.pixel * 2.0**level
+        texels = rasterize_uv(
+            model.uv, model.faces_uv, texture_size(model, world[0], pixel, LARGEST_MAP), model.face_mask
+        )
+        views = [self._capture.camera(name) for name in self._cameras]
+        some = sorted({0, len(world) - 1})  # two timesteps tell what all would
+        posed = [
+            pose_texels(
+                self._capture,
+                SurfaceScene(world[k], model.faces),
+                world[k],
+                model.faces,
+                texels,
+                self._cameras,
+                geometry.timesteps[k],
+                0.5**level,
+            )
+            for k in some
+        ]
+        found: dict[str, float | None] = {}
+        for a, b in self._pairs:
+            residual = epipolar_residual(texels, posed, views, (a, b), pixel, WINDOW)
+            found[f"{self._cameras[a]}, {self._cameras[b]}"] = None if residual is None else residual * 2.0**level
+        return found
+
 
 def _normals(world: NDArray, faces: NDArray) -> NDArray[np.float64]:
     """(T, V, 3) unit normals of the vertices of each timestep."""
@@ -256,7 +289,18 @@ def _unchanged(geometry: GeometryEstimate, warning: str, began: float) -> Geomet
     return replace(geometry, report=replace(report, warnings=(*report.warnings, warning)))
 
 
-def _extended(report: Report, seconds: float, phase: dict) -> Report:
+def _extended(report: Report, seconds: float, phase: dict, warnings: Sequence[str] = ()) -> Report:
     """A report with one more phase."""
     details = {**report.details, "phases": [*report.details.get("phases", []), phase]}
-    return replace(report, seconds=report.seconds + seconds, details=details)
+    warnings = (*report.warnings, *warnings)
+    return replace(report, seconds=report.seconds + seconds, details=details, warnings=warnings)
+
+
+def epipolar_warnings(residuals: Mapping[str, float | None]) -> list[str]:
+    """What to say of views, such as ``"left, right"``, that show points off one another's epipolar lines."""
+    return [
+        f"cameras {names}: what they show lies {pixels:.1f} pixels off one another's epipolar lines; the calibration "
+        "is off, or the cameras aren't in step"
+        for names, pixels in residuals.items()
+        if pixels is not None and pixels > OFF_PIXELS
+    ]

@@ -235,3 +235,17 @@ def test_the_outcome_tells_whether_the_last_sweep_still_moved_the_surface(model,
         ends.append(find_surface(bumpy, model, start, BOTH).report.details["phases"][-1])
     assert [end["outcome"] for end in ends] == ["max_iterations", "converged"]
     assert ends[1]["moved_last_mm"] < 0.3 * ends[0]["moved_last_mm"]
+
+
+def test_a_camera_off_its_calibration_is_told_by_the_epipolar_lines(model, bumpy, start, found):
+    """Turned by 3 pixels of its image, half of which the surface can't follow."""
+    assert found.report.details["phases"][-1]["epipolar_pixels"]["left, right"] < 0.3
+    assert not any("epipolar" in text for text in found.report.warnings)
+    right = bumpy.camera("right")
+    turn = np.eye(4)
+    turn[:3, :3] = exponential(np.array([3.0 / right.fy, 0.0, 0.0]))
+    turned = replace(right, world_to_camera=turn @ right.world_to_camera)
+    off = replace(bumpy, cameras_by_name={**bumpy.cameras_by_name, "right": turned})
+    told = find_surface(off, model, start, BOTH)
+    assert 2.5 < told.report.details["phases"][-1]["epipolar_pixels"]["left, right"] < 3.5
+    assert any("epipolar" in text for text in told.report.warnings)

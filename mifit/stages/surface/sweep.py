@@ -42,12 +42,15 @@ class Posed:
     images : sequence of FeatureImage
     seen : (views, N) float32
         Cosine of the angle of view; 0 where hidden or grazing.
+    shift : (views, N, 3), optional
+        What moves by an offset of 1 in each view; by default the normal in all of them.
     """
 
     position: NDArray
     normal: NDArray
     images: Sequence[FeatureImage]
     seen: NDArray[np.float32]
+    shift: NDArray | None = None
 
 
 @dataclass(frozen=True)
@@ -89,9 +92,8 @@ def sweep(texels: TexelMap, steps: Sequence[Posed], offsets: NDArray, window: in
     for step in steps:
         at = {}
         for i in {i for pair in pairs for i in pair}:
-            at[i] = np.stack(
-                [step.images[i].sample(step.position + offset * step.normal) for offset in offsets]
-            )  # (K, N, 2)
+            way = step.normal if step.shift is None else step.shift[i]
+            at[i] = np.stack([step.images[i].sample(step.position + offset * way) for offset in offsets])  # (K, N, 2)
         for a, b in pairs:
             trust = np.sqrt(step.seen[a] * step.seen[b])
             if not (trust > 0).any():

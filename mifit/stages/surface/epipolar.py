@@ -1,0 +1,66 @@
+"""How far what two views show lies off one another's epipolar lines: calibration and synchrony, measured densely.
+
+Along its normal a texel is moved until the views agree; across the plane through it and both cameras no depth moves
+it, so that a shift which remains there is no matter of the surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mifit.core.camera import Camera
+from mifit.core.mesh import normalize
+from mifit.core.uv import TexelMap
+from mifit.stages.surface.sweep import Posed, sweep
+
+FARTHEST = 4
+"""Pixels that are searched to either side."""
+FEWEST = 200
+"""Texels that must match for a residual to be told."""
+
+
+def epipolar_residual(
+    texels: TexelMap,
+    steps: Sequence[Posed],
+    cameras: Sequence[Camera],
+    pair: tuple[int, int],
+    pixel: float,
+    window: int,
+) -> float | None:
+    """Median distance from the epipolar lines of a pair of views, pixels of the level.
+
+    Parameters
+    ----------
+    texels : TexelMap
+    steps : sequence of Posed
+        Texels where the views agree best, per timestep.
+    cameras : sequence of Camera
+    pair : (int, int)
+    pixel : float
+        World length of a pixel at the face.
+    window : int
+        As for `sweep`.
+
+    Returns
+    -------
+    float or None
+        None where too few texels match, or they do only beyond ``FARTHEST``.
+    """
+    a, b = pair
+    moved = []
+    for step in steps:
+        across = np.cross(cameras[a].position - step.position, cameras[b].position - step.position)
+        shift = np.zeros((len(cameras), *step.position.shape))
+        shift[b] = normalize(across)
+        moved.append(replace(step, shift=shift))
+    found = sweep(texels, moved, pixel * np.arange(-FARTHEST, FARTHEST + 1), window, [pair])
+    used = found.precision > 0
+    if used.sum() < FEWEST:
+        return None
+    distance, weight = np.abs(found.offset[used]) / pixel, found.precision[used]
+    order = np.argsort(distance)
+    total = np.cumsum(weight[order])
+    return float(distance[order][np.searchsorted(total, 0.5 * total[-1])])
