@@ -153,6 +153,8 @@ class Surface:
         Weigh observations by how likely they show the point; without it by pixels alone, as the paper's sums do.
     whole : bool
         All texels that the model's maps hold, neck, scalp and eyes included, and not those of its face area alone.
+    texels : TexelMap, optional
+        These texels, where another surface of the same model has found them already.
 
     Raises
     ------
@@ -169,6 +171,7 @@ class Surface:
         size: int,
         trust: bool = True,
         whole: bool = False,
+        texels: TexelMap | None = None,
     ) -> None:
         if not cameras or not geometry.timesteps:
             raise InputError(
@@ -177,7 +180,7 @@ class Surface:
         from mifit.render.gbuffer import SurfaceScene
 
         shown = model.mapped if whole else model.face_mask
-        self.texels: TexelMap = rasterize_uv(model.uv, model.faces_uv, size, shown)
+        self.texels: TexelMap = rasterize_uv(model.uv, model.faces_uv, size, shown) if texels is None else texels
         self.facial: NDArray[np.bool_] = model.face_mask[self.texels.face]
         if not len(self.texels.index):
             raise InputError(f"model {model.name}: its face area covers no texel of a map of {size} texels a side")

@@ -56,9 +56,9 @@ def normal_error(scene, result):
 
 
 def image(rng, n=5):
-    """One image of n texels: target, weight, diffuse, specular, slope, cosine."""
+    """One image of n texels: rows, target, weight, diffuse, specular, slope, cosine."""
     shapes = ((n, 3), (n, 3), (n, 3), (n, 3), (n, 3, 2), (n,))
-    return [rng.uniform(0.1, 1.0, shape) for shape in shapes]
+    return [np.arange(n), *(rng.uniform(0.1, 1.0, shape) for shape in shapes)]
 
 
 def test_sums_give_the_residual_at_any_state():
@@ -69,7 +69,7 @@ def test_sums_give_the_residual_at_any_state():
         sums.add(*one)
     albedo, specular, offsets = rng.uniform(0, 1, (5, 3)), rng.uniform(0, 1, 5), rng.normal(size=(5, 2))
     expected = np.zeros(5)
-    for target, weight, diffuse, gloss, slope, _ in images:
+    for _, target, weight, diffuse, gloss, slope, _ in images:
         shown = albedo * diffuse + specular[:, None] * gloss + np.einsum("nci,ni->nc", slope, offsets)
         expected += (weight * (target - shown) ** 2).sum(1)
     assert_allclose(sums.residual(albedo, specular, offsets), expected, rtol=1e-10)

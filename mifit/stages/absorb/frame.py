@@ -81,43 +81,45 @@ class Absorber:
         self.texels, self.facial = surface.texels, surface.facial
         self.carried = CarriedTangents(model, self.texels)
         self.diffuse, self.specular = (self.texels.from_map(m) for m in (reflectance.diffuse, reflectance.specular))
-        lobe = reflectance.lobe.at(lambda m: self.texels.from_map(m))
-        self._appearance = Appearance.of(reflectance, lobe)
 
     def absorb(self, information: Information, geometry: GeometryEstimate, limit: float = np.inf) -> FrameFit:
         """Add the frame of a geometry's one timestep to the sums, in place, unless its residual is above a limit."""
         size = self.texels.size
-        surface = Surface(self._capture, self._model, geometry, self._cameras, size, trust=True, whole=True)
-        seen = surface.observe(np.arange(len(self.texels.index)))
-        rotation = geometry.rotation[0]
-        base, tangents = self.carried.frame(geometry)
-        base, tangents = base @ rotation.T, tangents @ rotation.T
+        surface = Surface(self._capture, self._model, geometry, self._cameras, size, whole=True, texels=self.texels)
+        every = surface.observe(np.arange(len(self.texels.index)))
+        rows = np.flatnonzero((every.weight > 0).any(axis=1))
+        seen = every.take(rows)
+        rotation, facial, offsets = geometry.rotation[0], self.facial[rows], self.offsets[rows]
+        base, tangents = (part @ rotation.T for part in self.carried.frame(geometry, rows))
+        diffuse, specular = self.diffuse[rows], self.specular[rows]
         points = MeshPoints(seen.point[:, 0], base, seen.face, seen.barycentric)
-        occlusion = self._appearance.trace(surface.meshes[0], points, self._seed)
+        appearance = Appearance.of(self.reflectance, self.reflectance.lobe.at(lambda m: self.texels.from_map(m)[rows]))
+        occlusion = appearance.trace(surface.meshes[0], points, self._seed)
         images, residuals = [], []
         for j in range(len(seen.step)):
-            shade = self._appearance.shader(base, seen.view[:, j], occlusion, points.position)
-            d, s, d_slope, s_slope = linear_shading(shade, base, tangents, self.offsets, seen.view[:, j])
-            target = seen.colour[:, j] - np.float32(self._appearance.illumination.ambient)
-            residuals.append(target - form_image(0.0, self.diffuse, d, self.specular[:, None], s))
-            slope = form_image(0.0, self.diffuse[..., None], d_slope, self.specular[:, None, None], s_slope)
-            slope[~self.facial] = 0.0
+            shade = appearance.shader(base, seen.view[:, j], occlusion, points.position)
+            d, s, d_slope, s_slope = linear_shading(shade, base, tangents, offsets, seen.view[:, j])
+            target = seen.colour[:, j] - np.float32(appearance.illumination.ambient)
+            residuals.append(target - form_image(0.0, diffuse, d, specular[:, None], s))
+            slope = form_image(0.0, diffuse[..., None], d_slope, specular[:, None, None], s_slope)
+            slope[~facial] = 0.0
             images.append((target, d, s, slope))
         weight = seen.weight[..., None] * noise_weight(seen.colour, True)
         residual = np.stack(residuals, axis=1)
         robust, sigma = active_weight(weight, seen.clipped, residual, True)
-        shown = (seen.measured > 0) & self.facial[:, None]
+        shown = (seen.measured > 0) & facial[:, None]
         far = np.abs(residual[shown]) > 3.0 * max(sigma, 1e-6)
-        fit = FrameFit(sigma, float(far.mean()) if far.size else 0.0, float(shown.any(1).sum() / self.facial.sum()))
+        measured = float(shown.any(1).sum() / self.facial.sum())
+        fit = FrameFit(sigma, float(far.mean()) if far.size else 0.0, measured)
         if not sigma <= limit:
             return fit
         cosine = np.einsum("njk,njk->nj", seen.image_normal, seen.view)
         cosine = np.where(seen.measured > 0, np.clip(cosine, 0.0, 1.0) * seen.right, 0.0)
         for j, (target, d, s, slope) in enumerate(images):
             # What was linearised about x0 is a function of x itself.
-            shift = np.einsum("nci,ni->nc", slope, self.offsets)
-            information.add(target + shift, robust[:, j], d, s, slope, cosine[:, j])
-        information.frames[:] += (seen.measured > 0).any(1)
+            shift = np.einsum("nci,ni->nc", slope, offsets)
+            information.add(rows, target + shift, robust[:, j], d, s, slope, cosine[:, j])
+        information.frames[rows] += (seen.measured > 0).any(1)
         return fit
 
 

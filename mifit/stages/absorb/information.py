@@ -63,6 +63,7 @@ class Information:
 
     def add(
         self,
+        rows: NDArray,
         target: NDArray,
         weight: NDArray,
         diffuse: NDArray,
@@ -70,33 +71,35 @@ class Information:
         slope: NDArray,
         cosine: NDArray,
     ) -> None:
-        """Add one image, in place.
+        """Add one image of n of the texels, in place.
 
         Parameters
         ----------
-        target, weight : (N, 3)
+        rows : (n,) int
+            Which texels; none twice.
+        target, weight : (n, 3)
             Observed radiance without ambient, and the weight of its squared residual; 0 where nothing is measured.
-        diffuse, specular : (N, 3)
+        diffuse, specular : (n, 3)
             Radiance at unit albedo.
-        slope : (N, 3, 2)
+        slope : (n, 3, 2)
             Derivative of the image by the normal's offsets.
-        cosine : (N,)
+        cosine : (n,)
             Of the angle to the camera times the trust in the observation; 0 where nothing is measured.
         """
         wd, ws, wt = weight * diffuse, weight * specular, weight * target
-        self.dd[:] += wd * diffuse
-        self.ds[:] += wd * specular
-        self.dr[:] += wd * target
-        self.ss[:] += (ws * specular).sum(1)
-        self.sr[:] += (ws * target).sum(1)
-        self.dx[:] += wd[..., None] * slope
-        self.sx[:] += (ws[..., None] * slope).sum(1)
+        self.dd[rows] += wd * diffuse
+        self.ds[rows] += wd * specular
+        self.dr[rows] += wd * target
+        self.ss[rows] += (ws * specular).sum(1)
+        self.sr[rows] += (ws * target).sum(1)
+        self.dx[rows] += wd[..., None] * slope
+        self.sx[rows] += (ws[..., None] * slope).sum(1)
         for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
-            self.xx[:, k] += (weight * slope[..., i] * slope[..., j]).sum(1)
-        self.xr[:] += (wt[..., None] * slope).sum(1)
-        self.square[:] += (wt * target).sum(1)
-        self.weight[:] += weight.mean(1)
-        self.quality[:] += cosine
+            self.xx[rows, k] += (weight * slope[..., i] * slope[..., j]).sum(1)
+        self.xr[rows] += (wt[..., None] * slope).sum(1)
+        self.square[rows] += (wt * target).sum(1)
+        self.weight[rows] += weight.mean(1)
+        self.quality[rows] += cosine
 
     def residual(self, diffuse: NDArray, specular: NDArray, offsets: NDArray) -> NDArray[np.float64]:
         """(N,) sum of weighted squared residuals at albedos (N, 3), (N,) and offsets (N, 2)."""

@@ -24,12 +24,17 @@ class CarriedTangents:
         self.home = self._base(model.mean)
         self._tangents = tangent_plane(self.home)
 
-    def frame(self, geometry: GeometryEstimate) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Base normals (N, 3) and tangents (N, 2, 3) of the first timestep of a geometry, object space."""
-        base = self._base(geometry.vertices[0].astype(np.float64) @ geometry.rotation[0])
-        return base, transport(self.home, self._tangents, base)
+    def frame(
+        self, geometry: GeometryEstimate, rows: NDArray | slice = slice(None)
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Base normals (N, 3) and tangents (N, 2, 3) of the first timestep of a geometry, object space.
 
-    def _base(self, vertices: NDArray) -> NDArray[np.float64]:
-        return normalize(
-            interpolate(vertex_normals(vertices, self._faces), self._faces, self._texels.face, self._texels.weights)
-        )
+        ``rows`` are the texels that are wanted; all by default.
+        """
+        base = self._base(geometry.vertices[0].astype(np.float64) @ geometry.rotation[0], rows)
+        return base, transport(self.home[rows], self._tangents[rows], base)
+
+    def _base(self, vertices: NDArray, rows: NDArray | slice = slice(None)) -> NDArray[np.float64]:
+        texels = self._texels
+        normals = vertex_normals(vertices, self._faces)
+        return normalize(interpolate(normals, self._faces, texels.face[rows], texels.weights[rows]))
