@@ -48,7 +48,7 @@ def main() -> int:
 
 
 def keep(notebook: nbformat.NotebookNode, path: Path) -> None:
-    """Write a notebook with its outputs: pictures as JPEG, no times, no progress, no counts of executions."""
+    """Write a notebook with its outputs: pictures as JPEG, without progress, counts and times of executions."""
     for number, cell in enumerate(notebook.cells):
         cell.id = f"cell-{number}"
         cell.metadata = {}
