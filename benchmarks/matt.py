@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
 
@@ -20,25 +20,13 @@ from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution
 
 
-class Diffuse(Forward):
-    """A shading model without its specular reflection."""
-
-    def transfers(self, seen: Observations, light: Any) -> tuple[Any, Any]:
-        diffuse, specular = super().transfers(seen, light)
-        return diffuse, np.zeros_like(specular)
-
-    def shade(self, seen: Observations, light: Any) -> tuple[Any, Any]:
-        shade, glint = super().shade(seen, light)
-        return shade, np.zeros_like(glint)
-
-
 def choose_diffuse_lighting(
     surface: Surface, seen: Observations, albedo: Any, config: ReflectanceConfig, progress: Progress
 ) -> tuple[Forward, LightingSolution, dict]:
     """The model that stage 2 chooses, and the lighting that explains the images best without its specular part."""
     forward, _, choice = choose_lighting(surface, seen, albedo, config, progress)
-    diffuse = Diffuse(**{f.name: getattr(forward, f.name) for f in fields(forward)})
-    return diffuse, fit_lighting(seen, diffuse, albedo, config, config.max_iterations, 0.0), choice
+    diffuse = replace(forward, glossy=False)
+    return diffuse, fit_lighting(seen, diffuse, albedo, config, config.max_iterations), choice
 
 
 def infer_matt(

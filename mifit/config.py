@@ -73,7 +73,7 @@ class ShapeConfig:
     )
 
 
-SHADINGS = ["auto", "paper", "printed", "prefiltered", "shadowed", "keyed"]
+SHADINGS = ["auto", "paper", "printed", "prefiltered", "shadowed", "keyed", "matt"]
 """What ``shading`` may be; registering a shading model (``appearance.models``) adds its name."""
 
 
@@ -114,12 +114,17 @@ class ReflectanceConfig:
     )
     shading: Annotated[str, pydantic.AfterValidator(_known_shading)] = one_of(
         "auto",
-        "image-formation model: paper, prefiltered, shadowed, keyed (shadowed with a compact light), or another that "
-        "is registered; auto takes the cheapest of the four that explains the images",
+        "image-formation model: paper, prefiltered, shadowed, keyed (shadowed with a compact light), matt (shadowed "
+        "without specular reflection), or another that is registered; auto takes the one of the last three that best "
+        "predicts images that are left out",
     )
     bands: int = number(10, "bands of the lighting of prefiltered and shadowed; paper has 3", least=3, most=10)
     exponent: float | None = number(
-        None, "Blinn-Phong exponent; none: 5 for paper, as in the paper, and estimated otherwise", least=1, most=10_000
+        None,
+        "Blinn-Phong exponent; none: 5 for paper, as in the paper, and otherwise the one that best predicts images "
+        "that are left out",
+        least=1,
+        most=10_000,
     )
     specular_difference_weight: float = number(0.1, "the paper's lambda_S", least=0, most=WEIGHT)
     smoothness_weight: float = number(0.001, "the paper's lambda_H", least=0, most=WEIGHT)

@@ -136,7 +136,9 @@ def test_auto_says_what_it_chose_and_why(dome):
     estimate = infer(dome, replace(CONFIG, shading="auto"))
     choice = estimate.report.details["shading"]
     assert choice["chosen"] == estimate.shading_model == "shadowed"
-    assert set(choice["residuals"]) == {"shadowed"} and choice["why"]
+    assert set(choice["residuals"]) == {"shadowed", "matt"} and choice["why"]
+    error = {trial["shading"]: trial["error"] for trial in choice["predicted"]}
+    assert choice["left_out"] == "timesteps" and error["shadowed"] < 0.8 * error["matt"]
 
 
 def test_level_of_the_albedo_is_that_of_the_mean_face(dome, found):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,30 +18,46 @@ from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.key import RADII, STEPS, TEXELS, Candidates, find_lights, search
 from mifit.stages.reflectance.lighting import LightingProblem, LightingSolution, solve_lighting
+from mifit.stages.reflectance.prediction import Prediction, predict
 from mifit.stages.reflectance.priors import EXPONENT, NORMAL_REFLECTANCE
 
 NOISE_FLOOR = 0.03
 """Read noise over shot noise, as variance in units of linear colour; 8-bit sRGB is coded about so as well."""
-EXPLAINED = 0.03
-"""A costlier shading model is taken where it lowers the residual by more than this part."""
+MARGIN = 0.03
+"""Another way to explain the images is taken where it lowers the error of predicted images by more than this part."""
+LEAN = 0.005
+"""Logarithm of the predicted error by which a lobe an octave off the physical one has to predict better, fourfold for
+two octaves: a normal prior of one octave beside a hundred independent measurements, which is about how many patches of
+a face with their own error there are."""
+EXPONENTS = (10.0, 160.0)
+"""Exponents between which a lobe is looked for, an octave at a time: Beckmann roughness 0.4 to 0.1."""
+JUDGES = 1200
+"""Texels by which ways to explain the images are compared."""
 FAINT = 0.2
 """Irradiance of a compact light, relative to that of all other light: below, it is taken for a flaw of the model."""
 START_ITERATIONS = 5
 """Gauss-Newton iterations where they are only a start: the objective over all texels is minimised afterwards."""
+TRIAL_ITERATIONS = 8
+"""Gauss-Newton iterations of a way to explain the images that is only compared with others."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A way to explain the images: a shading model by name, with or without a search for compact lights."""
+    """A way to explain the images: a shading model by name, with or without compact lights and specular reflection."""
 
     model: str
     lights: bool = False
+    glossy: bool = True
 
 
-CANDIDATES = {"shadowed": Candidate("shadowed"), "keyed": Candidate("shadowed", lights=True)}
-"""What ``shading = auto`` chooses from, cheap to costly. Every face shadows itself: a model without shadows, free to
-bend the light to its needs, explains images as well but predicts other light worse. Other registered shading models
-can be asked for by name."""
+CANDIDATES = {
+    "shadowed": Candidate("shadowed"),
+    "keyed": Candidate("shadowed", lights=True),
+    "matt": Candidate("shadowed", glossy=False),
+}
+"""What ``shading = auto`` chooses from. Every face shadows itself: a model without shadows, free to bend the light to
+its needs, explains images as well but predicts other light worse. Other registered shading models can be asked for by
+name."""
 
 
 def candidate(name: str) -> Candidate:
@@ -48,17 +65,10 @@ def candidate(name: str) -> Candidate:
     return CANDIDATES.get(name) or Candidate(name)
 
 
-def wanted_candidates(config: ReflectanceConfig) -> list[str]:
-    """Names of what is to be fitted, in order; a search for lights starts from the fit of its model without them."""
-    if config.shading == "auto":
-        return list(CANDIDATES)
-    asked = candidate(config.shading)
-    return [asked.model, config.shading] if asked.lights else [config.shading]
-
-
 def fitted_models(config: ReflectanceConfig) -> list[ShadingModel]:
     """The shading models among which settings leave a choice."""
-    return [models.get(candidate(name).model) for name in wanted_candidates(config)]
+    names = list(CANDIDATES) if config.shading == "auto" else [config.shading]
+    return [models.get(candidate(name).model) for name in names]
 
 
 def plain_forward(model: ShadingModel, exponent: float, config: ReflectanceConfig, surface: Surface) -> Forward:
@@ -70,7 +80,7 @@ def plain_forward(model: ShadingModel, exponent: float, config: ReflectanceConfi
 def choose_lighting(
     surface: Surface, seen: Observations, albedo: NDArray, config: ReflectanceConfig, progress: Progress
 ) -> tuple[Forward, LightingSolution, dict]:
-    """Fit the lighting under the configured model, or under all of them, of which the cheapest sufficient one wins.
+    """Choose a way to explain the images by how well it predicts images that it isn't shown, and fit its lighting.
 
     Parameters
     ----------
@@ -85,45 +95,122 @@ def choose_lighting(
     -------
     Forward, LightingSolution, and what was chosen and why, as JSON values.
     """
-    tried: dict[str, tuple[Forward, LightingSolution]] = {}
     auto = config.shading == "auto"
-    wanted = wanted_candidates(config)
-    iterations = config.max_iterations if config.robust else min(START_ITERATIONS, config.max_iterations)
-    for name in wanted:
-        progress("Reflectance lighting", len(tried), len(wanted))
-        way = candidate(name)
-        model = models.get(way.model)
-        if way.lights:
-            found_light = _with_light(surface, seen, *tried[way.model], albedo, config)
-            if found_light is None:
-                continue
-            forward = found_light
+    way = candidate("shadowed" if auto else config.shading)
+    model = models.get(way.model)
+    plain = plain_forward(model, config.exponent or model.exponent or EXPONENT, config, surface)
+    plain = replace(plain, glossy=way.glossy)
+    step = max(1, len(seen.texel) // JUDGES)
+    trials = _Trials(seen.take(slice(0, None, step)), albedo[::step], config, progress)
+    chosen = trials.add(way.model if way.lights else config.shading if not auto else "shadowed", plain)
+    free = config.exponent is None and model.exponent is None and way.glossy
+    if free:
+        chosen = trials.best_exponent(chosen)
+    why = "as configured"
+    if auto or way.lights:
+        lit = _with_light(trials.seen, chosen.forward, chosen.found, trials.albedo, config)
+        if lit is None:
+            why = "no compact light explains enough"
         else:
-            exponent = config.exponent or model.exponent or EXPONENT
-            forward = plain_forward(model, exponent, config, surface)
-        tried[name] = forward, fit_lighting(seen, forward, albedo, config, iterations)
-    progress("Reflectance lighting", len(wanted), len(wanted))
-    chosen, why = list(tried)[-1], "as configured"
+            keyed = trials.add("keyed", lit)
+            if not auto or keyed.error < (1.0 - MARGIN) * chosen.error:
+                chosen = trials.best_exponent(keyed) if free else keyed
     if auto:
-        chosen = next(iter(tried))
-        for name in tried:
-            if tried[name][1].unexplained < (1.0 - EXPLAINED) * tried[chosen][1].unexplained:
-                chosen = name
-        why = f"cheapest whose unexplained residual no costlier model lowers by more than {EXPLAINED:.0%}"
-    elif chosen != config.shading:
-        why = "no compact light explains enough"
-    forward, found = tried[chosen]
-    choice = {
-        "chosen": chosen,
-        "why": why,
-        "residuals": {name: float(f.unexplained) for name, (_, f) in tried.items()},
-        "exponent": forward.lobe.typical,
-    }
-    return forward, found, choice
+        why = f"predicts images left out better than others by more than {MARGIN:.0%}, or is the likeliest beforehand"
+        if chosen.prediction is not None:
+            matt = trials.add("matt", replace(plain, glossy=False))
+            if matt.error < (1.0 - MARGIN) * chosen.error:
+                chosen = matt
+    iterations = config.max_iterations if config.robust else min(START_ITERATIONS, config.max_iterations)
+    found = fit_lighting(seen, chosen.forward, albedo, config, iterations)
+    return chosen.forward, found, {"chosen": chosen.name, "why": why, **trials.figures()}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A way to explain the images, fitted to some of the texels.
+
+    Attributes
+    ----------
+    name : str
+        Of the candidate.
+    forward : Forward
+    found : LightingSolution
+    prediction : Prediction or None
+        None where there is nothing to leave out.
+    """
+
+    name: str
+    forward: Forward
+    found: LightingSolution
+    prediction: Prediction | None
+
+    @property
+    def exponent(self) -> float:
+        """Of its lobe."""
+        return self.forward.lobe.typical
+
+    @property
+    def error(self) -> float:
+        """Error of predicted images; of the fitted ones where none can be predicted."""
+        return self.found.unexplained if self.prediction is None else self.prediction.error
+
+    @property
+    def score(self) -> float:
+        """Logarithm of the error, and of how unlikely the lobe is beforehand."""
+        return float(np.log(max(self.error, 1e-12)) + LEAN * np.log2(self.exponent / EXPONENT) ** 2)
+
+
+class _Trials:
+    """Ways to explain some of the texels, each tried once."""
+
+    def __init__(self, seen: Observations, albedo: NDArray, config: ReflectanceConfig, progress: Progress) -> None:
+        self.seen, self.albedo, self.config, self.progress = seen, albedo, config, progress
+        self.done: list[Trial] = []
+
+    def add(self, name: str, forward: Forward) -> Trial:
+        """Fit one, and let it predict."""
+        self.progress("Reflectance lighting", len(self.done), len(self.done) + 1)
+        config = self.config
+        specular = NORMAL_REFLECTANCE if forward.glossy else 0.0
+        found = fit_lighting(self.seen, forward, self.albedo, config, TRIAL_ITERATIONS, specular)
+        prediction = None
+        if config.robust and not forward.model.turns:
+            problem = lighting_problem(self.seen, forward, found.light, self.albedo, config.robust)
+            prediction = predict(self.seen, problem, specular)
+        self.done.append(Trial(name, forward, found, prediction))
+        return self.done[-1]
+
+    def best_exponent(self, best: Trial) -> Trial:
+        """The exponent that predicts best, beginning with a trial's; its own where there is nothing to predict."""
+        if best.prediction is None:
+            return best
+        start = best
+        for factor in (2.0, 0.5):
+            while EXPONENTS[0] <= factor * best.exponent <= EXPONENTS[1]:
+                lobe = replace(best.forward.lobe, exponent=factor * best.exponent)
+                trial = self.add(start.name, best.forward.with_lobe(lobe))
+                if not trial.score < best.score:
+                    break
+                best = trial
+            if best is not start:
+                break
+        return best
+
+    def figures(self) -> dict[str, Any]:
+        """Errors of fitted and predicted images, by candidate: the lowest of its exponents, and of every exponent."""
+        names = dict.fromkeys(t.name for t in self.done)
+        residuals = {name: min(float(t.found.unexplained) for t in self.done if t.name == name) for name in names}
+        predicted = [
+            {"shading": t.name, "exponent": t.exponent if t.forward.glossy else None, "error": t.prediction.error}
+            for t in self.done
+            if t.prediction is not None
+        ]
+        left_out = next((t.prediction.left_out for t in self.done if t.prediction is not None), None)
+        return {"residuals": residuals, "predicted": predicted, "left_out": left_out}
 
 
 def _with_light(
-    surface: Surface,
     seen: Observations,
     forward: Forward,
     found: LightingSolution,
@@ -181,6 +268,7 @@ def fit_lighting(
     """Lighting and the subset's albedos; a model that turns with the lighting is linearised anew."""
     light = np.zeros((forward.unknowns, 3))
     if not forward.model.turns:
+        specular = specular if forward.glossy else 0.0
         problem = lighting_problem(seen, forward, light, albedo, config.robust)
         return solve_lighting(
             problem,

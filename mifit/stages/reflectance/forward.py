@@ -28,10 +28,13 @@ class Forward:
         Model and lobe; its illumination says how many bands and which compact lights there are, not how bright.
     meshes : tuple of OccludingMesh
         One per timestep.
+    glossy : bool
+        Whether there is a specular reflection at all.
     """
 
     appearance: Appearance
     meshes: tuple[OccludingMesh, ...] = field(default=(), repr=False)
+    glossy: bool = True
 
     @classmethod
     def of(cls, model: ShadingModel, order: int, lobe: Lobe, meshes: tuple[OccludingMesh, ...] = ()) -> Forward:
@@ -83,7 +86,7 @@ class Forward:
         """
         n, j = seen.weight.shape
         found = self.under(light).transfers(*_flat(seen), self.occlusion(seen), _points(seen))
-        return found[0].reshape(n, j, -1), found[1].reshape(n, j, -1)
+        return found[0].reshape(n, j, -1), self._gloss(found[1].reshape(n, j, -1))
 
     def shade(self, seen: Observations, light: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Diffuse and specular radiance (N, J, 3) at unit albedo, without ambient."""
@@ -95,7 +98,10 @@ class Forward:
             part = seen.take(rows)
             d, s = appearance.shade(*_flat(part), self.occlusion(part), _points(part))
             diffuse[rows], specular[rows] = d.reshape(-1, j, 3), s.reshape(-1, j, 3)
-        return diffuse, specular
+        return diffuse, self._gloss(specular)
+
+    def _gloss(self, specular: NDArray[np.float32]) -> NDArray[np.float32]:
+        return specular if self.glossy else np.zeros_like(specular)
 
     def occlusion(self, seen: Observations) -> Occlusion:
         """Shadows at the N * J observations, image after image of each texel."""
@@ -129,7 +135,7 @@ class Forward:
             steps = [light.visible(m.scene, seen.point[:, t], seen.normal[:, t]) for t, m in enumerate(self.meshes)]
             visible = np.stack(steps, axis=1)
         found = self.appearance.light_transfer(light, *_flat(seen), visible[:, seen.step].ravel(), _points(seen))
-        return found[0].reshape(seen.weight.shape), found[1].reshape(seen.weight.shape)
+        return found[0].reshape(seen.weight.shape), self._gloss(found[1].reshape(seen.weight.shape))
 
 
 def _flat(seen: Observations) -> tuple[NDArray, NDArray]:

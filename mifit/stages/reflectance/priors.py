@@ -3,12 +3,9 @@
 Images show albedo times light. What of the two is whose, they tell through highlights alone, and weakly, so it falls
 back to what has been measured of skin and not to whatever a fit without highlights happened to leave.
 
-Sources
--------
-- Reflectance at normal incidence 0.028 (index of refraction 1.4): d'Eon and Luebke, GPU Gems 3 (2007), chapter 14.
-- Beckmann roughness of facial regions 0.2 to 0.4: Weyrich et al., "Analysis of human faces using a measurement-based
-  skin reflectance model" (SIGGRAPH 2006), and 0.3 as the mean that d'Eon and Luebke take from it. A roughness a is
-  about as wide as the exponent 2 / a^2 - 2: 48 to 11.
+Reflectance at normal incidence follows from skin's index of refraction, 1.4: ((1.4 - 1) / (1.4 + 1))^2 = 0.028. The
+lobe beforehand has a Beckmann roughness a = 0.3, as skin is usually rendered; that is about as wide as the exponent
+2 / a^2 - 2 = 20. It is an assumption, and gives way where images that are left out are better predicted by another.
 """
 
 from __future__ import annotations
@@ -18,8 +15,8 @@ from numpy.typing import NDArray
 
 NORMAL_REFLECTANCE = 0.028
 """Specular albedo of skin at normal incidence."""
-EXPONENT = 40.0
-"""Exponent where none is given: within the measured range, towards its smooth end, where highlights show most."""
+EXPONENT = 20.0
+"""Exponent of a roughness of 0.3: where none is given, and the images left out aren't predicted better by another."""
 
 
 def levelled(albedo: NDArray, fitted: NDArray, mean: NDArray) -> NDArray:
