@@ -37,6 +37,8 @@ BEHIND_MM = 0.05
 STRIP = 0.09
 """Height of the strip at the bottom of the maps that holds eyes and pouch; what was there moves up."""
 MARGIN = 0.004
+SMALLEST_RIM = 8
+"""Vertices around an eye or the mouth at the least."""
 SMALLEST = 20
 """Vertices of an eyeball at the least."""
 EYES, CORNERS, INNER_LIPS = (slice(36, 42), slice(42, 48)), ((36, 39), (45, 42)), slice(60, 68)
@@ -87,19 +89,20 @@ def eyeballs(model: MorphableModel) -> list[NDArray[np.int64]]:
     links = sp.coo_matrix((np.ones(corners.size), (corners.ravel(), np.roll(corners, 1, axis=1).ravel())))
     links.resize(model.n_vertices, model.n_vertices)
     piece = sp.csgraph.connected_components(links, directed=False)[1]
-    skin = np.bincount(piece).argmax()
+    sizes = np.bincount(piece)
+    low, high = (np.full((len(sizes), 3), sign * np.inf) for sign in (1.0, -1.0))
+    np.minimum.at(low, piece, model.mean)
+    np.maximum.at(high, piece, model.mean)
+    balls = sizes >= SMALLEST
+    balls[sizes.argmax()] = False  # the skin
+    balls &= np.isin(np.arange(len(sizes)), piece[model.faces[~model.face_mask].ravel()])
     found = []
     for eye in EYES:
         around = model.mean[model.landmarks[eye]]
         centre, reach = around.mean(axis=0), np.ptp(around[:, 0])
-        for k in np.unique(piece[model.faces[~model.face_mask].ravel()]):
-            vertices = np.flatnonzero(piece == k)
-            if k == skin or len(vertices) < SMALLEST:
-                continue
-            points = model.mean[vertices]
-            at_eye = np.linalg.norm(0.5 * (points.min(axis=0) + points.max(axis=0)) - centre) < reach
-            if at_eye and np.ptp(points[:, 0]) < 2.5 * reach:
-                found.append(vertices)
+        near = np.linalg.norm(0.5 * (low + high) - centre, axis=1) < reach
+        small = high[:, 0] - low[:, 0] < 2.5 * reach
+        found += [np.flatnonzero(piece == k) for k in np.flatnonzero(balls & near & small)]
     return found
 
 
@@ -169,7 +172,7 @@ def with_eyes(model: MorphableModel) -> MorphableModel:
 def _openings(model: MorphableModel) -> tuple[list[NDArray[np.int64]], NDArray[np.int64] | None]:
     """Borders around the eyes, at x < 0 and x > 0, and around the mouth."""
     marks = model.mean[model.landmarks].astype(np.float64)
-    borders = holes(model)
+    borders = [loop for loop in holes(model) if len(loop) >= SMALLEST_RIM]
 
     def at(part: slice) -> NDArray[np.int64] | None:
         centre, extent = marks[part].mean(axis=0), float(np.ptp(marks[part][:, 0]))
