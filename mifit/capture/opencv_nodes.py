@@ -54,7 +54,7 @@ _Loader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
 
 def _yaml(text: str, path: Path) -> Iterator[Entry]:
-    text = re.sub(r"\A%YAML:(\d)", r"%YAML \1", text)  # as OpenCV writes the directive
+    text = re.sub(r"\A%YAML[: ]1\.\d", "%YAML 1.1", text)  # OpenCV 4 writes %YAML:1.0, 5 writes %YAML 1.2
     try:
         depth = 0
         for event in yaml.parse(text, Loader=_Loader):

@@ -80,6 +80,17 @@ def test_stereo_files_hold_opencv_pixels(tmp_path: Path) -> None:
     assert left.intrinsics == pytest.approx((701.25, 699.5, 171.3, 118.9))
 
 
+@pytest.mark.parametrize("first_line", ["%YAML:1.0", "%YAML 1.0", "%YAML 1.1", "%YAML 1.2"])
+def test_stereo_files_of_every_opencv_are_read(tmp_path: Path, first_line: str) -> None:
+    """OpenCV 2 to 4 begin them with %YAML:1.0, OpenCV 5 with %YAML 1.2."""
+    path = tmp_path / "s.yml"
+    write_stereo(path, make_camera("a", -20.0), make_camera("b", 20.0))
+    _, rest = path.read_text().split("\n", 1)
+    path.write_text(f"{first_line}\n{rest}")
+    left, _ = read_stereo(path, ("a", "b"), [(340, 240)] * 2)
+    assert left.intrinsics == pytest.approx((701.25, 699.5, 171.3, 118.9))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
