@@ -65,10 +65,10 @@ def holes(model: MorphableModel) -> list[NDArray[np.int64]]:
     _, first, count = np.unique(codes, return_index=True, return_counts=True)
     following = dict(edges[first[count == 1]].tolist())
     found = []
-    while following:
-        start, vertex = next(iter(following.items()))
-        loop = [start]
-        del following[start]
+    for start in list(following):
+        if start not in following:
+            continue
+        loop, vertex = [start], following.pop(start)
         while vertex != start and vertex in following:
             loop.append(vertex)
             vertex = following.pop(vertex)

@@ -79,8 +79,6 @@ class Consensus:
         `OPPONENT` logarithms without shading.
     known : (S, S) float32
         1 where some image measures the texel.
-    outvoted : (S, S) float32
-        1 where more than two do, so that one that contradicts is wrong: of two, either may be.
     shading : (9, 3) float64
         Of `_harmonics` of the world normal.
     deviation : (3,) float64
@@ -91,7 +89,6 @@ class Consensus:
 
     colour: NDArray[np.float32]
     known: NDArray[np.float32]
-    outvoted: NDArray[np.float32]
     shading: NDArray[np.float64]
     deviation: NDArray[np.float64]
     skin: NDArray[np.float64]
@@ -133,13 +130,11 @@ def consensus(surface: Surface, seed: int = 0) -> Consensus:
         shading[0] = 0.0  # a constant belongs to the colours
     known = seen_at.any(axis=1)
     size = surface.texels.size
-    colour, mask = np.zeros((size * size, 3), np.float32), np.zeros((2, size * size), np.float32)
+    colour, mask = np.zeros((size * size, 3), np.float32), np.zeros(size * size, np.float32)
     index = surface.texels.index[np.concatenate(texels)][known]
-    colour[index], mask[0, index] = centre[known], 1.0
-    mask[1, index] = seen_at[known].sum(axis=1) > 2
+    colour[index], mask[index] = centre[known], 1.0
     skin = np.median(centre[known].astype(np.float64), axis=0) if known.any() else np.zeros(3)
-    known_map, outvoted = mask.reshape(2, size, size)
-    return Consensus(colour.reshape(size, size, 3), known_map, outvoted, shading, deviation, skin)
+    return Consensus(colour.reshape(size, size, 3), mask.reshape(size, size), shading, deviation, skin)
 
 
 def segment(surface: Surface, capture: Capture, model: MorphableModel, seed: int = 0) -> tuple[NDArray[np.uint8], ...]:
@@ -208,7 +203,7 @@ def _objects(
     blur = max(BLUR * size, 0.7)
     uv = np.einsum("hwk,hwkc->hwc", weights, model.uv[model.faces_uv[face]])
     normal = normalize(np.einsum("hwk,hwkc->hwc", weights, view.normals[model.faces[face]]))
-    known, outvoted, colour = _look_up(agreed, uv)
+    known, colour = _look_up(agreed, uv)
     usable = usable & (known > 0.5)
     predicted = colour + _harmonics(normal) @ agreed.shading
     smooth = cv2.GaussianBlur(image, (0, 0), 0.5 * blur)
@@ -218,12 +213,11 @@ def _objects(
     weight = cv2.GaussianBlur(usable.astype(np.float32), (0, 0), blur)
     departure = cv2.GaussianBlur(departure.astype(np.float32), (0, 0), blur) / np.maximum(weight, 1e-3)
     inner = cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 3) > RIM * size
-    told = (outvoted > 0.5) | _no_skin(level - predicted + colour, agreed)
     covered = _no_skin(colour, agreed) & usable
     picture = to_8_bit(image)
     found = _outlines(
         picture,
-        (departure > SURE) & inner & told,
+        (departure > SURE) & inner,
         departure > LIKELY,
         (departure < CLEAN) & usable,
         facial,
@@ -323,14 +317,13 @@ def _no_skin(flat: NDArray, agreed: Consensus) -> NDArray[np.bool_]:
     return np.asarray((unlike[..., 0] < -COVERED[0]) | (np.hypot(unlike[..., 1], unlike[..., 2]) > COVERED[1]))
 
 
-def _look_up(agreed: Consensus, uv: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """How well texture coordinates (H, W, 2) are known, how sure that is, and the colour there."""
+def _look_up(agreed: Consensus, uv: NDArray) -> tuple[NDArray, NDArray]:
+    """How well texture coordinates (H, W, 2) are known, and the colour there."""
     size = len(agreed.known)
     x, y = (uv[..., 0] * size - 0.5).astype(np.float32), ((1.0 - uv[..., 1]) * size - 0.5).astype(np.float32)
     known = cv2.remap(agreed.known, x, y, cv2.INTER_LINEAR)
     colour = cv2.remap(agreed.colour, x, y, cv2.INTER_LINEAR)
-    outvoted = cv2.remap(agreed.outvoted, x, y, cv2.INTER_LINEAR)
-    return known, outvoted, (colour / np.maximum(known, 1e-3)[..., None]).astype(np.float32)
+    return known, (colour / np.maximum(known, 1e-3)[..., None]).astype(np.float32)
 
 
 def _polygons(shape: tuple[int, ...], marks: NDArray, parts: Sequence[slice]) -> NDArray[np.bool_]:
