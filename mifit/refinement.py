@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic
 
@@ -40,8 +40,9 @@ if TYPE_CHECKING:
 POSE = ("expression", "rotation", "translation", "vertices")
 EVERY = 8
 """Frames between two checkpoints."""
-DISAGREES = 2.0
-"""Residual of a frame, relative to the median of the fitted ones, beyond which it is left out."""
+DISAGREES, COVERED, LEAST_COVERED, BLURRED = 3.0, 2.0, 0.1, 0.7
+"""Of a frame that is left out, relative to the median of the fitted ones: residual above; outliers above, and at least
+this part of the face; contrast of the detail below."""
 
 
 def refine(
@@ -162,18 +163,17 @@ class Refinement(Generic[R]):
 
     def add(self, timestep: int) -> FrameFit:
         """Add a frame, or leave it out where it disagrees with what was known before."""
-        known = [self.fits[t].residual for t in self.fitted if t in self.fits]
-        usual = float(np.median(known)) if known else np.inf
-        limit = np.inf if timestep in self.fitted else DISAGREES * usual
+
+        def disagrees(fit: FrameFit) -> str:
+            return "" if timestep in self.fitted else _disagreement(fit, [self.fits[t] for t in self.fitted])
+
         try:
-            fit = self._absorber.absorb(self._information, self._geometry(timestep), limit)
+            fit = self._absorber.absorb(self._information, self._geometry(timestep), disagrees)
+            why = disagrees(fit)
         except ConvergenceError:
-            fit = FrameFit(np.inf, 1.0, 0.0)
-        if not np.isfinite(fit.residual):
-            self.left_out[timestep] = "lost the face"
-        elif fit.residual > limit:
-            times = fit.residual / usual
-            self.left_out[timestep] = f"differs {times:.1f} times as much from what was expected as the fitted frames"
+            fit, why = FrameFit(np.inf, 1.0, 0.0, 0.0), "lost the face"
+        if why:
+            self.left_out[timestep] = why
         self.fits[timestep] = fit
         return fit
 
@@ -186,7 +186,7 @@ class Refinement(Generic[R]):
     def keep(self, folder: Path, key: str) -> None:
         """Write the sums so far, to be found again by the same key."""
         pose = tuple(getattr(self._last, name) for name in POSE)
-        rows = tuple((t, f.residual, f.outliers, f.measured, self.left_out.get(t, "")) for t, f in self.fits.items())
+        rows = tuple((t, *astuple(fit), self.left_out.get(t, "")) for t, fit in self.fits.items())
         sums = tuple(getattr(self._information, f.name) for f in fields(self._information))
         checkpoint.save(folder, "refine", _Kept(sums, rows, pose), key)
 
@@ -259,6 +259,23 @@ class Refinement(Generic[R]):
         normals_estimate = NormalsEstimate(result.timesteps, np.stack(shown), report)
         refined = replace(result, reflectance=reflectance, normals=normals_estimate)
         return replace(refined, mesh=_mesh(refined)) if result.mesh is not None else refined
+
+
+def _disagreement(fit: FrameFit, fitted: Sequence[FrameFit]) -> str:
+    """Why a frame is left out, beside the fitted ones; empty where it isn't."""
+    if not fitted:
+        return ""
+    residual, outliers, detail = (
+        float(np.median([getattr(f, name) for f in fitted])) for name in ("residual", "outliers", "detail")
+    )
+    if fit.residual > DISAGREES * residual:
+        times = fit.residual / residual
+        return f"differs {times:.1f} times as much from what was expected as the fitted frames: its light?"
+    if fit.outliers > max(COVERED * outliers, LEAST_COVERED):
+        return f"{fit.outliers:.0%} of the face is not what was expected there: something before it?"
+    if fit.detail < BLURRED * detail:
+        return f"blurred: {fit.detail / detail:.0%} of the fitted frames' detail"
+    return ""
 
 
 def _fitted(result: Result) -> list[int]:

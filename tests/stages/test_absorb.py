@@ -225,3 +225,30 @@ def test_frames_per_texel_are_in_the_folder(scene, result, tmp_path):
     again = Reconstruction.load(tmp_path / "out")
     assert_array_equal(again.reflectance.frames, found.reflectance.frames)
     assert again.normals.report.details["refined"] == found.normals.report.details["refined"]
+
+
+def test_what_makes_a_frame_disagree():
+    from mifit.refinement import _disagreement
+    from mifit.stages.absorb.frame import FrameFit
+
+    fitted = [FrameFit(0.01, 0.06, 0.9, 0.8), FrameFit(0.012, 0.05, 0.9, 0.9)]
+    usual = FrameFit(0.015, 0.08, 0.9, 0.8)
+    assert _disagreement(usual, fitted) == "" == _disagreement(usual, [])
+    for change, word in (({"residual": 0.04}, "light"), ({"outliers": 0.2}, "before it"), ({"detail": 0.4}, "blurred")):
+        assert word in _disagreement(replace(usual, **change), fitted)
+
+
+def test_detail_falls_with_blur(scene):
+    from scipy.ndimage import gaussian_filter
+
+    from mifit.stages.absorb.frame import Absorber
+    from mifit.stages.observations import Surface
+
+    texture = np.random.default_rng(3).uniform(0.2, 0.6, scene.reflectance.diffuse.shape).astype(np.float32)
+    surface = Surface(scene, scene.model, scene.geometry.at((0,)), CAMERAS, len(texture), whole=True)
+    count = len(surface)
+    absorber = Absorber(scene, scene.model, scene.reflectance, np.zeros((count, 2)), CAMERAS, surface)
+    sharp, blurred = (surface.texels.from_map(t) for t in (texture, gaussian_filter(texture, (1, 1, 0))))
+    rows, shown = np.arange(count), np.ones(count, bool)
+    assert absorber._detail(rows, blurred, shown) < 0.5 * absorber._detail(rows, sharp, shown)
+    assert absorber._detail(rows, sharp, np.zeros(count, bool)) == 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mifit.appearance.formation import Appearance, form_image
 from mifit.appearance.occlusion import MeshPoints
-from mifit.core.bend import unbend
+from mifit.core.bend import texel_neighbours, unbend
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
 from mifit.core.mesh import normalize
 from mifit.stages.absorb.information import Information
@@ -38,11 +38,14 @@ class FrameFit:
         Part of the observations beyond three deviations, against those of a normal distribution 0.003.
     measured : float
         Part of the face's texels that the frame measures.
+    detail : float
+        Contrast of the observed detail, texel against texel, relative to that of the whole face: falls with blur.
     """
 
     residual: float
     outliers: float
     measured: float
+    detail: float
 
 
 class Absorber:
@@ -80,10 +83,16 @@ class Absorber:
         self.reflectance, self.offsets = reflectance, offsets
         self.texels, self.facial = surface.texels, surface.facial
         self.carried = CarriedTangents(model, self.texels)
+        self._near = texel_neighbours(self.texels)
         self.diffuse, self.specular = (self.texels.from_map(m) for m in (reflectance.diffuse, reflectance.specular))
 
-    def absorb(self, information: Information, geometry: GeometryEstimate, limit: float = np.inf) -> FrameFit:
-        """Add the frame of a geometry's one timestep to the sums, in place, unless its residual is above a limit."""
+    def absorb(
+        self,
+        information: Information,
+        geometry: GeometryEstimate,
+        disagrees: Callable[[FrameFit], object] = lambda fit: False,
+    ) -> FrameFit:
+        """Add the frame of a geometry's one timestep to the sums, in place, unless it disagrees."""
         size = self.texels.size
         surface = Surface(self._capture, self._model, geometry, self._cameras, size, whole=True, texels=self.texels)
         every = surface.observe(np.arange(len(self.texels.index)))
@@ -110,8 +119,10 @@ class Absorber:
         shown = (seen.measured > 0) & facial[:, None]
         far = np.abs(residual[shown]) > 3.0 * max(sigma, 1e-6)
         measured = float(shown.any(1).sum() / self.facial.sum())
-        fit = FrameFit(sigma, float(far.mean()) if far.size else 0.0, measured)
-        if not sigma <= limit:
+        observed = np.stack([target for target, *_ in images], axis=1)
+        detail = min(self._detail(rows, observed[:, j], shown[:, j]) for j in range(len(images)))
+        fit = FrameFit(sigma, float(far.mean()) if far.size else 0.0, measured, detail)
+        if disagrees(fit):
             return fit
         cosine = np.einsum("njk,njk->nj", seen.image_normal, seen.view)
         cosine = np.where(seen.measured > 0, np.clip(cosine, 0.0, 1.0) * seen.right, 0.0)
@@ -121,6 +132,16 @@ class Absorber:
             information.add(rows, target + shift, robust[:, j], d, s, slope, cosine[:, j])
         information.frames[rows] += (seen.measured > 0).any(1)
         return fit
+
+    def _detail(self, rows: NDArray, observed: NDArray, shown: NDArray) -> float:
+        """Deviation of one image's texels (n, 3) from their neighbours' mean, relative to that from the face's mean."""
+        values, known = np.zeros(len(self.texels.index)), np.zeros(len(self.texels.index), dtype=bool)
+        values[rows], known[rows] = observed.mean(-1), shown
+        inside = known & known[self._near].all(axis=1)
+        if not inside.any():
+            return 0.0
+        fine = (values[self._near].mean(axis=1) - values)[inside]
+        return float(np.sqrt(np.mean(fine**2)) / max(float(values[inside].std()), 1e-12))
 
 
 def carried_offsets(
