@@ -101,7 +101,7 @@ def _csv(path: Path, size: Size) -> list[Photo]:
             "internal and external camera parameters"
         )
     photos = []
-    for i, row in enumerate(csv.reader(lines[first + 1 :]), start=first + 2):
+    for i, row in enumerate(_rows(lines[first + 1 :], path), start=first + 2):
         if not row or row[0].startswith("#"):
             continue
         where = f"{path}: line {i}"
@@ -142,3 +142,11 @@ def _photo(
     )
     intrinsics = fx, fx * aspect, 0.5 * width + centre[0] * longer, 0.5 * height + centre[1] * longer
     return Photo(name, View(view_name(name), width, height, intrinsics, distortion, pose))
+
+
+def _rows(lines: list[str], path: Path) -> list[list[str]]:
+    """The lines' fields; InputError where Python's reader gives up (Python 3.10 at a NUL)."""
+    try:
+        return list(csv.reader(lines))
+    except csv.Error as error:
+        raise InputError(f"{path}: not a readable table ({error})") from None

@@ -6,6 +6,7 @@ import copy
 import json
 import os
 import pickle
+import re
 import shutil
 import struct
 import zipfile
@@ -23,6 +24,7 @@ from mifit.capture.colmap import write_colmap
 from mifit.capture.stereo import write_stereo
 from mifit.core.image import encode_png, write_image
 from mifit.morphable import MorphableModel
+from tests.capture import photogrammetry as exports
 from tests.morphable import layouts
 from tests.output.conftest import ball_camera, ball_result
 
@@ -129,8 +131,8 @@ def make_base(folder: Path) -> Path:
 def all_cases(base: Path) -> Iterator[Case]:
     """Every case; the order is the same in every run."""
     for group in (
-        places, numbers, words, transforms, documents, images, landmarks, calibrations, colmap, videos, models,
-        results, result_files, experiments, names, links,
+        places, numbers, words, transforms, documents, images, landmarks, calibrations, colmap, photogrammetry,
+        videos, models, results, result_files, experiments, names, links,
     ):  # fmt: skip
         yield from group(base)
 
@@ -601,6 +603,66 @@ def colmap(base: Path) -> Iterator[Case]:
                     ("colmap",),
                     lambda work, t=text: (work / "colmap" / "images.txt").write_text(t) and None,
                 )
+
+
+def photogrammetry(base: Path) -> Iterator[Case]:
+    """What Metashape, RealityCapture, COLMAP (binary) and NeRSemble write: cut short, its numbers and names replaced."""
+    cameras = [ball_camera(name, angle, SIZE) for name, angle in (("left", -15.0), ("right", 15.0))]
+    photos = [(camera, f"{camera.name}.png") for camera in cameras]
+    folder = base / "programs"
+    (folder / "photos").mkdir(parents=True)
+    images = folder / "074" / "sequences" / "EMO-1" / "images"
+    for name in ("left", "right"):
+        shutil.copy(base / "pictures" / name / "0000.png", folder / "photos" / f"{name}.png")
+        shutil.copytree(base / "pictures" / name, images / f"cam_{name}")
+    exports.write_metashape(folder / "cameras.xml", photos)
+    exports.write_csv(folder / "cameras.csv", photos)
+    exports.write_xmp(folder / "photos", photos)
+    exports.write_colmap_binary(folder / "model", photos)
+    (folder / "074" / "calibration").mkdir()
+    parameters = exports.nersemble_parameters(cameras, 1.0)
+    (folder / "074" / "calibration" / "camera_params.json").write_text(json.dumps(parameters))
+    pictures = ("--images", "programs/photos")
+    kinds = {
+        "cameras.xml": ("--metashape", "programs/cameras.xml", *pictures),
+        "cameras.csv": ("--realitycapture", "programs/cameras.csv", *pictures),
+        "photos/left.xmp": ("--realitycapture", "programs/photos", *pictures),
+        "model/cameras.bin": ("--colmap", "programs/model", *pictures),
+        "model/images.bin": ("--colmap", "programs/model", *pictures),
+        "074/calibration/camera_params.json": ("--nersemble", "programs/074/sequences/EMO-1"),
+    }
+    rng = np.random.default_rng(3)
+
+    def case(file: str, name: str, data: bytes) -> Case:
+        def prepare(work: Path) -> None:
+            (work / "programs" / file).write_bytes(data)
+
+        return Case(
+            f"photogrammetry:{file} {name}", ("import", *kinds[file], "--out", "out"), ("programs",), prepare, True
+        )
+
+    for file in kinds:
+        data = (folder / file).read_bytes()
+        yield case(file, "as it is", data)
+        for part in (0.0, 0.1, 0.5, 0.9):
+            yield case(file, f"cut at {part}", data[: int(part * len(data))])
+        if file.endswith(".bin"):
+            for i in range(40):
+                place = int(rng.integers(0, len(data) - 8))
+                yield case(file, f"byte {place}", data[:place] + b"\xff" * (1 + i % 8) + data[place + 1 + i % 8 :])
+            yield case(file, "counts", struct.pack("<Q", 2**62) + data[8:])
+            continue
+        found = [match.span() for match in re.finditer(rb"-?\d+(?:\.\d+)?(?:e-?\d+)?", data)]
+        for k in range(0, len(found), max(1, len(found) // 12)):
+            start, stop = found[k]
+            for value in (b"nan", b"1e999", b"-1", b"9" * 5000, b"x"):
+                yield case(file, f"number {k} {value[:6].decode()}", data[:start] + value + data[stop:])
+        for name in (b"../../../../evil", b"/etc/passwd", b"a/../../b", b"\xff\xfe", b"<!DOCTYPE a>", b"%s%n"):
+            yield case(file, f"name {name!r}", data.replace(b"left", name))
+        bomb = b'<?xml version="1.0"?><!DOCTYPE d [<!ENTITY a "ha"><!ENTITY b "' + b"&a;" * 999 + b'">]><d>&b;</d>'
+        yield case(file, "entities", bomb)
+        yield case(file, "deep", b"<a>" * 50_000 if not file.endswith(".json") else b"[" * 50_000)
+        yield case(file, "long line", b"1," * 500_000)
 
 
 def videos(base: Path) -> Iterator[Case]:
