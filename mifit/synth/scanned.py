@@ -96,8 +96,12 @@ class ScannedHead:
         vertices = np.asarray(mesh.vertices, dtype=np.float64) * unit_mm / 10.0
         middle = 0.5 * (vertices[:, 0].min() + vertices[:, 0].max())
         near = np.abs(vertices[:, 0] - middle) < 0.2 * np.ptp(vertices[:, 0])
+        sizes = np.ptp(vertices, axis=0)
+        if not near.any() or not sizes.min() > 0.05 * sizes.max():
+            found = " x ".join(f"{size:.3g}" for size in sizes)
+            raise InputError(f"{path}: found a mesh of {found} cm, flat or without a middle, expected a head")
         nose = vertices[near][np.argmax(vertices[near, 2])]
-        height = np.ptp(vertices[:, 1])
+        height = sizes[1]
         if not 10 < height < 100:
             raise InputError(
                 f"{path}: the head is {height:.3g} cm high at {unit_mm:g} mm per unit, expected 10 to 100; set the unit"

@@ -298,3 +298,13 @@ def test_npy_that_claims_more_than_it_has(tmp_path: Path) -> None:
     buffer = io.BytesIO(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode() + bytes(64))
     (tmp_path / "l.npy").write_bytes(buffer.getvalue())
     refused(read_landmarks, tmp_path / "l.npy", match="header claims shape")
+
+
+@pytest.mark.parametrize("corners", ["0 0 0, 1 0 0, 0 1 0, 1 1 0", "0 0 0, 0 0 0, 0 0 0, 0 0 0"], ids=["flat", "point"])
+def test_flat_meshes_are_no_heads(tmp_path: Path, capsys, corners: str) -> None:
+    lines = [f"v {corner.strip()}" for corner in corners.split(",")]
+    (tmp_path / "h.obj").write_text("\n".join([*lines, "vt 0 0", "vt 1 0", "vt 0 1", "f 1/1 2/2 3/3", "f 2/2 4/1 3/3"]))
+    write_image(tmp_path / "a.png", np.full((8, 8, 3), 0.5))
+    head = ("--head", str(tmp_path / "h.obj"), "--maps", f"albedo={tmp_path / 'a.png'}")
+    assert main(["synth", "--out", str(tmp_path / "out"), *head, "--quiet"]) == 2
+    assert "flat or without a middle, expected a head" in capsys.readouterr().err and not (tmp_path / "out").exists()
