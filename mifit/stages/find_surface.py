@@ -19,7 +19,7 @@ from mifit.progress import Progress, silent
 from mifit.render.gbuffer import SurfaceScene
 from mifit.solve import Outcome
 from mifit.stages.geometry.points import corner_matrix
-from mifit.stages.surface.displace import Plate, solve_displacement
+from mifit.stages.surface.displace import USUAL, Plate, solve_displacement
 from mifit.stages.surface.epipolar import epipolar_residual
 from mifit.stages.surface.model_fit import FoundSurface, fit_model, landmarks_are_biased
 from mifit.stages.surface.sweep import sweep
@@ -47,8 +47,8 @@ CONTACT_MM = 1.5
 SETTLED = 0.25
 """Part of the last sweep's step below which the surface counts as settled."""
 THIN = 2
-START, STIFFEST = 20.0, 5000.0
-"""Stiffness at the start, and the largest."""
+STIFFEST = 5000.0
+"""Largest stiffness."""
 FITTED = ("identity", "expression", "rotation", "translation", "vertices")
 """What the fit of the model to the found surface renews."""
 OFF_PIXELS = 1.0
@@ -174,7 +174,7 @@ class _Search:
         plate = Plate.of(neutral, model.faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm)
         world = geometry.vertices.astype(np.float64)
         scene = SurfaceScene(world[0], model.faces)
-        displacement, stiffness, surfaces, matched = np.zeros_like(neutral), START, [], 0.0
+        displacement, stiffness, surfaces, matched = np.zeros_like(neutral), USUAL, [], 0.0
         moved, step = 0.0, 0.0
         for level, half in levels:
             pixel = self._resolution.pixel * 2.0**level

@@ -20,8 +20,9 @@ from mifit.stages.geometry.normal import NormalEquations
 from mifit.stages.geometry.parameters import Frames, Layout, exponential
 from mifit.stages.geometry.points import PointBasis
 from mifit.stages.geometry.visibility import spread_points
-from mifit.stages.surface.displace import Plate, solve_displacement
+from mifit.stages.surface.displace import USUAL, Displaced, Plate, solve_displacement
 from mifit.stages.surface.model_fit import PlaneTerm, landmarks_are_biased
+from mifit.stages.surface.sweep import _without_glare
 from tests.morphable.intersections import intersections
 
 QUICK = GeometryConfig(rounds=1, surface_points=800, pixels=400, max_iterations=15)
@@ -171,7 +172,7 @@ def test_the_solution_is_the_minimum(model):
 def test_noise_stiffens_and_a_signal_softens():
     """The likely stiffness follows the size of what is measured."""
     rng = np.random.default_rng(1)
-    side = 24
+    side = 64
     grid = np.stack(np.meshgrid(*[np.arange(float(side))] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
     corner = (side * np.arange(side - 1)[:, None] + np.arange(side - 1)).ravel()
     faces = np.concatenate([corner[:, None] + (0, side, side + 1), corner[:, None] + (0, side + 1, 1)])
@@ -191,6 +192,22 @@ def test_noise_stiffens_and_a_signal_softens():
         found.append((stiffness, np.abs(solved.displacement[:, 2] - height * wave).mean()))
     (still, error_still), (moved, error_moved) = found
     assert still > 30 * moved and error_still < 0.05 and error_moved < 0.1
+
+
+def test_a_highlight_that_one_view_shows_counts_little_and_exposure_nothing():
+    rng = np.random.default_rng(5)
+    valid = np.ones(1000, bool)
+    difference = 0.4 + 0.01 * rng.normal(size=1000)
+    difference[:50] += 0.6
+    weight = _without_glare(difference, valid)
+    assert weight[:50].max() < 0.05 and weight[50:].min() > 0.5 and np.median(weight) > 0.9
+
+
+def test_next_to_no_measurements_leave_the_usual_stiffness():
+    few = Displaced(np.zeros((3, 3)), measured=0.0, energy=0.0)
+    many = Displaced(np.zeros((3, 3)), measured=1000.0, energy=10.0)
+    assert few.likely_stiffness(1.0, 1e6) == pytest.approx(USUAL)
+    assert many.likely_stiffness(1.0, 1e6) == pytest.approx(100.0, rel=0.06)
 
 
 def test_the_jacobian_of_the_planes_is_that_of_finite_differences(model):

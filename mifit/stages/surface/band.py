@@ -28,8 +28,8 @@ class FeatureImage:
         Of the full image.
     factor : float
         Pixels of the level per pixel of the image, at most 1.
-    values : (h, w, 2) float32
-        Feature, and 1 where it is measured.
+    values : (h, w, 3) float32
+        Feature, 1 where it is measured, and the logarithm between features and shading: how bright it is there.
     """
 
     camera: Camera
@@ -37,7 +37,7 @@ class FeatureImage:
     values: NDArray[np.float32]
 
     def sample(self, points: NDArray) -> NDArray[np.float32]:
-        """(N, 2) feature and validity at world points (N, 3); 0 outside the image."""
+        """(N, 3) feature, validity and brightness at world points (N, 3); 0 outside the image."""
         pixels = self.camera.project(points) * self.factor - 0.5
         pixels = np.nan_to_num(pixels, nan=-10.0).astype(np.float32)
         return _remap(self.values, pixels)
@@ -60,7 +60,7 @@ def feature_image(camera: Camera, image: NDArray, valid: NDArray[np.bool_], fact
         cv2.GaussianBlur(log, (0, 0), s) / np.maximum(cv2.GaussianBlur(usable, (0, 0), s), 1e-3) for s in (WINDOW, 0.6)
     )
     band = LARGEST * np.tanh((fine - wide) / LARGEST)
-    return FeatureImage(camera, factor, np.stack([band * usable, usable], axis=-1).astype(np.float32))
+    return FeatureImage(camera, factor, np.stack([band * usable, usable, wide * usable], axis=-1).astype(np.float32))
 
 
 def _remap(values: NDArray, pixels: NDArray, columns: int = 4096) -> NDArray[np.float32]:

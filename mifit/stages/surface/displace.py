@@ -26,6 +26,8 @@ from mifit.core.mesh_update import cotangent_laplacian
 
 CONTACT_WEIGHT = 30.0
 """Of vertices that nearly touch, times the squared distance at which they do."""
+USUAL, KNOWN = 8.0, 4.0
+"""Stiffness of the displacements that heads beyond a model's span ask for, and degrees of freedom that it counts as."""
 PROBES = 16
 """Random vectors that estimate a trace."""
 OPPOSED = -0.2
@@ -107,8 +109,10 @@ class Displaced:
         """Stiffness under which the displacement is as large as one expects, within bounds (MacKay 1992, eq. 4.8).
 
         A head that the model spans needs no displacement: what little is found then is noise, and is held down.
+        ``USUAL`` counts as ``KNOWN`` further degrees of freedom (a gamma prior), so that a coarse sweep that measures
+        next to nothing doesn't hold down all that come after it.
         """
-        return float(np.clip(self.measured / max(self.energy, 1e-30), low, high))
+        return float(np.clip((self.measured + KNOWN) / max(self.energy + KNOWN / USUAL, 1e-30), low, high))
 
 
 def solve_displacement(

@@ -27,6 +27,10 @@ UNIQUE = 0.2
 """Correlation by which an offset must be ahead of all that aren't its neighbours to count fully."""
 POWER, INDEPENDENT = 1.5, 0.11
 """Precision is INDEPENDENT * sharpness ** POWER: as the errors of offsets on rendered heads are."""
+GLARE = 0.1
+"""Least difference in log brightness between two views at which a match counts a quarter."""
+GLARE_DEVIATIONS = 3.5
+"""The same in units of the differences' deviation over the face, where that is more."""
 LEAST_SCORE = 0.4
 """Correlation below which a texel counts as not matched."""
 
@@ -93,12 +97,13 @@ def sweep(texels: TexelMap, steps: Sequence[Posed], offsets: NDArray, window: in
         at = {}
         for i in {i for pair in pairs for i in pair}:
             way = step.normal if step.shift is None else step.shift[i]
-            at[i] = np.stack([step.images[i].sample(step.position + offset * way) for offset in offsets])  # (K, N, 2)
+            at[i] = np.stack([step.images[i].sample(step.position + offset * way) for offset in offsets])  # (K, N, 3)
         for a, b in pairs:
             trust = np.sqrt(step.seen[a] * step.seen[b])
             if not (trust > 0).any():
                 continue
             valid = (at[a][..., 1] > 0.99).all(0) & (at[b][..., 1] > 0.99).all(0) & (trust > 0)
+            trust = trust * _without_glare(at[a][layers // 2, :, 2] - at[b][layers // 2, :, 2], valid)
             mask = texels.to_map(valid.astype(np.float32))
             inside = cv2.blur(mask, (window, window))
             enough = texels.from_map(inside) > 0.5
@@ -110,6 +115,19 @@ def sweep(texels: TexelMap, steps: Sequence[Posed], offsets: NDArray, window: in
             weight += use
     score = total / np.maximum(weight, 1e-6)
     return _peak(score, weight, offsets)
+
+
+def _without_glare(difference: NDArray, valid: NDArray) -> NDArray[np.float32]:
+    """How far texels look as bright in one view as in the other, 0..1, from differences of log brightness.
+
+    What is painted on skin does; a highlight lies elsewhere on it in every view, and matches itself at the depth of
+    what it mirrors.
+    """
+    if not valid.any():
+        return np.ones(len(difference), np.float32)
+    difference = difference - np.median(difference[valid])
+    spread = 1.4826 * float(np.median(np.abs(difference[valid])))
+    return (1.0 / (1.0 + (difference / max(GLARE, GLARE_DEVIATIONS * spread)) ** 2) ** 2).astype(np.float32)
 
 
 def _correlate(
