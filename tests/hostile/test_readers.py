@@ -8,6 +8,7 @@ import os
 import pickle
 import struct
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -308,3 +309,11 @@ def test_flat_meshes_are_no_heads(tmp_path: Path, capsys, corners: str) -> None:
     head = ("--head", str(tmp_path / "h.obj"), "--maps", f"albedo={tmp_path / 'a.png'}")
     assert main(["synth", "--out", str(tmp_path / "out"), *head, "--quiet"]) == 2
     assert "flat or without a middle, expected a head" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_a_flat_model_is_no_face(tmp_path: Path) -> None:
+    model = MorphableModel.load("builtin:coarse")
+    flat = replace(model, mean=model.mean * np.float32([1.0, 1.0, 0.001]), fingerprint="")
+    flat.save(tmp_path / "flat.npz")
+    with pytest.raises(InputError, match="in a plane; expected a face"):
+        MorphableModel.load(tmp_path / "flat.npz")
