@@ -154,24 +154,27 @@ def segment(surface: Surface, capture: Capture, model: MorphableModel, seed: int
         `Label` values, in the order of the surface's images.
     """
     agreed = consensus(surface, seed)
-    return tuple(_segment_image(view, agreed, capture, model) for view in surface.views())
+    gain = surface.geometry.gain
+    return tuple(_segment_image(view, agreed, capture, model, gain(view.camera.name)) for view in surface.views())
 
 
-def _segment_image(view: Seen, agreed: Consensus, capture: Capture, model: MorphableModel) -> NDArray[np.uint8]:
+def _segment_image(
+    view: Seen, agreed: Consensus, capture: Capture, model: MorphableModel, gain: NDArray
+) -> NDArray[np.uint8]:
     frame = capture.frame(view.camera.name, view.timestep)
+    number = np.isfinite(frame.image).all(axis=-1)
+    image = np.where(number[..., None], frame.image / gain, 0.0).astype(np.float32)  # as the consensus was formed
     hit = view.face >= 0
     labels = np.where(hit, np.uint8(Label.SKIN), np.uint8(Label.BACKGROUND))
     facial = hit & model.face_mask[np.maximum(view.face, 0)]
     marks = view.camera.project(view.vertices[model.landmarks])
     eyes, mouth = _polygons(hit.shape, marks, EYES), _polygons(hit.shape, marks, (INNER_LIPS,))
     if facial.any() and not frame.masked:
-        usable = facial & frame.valid & ~eyes & ~mouth
+        usable = facial & frame.valid & number & ~eyes & ~mouth
         rows, columns = _box(facial)
         step = -(-max(rows.stop - rows.start, columns.stop - columns.start) // LONGEST)
         grid = slice(rows.start, rows.stop, step), slice(columns.start, columns.stop, step)
-        objects = _objects(
-            view, frame.image[rows, columns], usable, grid, agreed, model, facial, _plain(hit.shape, marks)
-        )
+        objects = _objects(view, image[rows, columns], usable, grid, agreed, model, facial, _plain(hit.shape, marks))
         found = np.zeros(hit.shape, bool)
         shape = columns.stop - columns.start, rows.stop - rows.start
         found[rows, columns] = cv2.resize(objects.astype(np.uint8), shape, interpolation=cv2.INTER_NEAREST) > 0
