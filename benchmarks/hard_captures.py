@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from mifit import MorphableModel
 from mifit.capture.landmark_files import Landmarks, read_landmarks, write_landmarks
 from mifit.core.image import read_image, write_image
-from mifit.synth import compose
+from mifit.synth import compose, head
 from mifit.synth.skin import SkinMaps, SkinStyle
 from mifit.synth.studio import studio_environment
 
@@ -41,7 +41,7 @@ def traced(
 
     def make(base: Path, out: Path) -> None:
         model = MorphableModel.load(MODEL)
-        subject = compose._draw_subject(model, SkinStyle.draw(SEED), TIMESTEPS, 512)
+        subject = compose._draw_subject(model, SkinStyle.draw(SEED), TIMESTEPS, 512, "poses", head.OUTSIDE)
         rotation = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
         subject = dataclasses.replace(
             subject,
