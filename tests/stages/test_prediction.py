@@ -76,3 +76,10 @@ def test_the_error_tells_the_lobe_and_that_there_is_one(scene):
     sharper = predict(seen, problem(EXPONENT * 4), 0.05).error
     assert abs(sharper / right.error - 1.0) < 0.05  # four bands of light don't tell it from a sharper one
     assert predict(seen, problem(glossy=False), 0.0).error > 1.5 * right.error
+
+
+def test_a_camera_that_sees_nothing_predicts_nothing(scene):
+    seen, problem = scene
+    still = replace(seen, step=np.zeros_like(seen.step))  # cameras are left out in turn
+    blind = replace(problem(), weight=np.where((seen.camera == 1)[:, None], np.float32(0.0), problem().weight))
+    assert predict(still, blind, 0.05) is None

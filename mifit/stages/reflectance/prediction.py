@@ -22,6 +22,8 @@ from mifit.stages.reflectance.lighting import (
 
 ENOUGH = 3
 """Timesteps from which they are left out in turn: what remains shows the head in several poses. Below it is cameras."""
+LEAST = 50
+"""Texels that the other images must show at the least: lighting has some hundred unknowns."""
 ITERATIONS = 8
 """Gauss-Newton iterations without the images left out. They start anew: a few from the solution with all images still
 knew what was left out, and made sheen look good that no other view had."""
@@ -73,8 +75,10 @@ def predict(seen: Observations, problem: LightingProblem, specular: float, robus
     errors = []
     for out in groups:
         rest = replace(problem, weight=np.where(out[:, None], np.float32(0.0), problem.weight))
-        solved = solve_lighting(rest, specular=specular, robust=robust, iterations=ITERATIONS)
         known = np.any((rest.weight > 0).any(axis=2) & ~rest.clipped, axis=1)
+        if known.sum() < LEAST:
+            continue  # a camera that sees next to nothing can't predict the others
+        solved = solve_lighting(rest, specular=specular, robust=robust, iterations=ITERATIONS)
         judged = replace(
             problem,
             colour=problem.colour[:, out],
