@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 
@@ -158,3 +161,14 @@ def test_a_view_past_everything_is_empty() -> None:
     dr.backward(dr.mean(image, axis=None))
     assert not np.array(image)[..., :3].any()
     assert not np.array(dr.grad(params[key])).any()
+
+
+def test_a_scene_that_is_gone_leaves_nothing() -> None:
+    """An integrator that held its scene, which holds it, would stay for ever, with all that it keeps."""
+    scene = textured()
+    image_of(scene)
+    kept = weakref.ref(scene.integrator()._hits)
+    assert kept() is not None
+    del scene
+    gc.collect()
+    assert kept() is None

@@ -41,6 +41,10 @@ def make() -> type:
         parameters = mi.traverse(mesh)
         return [parameters[key] for key in MESH_BUFFERS if key in parameters]
 
+    def number_of(pointer: Any) -> int:
+        """The number by which kernels know a shape or a sensor."""
+        return int(np.array(dr.reinterpret_array(mi.UInt32, pointer))[0])
+
     class FirstHits:
         """What primary rays meet, kept for as long as neither they nor the meshes move.
 
@@ -63,8 +67,8 @@ def make() -> type:
             with dr.suspend_grad():
                 still = mi.Ray3f(dr.detach(ray))
                 buffers = [value for shape in shapes for value in buffers_of(shape)]
-                moved = (id(scene), *(buffer.index for buffer in buffers))
-                name = int(np.array(dr.reinterpret_array(mi.UInt32, mi.SensorPtr(self.sensor)))[0]), dr.width(still.d)
+                moved = (*(number_of(mi.ShapePtr(shape)) for shape in shapes), *(buffer.index for buffer in buffers))
+                name = number_of(mi.SensorPtr(self.sensor)), dr.width(still.d)
                 kept = self.kept.get(name)
                 if kept is None or kept["moved"] != moved or not same(kept["ray"], still):
                     hits = scene.ray_intersect_preliminary(still, coherent=True)
@@ -74,8 +78,8 @@ def make() -> type:
                         kept["hits"] = dr.gather(type(hits), hits, index)
                         kept["si"] = kept["hits"].compute_surface_interaction(dr.gather(mi.Ray3f, still, index))
                     dr.eval(kept)
-                    # While scene and buffers are kept, no other one can have their name.
-                    kept["alive"] = scene, buffers
+                    # While a buffer is kept, no other one can have its index. The scene is not kept: it holds us.
+                    kept["buffers"] = buffers
                     self.kept.pop(name, None)
                     self.kept[name] = kept
                     while sum(RAY_BYTES * rays for _, rays in self.kept) > KEPT_BYTES and len(self.kept) > 1:
