@@ -244,7 +244,7 @@ class Refinement(Generic[R]):
         for timestep in result.timesteps:
             normals = normalize(bend(*absorber.carried.frame(result.geometry.at((timestep,))), found.offsets))
             shown.append(texels.to_map((normals * facial).astype(np.float32)))
-        before = result.normals.report if result.normals is not None else Report("converged")
+        before = Report(found.outcome.value) if result.normals is None else result.normals.report
         details = {
             **before.details,
             "refined": {
@@ -255,7 +255,7 @@ class Refinement(Generic[R]):
             },
         }
         lines = tuple(f"timestep {t}: left out of the refinement, {why}" for t, why in self.left_out.items())
-        report = replace(before, warnings=(*before.warnings, *lines), details=details)
+        report = replace(before, outcome=found.outcome.value, warnings=(*before.warnings, *lines), details=details)
         normals_estimate = NormalsEstimate(result.timesteps, np.stack(shown), report)
         refined = replace(result, reflectance=reflectance, normals=normals_estimate)
         return replace(refined, mesh=_mesh(refined)) if result.mesh is not None else refined

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
 
+from mifit.solve import Outcome
 from mifit.stages.absorb.information import Information
 
 BEND = 0.10
@@ -42,7 +44,7 @@ def reduced(
 
 def solve_offsets(
     system: NDArray, right: NDArray, neighbours: NDArray, size: int, start: NDArray
-) -> NDArray[np.float64]:
+) -> tuple[NDArray[np.float64], Outcome]:
     """Offsets (N, 2) that minimise ``x A x - 2 b x`` with their own size and their differences held small.
 
     Parameters
@@ -54,32 +56,34 @@ def solve_offsets(
     size : int
         Texels along one side of the map: finer ones lie closer to each other.
     start : (N, 2)
+
+    Returns
+    -------
+    offsets, and how conjugate gradients ended.
     """
     pull, tie = 1.0 / BEND**2, (size / 512.0) ** 2 / ROUGH**2
     blocks = INDEPENDENT * system + pull * np.eye(2)
     own = np.arange(len(right))
     degree = (neighbours != own[:, None]).sum(1)[:, None]
+    inverse = np.linalg.inv(blocks + tie * degree[..., None] * np.eye(2))
 
-    def apply(x: NDArray) -> NDArray:
+    def apply(flat: NDArray) -> NDArray:
+        x = flat.reshape(-1, 2)
         out = np.einsum("nij,nj->ni", blocks, x)
         for k in range(4):
             out += tie * (x - x[neighbours[:, k]])
-        return out
+        return out.ravel()
 
-    inverse = np.linalg.inv(blocks + tie * degree[..., None] * np.eye(2))
-    x = start.astype(np.float64).copy()
-    b = INDEPENDENT * right
-    r = b - apply(x)
-    z = np.einsum("nij,nj->ni", inverse, r)
-    p, rz = z, float((r * z).sum())
-    goal = TOLERANCE**2 * float((b * np.einsum("nij,nj->ni", inverse, b)).sum())
-    for _ in range(ITERATIONS):
-        if rz <= goal:
-            break
-        q = apply(p)
-        alpha = rz / float((p * q).sum())
-        x, r = x + alpha * p, r - alpha * q
-        z = np.einsum("nij,nj->ni", inverse, r)
-        before, rz = rz, float((r * z).sum())
-        p = z + rz / before * p
-    return x
+    def precondition(flat: NDArray) -> NDArray:
+        return np.einsum("nij,nj->ni", inverse, flat.reshape(-1, 2)).ravel()
+
+    n = right.size
+    found, left = spl.cg(
+        spl.LinearOperator((n, n), apply, dtype=np.float64),
+        INDEPENDENT * right.ravel(),
+        start.astype(np.float64).ravel(),
+        rtol=TOLERANCE,
+        maxiter=ITERATIONS,
+        M=spl.LinearOperator((n, n), precondition, dtype=np.float64),
+    )
+    return found.reshape(-1, 2), Outcome.CONVERGED if left == 0 else Outcome.MAX_ITERATIONS

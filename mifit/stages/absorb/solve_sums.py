@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.uv import TexelMap
+from mifit.solve import Outcome
 from mifit.stages.absorb.information import Information
 from mifit.stages.absorb.normals import reduced, solve_offsets
 from mifit.stages.reflectance.lighting import specular_pull
@@ -32,11 +33,14 @@ class Solved:
         Corrections of the normals.
     sigma : float
         Standard deviation of the residuals, linear colour.
+    outcome : Outcome
+        Of the normals' last solve.
     """
 
     maps: NDArray[np.float32]
     offsets: NDArray[np.float64]
     sigma: float
+    outcome: Outcome
 
 
 def solve_sums(
@@ -72,13 +76,13 @@ def solve_sums(
     share = min(1.0, IMAGES / max(images, 1))
     counted = 3.0 * max(float(information.weight.sum()), 1e-12)
     face = take(information, rows)
-    noise = 0.0
+    noise, outcome = 0.0, Outcome.MAX_ITERATIONS
     for _ in range(ROUNDS):
         texel = maps.reshape(-1, 4)[texels.index].astype(np.float64)
         noise = float(information.residual(texel[:, :3], texel[:, 3], offsets).sum()) / counted
         system, right = reduced(face, texel[rows, :3], texel[rows, 3], max(noise, 1e-8))
         offsets = offsets.copy()
-        offsets[rows] = solve_offsets(system, right, neighbours, texels.size, offsets[rows])
+        offsets[rows], outcome = solve_offsets(system, right, neighbours, texels.size, offsets[rows])
         systems = TexelSystems(
             *(
                 (share * part).astype(np.float32)
@@ -93,7 +97,7 @@ def solve_sums(
         )
         pull = specular_pull(float(prior[..., 3].max()), float(np.sqrt(noise)))
         maps = solve_maps(systems, texels.index, prior, smoothness, maps, specular_pull=pull, splits=splits)
-    return Solved(maps, offsets, float(np.sqrt(noise)))
+    return Solved(maps, offsets, float(np.sqrt(noise)), outcome)
 
 
 def take(information: Information, rows: NDArray) -> Information:
