@@ -17,8 +17,6 @@ from mifit.core.mesh import face_cross
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 
-FLATTEST = 0.02
-"""Depth of a face's landmarks relative to their height, root mean squares; heads have 0.3 and more."""
 _LANDMARKS = 68
 MAPPED_SIZE = 512
 """Texels along the side of the map in which faces that share a place are looked for."""
@@ -374,11 +372,6 @@ class MorphableModel:
             The file is missing, damaged or of no known kind; the message says what was found.
         """
         model = _PROVIDED["load"](path, kind)
-        points = model.mean[model.landmarks].astype(np.float64)
-        extent = np.linalg.svd(points - points.mean(0), compute_uv=False) * model.unit_mm / len(points) ** 0.5
-        if extent[2] < FLATTEST * extent[0]:
-            found = " x ".join(f"{length:.3g}" for length in extent)
-            raise InputError(f"{model.name}: the landmarks spread by {found} mm, in a plane; expected a face")
         # Not a field: a model that is made from this one by `replace` is no longer the file's.
         named = isinstance(path, str) and path.partition(":")[0] == "builtin"
         model._set("_source", str(path) if named else str(Path(path).resolve()))

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import h5py
+import numpy as np
 
 from mifit.core.files import check_file
 from mifit.core.limits import MAX_MODEL_BYTES
@@ -40,6 +41,10 @@ KINDS: dict[str, Callable[[Path], MorphableModel]] = {
 """Every kind of model file and its loader; ``mifit model convert --kind`` takes these names."""
 
 
+FLATTEST = 0.02
+"""Depth of a face's landmarks relative to their height, root mean squares; heads have 0.3 and more."""
+
+
 @provides("load")
 def load_model(path: str | Path, kind: str | None = None) -> MorphableModel:
     """Load ``"builtin"``, ``"builtin:coarse"``, or a file or folder of a known kind.
@@ -63,9 +68,19 @@ def load_model(path: str | Path, kind: str | None = None) -> MorphableModel:
     if kind is not None and kind not in KINDS:
         raise InputError(f"kind '{kind}' is unknown, expected one of {', '.join(KINDS)}")
     try:
-        return KINDS[kind or recognise(path)](path)
+        model = KINDS[kind or recognise(path)](path)
     except OSError as error:
         raise InputError(f"{path}: cannot read: {error}") from None
+    _refuse_flat(model)
+    return model
+
+
+def _refuse_flat(model: MorphableModel) -> None:
+    points = model.mean[model.landmarks].astype(np.float64)
+    extent = np.linalg.svd(points - points.mean(0), compute_uv=False) * model.unit_mm / len(points) ** 0.5
+    if extent[2] < FLATTEST * extent[0]:
+        found = " x ".join(f"{length:.3g}" for length in extent)
+        raise InputError(f"{model.name}: the landmarks spread by {found} mm, in a plane; expected a face")
 
 
 def recognise(path: Path) -> str:

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from mifit.core.image import to_8_bit
 from mifit.core.labels import Label
-from mifit.core.mesh import normalize
+from mifit.core.mesh import interpolate, normalize
+from mifit.core.sh import basis
 from mifit.stages.trust import DARKEST
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ class Consensus:
     known : (S, S) float32
         1 where some image measures the texel.
     shading : (9, 3) float64
-        Of `_harmonics` of the world normal.
+        Of `core.sh.basis` of the world normal.
     deviation : (3,) float64
         Robust standard deviations of what an image shows.
     skin : (3,) float64
@@ -108,8 +109,8 @@ def consensus(surface: Surface, seed: int = 0) -> Consensus:
         texels.append(rows)
         levels.append(np.log(np.maximum(seen.colour, DARKEST)) @ OPPONENT.T.astype(np.float32))
         weights.append(seen.measured)
-        bases.append(_harmonics(seen.image_normal))
-    level, weight, basis = np.concatenate(levels), np.concatenate(weights), np.concatenate(bases)
+        bases.append(basis(seen.image_normal, 3).astype(np.float32))
+    level, weight, waves = np.concatenate(levels), np.concatenate(weights), np.concatenate(bases)
     seen_at = weight > 0
     shading = np.zeros((9, 3))
     share, deviation = np.ones_like(weight), FLOOR
@@ -117,14 +118,14 @@ def consensus(surface: Surface, seed: int = 0) -> Consensus:
     rng = np.random.default_rng(seed)
     places = np.argwhere(seen_at)
     for _ in range(ROUNDS if len(places) else 0):
-        flat = level - (basis @ shading).astype(np.float32)
+        flat = level - (waves @ shading).astype(np.float32)
         centre = np.stack([_median(flat[..., k], weight * share) for k in range(3)], axis=-1)
         departure = flat - centre[:, None]
         deviation = np.maximum(1.4826 * np.median(np.abs(departure[seen_at].astype(np.float64)), axis=0), FLOOR)
         share = (1.0 / (1.0 + ((departure / deviation) ** 2).mean(axis=-1))).astype(np.float32)
         i, j = places[rng.choice(len(places), min(SAMPLES, len(places)), replace=False)].T
         scale = (share[i, j] * np.sqrt(weight[i, j]))[:, None]
-        rows = basis[i, j] * scale
+        rows = waves[i, j] * scale
         damping = SMOOTH * float(scale.sum()) * np.eye(9)
         shading = np.linalg.solve(rows.T @ rows + damping, rows.T @ ((level[i, j] - centre[i]) * scale))
         shading[0] = 0.0  # a constant belongs to the colours
@@ -162,7 +163,7 @@ def _segment_image(
     view: Seen, agreed: Consensus, capture: Capture, model: MorphableModel, gain: NDArray
 ) -> NDArray[np.uint8]:
     frame = capture.frame(view.camera.name, view.timestep)
-    number = np.isfinite(frame.image).all(axis=-1)
+    number = np.asarray(np.isfinite(frame.image).all(axis=-1))
     image = np.where(number[..., None], frame.image / gain, 0.0).astype(np.float32)  # as the consensus was formed
     hit = view.face >= 0
     labels = np.where(hit, np.uint8(Label.SKIN), np.uint8(Label.BACKGROUND))
@@ -204,11 +205,12 @@ def _objects(
         return np.zeros_like(usable)
     image = cv2.resize(image, usable.shape[::-1], interpolation=cv2.INTER_AREA)
     blur = max(BLUR * size, 0.7)
-    uv = np.einsum("hwk,hwkc->hwc", weights, model.uv[model.faces_uv[face]])
-    normal = normalize(np.einsum("hwk,hwkc->hwc", weights, view.normals[model.faces[face]]))
+    at, shape = (face.ravel(), weights.reshape(-1, 3)), face.shape
+    uv = interpolate(model.uv, model.faces_uv, *at).reshape(*shape, 2)
+    normal = normalize(interpolate(view.normals, model.faces, *at)).reshape(*shape, 3)
     known, colour = _look_up(agreed, uv)
     usable = usable & (known > 0.5)
-    predicted = colour + _harmonics(normal) @ agreed.shading
+    predicted = colour + basis(normal, 3) @ agreed.shading
     smooth = cv2.GaussianBlur(image, (0, 0), 0.5 * blur)
     level = np.log(np.maximum(smooth, DARKEST)) @ OPPONENT.T
     departure = np.sqrt((((level - predicted) / agreed.deviation) ** 2).mean(axis=-1))
@@ -340,13 +342,6 @@ def _polygons(shape: tuple[int, ...], marks: NDArray, parts: Sequence[slice]) ->
 def _box(area: NDArray[np.bool_]) -> tuple[slice, slice]:
     rows, columns = np.flatnonzero(area.any(axis=1)), np.flatnonzero(area.any(axis=0))
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-
-
-def _harmonics(normal: NDArray) -> NDArray[np.float32]:
-    """(..., 9) polynomials of a unit normal up to the second order, not normalised."""
-    x, y, z = (normal[..., k] for k in range(3))
-    parts = [np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1]
-    return np.stack(parts, axis=-1).astype(np.float32)
 
 
 def _median(values: NDArray, weights: NDArray) -> NDArray:

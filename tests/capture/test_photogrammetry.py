@@ -6,7 +6,6 @@ import dataclasses
 import json
 import shutil
 import struct
-import time
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +22,7 @@ from mifit.cli import main
 from mifit.core.camera import Camera
 from mifit.errors import InputError
 from tests.capture import photogrammetry as write
+from tests.refused import refused
 
 SIZE = (64, 48)
 LENSES = [(), (-0.21, 0.08, 0.001, -0.002), (-0.21, 0.08, 0.001, -0.002, 0.03)]
@@ -201,14 +201,6 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 
 # -- what is refused ------------------------------------------------------------------------------------------------
-
-
-def refused(read, *arguments, match: str) -> None:
-    start = time.process_time()
-    with pytest.raises(InputError, match=match) as caught:
-        read(*arguments)
-    assert time.process_time() - start < 2
-    assert "\n" not in str(caught.value)
 
 
 BOMB = '<!DOCTYPE a [<!ENTITY b "bb"><!ENTITY c "&b;&b;&b;&b;&b;&b;&b;&b;">]>'

@@ -23,17 +23,9 @@ from mifit.cli import main
 from mifit.core.image import load_image, write_image
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
+from tests.refused import refused
 
 SIZES = ((40, 30), (40, 30))
-
-
-def refused(read, *arguments, match: str) -> None:
-    """The reader raises InputError with the message, in one line, within two seconds of processor time."""
-    start = time.process_time()
-    with pytest.raises(InputError, match=match) as caught:
-        read(*arguments)
-    assert time.process_time() - start < 2
-    assert "\n" not in str(caught.value)
 
 
 # -- pickles --------------------------------------------------------------------------------------------------------
