@@ -84,7 +84,9 @@ def background(image: NDArray, hit: NDArray[np.bool_], kept: NDArray[np.bool_]) 
     there = smooth[row, column]
     alike = (np.abs(smooth - there) < ALIKE * there + 5.0 * DARKEST).all(axis=-1) & ~kept
     _, piece = cv2.connectedComponents((alike | off).astype(np.uint8))
-    return hit & alike & np.isin(piece, np.unique(piece[off]))
+    found = hit & alike & np.isin(piece, np.unique(piece[off]))
+    # Pixels along its outline mix both: they alone would colour all that nothing else shows.
+    return hit & ~kept & cv2.dilate(found.astype(np.uint8), np.ones((2 * BESIDE + 1,) * 2, np.uint8)).astype(bool)
 
 
 def elsewhere(cosine: NDArray, millimetres: NDArray) -> NDArray[np.float32]:

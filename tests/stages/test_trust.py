@@ -77,6 +77,9 @@ def test_background_over_a_head_that_is_too_wide_is_found_and_the_face_is_not() 
     inner[18:, 28:57] = True
     assert not (found & inner).any()
     assert found[truth].mean() > 0.8
+    edge = np.zeros_like(hit)
+    edge[13:15, 25:60] = True  # still background, but blurred into the head
+    assert found[edge & hit].all()
     dark = image.copy()
     dark[25:35, 35:45] = 0.02  # as dark as the background, but joined to nothing of it
     assert not background(dark, hit, face)[27:33, 37:43].any()
