@@ -23,7 +23,7 @@ demo:
 test:
 	@.ci/setup test cluster view bench
 	$(BIN)/ruff check .
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 quick:
 	@.ci/setup test

@@ -20,6 +20,7 @@ from mifit.config import GeometryConfig, ReflectanceConfig, from_mapping
 from mifit.core.bend import bend, texel_neighbours
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, Report
 from mifit.core.mesh import interpolate, normalize
+from mifit.core.rows import Rows
 from mifit.core.uv import TexelMap
 from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
@@ -240,10 +241,11 @@ class Refinement(Generic[R]):
             confidence=confidence,
             frames=texels.to_map(information.frames.astype(np.float32)),
         )
-        shown, facial = [], np.where(absorber.facial[:, None], 1.0, 0.0)
+        facial = np.where(absorber.facial[:, None], 1.0, 0.0)
+        shown = Rows(len(result.timesteps), diffuse.shape, np.float32)
         for timestep in result.timesteps:
             normals = normalize(bend(*absorber.carried.frame(result.geometry.at((timestep,))), found.offsets))
-            shown.append(texels.to_map((normals * facial).astype(np.float32)))
+            shown.add(texels.to_map((normals * facial).astype(np.float32)))
         before = Report(found.outcome.value) if result.normals is None else result.normals.report
         details = {
             **before.details,
@@ -256,7 +258,7 @@ class Refinement(Generic[R]):
         }
         lines = tuple(f"timestep {t}: left out of the refinement, {why}" for t, why in self.left_out.items())
         report = replace(before, outcome=found.outcome.value, warnings=(*before.warnings, *lines), details=details)
-        normals_estimate = NormalsEstimate(result.timesteps, np.stack(shown), report)
+        normals_estimate = NormalsEstimate(result.timesteps, shown.all, report)
         refined = replace(result, reflectance=reflectance, normals=normals_estimate)
         return replace(refined, mesh=_mesh(refined)) if result.mesh is not None else refined
 
@@ -314,17 +316,15 @@ def _solved(result: Result, absorber: Absorber, information: Information, images
 def _mesh(result: Result) -> Any:
     """The refined meshes anew, from new normals."""
     assert result.mesh is not None and result.normals is not None
-    refiner = mesh_refiner(result)
-    made = [
-        refiner.refine(result.geometry, t, n)[:2]
-        for t, n in zip(result.timesteps, result.normals.normal_object, strict=True)
-    ]
-    return replace(
-        result.mesh,
-        timesteps=result.timesteps,
-        vertices=np.stack([vertices for vertices, _ in made]),
-        displacement=np.stack([height for _, height in made]),
+    refiner, count = mesh_refiner(result), len(result.timesteps)
+    vertices, displacement = (
+        Rows(count, array.shape[1:], array.dtype) for array in (result.mesh.vertices, result.mesh.displacement)
     )
+    for timestep, normals in zip(result.timesteps, result.normals.normal_object, strict=True):
+        mesh, height, _ = refiner.refine(result.geometry, timestep, normals)
+        vertices.add(mesh)
+        displacement.add(height)
+    return replace(result.mesh, timesteps=result.timesteps, vertices=vertices.all, displacement=displacement.all)
 
 
 def _digest(result: Result) -> str:

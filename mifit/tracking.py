@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, from_mapping
 from mifit.core.estimate import NormalsEstimate, Report
+from mifit.core.rows import Rows
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
 from mifit.result.ownership import claim, locked
@@ -63,7 +65,8 @@ def track_into(
     -----
     The files of a frame are written before ``result.json`` names it, and ``result.json`` is replaced as a whole, so
     a run that is killed leaves a folder with the frames finished so far. Frames depend on those before alone:
-    going on later gives what an uninterrupted run gives.
+    going on later gives what an uninterrupted run gives. Meshes and normals of a long sequence lie in a file that is
+    mapped (`core.rows`), so that memory doesn't grow with the frames.
     """
     if result.reflectance is None:
         raise InputError(f"{folder}: found a result without reflectance, expected one of 'mifit fit' with all stages")
@@ -78,6 +81,7 @@ def track_into(
     claim(folder)
     refiner = None if result.mesh is None else mesh_refiner(result)
     with locked(folder):
+        result, room = _with_room(result, len(timesteps))
         for frame in track(
             capture.with_fitted(result.cameras),
             result.model,
@@ -92,7 +96,7 @@ def track_into(
             seed,
             progress,
         ):
-            result = extend(result, frame, refiner, digests[frame.timestep])
+            result = extend(result, frame, refiner, digests[frame.timestep], room)
             add_timestep(result, folder, frame.timestep)
     return result
 
@@ -121,18 +125,58 @@ def _not_yet(result: Result, timesteps: Sequence[int], digests: Mapping[int, str
     return [t for t in timesteps if t not in kept or (changed and t > min(changed))]
 
 
-def extend(result: R, frame: TrackedFrame, refiner: MeshRefiner | None = None, digest: str = "") -> R:
+@dataclass(frozen=True)
+class _Room:
+    """Where the large arrays of further timesteps are written; None for those of a mesh that a result lacks."""
+
+    vertices: Rows
+    normals: Rows
+    refined: Rows | None
+    displacement: Rows | None
+
+
+def _with_room(result: R, count: int) -> tuple[R, _Room]:
+    """A result whose large arrays lie where ``count`` further timesteps have room behind them."""
+
+    def moved(array: NDArray) -> tuple[Rows, NDArray]:
+        rows = Rows(len(array) + count, array.shape[1:], array.dtype)
+        return rows, rows.extend(array)
+
+    vertices, kept = moved(result.geometry.vertices)
+    result = replace(result, geometry=replace(result.geometry, vertices=kept))
+    refined = displacement = None
+    if result.normals is None:
+        assert result.reflectance is not None
+        normals = Rows(count, result.reflectance.diffuse.shape, np.float32)
+    else:
+        normals, kept = moved(result.normals.normal_object)
+        result = replace(result, normals=replace(result.normals, normal_object=kept))
+    if result.mesh is not None:
+        refined, meshes = moved(result.mesh.vertices)
+        displacement, kept = moved(result.mesh.displacement)
+        result = replace(result, mesh=replace(result.mesh, vertices=meshes, displacement=kept))
+    return result, _Room(vertices, normals, refined, displacement)
+
+
+def extend(
+    result: R, frame: TrackedFrame, refiner: MeshRefiner | None = None, digest: str = "", room: _Room | None = None
+) -> R:
     """A result with one more timestep; its normals' report lists it under ``tracked``, with the images' digest.
 
-    With a refiner its refined mesh is made too.
+    With a refiner its refined mesh is made too. With ``room``, in which the result's arrays lie, they aren't copied.
     """
+
+    def longer(array: NDArray, row: NDArray, rows: Rows | None) -> NDArray:
+        return np.concatenate([array, row[None]]) if rows is None else rows.add(row)
+
     a, b = result.geometry, frame.geometry
     geometry = replace(
         a,
         timesteps=(*a.timesteps, frame.timestep),
+        vertices=longer(a.vertices, b.vertices[0], room and room.vertices),
         **{
             name: np.concatenate([getattr(a, name), getattr(b, name)])
-            for name in ("expression", "rotation", "translation", "vertices")
+            for name in ("expression", "rotation", "translation")
         },
     )
     before = result.normals or NormalsEstimate((), frame.normal_object[None][:0], Report("converged"))
@@ -149,7 +193,7 @@ def extend(result: R, frame: TrackedFrame, refiner: MeshRefiner | None = None, d
     )
     normals = NormalsEstimate(
         (*before.timesteps, frame.timestep),
-        np.concatenate([before.normal_object, frame.normal_object[None]]),
+        longer(before.normal_object, frame.normal_object, room and room.normals),
         report,
     )
     mesh = result.mesh
@@ -158,8 +202,8 @@ def extend(result: R, frame: TrackedFrame, refiner: MeshRefiner | None = None, d
         mesh = replace(
             mesh,
             timesteps=(*mesh.timesteps, frame.timestep),
-            vertices=np.concatenate([mesh.vertices, vertices[None]]),
-            displacement=np.concatenate([mesh.displacement, height[None]]),
+            vertices=longer(mesh.vertices, vertices, room and room.refined),
+            displacement=longer(mesh.displacement, height, room and room.displacement),
         )
     return replace(result, geometry=geometry, normals=normals, mesh=mesh)
 
@@ -168,23 +212,33 @@ def _without(result: R, dropped: Sequence[int]) -> R:
     """A result less some of its tracked timesteps."""
     if not dropped or result.normals is None:
         return result
-    normals, report = result.normals, result.normals.report
-    rows = [i for i, t in enumerate(normals.timesteps) if t not in dropped]
-    mesh = result.mesh
+
+    def kept(array: NDArray, timesteps: Sequence[int]) -> NDArray:
+        rows = [i for i, t in enumerate(timesteps) if t not in dropped]
+        return Rows(len(rows), array.shape[1:], array.dtype).extend(array[i] for i in rows)
+
+    def left(timesteps: Sequence[int]) -> tuple[int, ...]:
+        return tuple(t for t in timesteps if t not in dropped)
+
+    geometry, normals, report, mesh = result.geometry, result.normals, result.normals.report, result.mesh
     if mesh is not None:
-        kept = [i for i, t in enumerate(mesh.timesteps) if t not in dropped]
         mesh = replace(
             mesh,
-            timesteps=tuple(mesh.timesteps[i] for i in kept),
-            vertices=mesh.vertices[kept],
-            displacement=mesh.displacement[kept],
+            timesteps=left(mesh.timesteps),
+            vertices=kept(mesh.vertices, mesh.timesteps),
+            displacement=kept(mesh.displacement, mesh.timesteps),
         )
     details = {**report.details, "tracked": [t for t in report.details["tracked"] if t not in dropped]}
+    parts = ("expression", "rotation", "translation", "vertices")
     return replace(
         result,
-        geometry=result.geometry.at([t for t in result.timesteps if t not in dropped]),
+        geometry=replace(
+            geometry,
+            timesteps=left(geometry.timesteps),
+            **{name: kept(getattr(geometry, name), geometry.timesteps) for name in parts},
+        ),
         normals=NormalsEstimate(
-            tuple(normals.timesteps[i] for i in rows), normals.normal_object[rows], replace(report, details=details)
+            left(normals.timesteps), kept(normals.normal_object, normals.timesteps), replace(report, details=details)
         ),
         mesh=mesh,
     )

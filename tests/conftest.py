@@ -10,6 +10,11 @@ import pytest
 
 from tests.variant import VARIANT
 
+LONGEST = (
+    "tests/test_experiment_page.py", "tests/test_foreign.py", "tests/test_resume.py", "tests/output/test_live_view.py",
+    "tests/test_experiment.py", "tests/capture/test_boards.py", "tests/hostile/test_promises.py", "tests/test_cli.py",
+)  # fmt: skip
+"""Files that take longest, in that order: with two processes they go first, or one would work on after the other."""
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
@@ -51,6 +56,13 @@ def variant(request: pytest.FixtureRequest) -> str:
 
         dr.set_thread_count(threads)
     return name
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Put the longest files first; the rest stays in order."""
+    rank = {config.rootpath / name: place for place, name in enumerate(LONGEST)}
+    assert all(path.is_file() for path in rank), "LONGEST names a file that is no longer there"
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
 
 
 def compile_for(cpu: str, width: int) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -136,8 +137,7 @@ def test_the_demo_leaves_the_users_capture_alone(variant, tmp_path, monkeypatch)
         (folder / "transforms.json").write_text("{}")
 
     monkeypatch.setattr("mifit.synth.synthesize", synthesize)
-    monkeypatch.setattr(commands.fits, "fit", lambda arguments: None)
-    monkeypatch.setattr(commands.fits, "evaluate", lambda arguments: None)
+    monkeypatch.setattr(commands.fits, "_fit_and_judge", lambda *arguments: None)
     arguments = SimpleNamespace(out=tmp_path / "out", quiet=True, debug=False, variant=VARIANT, seed=0)
     mine = tmp_path / "out" / "capture" / "images" / "mine.png"
     mine.parent.mkdir(parents=True)
@@ -153,3 +153,30 @@ def test_the_demo_leaves_the_users_capture_alone(variant, tmp_path, monkeypatch)
     with pytest.raises(InputError, match=r"found mine\.png"):
         commands.demo(arguments)
     assert (tmp_path / "again" / "capture" / "mine.png").read_text() == "mine"
+
+
+def test_the_demo_shows_a_picture_of_the_first_step_and_reports_once(variant, tmp_path, monkeypatch):
+    result, reports, events = ball_result(), [], []
+    early = dataclasses.replace(result, reflectance=None, normals=None, mesh=None)
+
+    def fit_into(folder, capture, model, watch, **options):
+        ownership.claim(folder)
+        watch(early)
+        events.append((folder / "first.png").read_bytes())
+        watch(result)
+        result.save(folder)
+        return result
+
+    frame = SimpleNamespace(image=np.full((64, 64, 3), 0.2, np.float32))
+    monkeypatch.setattr("mifit.Capture.load", lambda path: SimpleNamespace(frame=lambda camera, timestep: frame))
+    monkeypatch.setattr("mifit.MorphableModel.load", lambda name: result.model)
+    monkeypatch.setattr("mifit.fitting.fit_into", fit_into)
+    monkeypatch.setattr("mifit.output.report.write_report", lambda *arguments: reports.append(arguments))
+    monkeypatch.setattr(commands.fits, "judge", lambda arguments, judged, capture: events.append(judged))
+    arguments = SimpleNamespace(out=tmp_path / "out", quiet=True, seed=0)
+    commands.fits._fit_and_judge(arguments, tmp_path / "capture", lambda *step: None)
+    picture = cv2.imread(str(tmp_path / "out" / "first.png"))
+    assert (tmp_path / "out" / "first.png").read_bytes() == events[0]  # of the first step, and still there
+    assert picture.shape == (64, 128, 3) and np.ptp(picture[:, :64]) == 0 and np.ptp(picture[:, 64:]) > 20
+    assert events[1] is result and reports == []  # `judge` writes it
+    assert "first.png" in ownership.written(tmp_path / "out")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import shutil
 from argparse import Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mifit.commands.common import say, use_variant
-from mifit.commands.results import evaluate
+from mifit.commands.results import judge
 from mifit.config import PRESETS, FitConfig, NormalsConfig, from_mapping
 from mifit.console import console_progress
 from mifit.core.files import check_file
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mifit.reconstruction import Reconstruction
 
 
-DEMO = {"model": "builtin:coarse", "width": 340, "height": 240, "spp": 32, "timesteps": 3}
+DEMO: dict[str, Any] = {"model": "builtin:coarse", "width": 340, "height": 240, "spp": 32, "timesteps": 3}
 """Size of the capture that ``mifit demo`` makes: small enough for seconds, large enough to show a face."""
 
 
@@ -43,47 +43,63 @@ def demo(arguments: Namespace) -> None:
     say(arguments, "Rendering a capture: two cameras to fit, a third to judge by")
     made = out / MARK / "capture"
     shutil.rmtree(made, ignore_errors=True)  # of a demo that was killed
-    synthesize(made, seed=arguments.seed, progress=progress, **DEMO)  # type: ignore[arg-type]
+    synthesize(made, seed=arguments.seed, progress=progress, **DEMO)
     claim(made, force=True)
     remember(
         made, [p.relative_to(made).as_posix() for p in made.rglob("*") if p.is_file() and MARK not in p.parts[-2:]]
     )
     made.rename(capture)
-    common = {
-        "quiet": arguments.quiet,
-        "debug": arguments.debug,
-        "variant": arguments.variant,
-        "seed": arguments.seed,
-    }
-    fit(
-        Namespace(
-            **common,
-            capture=capture,
-            out=out,
-            config=None,
-            preset=None,
-            model=DEMO["model"],
-            cameras=["left", "right"],
-            timesteps=None,
-            until="normals",
-            resume=False,
-            force=True,
-            view=False,
-        )
-    )
-    evaluate(
-        Namespace(
-            **common,
-            result=out,
-            capture=capture,
-            camera="third",
-            timesteps=None,
-            region="model",
-            baseline=True,
-            json=out / "third.json",
-        )
-    )
+    _fit_and_judge(arguments, capture, progress)
     print(f"Report: {out / 'report.html'}")
+
+
+def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> None:
+    """Fit two cameras of the demo's capture, judge by the third; a picture of the first step comes at once."""
+    import mifit
+    from mifit.fitting import fit_into
+    from mifit.result.ownership import remember
+
+    out: Path = arguments.out
+    capture = mifit.Capture.load(folder)
+    cameras = ("left", "right")
+    first: list[Path] = []
+
+    def show(result: Reconstruction) -> None:
+        if not first:
+            first.append(_first_picture(out, result, capture))
+            say(arguments, f"First picture, of the model before light and skin are found: {first[0]}")
+
+    result = fit_into(
+        out,
+        capture,
+        mifit.MorphableModel.load(DEMO["model"]),
+        cameras=cameras,
+        seed=arguments.seed,
+        progress=progress,
+        force=True,
+        watch=show,
+    )
+    remember(out, [path.name for path in first])  # after the fit, which clears away what a result before it left
+    judged = {"camera": "third", "timesteps": None, "region": "model", "baseline": True, "json": out / "third.json"}
+    judge(Namespace(quiet=arguments.quiet, result=out, capture=folder, **judged), result, capture)
+
+
+def _first_picture(out: Path, result: Reconstruction, capture: Capture) -> Path:
+    """Write a photograph of the first camera beside the fit laid over it; returns the file."""
+    import numpy as np
+
+    from mifit.core.files import write_bytes
+    from mifit.core.image import encode_png, to_8_bit
+    from mifit.output.evaluate import as_photographed, rgba_8_bit
+    from mifit.output.figures import overlay
+
+    camera, timestep = result.cameras[0], result.timesteps[0]
+    photograph = to_8_bit(capture.frame(camera.name, timestep).image)
+    linear = result.render(camera, timestep, result.methods[-1])
+    laid_over = overlay(photograph, rgba_8_bit(as_photographed(result, linear, camera.name)))
+    path = out / "first.png"
+    write_bytes(path, encode_png(np.concatenate([photograph, laid_over], axis=1)))
+    return path
 
 
 def fit(arguments: Namespace) -> None:

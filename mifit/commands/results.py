@@ -13,6 +13,7 @@ from mifit.core.files import write_text
 from mifit.errors import InputError
 
 if TYPE_CHECKING:
+    from mifit.capture import Capture
     from mifit.reconstruction import Reconstruction
 
 
@@ -23,10 +24,16 @@ def evaluate(arguments: Namespace) -> None:
     result = mifit.Reconstruction.load(arguments.result)
     capture = mifit.Capture.load(arguments.capture)
     use_variant(arguments)
-    from mifit.output.evaluate import evaluate
-    from mifit.output.report import write_report
+    judge(arguments, result, capture)
+
+
+def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> None:
+    """`evaluate` of a result that has been read, or just been made and written into ``arguments.result``."""
+    from mifit.output.evaluate import Comparison, evaluate
+    from mifit.output.report import SHOWN_TIMESTEPS, write_report
     from mifit.pipeline import fitted_to
 
+    shown: list[Comparison] = []
     found = evaluate(
         result,
         capture,
@@ -35,6 +42,7 @@ def evaluate(arguments: Namespace) -> None:
         region=arguments.region,
         progress=console_progress(arguments.quiet),
         baseline=arguments.baseline,
+        watch=lambda one: shown.append(one) if len(shown) < SHOWN_TIMESTEPS else None,
     )
     if not fitted_to(result, capture):
         say(arguments, f"mifit: warning: {arguments.capture}: isn't the capture that was fitted, or has changed since")
@@ -52,7 +60,7 @@ def evaluate(arguments: Namespace) -> None:
     if "baseline" in found:
         print(f"image-based rendering on the same mesh, {found['baseline']['region_pixels']} pixels that it can fill")
         _print_measures(found["baseline"]["methods"])
-    write_report(arguments.result, result, capture, evaluation=found)
+    write_report(arguments.result, result, capture, found, shown)
 
 
 def _print_measures(methods: dict[str, dict[str, float]]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -65,6 +65,7 @@ def evaluate(
     region: Literal["model", "truth"] = "model",
     progress: Progress = silent,
     baseline: bool = False,
+    watch: Callable[[Comparison], None] | None = None,
 ) -> dict[str, Any]:
     """Compare renders with photographs over the face area.
 
@@ -88,6 +89,8 @@ def evaluate(
     progress : Progress
     baseline : bool
         Compare image-based rendering on the fitted mesh as well (`output.baseline`).
+    watch : callable, optional
+        Given the comparison of each timestep.
 
     Returns
     -------
@@ -117,6 +120,8 @@ def evaluate(
         if found.baseline is not None and found.seen is not None:
             seen.add({"image_based": found.baseline, **renders}, found.photograph, found.seen)
         per_timestep.append({"timestep": timestep, "region_pixels": int(found.region.sum()), "methods": figures})
+        if watch is not None:
+            watch(found)
         progress("Evaluating", done + 1, len(steps))
     out = {
         "camera": camera,

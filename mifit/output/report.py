@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -53,6 +54,7 @@ def write_report(
     reconstruction: Result,
     capture: Capture,
     evaluation: dict[str, Any] | None = None,
+    comparisons: Sequence[Comparison] = (),
 ) -> Path:
     """Write ``report.html`` into a result folder, whole or not at all.
 
@@ -64,6 +66,8 @@ def write_report(
         Only the fitted cameras are read, and the evaluated one when an evaluation is given.
     evaluation : dict, optional
         What `evaluate` returned; adds the comparison of that view.
+    comparisons : sequence of Comparison
+        Those of the evaluation, where they are at hand; others are rendered.
 
     Returns
     -------
@@ -83,7 +87,7 @@ def write_report(
         ("Settings", _settings(reconstruction)),
     ]
     if evaluation is not None:
-        sections.insert(2, ("Comparison", _comparison(reconstruction, capture, evaluation)))
+        sections.insert(2, ("Comparison", _comparison(reconstruction, capture, evaluation, comparisons)))
     sections = [(title, body) for title, body in sections if body]
     links = "".join(f'<a href="#s{i}">{title}</a>' for i, (title, _) in enumerate(sections))
     body = "".join(f'<section><h2 id="s{i}">{title}</h2>{text}</section>' for i, (title, text) in enumerate(sections))
@@ -178,14 +182,16 @@ def _view3d(result: Result, timestep: int) -> str:
 <script type="application/json" id="view3d-data">{data}</script>"""
 
 
-def _comparison(result: Result, capture: Capture, evaluation: dict[str, Any]) -> str:
+def _comparison(result: Result, capture: Capture, evaluation: dict[str, Any], comparisons: Sequence[Comparison]) -> str:
     camera, parts = evaluation["camera"], []
+    known = {found.timestep: found for found in comparisons}
     limit = f"{HEAT_LIMIT:.0f} of 255"
     parts.append(
         f'<p class="scale">Error maps: 0 <img src="{jpeg_uri(heat_scale())}" alt="black to yellow"> {limit} or more</p>'
     )
     for entry in evaluation["per_timestep"][:SHOWN_TIMESTEPS]:
-        found = compare(result, capture, camera, entry["timestep"], evaluation["region"])
+        timestep = entry["timestep"]
+        found = known.get(timestep) or compare(result, capture, camera, timestep, evaluation["region"])
         maps = "".join(
             _figure(
                 jpeg_uri(heat_map(found.photograph, render, found.region)[bounding_box(found.region)]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from mifit.core.image import read_image, to_8_bit
 from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_PIXELS
 from mifit.core.npz import read_npz
 from mifit.core.ply import read_ply
+from mifit.core.rows import Rows
 from mifit.core.split_mesh import SplitMesh, split_at_seams
 from mifit.core.subdivision import split_faces
 from mifit.errors import InputError
@@ -138,18 +140,19 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
     n = len(steps)
     expression = _array([s["expression"] for s in steps], (n, model.expression.shape[2]), "expression")
     mesh = split_at_seams(model)
-    vertices = np.empty((n, len(model.mean), 3), dtype=np.float32)
+    vertices = Rows(n, (len(model.mean), 3), np.float32)
     vertex_albedo = model.albedo(albedo).astype(np.float32)
     for i, step in enumerate(steps):
         # Vertices that no face uses are in no mesh file: they follow from the coefficients.
         rotation, translation = np.array(step["rotation"]), np.array(step["translation"])
         shape = model.shape(identity, expression[i])
         with np.errstate(over="ignore"):
-            vertices[i] = entry["scale"] * shape @ rotation.T + translation
-        if not np.isfinite(vertices[i]).all():
+            posed = (entry["scale"] * shape @ rotation.T + translation).astype(np.float32)
+        if not np.isfinite(posed).all():
             raise ValueError(f"timestep {step['timestep']}: found a pose that is out of all bounds")
         stored = _read_mesh(folder / "geometry" / f"{step['timestep']:04d}.ply", mesh)
-        vertices[i, mesh.origin] = stored["vertices"]
+        posed[mesh.origin] = stored["vertices"]
+        vertices.add(posed)
         vertex_albedo[mesh.origin] = stored["albedo"]
     return GeometryEstimate(
         timesteps=tuple(int(s["timestep"]) for s in steps),
@@ -159,7 +162,7 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
         rotation=_array([s["rotation"] for s in steps], (n, 3, 3), "rotation"),
         translation=_array([s["translation"] for s in steps], (n, 3), "translation"),
         scale=float(entry["scale"]),
-        vertices=vertices,
+        vertices=vertices.all,
         vertex_albedo=vertex_albedo,
         shading=_array(lighting["shading"], (9, 3), "shading"),
         ambient=float(lighting["shading_ambient"]),
@@ -205,6 +208,14 @@ def _read_map(path: Path, channels: int, size: int | None = None) -> NDArray[np.
             f"of {channels} finite channels; fit again"
         )
     return np.ascontiguousarray(image, dtype=np.float32)
+
+
+def _read_maps(paths: Sequence[Path], channels: int) -> NDArray[np.float32]:
+    """Maps of one size, one after the other."""
+    first = _read_map(paths[0], channels)
+    rows = Rows(len(paths), first.shape, np.float32)
+    rows.add(first)
+    return rows.extend(_read_map(path, channels, len(first)) for path in paths[1:])
 
 
 def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate | None:
@@ -259,8 +270,8 @@ def _normals(folder: Path, document: dict[str, Any]) -> NormalsEstimate | None:
     if "normals" not in document["stages"]:
         return None
     timesteps = [int(s["timestep"]) for s in document["timesteps"] if s["refined_normals"]]
-    maps = [_read_map(folder / "maps" / f"normal_object_{t:04d}.exr", 3) for t in timesteps]
-    return NormalsEstimate(tuple(timesteps), np.stack(maps), _report(document, "normals"))
+    paths = [folder / "maps" / f"normal_object_{t:04d}.exr" for t in timesteps]
+    return NormalsEstimate(tuple(timesteps), _read_maps(paths, 3), _report(document, "normals"))
 
 
 def _mesh(
@@ -274,16 +285,18 @@ def _mesh(
     timesteps = tuple(int(s["timestep"]) for s in document["timesteps"] if s["refined_mesh"])
     mesh = split_at_seams(topology)
     # Vertices that no face uses are in no mesh file: they stay where the fit left them.
-    vertices = np.stack([topology.matrix @ geometry.vertices[geometry.index(t)] for t in timesteps])
-    for k, timestep in enumerate(timesteps):
-        vertices[k, mesh.origin] = _read_mesh(folder / "refined" / f"{timestep:04d}.ply", mesh)["vertices"]
-    heights = [_read_map(folder / "maps" / f"displacement_{t:04d}.exr", 1) for t in timesteps]
+    vertices = Rows(len(timesteps), (topology.matrix.shape[0], 3), np.float32)
+    for timestep in timesteps:
+        row = topology.matrix @ geometry.vertices[geometry.index(timestep)]
+        row[mesh.origin] = _read_mesh(folder / "refined" / f"{timestep:04d}.ply", mesh)["vertices"]
+        vertices.add(row)
+    heights = [folder / "maps" / f"displacement_{t:04d}.exr" for t in timesteps]
     return MeshEstimate(
         timesteps,
-        vertices.astype(np.float32),
+        vertices.all,
         topology.faces,
         topology.faces_uv,
         topology.uv,
-        np.stack(heights),
+        _read_maps(heights, 1),
         report,
     )

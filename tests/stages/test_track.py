@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import shutil
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -231,8 +234,6 @@ def test_meshes_of_tracked_frames_are_refined_as_those_of_the_fit(scene, fit_tru
 @pytest.mark.slow
 @pytest.mark.parametrize(("moment", "killed_after"), [("before", 0), ("between", 1)])
 def test_a_killed_run_resumes_to_the_same_result(scene, fit_truth, saved, tmp_path, monkeypatch, killed_after, moment):
-    import shutil
-
     from mifit import tracking
     from mifit.result import writing as folder_module
 
@@ -301,6 +302,32 @@ def test_frames_whose_images_changed_are_tracked_anew(scene, fit_truth, saved):
     assert steps == (1, 2)
     track_into(saved, reload(saved), changed, steps, CONFIG, resume=True)
     assert len(fit_truth) == 5
+
+
+def test_memory_does_not_grow_with_tracked_frames(scene, fit_truth, saved, tmp_path, monkeypatch):
+    """Tracked, then refined: what frames leave behind in memory is their pose, not their maps and meshes."""
+    from mifit.core import rows
+    from mifit.refinement import refine
+    from mifit.tracking import track_into
+
+    monkeypatch.setattr(rows, "IN_MEMORY", 0)  # as for a long video
+    left = []
+    for k, steps in enumerate(((1, 2, 3), (1,), (1, 2, 3))):  # the first for kernels and caches
+        folder = shutil.copytree(saved, tmp_path / str(k))
+        tracemalloc.start()
+        tracked = track_into(folder, reload(folder), scene, steps, CONFIG)
+        refined = refine(tracked, scene, tracked.timesteps)
+        refined.save(folder)
+        gc.collect()
+        left.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+        assert refined.timesteps == tracked.timesteps == (0, *steps)
+    frame = sum(
+        array[0].nbytes
+        for result in (tracked, refined)
+        for array in (result.normals.normal_object, result.mesh.vertices, result.mesh.displacement)
+    )
+    assert (left[2] - left[1]) / 2 < 0.05 * frame, (left, frame)
 
 
 def test_a_result_without_reflectance_is_refused(scene, saved):
