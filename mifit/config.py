@@ -142,6 +142,11 @@ class ReflectanceConfig:
     segment: bool = flag(
         True, "leave out what hides the face in an image: hair, cloth, glasses, a hand; with robust alone"
     )
+    relief: bool = flag(
+        True,
+        "part from the albedo what varies more than skin does: relief and shadows that the mesh doesn't have, which "
+        "another light doesn't show; with robust alone",
+    )
     symmetric_fill: bool = flag(
         False, "fill what no image shows from the opposite half of the face, where that was seen"
     )

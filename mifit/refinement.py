@@ -32,6 +32,7 @@ from mifit.stages.normals.carried import CarriedTangents
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.fill import blend_unseen
 from mifit.stages.reflectance.maps import Smoothness
+from mifit.stages.reflectance.relief import part_relief
 from mifit.stages.track import Follower
 from mifit.tracking import mesh_refiner
 
@@ -234,9 +235,11 @@ class Refinement(Generic[R]):
         quality = np.minimum(information.quality / max(1.0, 0.35 * images), 1.0)
         albedo = interpolate(result.geometry.vertex_albedo, model.faces, texels.face, texels.weights)
         diffuse, specular, confidence = blend_unseen(model, texels, albedo, found.maps, quality)
+        parted = part_relief(model, texels, diffuse, confidence) if result.reflectance.relief is not None else None
         reflectance = replace(
             result.reflectance,
-            diffuse=diffuse,
+            diffuse=diffuse if parted is None else parted.skin,
+            relief=None if parted is None else parted.relief,
             specular=specular,
             confidence=confidence,
             frames=texels.to_map(information.frames.astype(np.float32)),
@@ -292,7 +295,7 @@ def _solved(result: Result, absorber: Absorber, information: Information, images
     settings = from_mapping(ReflectanceConfig, result.config.get("reflectance", {}), "result.json: config: reflectance")
     texels, model = absorber.texels, result.model
     albedo = interpolate(result.geometry.vertex_albedo, model.faces, texels.face, texels.weights)
-    maps = np.concatenate([result.reflectance.diffuse, result.reflectance.specular[..., None]], axis=2)
+    maps = np.concatenate([result.reflectance.lit_diffuse, result.reflectance.specular[..., None]], axis=2)
     seen = (information.frames > 0) & absorber.facial
     prior = np.zeros((texels.size**2, 4), np.float32)
     prior[texels.index, :3] = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0)

@@ -133,6 +133,9 @@ class ReflectanceEstimate:
         Of which image each of ``labels`` is.
     frames : (S, S) float32 or None
         Number of timesteps that showed each texel, where a video was absorbed (`mifit.refine`).
+    relief : (S, S) float32 or None
+        Factor of the diffuse light of the capture that mesh and lighting don't explain: relief finer than the mesh,
+        edges of shadows. None where nothing was parted from the albedo, and under any other light.
     """
 
     diffuse: NDArray
@@ -145,6 +148,12 @@ class ReflectanceEstimate:
     labels: tuple[NDArray, ...] = ()
     labelled: tuple[tuple[str, int], ...] = ()
     frames: NDArray | None = None
+    relief: NDArray | None = None
+
+    @property
+    def lit_diffuse(self) -> NDArray:
+        """(S, S, 3) what the diffuse light of this illumination is multiplied by: albedo, and relief where known."""
+        return self.diffuse if self.relief is None else self.diffuse * self.relief[..., None]
 
     def label(self, camera: str, timestep: int) -> NDArray | None:
         """The labels of one image; None where there are none."""

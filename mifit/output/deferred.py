@@ -195,7 +195,7 @@ def _vertex_albedo(reconstruction: Result) -> NDArray[np.float32]:
     albedo = np.clip(reconstruction.geometry.vertex_albedo, 0.0, 1.0).astype(np.float32)
     inside = model.face_mask
     uv = model.uv[model.faces_uv[inside].ravel()]
-    albedo[model.faces[inside].ravel()] = sample_map(reflectance.diffuse, uv)
+    albedo[model.faces[inside].ravel()] = sample_map(reflectance.lit_diffuse, uv)
     return albedo
 
 

@@ -99,7 +99,7 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int) -> None:
     vertices = reconstruction.geometry.vertices[i]
     normals = vertex_normals(vertices, model.faces)
     mesh, mapped = split_at_seams(model), mapped_faces(reconstruction)
-    maps = surface_maps(reconstruction, timestep)
+    maps = surface_maps(reconstruction, timestep, skin=True)
     rotation = reconstruction.geometry.rotation[i]
     bent = tangent_space_map(
         maps.normal, (vertices @ rotation)[mesh.origin], (normals @ rotation)[mesh.origin], mesh, mapped

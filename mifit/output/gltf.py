@@ -204,7 +204,7 @@ def _skin(
     out: _Buffer, reconstruction: Result, timestep: int, mesh: SplitMesh, vertices: NDArray, normals: NDArray
 ) -> tuple[list[dict], list[dict], dict[str, Any]]:
     """Images, textures and material of the face area."""
-    maps = surface_maps(reconstruction, timestep)
+    maps = surface_maps(reconstruction, timestep, skin=True)
     bent = tangent_space_map(
         maps.normal, vertices[mesh.origin], normals[mesh.origin], mesh, mapped_faces(reconstruction)
     )

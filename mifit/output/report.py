@@ -292,6 +292,14 @@ def _maps(result: Result, timestep: int) -> str:
         _grey("Specular albedo", reflectance.specular),
         _grey("Confidence: how often and how well each texel was seen", reflectance.confidence, 1.0),
     ]
+    if reflectance.relief is not None:
+        figures.append(
+            _grey(
+                "Light that mesh and lighting don't explain (mid-grey: none), parted from the albedo",
+                0.5 * reflectance.relief,
+                1.0,
+            )
+        )
     if reflectance.frames is not None:
         figures.append(
             _grey("Frames that showed each texel", reflectance.frames, float(reflectance.frames.max()) or 1.0)

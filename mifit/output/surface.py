@@ -47,12 +47,13 @@ class SurfaceMaps:
     normal: NDArray[np.float32]
 
 
-def surface_maps(reconstruction: Result, timestep: int) -> SurfaceMaps:
+def surface_maps(reconstruction: Result, timestep: int, skin: bool = False) -> SurfaceMaps:
     """Maps of one timestep as a renderer wants them.
 
     Texels that belong to no face repeat the nearest texel inside, so bilinear look-ups at a seam see no gap.
     Without stage 2 the albedo is the fitted model's at 512 texels; without stage 3, or for a timestep that it
-    did not refine, the normals are the mesh's.
+    did not refine, the normals are the mesh's. ``skin`` asks for the albedo alone, for files without a light of their
+    own: what the capture's light leaves unexplained (``relief``) is part of the diffuse map otherwise.
     """
     model, geometry = reconstruction.model, reconstruction.geometry
     reflectance = reconstruction.reflectance
@@ -63,7 +64,7 @@ def surface_maps(reconstruction: Result, timestep: int) -> SurfaceMaps:
         diffuse = texels.to_map(np.clip(interpolate(geometry.vertex_albedo, *corners), 0, 1).astype(np.float32))
         specular = np.zeros((size, size), dtype=np.float32)
     else:
-        diffuse, specular = reflectance.diffuse, reflectance.specular
+        diffuse, specular = reflectance.diffuse if skin else reflectance.lit_diffuse, reflectance.specular
     i = reconstruction.index(timestep)
     normals = vertex_normals(geometry.vertices[i], model.faces) @ geometry.rotation[i]
     normal = texels.to_map(normalize(interpolate(normals, *corners)).astype(np.float32))

@@ -45,7 +45,7 @@ def viewer_data(reconstruction: Result, timestep: int) -> str:
     face_centre = vertices[np.unique(model.faces[model.face_mask])]
     colour = np.column_stack([to_8_bit(vertex_materials(reconstruction)[origin, :3]), has_maps * 255]).astype(np.uint8)
     wide = len(origin) > 65535
-    maps = surface_maps(reconstruction, timestep)
+    maps = surface_maps(reconstruction, timestep, skin=True)
     peak = max(float(maps.specular.max()), 1e-3)
     data: dict[str, Any] = {
         "vertices": len(origin),

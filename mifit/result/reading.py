@@ -235,7 +235,7 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
     radiance = _array(lighting["radiance"], (order * order, 3), "radiance")
     diffuse = _read_map(folder / "maps" / "diffuse.exr", 3)
     labels = _labels(folder, document)
-    frames = folder / "maps" / "frames.exr"
+    frames, relief = (folder / "maps" / name for name in ("frames.exr", "relief.exr"))
     return ReflectanceEstimate(
         diffuse=diffuse,
         specular=_read_map(folder / "maps" / "specular.exr", 1, len(diffuse)),
@@ -247,6 +247,7 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
         labels=tuple(labels.values()),
         labelled=tuple(labels),
         frames=_read_map(frames, 1, len(diffuse)) if frames.exists() else None,
+        relief=_read_map(relief, 1, len(diffuse)) if relief.exists() else None,
     )
 
 

@@ -140,6 +140,8 @@ class Result:
     def with_illumination(self: R, illumination: Illumination) -> R:
         """The same face in another light, taken as it is; see `Reconstruction.relight` for environment maps.
 
+        What the capture's own light left unexplained (``reflectance.relief``) is gone with it.
+
         Raises
         ------
         InputError
@@ -147,7 +149,7 @@ class Result:
         """
         if self.reflectance is None:
             raise InputError("illumination: this result has no reflectance; fit with --until reflectance")
-        reflectance = replace(self.reflectance, illumination=illumination)
+        reflectance = replace(self.reflectance, illumination=illumination, relief=None)
         return replace(self, reflectance=reflectance, environment=None, environment_rotation=None)
 
     @property

@@ -46,8 +46,10 @@ def save(result: Result, folder: Path, write_scene: Callable[[Path], None], forc
         if result.reflectance is not None:
             for name in ("diffuse", "specular", "confidence"):
                 write_image(new / "maps" / f"{name}.exr", getattr(result.reflectance, name))
-            if result.reflectance.frames is not None:
-                write_image(new / "maps" / "frames.exr", result.reflectance.frames)
+            for name in ("frames", "relief"):
+                found = getattr(result.reflectance, name)
+                if found is not None:
+                    write_image(new / "maps" / f"{name}.exr", found)
             write_image(new / "lighting.exr", result.lighting.to_latlong())
             for (camera, timestep), labels in zip(result.reflectance.labelled, result.reflectance.labels, strict=True):
                 write_bytes(new / label_file(camera, timestep), encode_png(labels))

@@ -23,6 +23,7 @@ from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.objective import energies
 from mifit.stages.reflectance.paper_solver import fit_adam
 from mifit.stages.reflectance.priors import levelled
+from mifit.stages.reflectance.relief import part_relief
 from mifit.stages.segment import segment
 
 if TYPE_CHECKING:
@@ -114,8 +115,14 @@ def infer_reflectance(
         light = illumination.unknowns, illumination.ambient
         terms = energies(surface, forward, *light, fitted.maps, albedo, config)
         details["objective"] = {**terms, "total": sum(terms.values())}
+    relief = None
+    if config.robust and config.relief and config.solver == "als":
+        parted = part_relief(model, surface.texels, diffuse, confidence)
+        diffuse, relief = parted.skin, parted.relief
+        details["spread"] = {"symmetric": parted.symmetric, "sided": parted.sided}
     return ReflectanceEstimate(
         diffuse=diffuse,
+        relief=relief,
         specular=specular,
         confidence=confidence,
         illumination=illumination,

@@ -84,7 +84,7 @@ class Absorber:
         self.texels, self.facial = surface.texels, surface.facial
         self.carried = CarriedTangents(model, self.texels)
         self._near = texel_neighbours(self.texels)
-        self.diffuse, self.specular = (self.texels.from_map(m) for m in (reflectance.diffuse, reflectance.specular))
+        self.diffuse, self.specular = (self.texels.from_map(m) for m in (reflectance.lit_diffuse, reflectance.specular))
 
     def absorb(
         self,

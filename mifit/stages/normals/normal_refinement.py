@@ -210,7 +210,7 @@ def frame_problem(
         NormalView(part.colour[:, j], part.measured[:, j], part.view[:, j], base[rows], tangents)
         for j in range(len(part.step))
     ]
-    diffuse, specular = (texels.from_map(m)[rows] for m in (reflectance.diffuse, reflectance.specular))
+    diffuse, specular = (texels.from_map(m)[rows] for m in (reflectance.lit_diffuse, reflectance.specular))
     appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: texels.from_map(m)[rows]))
     points = MeshPoints(part.point[:, 0], base[rows], part.face, part.barycentric)
     occlusion = appearance.trace(surface.meshes[0], points, seed)
