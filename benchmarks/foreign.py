@@ -29,10 +29,10 @@ import numpy as np
 
 import mifit
 from benchmarks import foreign_tables, judge
-from benchmarks.matt import infer_matt
+from benchmarks.matt import as_chosen, infer_matt
 from benchmarks.measure import conditions
 from benchmarks.record import RESULTS, SHARED, record
-from mifit import Capture, FitConfig, MorphableModel, Reconstruction, ReflectanceConfig
+from mifit import Capture, FitConfig, MorphableModel, Reconstruction
 from mifit.core.files import write_text
 from mifit.core.image import write_image
 from mifit.errors import MifitError
@@ -106,12 +106,6 @@ def fits_of(case: Case, wanted: Sequence[str], config: FitConfig) -> dict[str, R
         paper = replace_size(FitConfig.paper(), config.reflectance.texture_size)
         found["paper"] = mifit.fit(capture, model, case.fitted, case.timesteps, paper, seed=SEED)
     return found
-
-
-def as_chosen(full: Reconstruction, config: ReflectanceConfig) -> ReflectanceConfig:
-    """Settings with the shading model that a full fit chose, so that it isn't chosen again."""
-    chosen = full.reports["reflectance"].details["shading"]["chosen"]
-    return replace(config, shading=chosen)
 
 
 def replace_size(config: FitConfig, size: int) -> FitConfig:

@@ -10,7 +10,7 @@ from unittest.mock import patch
 import numpy as np
 
 import mifit
-from mifit import Capture, MorphableModel
+from mifit import Capture, MorphableModel, Reconstruction
 from mifit.config import ReflectanceConfig
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate
 from mifit.progress import Progress
@@ -41,3 +41,9 @@ def infer_matt(
     with patch("mifit.stages.reflectance.als.choose_lighting", choose_diffuse_lighting):
         found = mifit.infer_reflectance(capture, model, geometry, cameras, config, seed=seed)
     return replace(found, specular=np.zeros_like(found.specular))
+
+
+def as_chosen(full: Reconstruction, config: ReflectanceConfig) -> ReflectanceConfig:
+    """Settings with the shading model that a full fit chose, so that it isn't chosen again."""
+    chosen = full.reports["reflectance"].details["shading"]["chosen"]
+    return replace(config, shading=chosen)

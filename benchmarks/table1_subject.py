@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import mifit
-from benchmarks.matt import infer_matt
+from benchmarks.matt import as_chosen, infer_matt
 from benchmarks.record import machine
 from benchmarks.truth import truth_errors
 from mifit import Capture, FitConfig, MorphableModel, Reconstruction
@@ -25,7 +25,7 @@ def fits(folder: Path, model: MorphableModel, config: FitConfig) -> dict[str, tu
     """The reconstructions of a subject: in full, without specular reflection, by the paper, from perfect landmarks."""
     capture, perfect = Capture.load(folder / "capture"), Capture.load(folder / "perfect")
     full = mifit.fit(capture, model, CAMERAS, capture.timesteps, config)
-    matt = infer_matt(capture, model, full.geometry, CAMERAS, config.reflectance)
+    matt = infer_matt(capture, model, full.geometry, CAMERAS, as_chosen(full, config.reflectance))
     normals = mifit.refine_normals(capture, model, full.geometry, matt, CAMERAS, config.normals)
     found = {
         "full": (full, capture),
