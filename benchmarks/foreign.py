@@ -41,7 +41,7 @@ from mifit.output.baseline import image_based
 ICT = str(SHARED / "models" / "ict_facekit" / "ict_facekit_head.npz")
 FITS = ("full", "refit", "paper")
 JUDGED = ("views", "mesh", "surface", "relit")
-RELIT_SAMPLES = 32
+RELIT_SAMPLES = 64
 SIZE = 256
 """Texels along the side of the maps, unless --size says otherwise: more show little at these pictures' sizes."""
 SEED = 0

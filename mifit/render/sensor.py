@@ -18,7 +18,7 @@ SQUARE = 1e-6
 """Relative difference of the focal lengths up to which pixels count as square: a thousandth of a pixel in 1000."""
 
 
-def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str = "independent") -> dict[str, Any]:
+def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str = "multijitter") -> dict[str, Any]:
     """The sensor of an undistorted camera, as a plain dictionary (`render.description`).
 
     Square pixels give Mitsuba's ``perspective``, others mifit's ``pinhole``; see `Camera.with_square_pixels` for
@@ -66,7 +66,7 @@ def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str =
     }
 
 
-def make_sensor(camera: Camera, spp: int = 16, sampler: str = "independent") -> Any:
+def make_sensor(camera: Camera, spp: int = 16, sampler: str = "multijitter") -> Any:
     """The loaded ``mi.Sensor`` of `sensor_description`; InputError as there."""
     import mitsuba as mi
 
