@@ -218,6 +218,7 @@ enabled = false
 rounds = 1
 [fit.reflectance]
 texture_size = 32
+shading = "prefiltered"
 [evaluate]
 camera = "third"
 [outputs]

@@ -100,7 +100,8 @@ def test_a_fit_is_shown_while_it_is_fitted(variant, tiny_capture, tmp_path, monk
     from mifit.progress import silent
 
     config = mifit.FitConfig(
-        geometry=mifit.GeometryConfig(rounds=1), reflectance=mifit.ReflectanceConfig(texture_size=64)
+        geometry=mifit.GeometryConfig(rounds=1),
+        reflectance=mifit.ReflectanceConfig(texture_size=64, shading="prefiltered", exponent=100),
     )
     capture, model = mifit.Capture.load(tiny_capture), mifit.MorphableModel.load("builtin:coarse")
     seen: list[np.ndarray] = []
@@ -126,8 +127,8 @@ def test_a_fit_is_shown_while_it_is_fitted(variant, tiny_capture, tmp_path, monk
     def watch(result):
         shown.append(result.methods)
         view.watch(result)
-        limit = time.monotonic() + 8
-        view.live.run(until=lambda: time.monotonic() > limit)  # the browser's time to open
+        taken, limit = len(seen), time.monotonic() + 30
+        view.live.run(until=lambda: len(seen) > taken + 1 or time.monotonic() > limit)  # the page shows this step
 
     watched = mifit.fit(capture, model, timesteps=[0], config=config, progress=view.progress, watch=watch)
     fitting.clear()
