@@ -1,6 +1,6 @@
 """Relighting judged by path-traced photographs: heads of Table 1 under a light that their fit never saw.
 
-    python -m benchmarks.relight [--subjects 3] [--work out/table1]
+    python -m benchmarks.relight [--subjects 3] [--work out/table1] [--reduced]
 
 Needs finished subjects of `benchmarks.table1`. Each head is path traced again, in the same poses, under the next of
 the table's environments; its fitted result is relit by that environment and compared with camera ``third``, with one
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.record import RESULTS, SHARED, record
-from benchmarks.table1 import ENVIRONMENTS, FULL_SIZE, SEED, TONES, mifit
+from benchmarks.table1 import ENVIRONMENTS, FULL_SIZE, REDUCED, SEED, TONES, mifit, outside
 from mifit import Capture, Reconstruction, set_variant
 from mifit.core.files import write_text
 from mifit.output.relight import evaluate_relit
@@ -24,14 +24,14 @@ from mifit.output.relight import evaluate_relit
 TIMESTEPS = 2
 
 
-def run_subject(subject: int, work: Path, model: str) -> dict[str, Any]:
+def run_subject(subject: int, work: Path, model: str, size: dict[str, int]) -> dict[str, Any]:
     """Path trace one head under another light and judge its relit result."""
     environment = SHARED / "hdri" / f"{ENVIRONMENTS[(subject + 1) % len(ENVIRONMENTS)]}.hdr"
     folder = work / f"subject_{subject:02d}"
     if not (folder / "relit" / "transforms.json").exists():
         mifit("synth", "--out", folder / "relit", "--seed", SEED + subject, "--model", model, "--env", environment,
-              "--tone", TONES[subject % len(TONES)], "--timesteps", TIMESTEPS, "--width", FULL_SIZE["width"],
-              "--height", FULL_SIZE["height"], "--spp", FULL_SIZE["spp"])  # fmt: skip
+              "--tone", TONES[subject % len(TONES)], "--outside", outside(subject), "--timesteps", TIMESTEPS,
+              "--width", size["width"], "--height", size["height"], "--spp", size["spp"])  # fmt: skip
     result, capture = Reconstruction.load(folder / "result"), Capture.load(folder / "relit")
     return {
         "subject": subject,
@@ -64,6 +64,7 @@ def main() -> int:
     parser.add_argument("--subjects", type=int, default=3)
     parser.add_argument("--work", type=Path, default=Path("out/table1"))
     parser.add_argument("--model", default="builtin")
+    parser.add_argument("--reduced", action="store_true", help="of a reduced table: small images")
     a = parser.parse_args()
     if not (SHARED / "hdri").is_dir():
         print(f"needs the environments in {SHARED / 'hdri'}", file=sys.stderr)
@@ -71,9 +72,13 @@ def main() -> int:
     set_variant("auto")
     rows = []
     for subject in range(a.subjects):
-        rows.append(run_subject(subject, a.work, a.model))
+        rows.append(run_subject(subject, a.work, a.model, REDUCED if a.reduced else FULL_SIZE))
         print(f"subject {subject}: full {rows[-1]['local']['full']['psnr']:.2f} dB", file=sys.stderr, flush=True)
-    record("relight", {"subjects": rows, "timesteps": TIMESTEPS}, seeds=[SEED + row["subject"] for row in rows])
+    record(
+        "relight",
+        {"subjects": rows, "timesteps": TIMESTEPS, "reduced": a.reduced},
+        seeds=[SEED + row["subject"] for row in rows],
+    )
     write_text(RESULTS / "relight.md", markdown(rows))
     print(markdown(rows))
     return 0

@@ -68,7 +68,9 @@ def main() -> None:
     mifit.set_variant("auto")
     config = FitConfig()
     config = replace(config, reflectance=replace(config.reflectance, texture_size=texels))
-    figures = judge(folder, fits(folder, MorphableModel.load(model), config))
+    found = fits(folder, MorphableModel.load(model), config)
+    found["full"][0].save(folder / "result", force=True)  # `benchmarks.relight` puts it under another light
+    figures = judge(folder, found)
     write_text(folder / "figures.json", json.dumps(figures, indent=2) + "\n")
 
 
