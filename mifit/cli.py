@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import mifit
+from mifit.commands import arguments
 from mifit.console import drop_chatter
 from mifit.core.files import FULL
-from mifit.core.limits import MAX_RENDERED_PIXELS, MAX_SAMPLES, MAX_SEED, MAX_TIMESTEPS
+from mifit.core.limits import MAX_RENDERED_PIXELS, MAX_SAMPLES, MAX_SEED
 from mifit.errors import InputError, MifitError
 
 LONGEST = 1000
@@ -36,84 +37,6 @@ def _one_line(text: str) -> str:
     return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
 
 
-def _names(text: str) -> list[str]:
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    if not names:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected names separated by commas")
-    return names
-
-
-def _timesteps(text: str) -> list[int]:
-    """``0,1,5-8`` -> [0, 1, 5, 6, 7, 8]."""
-    found: list[int] = []
-    for part in text.split(","):
-        first, dash, last = part.strip().partition("-")
-        try:
-            steps = range(int(first), int(last if dash else first) + 1)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"found {text[:60]!r}, expected numbers such as 0,1,2 or 0-7") from None
-        if len(steps) > MAX_TIMESTEPS or (steps and steps[-1] > sys.maxsize):
-            raise argparse.ArgumentTypeError(f"found {text[:60]!r}, expected at most {MAX_TIMESTEPS} timesteps")
-        found.extend(steps)
-    if not found:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a first number not above the last, such as 0-7")
-    return found
-
-
-def _timesteps_or_auto(text: str) -> list[int] | int:
-    """As `_timesteps`; ``auto`` -> 4 and ``auto:6`` -> 6, a number of timesteps to choose."""
-    kind, colon, count = text.strip().partition(":")
-    if kind != "auto":
-        return _timesteps(text)
-    try:
-        found = int(count) if colon else 4
-    except ValueError:
-        found = 0
-    if not 1 <= found <= MAX_TIMESTEPS:
-        raise argparse.ArgumentTypeError(f"found {text[:60]!r}, expected auto or a number of timesteps, such as auto:4")
-    return found
-
-
-def _whole(low: int, high: int) -> Callable[[str], int]:
-    def parse(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = low - 1
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"found {text[:60]!r}, expected a whole number from {low} to {high}")
-        return value
-
-    return parse
-
-
-def _at_least(low: int) -> Callable[[str], int]:
-    return _whole(low, MAX_TIMESTEPS)
-
-
-def _path(text: str) -> Path:
-    if not text or "\0" in text:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a file or folder")
-    return Path(text)
-
-
-def _real(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not abs(value) < float("inf"):
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a finite number")
-    return value
-
-
-def _rate(text: str) -> float:
-    value = _real(text)
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number above 0")
-    return value
-
-
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     common: Any = argparse.ArgumentParser(add_help=False)
@@ -124,8 +47,10 @@ def build_parser() -> argparse.ArgumentParser:
         default="auto",
         help="Mitsuba variant; auto: CUDA where it works, else LLVM (default: auto)",
     )
-    common.add_argument("--threads", type=_whole(1, 1024), help="processor cores to use; default: all")
-    common.add_argument("--seed", type=_whole(0, MAX_SEED), default=0, help="seed of everything random (default: 0)")
+    common.add_argument("--threads", type=arguments.whole(1, 1024), help="processor cores to use; default: all")
+    common.add_argument(
+        "--seed", type=arguments.whole(0, MAX_SEED), default=0, help="seed of everything random (default: 0)"
+    )
 
     parser = _Parser(prog="mifit", description="Facial reflectance and geometry from two views.")
     parser.add_argument("--version", action="version", version=f"mifit {mifit.__version__}")
@@ -137,29 +62,37 @@ def build_parser() -> argparse.ArgumentParser:
         return commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".", parents=[common])
 
     def add_rate(p: argparse.ArgumentParser) -> None:
-        p.add_argument("--fps", type=_rate, default=12.0, help="timesteps per second of what moves (default: 12)")
+        p.add_argument(
+            "--fps", type=arguments.rate, default=12.0, help="timesteps per second of what moves (default: 12)"
+        )
 
     def add_address(p: argparse.ArgumentParser) -> None:
         p.add_argument("--host", default="127.0.0.1", help="of the view: address (default: this machine only)")
-        p.add_argument("--port", type=_whole(0, 65535), default=8080, help="of the view (default: 8080); 0: a free one")
+        p.add_argument(
+            "--port", type=arguments.whole(0, 65535), default=8080, help="of the view (default: 8080); 0: a free one"
+        )
 
     p = add("doctor", "what of the set-up works, what doesn't, and the command that mends it")
     p.add_argument("--json", action="store_true", help="print JSON")
     p.add_argument("--install", choices=["landmarks"], help="fetch the networks that find landmarks, then check")
 
     p = add("demo", "fit a small capture made on the spot, judge it on the held-out view, write a report")
-    p.add_argument("--out", type=_path, default=Path("out/demo"), help="folder to write (default: out/demo)")
+    p.add_argument("--out", type=arguments.path, default=Path("out/demo"), help="folder to write (default: out/demo)")
 
     p = add("synth", "path-traced captures with ground truth")
-    p.add_argument("--out", type=_path, required=True, help="capture folder to write")
-    p.add_argument("--subjects", type=_at_least(1), default=1, help="people, a capture each (default: 1)")
-    p.add_argument("--timesteps", type=_at_least(1), default=4, help="moments of a capture (default: 4)")
-    p.add_argument("--env", type=_path, help="lat-long HDR environment; default: a procedural studio")
+    p.add_argument("--out", type=arguments.path, required=True, help="capture folder to write")
+    p.add_argument("--subjects", type=arguments.at_least(1), default=1, help="people, a capture each (default: 1)")
+    p.add_argument("--timesteps", type=arguments.at_least(1), default=4, help="moments of a capture (default: 4)")
+    p.add_argument("--env", type=arguments.path, help="lat-long HDR environment; default: a procedural studio")
     p.add_argument("--model", default="builtin", help="morphable model: a path or builtin")
-    p.add_argument("--width", type=_whole(16, MAX_RENDERED_PIXELS // 16), default=680, help="pixels (default: 680)")
-    p.add_argument("--height", type=_whole(16, MAX_RENDERED_PIXELS // 16), default=480, help="pixels (default: 480)")
-    p.add_argument("--spp", type=_whole(1, MAX_SAMPLES), default=64, help="samples per pixel (default: 64)")
-    p.add_argument("--tone", type=_real, help="skin from 0, fair, to 1, deep; default: drawn for each subject")
+    p.add_argument(
+        "--width", type=arguments.whole(16, MAX_RENDERED_PIXELS // 16), default=680, help="pixels (default: 680)"
+    )
+    p.add_argument(
+        "--height", type=arguments.whole(16, MAX_RENDERED_PIXELS // 16), default=480, help="pixels (default: 480)"
+    )
+    p.add_argument("--spp", type=arguments.whole(1, MAX_SAMPLES), default=64, help="samples per pixel (default: 64)")
+    p.add_argument("--tone", type=arguments.real, help="skin from 0, fair, to 1, deep; default: drawn for each subject")
     p.add_argument(
         "--motion",
         choices=["poses", "talk", "turn"],
@@ -167,11 +100,16 @@ def build_parser() -> argparse.ArgumentParser:
         help="default: poses; of talk and turn 30 timesteps are a second",
     )
     p.add_argument(
-        "--outside", type=_real, default=0.5, help="millimetres by which heads leave the model's span (default: 0.5)"
+        "--outside",
+        type=arguments.real,
+        default=0.5,
+        help="millimetres by which heads leave the model's span (default: 0.5)",
     )
-    p.add_argument("--landmark-bias", type=_real, default=0.0, help="millimetres; a detector's is about 2 (default: 0)")
     p.add_argument(
-        "--head", type=_path, help="a scanned head with texture coordinates (.glb, .obj, .ply), moved rigidly"
+        "--landmark-bias", type=arguments.real, default=0.0, help="millimetres; a detector's is about 2 (default: 0)"
+    )
+    p.add_argument(
+        "--head", type=arguments.path, help="a scanned head with texture coordinates (.glb, .obj, .ply), moved rigidly"
     )
     p.add_argument(
         "--maps",
@@ -180,35 +118,53 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="NAME=FILE",
         help="of --head: albedo, specular, roughness, displacement",
     )
-    p.add_argument("--unit-mm", type=_real, default=10.0, help="of --head: millimetres of its unit (default: 10)")
+    p.add_argument(
+        "--unit-mm", type=arguments.real, default=10.0, help="of --head: millimetres of its unit (default: 10)"
+    )
     p.add_argument("--flip-v", action="store_true", help="of --head: turn its maps upside down")
-    p.add_argument("--relit", type=_path, nargs="+", default=[], help="of --head: environments of relit true views")
+    p.add_argument(
+        "--relit", type=arguments.path, nargs="+", default=[], help="of --head: environments of relit true views"
+    )
     p.add_argument("--force", action="store_true", help="write into a folder that holds something already")
 
     p = add("import", "a capture from videos, image folders, photogrammetry projects, nerfstudio, VHAP or NeRSemble")
-    p.add_argument("--video", type=_path, action="append", default=[], help="one camera's video; repeat per camera")
-    p.add_argument("--images", type=_path, action="append", default=[], help="one camera's folder of images; repeat")
-    p.add_argument("--calibration", type=_path, help="OpenCV stereo calibration, YAML or XML")
-    p.add_argument("--colmap", type=_path, help="folder of a COLMAP model, text or binary")
-    p.add_argument("--metashape", type=_path, help="cameras exported by Metashape as XML")
-    p.add_argument("--realitycapture", type=_path, help="folder of RealityCapture's XMP files, or its CSV of cameras")
-    p.add_argument("--photos", type=_path, help="folder of the photographs of these three (default: beside them)")
-    p.add_argument("--vhap", type=_path, help="folder exported by VHAP")
-    p.add_argument("--nersemble", type=_path, help="folder of one sequence of NeRSemble")
-    p.add_argument("--transforms", type=_path, help="nerfstudio transforms.json")
-    p.add_argument("--digital-emily", type=_path, help="checkout of the public Digital Emily repository")
+    p.add_argument(
+        "--video", type=arguments.path, action="append", default=[], help="one camera's video; repeat per camera"
+    )
+    p.add_argument(
+        "--images", type=arguments.path, action="append", default=[], help="one camera's folder of images; repeat"
+    )
+    p.add_argument("--calibration", type=arguments.path, help="OpenCV stereo calibration, YAML or XML")
+    p.add_argument("--colmap", type=arguments.path, help="folder of a COLMAP model, text or binary")
+    p.add_argument("--metashape", type=arguments.path, help="cameras exported by Metashape as XML")
+    p.add_argument(
+        "--realitycapture", type=arguments.path, help="folder of RealityCapture's XMP files, or its CSV of cameras"
+    )
+    p.add_argument(
+        "--photos", type=arguments.path, help="folder of the photographs of these three (default: beside them)"
+    )
+    p.add_argument("--vhap", type=arguments.path, help="folder exported by VHAP")
+    p.add_argument("--nersemble", type=arguments.path, help="folder of one sequence of NeRSemble")
+    p.add_argument("--transforms", type=arguments.path, help="nerfstudio transforms.json")
+    p.add_argument("--digital-emily", type=arguments.path, help="checkout of the public Digital Emily repository")
     p.add_argument(
         "--units", help="unit of length of the cameras: mm, cm, dm or m (default: as the source has it, or cm)"
     )
-    p.add_argument("--every", type=_at_least(1), default=1, help="keep every N-th frame (default: 1)")
-    p.add_argument("--start", type=_at_least(0), default=0, help="first frame (default: 0)")
-    p.add_argument("--count", type=_at_least(1), help="number of frames to keep")
-    p.add_argument("--out", type=_path, required=True, help="capture folder to write")
+    p.add_argument("--every", type=arguments.at_least(1), default=1, help="keep every N-th frame (default: 1)")
+    p.add_argument("--start", type=arguments.at_least(0), default=0, help="first frame (default: 0)")
+    p.add_argument("--count", type=arguments.at_least(1), help="number of frames to keep")
+    p.add_argument("--out", type=arguments.path, required=True, help="capture folder to write")
 
     p = add("calibrate", "cameras from a calibration board, or of an uncalibrated capture from the heads in it")
-    p.add_argument("capture", type=_path, nargs="?", help="uncalibrated capture; the cameras are written into it")
-    p.add_argument("--video", type=_path, action="append", default=[], help="one camera's video of the board; repeat")
-    p.add_argument("--images", type=_path, action="append", default=[], help="one camera's folder of images; repeat")
+    p.add_argument(
+        "capture", type=arguments.path, nargs="?", help="uncalibrated capture; the cameras are written into it"
+    )
+    p.add_argument(
+        "--video", type=arguments.path, action="append", default=[], help="one camera's video of the board; repeat"
+    )
+    p.add_argument(
+        "--images", type=arguments.path, action="append", default=[], help="one camera's folder of images; repeat"
+    )
     p.add_argument(
         "--board",
         help="charuco:9x6:30:22, chessboard:10x7:25 or apriltag:6x4:34:9: columns, rows and lengths in millimetres; "
@@ -216,24 +172,28 @@ def build_parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--units", default="cm", help="unit of length of the calibration: mm, cm or m (default: cm)")
     p.add_argument("--model", default="builtin", help="of a capture: morphable model, a path or builtin (default)")
-    p.add_argument("--cameras", type=_names, help="of a capture: cameras that decide; default: the first two")
-    p.add_argument("--timesteps", type=_timesteps, help="of a capture: timesteps to use; default: the first four")
-    p.add_argument("--out", type=_path, help="of a board: folder to write")
+    p.add_argument("--cameras", type=arguments.listed, help="of a capture: cameras that decide; default: the first two")
+    p.add_argument(
+        "--timesteps", type=arguments.timesteps, help="of a capture: timesteps to use; default: the first four"
+    )
+    p.add_argument("--out", type=arguments.path, help="of a board: folder to write")
 
     p = add("landmarks", "detect 68 landmarks in every image and write them into the capture")
-    p.add_argument("capture", type=_path, help="capture folder, or its transforms.json")
+    p.add_argument("capture", type=arguments.path, help="capture folder, or its transforms.json")
     p.add_argument("--detector", help="mediapipe, face-alignment or lbf:FOLDER; default: the first that is there")
 
     p = add("fit", "fit geometry, reflectance and normals to a capture")
-    p.add_argument("capture", type=_path, help="capture folder, or its transforms.json")
-    p.add_argument("--out", type=_path, required=True, help="result folder to write")
-    p.add_argument("--config", type=_path, help="TOML file with tables geometry, reflectance, shape, normals, mesh")
+    p.add_argument("capture", type=arguments.path, help="capture folder, or its transforms.json")
+    p.add_argument("--out", type=arguments.path, required=True, help="result folder to write")
+    p.add_argument(
+        "--config", type=arguments.path, help="TOML file with tables geometry, reflectance, shape, normals, mesh"
+    )
     p.add_argument("--preset", choices=["default", "paper"], help="paper: the paper as written")
     p.add_argument("--model", default="builtin", help="morphable model: a path or builtin (default)")
-    p.add_argument("--cameras", type=_names, help="cameras to use, e.g. left,right; default: the first two")
+    p.add_argument("--cameras", type=arguments.listed, help="cameras to use, e.g. left,right; default: the first two")
     p.add_argument(
         "--timesteps",
-        type=_timesteps_or_auto,
+        type=arguments.timesteps_or_auto,
         help="e.g. 0,1,2,3 or 0-3, or auto (auto:6): the four (six) that tell most; default: the first four",
     )
     p.add_argument(
@@ -250,36 +210,42 @@ def build_parser() -> argparse.ArgumentParser:
     add_address(p)
 
     p = add("track", "geometry and normals of further timesteps, reflectance and lighting fixed")
-    p.add_argument("capture", type=_path, help="capture folder, or its transforms.json")
-    p.add_argument("--result", type=_path, required=True, help="result folder of mifit fit; extended in place")
-    p.add_argument("--timesteps", type=_timesteps, help="default: all that aren't in the result yet")
+    p.add_argument("capture", type=arguments.path, help="capture folder, or its transforms.json")
+    p.add_argument("--result", type=arguments.path, required=True, help="result folder of mifit fit; extended in place")
+    p.add_argument("--timesteps", type=arguments.timesteps, help="default: all that aren't in the result yet")
     p.add_argument("--resume", action="store_true", help="keep the frames that an earlier run has written")
     p.add_argument(
         "--refine", action="store_true", help="also add what the frames show to the maps and normals of the result"
     )
-    p.add_argument("--overlay", type=_names, help="cameras to write overlay videos of; default: the fitted ones")
+    p.add_argument(
+        "--overlay", type=arguments.listed, help="cameras to write overlay videos of; default: the fitted ones"
+    )
     add_rate(p)
 
     p = add("evaluate", "error on a held-out view")
-    p.add_argument("result", type=_path, help="result folder of mifit fit")
-    p.add_argument("--capture", type=_path, required=True, help="capture that has the view")
+    p.add_argument("result", type=arguments.path, help="result folder of mifit fit")
+    p.add_argument("--capture", type=arguments.path, required=True, help="capture that has the view")
     p.add_argument("--camera", required=True, help="camera to judge by, one that was not fitted")
-    p.add_argument("--timesteps", type=_timesteps, help="default: all of the result")
+    p.add_argument("--timesteps", type=arguments.timesteps, help="default: all of the result")
     p.add_argument(
         "--region", choices=["model", "truth"], default="model", help="whose face area counts (default: model)"
     )
     p.add_argument("--baseline", action="store_true", help="compare image-based rendering on the same mesh and pixels")
-    p.add_argument("--json", type=_path, help="file to write the figures to")
+    p.add_argument("--json", type=arguments.path, help="file to write the figures to")
 
     p = add("render", "render a reconstruction from a camera of the capture, or from any side")
-    p.add_argument("result", type=_path, help="result folder of mifit fit")
-    p.add_argument("--capture", type=_path, help="capture that --camera is of; default: the fitted cameras")
+    p.add_argument("result", type=arguments.path, help="result folder of mifit fit")
+    p.add_argument("--capture", type=arguments.path, help="capture that --camera is of; default: the fitted cameras")
     p.add_argument("--camera", help="default: a view of the face from --yaw, --pitch and --distance")
-    p.add_argument("--yaw", type=_real, help="degrees about the vertical; 0 is the front")
-    p.add_argument("--pitch", type=_real, help="degrees upwards")
-    p.add_argument("--distance", type=_rate, help="from the face, the result's units; default: the fitted cameras'")
-    p.add_argument("--timestep", type=_at_least(0), help="default: the first of the result")
-    p.add_argument("--out", type=_path, required=True, help="image to write: .png (8-bit sRGB) or .exr (linear)")
+    p.add_argument("--yaw", type=arguments.real, help="degrees about the vertical; 0 is the front")
+    p.add_argument("--pitch", type=arguments.real, help="degrees upwards")
+    p.add_argument(
+        "--distance", type=arguments.rate, help="from the face, the result's units; default: the fitted cameras'"
+    )
+    p.add_argument("--timestep", type=arguments.at_least(0), help="default: the first of the result")
+    p.add_argument(
+        "--out", type=arguments.path, required=True, help="image to write: .png (8-bit sRGB) or .exr (linear)"
+    )
     p.add_argument(
         "--method",
         choices=["full", "diffuse", "pca"],
@@ -291,11 +257,13 @@ def build_parser() -> argparse.ArgumentParser:
     )
 
     p = add("turntable", "novel views about the vertical axis, with and without specular")
-    p.add_argument("result", type=_path, help="result folder of mifit fit")
-    p.add_argument("--out", type=_path, required=True, help="folder to write")
-    p.add_argument("--from", dest="start", type=_real, default=-35.0, help="first angle in degrees (default: -35)")
-    p.add_argument("--to", dest="stop", type=_real, default=35.0, help="last angle in degrees (default: 35)")
-    p.add_argument("--steps", type=_at_least(1), default=7, help="number of views (default: 7)")
+    p.add_argument("result", type=arguments.path, help="result folder of mifit fit")
+    p.add_argument("--out", type=arguments.path, required=True, help="folder to write")
+    p.add_argument(
+        "--from", dest="start", type=arguments.real, default=-35.0, help="first angle in degrees (default: -35)"
+    )
+    p.add_argument("--to", dest="stop", type=arguments.real, default=35.0, help="last angle in degrees (default: 35)")
+    p.add_argument("--steps", type=arguments.at_least(1), default=7, help="number of views (default: 7)")
     p.add_argument(
         "--sequence",
         action="store_true",
@@ -304,24 +272,27 @@ def build_parser() -> argparse.ArgumentParser:
     add_rate(p)
 
     p = add("view", "a live view in the browser: turn the head and the light, switch parts, load an environment")
-    p.add_argument("result", type=_path, help="result folder")
+    p.add_argument("result", type=arguments.path, help="result folder")
     add_address(p)
 
     p = add("relight", "relit views under a measured environment")
-    p.add_argument("result", type=_path, help="result folder of mifit fit")
-    p.add_argument("--env", type=_path, required=True, help="lat-long environment, .hdr or .exr")
-    p.add_argument("--out", type=_path, required=True, help="folder to write")
+    p.add_argument("result", type=arguments.path, help="result folder of mifit fit")
+    p.add_argument("--env", type=arguments.path, required=True, help="lat-long environment, .hdr or .exr")
+    p.add_argument("--out", type=arguments.path, required=True, help="folder to write")
     p.add_argument(
-        "--rotate", type=_real, default=0.0, help="turn the environment about the vertical, degrees (default: 0)"
+        "--rotate",
+        type=arguments.real,
+        default=0.0,
+        help="turn the environment about the vertical, degrees (default: 0)",
     )
     p.add_argument("--sequence", action="store_true", help="also play the timesteps from the front: sequence.mp4")
     add_rate(p)
 
     p = add("export", "geometry with its maps for other programs")
-    p.add_argument("result", type=_path, help="result folder of mifit fit")
+    p.add_argument("result", type=arguments.path, help="result folder of mifit fit")
     p.add_argument("--format", choices=["glb", "obj", "ply", "mitsuba"], required=True, help="kind of file")
-    p.add_argument("--out", type=_path, required=True, help="file to write")
-    p.add_argument("--timestep", type=_at_least(0), help="default: the first of the result")
+    p.add_argument("--out", type=arguments.path, required=True, help="file to write")
+    p.add_argument("--timestep", type=arguments.at_least(0), help="default: the first of the result")
     p.add_argument("--animate", action="store_true", help="glb: play all timesteps, from --timestep's maps")
     add_rate(p)
     p.add_argument(
@@ -332,21 +303,21 @@ def build_parser() -> argparse.ArgumentParser:
     )
 
     p = add("run", "a scene-file driven experiment or a sweep of them")
-    p.add_argument("experiment", type=_path, help="experiment file, TOML")
+    p.add_argument("experiment", type=arguments.path, help="experiment file, TOML")
     p.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="replace a setting; repeat"
     )
-    p.add_argument("--out", type=_path, help="folder of the runs; default: out/NAME")
+    p.add_argument("--out", type=arguments.path, help="folder of the runs; default: out/NAME")
     p.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")
 
     p = add("model", "inspect and convert morphable models")
     actions = p.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser)
     q = actions.add_parser("info", help="print a table", parents=[common])
     q.add_argument("model", help="a path or builtin")
-    q.add_argument("--preview", type=_path, help="also write a sheet of the mean and the first modes")
+    q.add_argument("--preview", type=arguments.path, help="also write a sheet of the mean and the first modes")
     q = actions.add_parser("convert", help="write a model in mifit's own format", parents=[common])
-    q.add_argument("source", type=_path, help="file of a model, of any known kind")
-    q.add_argument("out", type=_path, help="file to write, .npz")
+    q.add_argument("source", type=arguments.path, help="file of a model, of any known kind")
+    q.add_argument("out", type=arguments.path, help="file to write, .npz")
     q.add_argument("--kind", help="format of SOURCE; default: recognised by content")
     q.add_argument("--eyes", action="store_true", help="put simple eyes and a mouth's inside where the model has holes")
     return parser

@@ -24,7 +24,8 @@ from mifit import checkpoint
 from mifit.core.files import FULL, file_name, read_text, replacing, write_text
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError, MifitError
-from mifit.plan import Experiment, Plan, Run, SynthRun, load_plan
+from mifit.experiment_settings import Experiment, SynthRun
+from mifit.plan import Plan, Run, load_plan
 from mifit.progress import Progress, silent
 from mifit.render.variant import set_fitting_variant
 from mifit.study import draw, over_subjects, subjects_table

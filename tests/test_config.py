@@ -8,7 +8,7 @@ import pytest
 
 from mifit.config import FitConfig, MeshConfig, ReflectanceConfig
 from mifit.errors import InputError
-from mifit.plan import (
+from mifit.experiment_settings import (
     EvaluateRun,
     Experiment,
     FitRun,
@@ -17,8 +17,8 @@ from mifit.plan import (
     RelightRun,
     RenderRun,
     SynthRun,
-    load_plan,
 )
+from mifit.plan import load_plan
 from mifit.schema import from_mapping, list_settings
 
 

@@ -38,11 +38,12 @@ MAY_IMPORT = {
     "refinement": DATA | {"morphable", "capture", "checkpoint", "stages", "result", "tracking"},
     "pipeline": DATA | {"morphable", "capture", "render", "steps", "reconstruction"},
     "fitting": DATA | {"morphable", "capture", "result", "reconstruction", "steps", "pipeline"},
-    "plan": DATA | {"schema", "morphable", "capture", "checkpoint", "pipeline"},
+    "experiment_settings": DATA | {"schema"},
+    "plan": DATA | {"schema", "experiment_settings", "morphable", "capture", "checkpoint", "pipeline"},
     "study": DATA,
     "experiment": DATA
     | FORMATION
-    | {"morphable", "capture", "checkpoint", "pipeline", "plan", "synth", "output", "study"},
+    | {"morphable", "capture", "checkpoint", "pipeline", "experiment_settings", "plan", "synth", "output", "study"},
     "console": BASE | {"core"},
 }
 TOP = {"commands", "cli", "__main__", "__init__"}  # may import everything

@@ -25,7 +25,8 @@ from mifit.progress import Progress, silent
 from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.choice import lighting_problem
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.lighting import LightingProblem, LightingSolution, solve_lighting
+from mifit.stages.reflectance.lighting import LightingSolution, solve_lighting
+from mifit.stages.reflectance.lighting_equations import LightingProblem
 
 if TYPE_CHECKING:
     from mifit.capture import Capture

@@ -13,7 +13,7 @@ from mifit.errors import InputError
 from mifit.solve import Outcome
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface
-from mifit.stages.reflectance.lighting import SPECULAR_LIMIT, expected_specular, specular_pull
+from mifit.stages.reflectance.lighting_equations import SPECULAR_LIMIT, expected_specular, specular_pull
 from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, laplacian, solve_maps
 
 CONFIG = ReflectanceConfig(texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)

@@ -22,7 +22,8 @@ from mifit.stages.observations import Surface
 from mifit.stages.reflectance import choice
 from mifit.stages.reflectance.choice import fit_lighting, lighting_problem
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.lighting import LightingPriors, solve_lighting
+from mifit.stages.reflectance.lighting import solve_lighting
+from mifit.stages.reflectance.lighting_equations import LightingPriors
 from mifit.stages.reflectance.maps import Smoothness, TexelSystems, laplacian, solve_maps
 
 SIZE = 24

@@ -11,7 +11,7 @@ from mifit.core.uv import TexelMap
 from mifit.solve import Outcome
 from mifit.stages.absorb.information import Information
 from mifit.stages.absorb.normals import reduced, solve_offsets
-from mifit.stages.reflectance.lighting import specular_pull
+from mifit.stages.reflectance.lighting_equations import specular_pull
 from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, solve_maps
 
 ROUNDS = 4

@@ -15,7 +15,8 @@ from mifit.solve import Outcome
 from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.choice import choose_lighting, noise_weight
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.lighting import LightingSolution, active_weight, expected_specular, specular_pull
+from mifit.stages.reflectance.lighting import LightingSolution, active_weight
+from mifit.stages.reflectance.lighting_equations import expected_specular, specular_pull
 from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, solve_maps
 from mifit.stages.reflectance.objective import energies
 

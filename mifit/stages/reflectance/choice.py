@@ -17,7 +17,8 @@ from mifit.progress import Progress
 from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.key import RADII, STEPS, TEXELS, Candidates, find_lights, search
-from mifit.stages.reflectance.lighting import LightingProblem, LightingSolution, solve_lighting
+from mifit.stages.reflectance.lighting import LightingSolution, solve_lighting
+from mifit.stages.reflectance.lighting_equations import LightingProblem
 from mifit.stages.reflectance.prediction import Prediction, predict
 from mifit.stages.reflectance.priors import EXPONENT, NORMAL_REFLECTANCE
 

@@ -17,12 +17,8 @@ from mifit.appearance.illumination import DistantLight
 from mifit.appearance.reception import fibonacci_sphere
 from mifit.stages.observations import Observations
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.lighting import (
-    LightingProblem,
-    LightingSolution,
-    bounded_weight,
-    linearize,
-)
+from mifit.stages.reflectance.lighting import LightingSolution, bounded_weight, linearize
+from mifit.stages.reflectance.lighting_equations import LightingProblem
 
 TEXELS = 1000
 """Texels that judge candidates."""

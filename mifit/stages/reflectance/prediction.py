@@ -14,11 +14,8 @@ from numpy.typing import NDArray
 
 from mifit.appearance.formation import form_image
 from mifit.stages.observations import Observations
-from mifit.stages.reflectance.lighting import (
-    LightingProblem,
-    bounded_weight,
-    solve_lighting,
-)
+from mifit.stages.reflectance.lighting import bounded_weight, solve_lighting
+from mifit.stages.reflectance.lighting_equations import LightingProblem
 
 ENOUGH = 3
 """Timesteps from which they are left out in turn: what remains shows the head in several poses. Below it is cameras."""
