@@ -72,6 +72,14 @@ LIGHT = [
       "tests/appearance/test_lobe.py"),
     M("relighting keeps the old ambient term", OUTPUT, r"ambient = reflectance\.illumination\.ambient \* exposure \* after / before",
       "ambient = reflectance.illumination.ambient", "tests/output/test_views.py"),
+    M("relief shown under another light", ANY, r"illumination=illumination, relief=None\)", "illumination=illumination)",
+      "tests/output/test_relief_shown.py"),
+    M("relief not shown under its own light", CORE, r"return self\.diffuse if self\.relief is None else",
+      "return self.diffuse if True else", "tests/output/test_relief_shown.py"),
+    M("relief written into exports", OUTPUT, r"diffuse, specular = reflectance\.diffuse if skin else",
+      "diffuse, specular = reflectance.diffuse if False else", "tests/output/test_relief_shown.py"),
+    M("light from one side left in the skin", STAGES, r"odd = np\.where\(known, 0\.5 \* \(level - opposite\), 0\.0\)",
+      "odd = 0.0 * level", "tests/stages/test_relief.py"),
 ]  # fmt: skip
 
 GEOMETRY = [

@@ -109,7 +109,7 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int) -> None:
     write_image(path.with_name(f"{stem}_specular.png"), maps.specular)
     with replacing(path.with_name(f"{stem}_normal.png")) as temporary:
         temporary.write_bytes(encode_png(np.round(127.5 * (bent + 1)).astype(np.uint8)))
-    albedo = vertex_materials(reconstruction)[:, :3]
+    albedo = vertex_materials(reconstruction, skin=True)[:, :3]
     rest = part_of(mesh, ~mapped) if not mapped.all() else None
     grey = albedo[rest.origin].mean(0) if rest else np.full(3, 0.5)
     colour = " ".join(f"{c:.5f}" for c in linear_to_srgb(np.clip(grey, 0, 1)))

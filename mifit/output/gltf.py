@@ -104,7 +104,7 @@ def write_glb(
 
     out = _Buffer()
     mesh = split_at_seams(model)
-    albedo = vertex_materials(reconstruction)[:, :3]
+    albedo = vertex_materials(reconstruction, skin=True)[:, :3]
     primitives = []
     mapped = mapped_faces(reconstruction)
     for material, selected in enumerate((mapped, ~mapped)):

@@ -75,8 +75,10 @@ def surface_maps(reconstruction: Result, timestep: int, skin: bool = False) -> S
     return SurfaceMaps(diffuse[nearest], specular[nearest], normal[nearest])
 
 
-def vertex_materials(reconstruction: Result) -> NDArray[np.float32]:
+def vertex_materials(reconstruction: Result, skin: bool = False) -> NDArray[np.float32]:
     """Diffuse and specular albedo at the vertices: the maps' where there are maps, continued over the other faces.
+
+    ``skin`` as in `surface_maps`.
 
     Returns
     -------
@@ -93,7 +95,8 @@ def vertex_materials(reconstruction: Result) -> NDArray[np.float32]:
     uv = np.zeros((len(albedo), 2))
     uv[model.faces[inside].ravel()] = model.uv[model.faces_uv[inside].ravel()]
     _, nearest = _shown_texels(reconstruction, len(reflectance.diffuse))
-    values = np.concatenate([reflectance.diffuse, reflectance.specular[..., None]], axis=2)[nearest]
+    diffuse = reflectance.diffuse if skin else reflectance.lit_diffuse
+    values = np.concatenate([diffuse, reflectance.specular[..., None]], axis=2)[nearest]
     offset = sample_map(values, uv[known]) - expected[known]
     if len(known) < len(albedo):
         where = sp.csr_matrix((np.ones(len(known)), (np.arange(len(known)), known)), (len(known), len(albedo)))

@@ -43,7 +43,9 @@ def viewer_data(reconstruction: Result, timestep: int) -> str:
     centre = (position.min(0) + position.max(0)) / 2
     radius = float(np.abs(position - centre).max())
     face_centre = vertices[np.unique(model.faces[model.face_mask])]
-    colour = np.column_stack([to_8_bit(vertex_materials(reconstruction)[origin, :3]), has_maps * 255]).astype(np.uint8)
+    colour = np.column_stack(
+        [to_8_bit(vertex_materials(reconstruction, skin=True)[origin, :3]), has_maps * 255]
+    ).astype(np.uint8)
     wide = len(origin) > 65535
     maps = surface_maps(reconstruction, timestep, skin=True)
     peak = max(float(maps.specular.max()), 1e-3)
