@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import cv2
@@ -44,6 +45,17 @@ def poses(count: int, board: Board, distance: float, seed: int = 0) -> list[NDAr
     return found
 
 
+@functools.cache
+def _rays(matrix: bytes, distortion: tuple[float, ...], width: int, height: int) -> NDArray[np.float64]:
+    """Undistorted rays (N, 3) of all samples of a camera; a second's work, and there are two cameras."""
+    n = FINER
+    x, y = np.meshgrid((np.arange(width * n) + 0.5) / n - 0.5, (np.arange(height * n) + 0.5) / n - 0.5)
+    pixels = np.stack([x.ravel(), y.ravel()], 1).reshape(-1, 1, 2)
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 60, 1e-12)
+    flat = cv2.undistortPoints(pixels, np.frombuffer(matrix).reshape(3, 3), np.array(distortion), criteria=criteria)
+    return np.concatenate([flat.reshape(-1, 2), np.ones((len(pixels), 1))], axis=1)
+
+
 @dataclass
 class Studio:
     """Renders a board for one camera."""
@@ -53,16 +65,8 @@ class Studio:
     noise: float = 1.5
 
     def __post_init__(self) -> None:
-        n = FINER
-        x, y = np.meshgrid(
-            (np.arange(self.camera.width * n) + 0.5) / n - 0.5, (np.arange(self.camera.height * n) + 0.5) / n - 0.5
-        )
-        pixels = np.stack([x.ravel(), y.ravel()], 1).reshape(-1, 1, 2)
-        criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 60, 1e-12)
-        flat = cv2.undistortPoints(
-            pixels, opencv_matrix(self.camera), np.array(self.camera.distortion), criteria=criteria
-        )
-        self._rays = np.concatenate([flat.reshape(-1, 2), np.ones((len(pixels), 1))], axis=1)
+        camera = self.camera
+        self._rays = _rays(opencv_matrix(camera).tobytes(), camera.distortion, camera.width, camera.height)
         self._scale = 4.0
         margin = round(12 * self._scale)
         self._margin = margin
