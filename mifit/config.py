@@ -99,7 +99,7 @@ class SurfaceConfig:
     )
     refit: bool = flag(
         False,
-        "where landmarks are biased, fit the model first to a rough surface that all views see",
+        "where landmarks are biased, fit the model first by colours and by sweeps of its surface (a minute)",
     )
     finest: int = number(0, "times that the images are halved at the finest level", least=0, most=6)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mifit.config import GeometryConfig, SurfaceConfig
 from mifit.core.estimate import GeometryEstimate, Report
-from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.mesh import normalize, vertex_normals
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.progress import Progress, silent
 from mifit.render.gbuffer import SurfaceScene
@@ -21,8 +21,9 @@ from mifit.solve import Outcome
 from mifit.stages.geometry.points import corner_matrix
 from mifit.stages.surface.displace import USUAL, Plate, solve_displacement
 from mifit.stages.surface.epipolar import epipolar_residual
-from mifit.stages.surface.model_fit import FoundSurface, fit_model, landmarks_are_biased
-from mifit.stages.surface.sweep import sweep
+from mifit.stages.surface.local_planes import MeasuredPlanes, touching_planes
+from mifit.stages.surface.model_fit import SHADING_ROUNDS, fit_model, landmarks_are_biased
+from mifit.stages.surface.sweep import Found, Posed, sweep
 from mifit.stages.surface.views import Resolution, pose_texels, texture_size
 
 if TYPE_CHECKING:
@@ -49,8 +50,8 @@ SETTLED = 0.25
 THIN = 2
 STIFFEST = 5000.0
 """Largest stiffness."""
-FITTED = ("identity", "expression", "rotation", "translation", "vertices")
-"""What the fit of the model to the found surface renews."""
+FINEST_AGAIN = 2
+"""Further sweeps at the finest level while the model alone moves."""
 OFF_PIXELS = 1.0
 """Median distance from epipolar lines that deserves a warning."""
 NARROWEST = 0.03
@@ -103,13 +104,22 @@ def find_surface(
     if resolution.parallax < NARROWEST:
         return _unchanged(geometry, "views from nearly one place: the surface stays in the model's span", began)
     levels = sweeps(resolution, config, capture.unit_mm)
-    # Landmarks that agree with the fit say more of a face within the model's span than a first, rough surface does.
-    rough = levels[: max(1, len(levels) - 1)] if config.refit and landmarks_are_biased(geometry) else []
-    search = _Search(capture, model, cameras, resolution, pairs, config, progress, len(rough) + len(levels))
-    if rough:
-        first = search.descend(geometry, rough)
-        refitted = fit_model(capture, model, geometry, cameras, first.surfaces, geometry_config or GeometryConfig())
-        geometry = replace(geometry, **{name: getattr(refitted, name) for name in FITTED})
+    # Landmarks that agree with the fit say more of a face within the model's span than shading and sweeps do.
+    refit = config.refit and landmarks_are_biased(geometry)
+    spanned = [*levels, *[levels[-1]] * FINEST_AGAIN] if refit else []
+    total = len(levels) + len(spanned) + SHADING_ROUNDS * refit
+    search = _Search(capture, model, cameras, resolution, pairs, config, progress, total)
+    if refit:
+        geometry = fit_model(
+            capture,
+            model,
+            geometry,
+            cameras,
+            lambda world, sweep: search.planes(geometry.timesteps, world, *sweep),
+            spanned,
+            geometry_config or GeometryConfig(),
+            progress=search.advance,
+        )
     last = search.descend(geometry, levels)
     displacement, world = last.displacement, last.world
     residuals = search.epipolar_residuals(geometry, world, config.finest)
@@ -140,7 +150,6 @@ class _Descent:
 
     displacement: NDArray[np.float64]
     world: NDArray[np.float64]
-    surfaces: list[FoundSurface]
     stiffness: float
     matched: float
     moved: float
@@ -167,6 +176,37 @@ class _Search:
         self._done, self._total = 0, total
         progress("find surface", 0, total)
 
+    def advance(self) -> None:
+        """One more step is done."""
+        self._done += 1
+        self._progress("find surface", self._done, self._total)
+
+    def _sweep(
+        self, timesteps: Sequence[int], world: NDArray, scene: SurfaceScene, level: int, half: int
+    ) -> tuple[TexelMap, list[Posed], Found, float]:
+        """One sweep of a surface (T, V, 3): texels, the views of them, what was found, and the step (world length)."""
+        model = self._model
+        pixel = self._resolution.pixel * 2.0**level
+        size = texture_size(model, world[0], pixel, LARGEST_MAP)
+        texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+        posed = []
+        for vertices, timestep in zip(world, timesteps, strict=True):
+            scene.update(vertices)
+            posed.append(
+                pose_texels(self._capture, scene, vertices, model.faces, texels, self._cameras, timestep, 0.5**level)
+            )
+        step = STEP_PIXELS * pixel / self._resolution.parallax
+        return texels, posed, sweep(texels, posed, step * np.arange(-half, half + 1), WINDOW, self._pairs), step
+
+    def planes(
+        self, timesteps: Sequence[int], world: NDArray, level: int, half: int
+    ) -> tuple[list[MeasuredPlanes], float]:
+        """Planes that touch what a sweep finds, per timestep, which share its precision, and the sweep's step."""
+        scene = SurfaceScene(world[0], self._model.faces)
+        texels, posed, found, step = self._sweep(timesteps, world, scene, level, half)
+        found = replace(found, precision=found.precision / len(posed))
+        return [touching_planes(texels, one, found) for one in posed], step
+
     def descend(self, geometry: GeometryEstimate, levels: Sequence[tuple[int, int]]) -> _Descent:
         """Displace a fitted model's surface; levels as of `sweeps`."""
         model, scale = self._model, float(geometry.scale)
@@ -174,22 +214,10 @@ class _Search:
         plate = Plate.of(neutral, model.faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm)
         world = geometry.vertices.astype(np.float64)
         scene = SurfaceScene(world[0], model.faces)
-        displacement, stiffness, surfaces, matched = np.zeros_like(neutral), USUAL, [], 0.0
+        displacement, stiffness, matched = np.zeros_like(neutral), USUAL, 0.0
         moved, step = 0.0, 0.0
         for level, half in levels:
-            pixel = self._resolution.pixel * 2.0**level
-            size = texture_size(model, world[0], pixel, LARGEST_MAP)
-            texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
-            posed = []
-            for vertices, timestep in zip(world, geometry.timesteps, strict=True):
-                scene.update(vertices)
-                posed.append(
-                    pose_texels(
-                        self._capture, scene, vertices, model.faces, texels, self._cameras, timestep, 0.5**level
-                    )
-                )
-            step = STEP_PIXELS * pixel / self._resolution.parallax
-            found = sweep(texels, posed, step * np.arange(-half, half + 1), WINDOW, self._pairs)
+            texels, posed, found, step = self._sweep(geometry.timesteps, world, scene, level, half)
             matched = float((found.precision > 0).mean())
             objects = [p.normal @ rotation for p, rotation in zip(posed, geometry.rotation, strict=True)]
             some = thinned(texels)
@@ -213,22 +241,10 @@ class _Search:
             )
             seen = np.unique(model.faces[texels.face[measured]])
             moved = float(np.sqrt(np.mean(along[:, seen] ** 2))) if len(seen) else 0.0
-            trust = found.precision[measured]
-            trust = np.minimum(1.0, trust / max(float(np.median(trust)), 1e-30)) if len(trust) else trust
-            corners = model.faces, texels.face[measured], texels.weights[measured]
-            surfaces = [
-                FoundSurface(
-                    interpolate(vertices, *corners),
-                    normalize(interpolate(vertex_normals(vertices, model.faces), *corners)),
-                    trust,
-                )
-                for vertices in world
-            ]
-            self._done += 1
-            self._progress("find surface", self._done, self._total)
+            self.advance()
         # A sweep tells offsets to a part of its step: where the last one moved the surface by less, it has settled.
         outcome = Outcome.CONVERGED if moved < SETTLED * step else Outcome.MAX_ITERATIONS
-        return _Descent(displacement, world, surfaces, stiffness, matched, moved, outcome)
+        return _Descent(displacement, world, stiffness, matched, moved, outcome)
 
     def epipolar_residuals(self, geometry: GeometryEstimate, world: NDArray, level: int) -> dict[str, float | None]:
         """Median distance from one another's epipolar lines for each pair of views, pixels of the images."""

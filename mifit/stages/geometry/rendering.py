@@ -22,7 +22,7 @@ from mifit.core.mesh import face_cross
 from mifit.core.sh import basis_gradient
 from mifit.morphable import MorphableModel
 from mifit.solve import geman_mcclure
-from mifit.solve.systems import System
+from mifit.solve.systems import ArrowSystem
 from mifit.stages.geometry.images import SmoothImage
 from mifit.stages.geometry.landmarks import LandmarkTerm
 from mifit.stages.geometry.normal import NormalEquations, prior_energy
@@ -196,7 +196,7 @@ class RenderingProblem:
         landmarks = self.landmarks.energy(self.layout, self.frames, x)
         return {"photo": float(data), "landmarks": landmarks, "prior": prior}
 
-    def linearize(self, x: NDArray) -> System:
+    def linearize(self, x: NDArray) -> ArrowSystem:
         """Normal equations at x."""
         surfaces, albedo = self._surfaces(x), self._vertex_albedo(x)
         equations = NormalEquations(self.layout)

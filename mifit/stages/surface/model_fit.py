@@ -1,13 +1,16 @@
-"""The model once more, fitted to the found surface: identity, expressions and poses by where the surface lies.
+"""The model once more, where landmarks are biased: identity, expressions and poses by what the images show.
 
-Landmarks name points but misplace them, each the same way in every image; a surface names no points but lies where it
-lies. Points of the model are compared with the planes that touch the found surface next to them, so that they slide
-freely; texture consistency keeps views and timesteps in step, landmarks count as one biased measurement each.
+Landmarks name points but misplace them, each the same way in every image. Three things correct them, in one sum of
+squares: colours, which the model's albedo under a smooth lighting explains (shading tells a nose that points elsewhere,
+which no view may see well enough to match); texture consistency between views and timesteps; and planes that touch the
+surface where a sweep of the current one found it, along which the model slides freely. Landmarks count as one biased
+measurement each. The model alone moves, and every round sweeps it anew: nothing stands between what is measured and
+the coefficients.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -18,115 +21,102 @@ from scipy.spatial import cKDTree
 from mifit.config import GeometryConfig
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.solve import geman_mcclure, minimize
 from mifit.solve.systems import DenseSystem
+from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.consistency import ConsistencyProblem
 from mifit.stages.geometry.landmarks import LandmarkView, slide_contour
 from mifit.stages.geometry.normal import NormalEquations
 from mifit.stages.geometry.parameters import Frames, Layout, cross_matrix
 from mifit.stages.geometry.points import PointBasis
-from mifit.stages.geometry.refine import ENERGY_TOLERANCE, joint_state, texture_problem
-from mifit.stages.geometry.start import bounds, landmark_views, object_vertices
+from mifit.stages.geometry.refine import ENERGY_TOLERANCE, joint_state, paper_problem, texture_problem
+from mifit.stages.geometry.rendering import RenderingProblem
+from mifit.stages.geometry.start import State, bounds, landmark_views, object_vertices
 from mifit.stages.geometry.visibility import Visibility, spread_points
+from mifit.stages.surface.local_planes import MeasuredPlanes
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
-ROUNDS, ITERATIONS = 4, 6
-"""Times that the planes are found anew, and iterations of each."""
-POINTS = 300.0
-"""Independent measurements that the found surface amounts to: errors of neighbours are alike."""
-DEVIATION_MM = 0.3
-"""Standard deviation of one of them."""
-OUTSIDE_MM = 1.5
-"""Distance from the found surface at which a point counts as outside the model's span."""
-FARTHEST_MM = 8.0
-"""Distance at which a point of the model has no counterpart on the found surface."""
+SHADING_ROUNDS, SHADING_ITERATIONS = 5, 10
+"""Rounds by colours and texture, before anything is swept: they reach farthest; and iterations of each."""
+PASSES, ITERATIONS = 2, 6
+"""Times that the planes' counterparts are found anew after a sweep, and iterations of each."""
+POINTS, TEXTURE_POINTS = 4000, 1000
+"""Planes of a timestep, and points whose texture is compared."""
+COUNTERPART_MAP = 256
+"""Side of the map whose texels may be counterparts of planes."""
+FARTHEST_MM = 6.0
+"""Distance at which a plane has no counterpart on the model."""
+OUTSIDE_STEPS = 1.0
+"""Distance from a plane, in steps of the sweep, at which the measured surface counts as outside the model's span."""
 SCATTER_PIXELS = 1.5
 """Deviation of a landmark between images of one head; what exceeds it is bias."""
 SMALLEST_COSINE = 0.7
 """Between normals of the model and of the found surface where they are compared."""
+COLOUR = 1.0
+"""Prior of the albedo's coefficients against the colours' mean square: an image counts as one measurement to 1 of 255,
+or a hundred to 10."""
+UNEXPLAINED = 100.0
+"""Mean square of a pixel's residual, of 255 and over all channels, above which colours count in inverse proportion."""
 
-
-@dataclass(frozen=True)
-class FoundSurface:
-    """Measured points of the found surface at one timestep.
-
-    Attributes
-    ----------
-    position, normal : (M, 3)
-        World space.
-    trust : (M,)
-        0..1.
-    """
-
-    position: NDArray
-    normal: NDArray
-    trust: NDArray
-
-    def touching(self, points: NDArray, normals: NDArray, farthest: float) -> tuple[NDArray, NDArray, NDArray]:
-        """Planes next to points (N, 3): where they touch (N, 3), their normals (N, 3), and trust (N,), 0 for none."""
-        distance, row = cKDTree(self.position).query(points, distance_upper_bound=farthest)
-        missing = ~np.isfinite(distance)
-        row = np.where(missing, 0, row)
-        aligned = (self.normal[row] * normals).sum(1) > SMALLEST_COSINE
-        return self.position[row], self.normal[row], np.where(missing | ~aligned, 0.0, self.trust[row])
+Measure = Callable[[NDArray, tuple[int, int]], tuple[list[MeasuredPlanes], float]]
+"""Planes of each timestep and the step of the sweep, from the model's world vertices (T, V, 3) and a sweep."""
 
 
 @dataclass(frozen=True)
 class PlaneTerm:
-    """Sum over timesteps t and points i of ``weight_ti * rho((n_ti . (x_ti - y_ti))^2)``, Geman and McClure's rho.
+    """Sum over points i of one timestep of ``weight_i * rho((n_i . (x_i - y_i))^2)``, Geman and McClure's rho.
 
     Attributes
     ----------
+    step : int
+        Position of the timestep.
     basis : PointBasis
         Of the N points.
-    touched, normal : (T, N, 3)
+    touched, normal : (N, 3)
         Planes, world space.
-    weight : (T, N)
+    weight : (N,)
     scale : float
         Distance at which a point counts as outside the model's span.
     """
 
+    step: int
     basis: PointBasis
     touched: NDArray
     normal: NDArray
     weight: NDArray
     scale: float
 
-    def _distance(self, layout: Layout, frames: Frames, x: NDArray, step: int) -> tuple[NDArray, NDArray]:
+    def _distance(self, layout: Layout, frames: Frames, x: NDArray) -> tuple[NDArray, NDArray]:
         """(N,) distances from the planes, and the points less the translation (N, 3)."""
-        objects = self.basis.evaluate(x[layout.at("identity")], x[layout.at("expression", step)])
-        pose = frames.pose(layout, x, step)
+        objects = self.basis.evaluate(x[layout.at("identity")], x[layout.at("expression", self.step)])
+        pose = frames.pose(layout, x, self.step)
         moved = pose.scale * objects.astype(np.float64) @ pose.rotation.T
-        return ((moved + pose.translation - self.touched[step]) * self.normal[step]).sum(1), moved
+        return ((moved + pose.translation - self.touched) * self.normal).sum(1), moved
 
     def energy(self, layout: Layout, frames: Frames, x: NDArray) -> float:
         """Value of the term."""
-        total = 0.0
-        for step in range(layout.timesteps):
-            distance, _ = self._distance(layout, frames, x, step)
-            total += float((self.weight[step] * geman_mcclure(distance**2, self.scale)[0]).sum())
-        return total
+        distance, _ = self._distance(layout, frames, x)
+        return float((self.weight * geman_mcclure(distance**2, self.scale)[0]).sum())
 
     def accumulate(self, equations: NormalEquations, layout: Layout, frames: Frames, x: NDArray) -> None:
         """Add the linearised term to the normal equations."""
-        count = len(self.touched[0])
-        for step in range(layout.timesteps):
-            distance, moved = self._distance(layout, frames, x, step)
-            pose, normal = frames.pose(layout, x, step), self.normal[step]
-            by_object = (pose.scale * normal @ pose.rotation).astype(self.basis.mean.dtype)
-            shared = np.zeros((count, layout.shared_size), dtype=by_object.dtype)
-            local = np.empty((count, layout.local_size), dtype=by_object.dtype)
-            shared[:, layout.at("identity")] = _along(by_object, self.basis.identity)
-            if layout.log_scale:
-                shared[:, layout.at("log_scale").start] = (moved * normal).sum(1)
-            local[:, : layout.expression] = _along(by_object, self.basis.expression)
-            turn = -np.einsum("ni,nij->nj", normal, cross_matrix(moved)) @ pose.left_jacobian
-            local[:, layout.expression :] = np.concatenate([turn, normal], axis=1)
-            weight = self.weight[step] * geman_mcclure(distance**2, self.scale)[1]
-            equations.add(step, shared, local, distance, weight)
+        distance, moved = self._distance(layout, frames, x)
+        pose, normal = frames.pose(layout, x, self.step), self.normal
+        by_object = (pose.scale * normal @ pose.rotation).astype(self.basis.mean.dtype)
+        shared = np.zeros((len(normal), layout.shared_size), dtype=by_object.dtype)
+        local = np.empty((len(normal), layout.local_size), dtype=by_object.dtype)
+        shared[:, layout.at("identity")] = _along(by_object, self.basis.identity)
+        if layout.log_scale:
+            shared[:, layout.at("log_scale").start] = (moved * normal).sum(1)
+        local[:, : layout.expression] = _along(by_object, self.basis.expression)
+        turn = -np.einsum("ni,nij->nj", normal, cross_matrix(moved)) @ pose.left_jacobian
+        local[:, layout.expression :] = np.concatenate([turn, normal], axis=1)
+        weight = self.weight * geman_mcclure(distance**2, self.scale)[1]
+        equations.add(self.step, shared, local, distance, weight)
 
 
 def _along(direction: NDArray, modes: NDArray) -> NDArray:
@@ -135,24 +125,47 @@ def _along(direction: NDArray, modes: NDArray) -> NDArray:
 
 
 @dataclass(frozen=True)
-class PlaneTextureProblem:
-    """Texture, landmarks and priors of stage 1, and the found surface, in one sum of squares."""
+class JointProblem:
+    """Colours, texture, landmarks, priors and the measured surface in one sum of squares.
 
+    Attributes
+    ----------
+    colours : RenderingProblem
+        Without landmarks; its priors are those of albedo and lighting.
+    texture : ConsistencyProblem
+        With landmarks and the priors of the shape, in the layout of ``colours``.
+    weight : float
+        Factor of the colours' terms.
+    planes : sequence of PlaneTerm
+    """
+
+    colours: RenderingProblem
     texture: ConsistencyProblem
-    planes: PlaneTerm
+    weight: float = 1.0
+    planes: Sequence[PlaneTerm] = ()
 
     def energies(self, x: NDArray) -> dict[str, float]:
         """Energy per term."""
-        texture = self.texture
-        return {**texture.energies(x), "surface": self.planes.energy(texture.layout, texture.frames, x)}
+        layout, frames = self.colours.layout, self.colours.frames
+        terms, colours = self.texture.energies(x), self.colours.energies(x)
+        return {
+            **terms,
+            "photo": self.weight * colours["photo"],
+            "prior": terms["prior"] + self.weight * colours["prior"],
+            "surface": sum(plane.energy(layout, frames, x) for plane in self.planes),
+        }
 
     def linearize(self, x: NDArray) -> DenseSystem:
         """Normal equations at x."""
-        texture = self.texture
-        equations = NormalEquations(texture.layout)
-        self.planes.accumulate(equations, texture.layout, texture.frames, x)
-        a, b = texture.linearize(x), equations.system()
-        return DenseSystem(a.hessian + b.dense(), a.gradient + b.gradient)
+        layout, frames = self.colours.layout, self.colours.frames
+        equations = NormalEquations(layout)
+        for plane in self.planes:
+            plane.accumulate(equations, layout, frames, x)
+        texture, colours, planes = self.texture.linearize(x), self.colours.linearize(x), equations.system()
+        return DenseSystem(
+            texture.hessian + self.weight * colours.dense() + planes.dense(),
+            texture.gradient + self.weight * colours.gradient + planes.gradient,
+        )
 
 
 def fit_model(
@@ -160,11 +173,13 @@ def fit_model(
     model: MorphableModel,
     geometry: GeometryEstimate,
     cameras: Sequence[str],
-    found: Sequence[FoundSurface],
+    measure: Measure,
+    sweeps: Sequence[tuple[int, int]],
     config: GeometryConfig,
     seed: int = 0,
+    progress: Callable[[], None] = lambda: None,
 ) -> GeometryEstimate:
-    """Identity, expressions and poses of a model whose surface lies on the found one, as far as its modes allow.
+    """Identity, expressions and poses by colours and texture first, then with sweeps of the model's surface.
 
     Parameters
     ----------
@@ -172,53 +187,67 @@ def fit_model(
         As in `fit_geometry`.
     geometry : GeometryEstimate
         Where to start; albedo, lighting and gains stay.
-    found : sequence of FoundSurface
-        Per timestep.
+    measure : callable
+        Sweeps the model's surface.
+    sweeps : sequence of (int, int)
+        Level and half the number of offsets of each.
     config : GeometryConfig
+        Its landmarks, texture and robust colours.
     seed : int
-        Of the choice of surface points.
+        Of the choice of points and pixels.
+    progress : callable
+        Called after each round.
 
     Returns
     -------
     GeometryEstimate
-        On the model's surface, without displacement.
+        On the model's surface, without displacement; ``geometry`` where a round ends without a usable result.
     """
     steps = geometry.timesteps
-    unit = float(geometry.scale) / model.unit_mm  # of world length in a millimetre
     noise = float(geometry.report.details.get("landmark_noise_pixels", config.landmark_noise))
+    config = replace(config, as_written=False, scale_deviation=0.0, landmark_noise=noise)
     views = landmark_views(capture, model, cameras, steps, biased_noise(noise, len(cameras) * len(steps)), fewest=0)
     views = slid(model, geometry, views)
     visibility = Visibility(capture, model, tuple(cameras), steps, geometry.gains)
-    points = spread_points(model, config.surface_points, seed)
-    weight = POINTS / len(points.face) / (DEVIATION_MM * unit) ** 2
+    points = spread_points(model, min(config.surface_points, TEXTURE_POINTS), seed)
+    texels = rasterize_uv(model.uv, model.faces_uv, COUNTERPART_MAP, model.face_mask)
+    farthest = FARTHEST_MM * float(geometry.scale) / model.unit_mm
+    rng = np.random.default_rng(seed)
     state = joint_state(model, geometry)
-    low, high = bounds(state.layout, model.expression_bounds)
-    for _ in range(ROUNDS):
-        state = state.recentred()
-        touched: list[NDArray] = []
-        normals: list[NDArray] = []
-        trust: list[NDArray] = []
-        for vertices, surface in zip(visibility.world(state), found, strict=True):
-            corners = model.faces, points.face, points.weights
-            own = normalize(interpolate(vertex_normals(vertices, model.faces), *corners))
-            plane = surface.touching(interpolate(vertices, *corners), own, FARTHEST_MM * unit)
-            for part, value in zip((touched, normals, trust), plane, strict=True):
-                part.append(value)
-        planes = PlaneTerm(
-            points.basis, np.stack(touched), np.stack(normals), weight * np.stack(trust), OUTSIDE_MM * unit
-        )
-        texture = texture_problem(state, views, visibility, points, config)
-        solution = minimize(
-            PlaneTextureProblem(texture, planes),
-            state.x,
-            lower=low,
-            upper=high,
-            max_iterations=ITERATIONS,
-            energy_tolerance=ENERGY_TOLERANCE,
-        )
-        if not solution.usable or not np.isfinite(solution.value).all():
-            return geometry
-        state = replace(state, x=solution.value)
+    pixels = visibility.pixels(state, config.pixels, 1.0, seed)
+    start = gather(model, visibility.world(state), pixels, config.robust_colour, config.albedo_prior)
+    appearance = fit_appearance(start, config.max_iterations).value
+    number = 0
+    for sweep in (*[None] * SHADING_ROUNDS, *sweeps):
+        planes, scale = ([], 1.0) if sweep is None else measure(visibility.world(state), sweep)
+        planes = [part.thinned(POINTS, rng) for part in planes]
+        for _ in range(PASSES if planes else 1):
+            state = state.recentred()
+            terms = _counterparts(model, texels, visibility.world(state), planes, farthest, OUTSIDE_STEPS * scale)
+            colours, x = paper_problem(model, state, appearance, (), visibility, config, seed + number)
+            colours = replace(colours, priors={"albedo": COLOUR, "ambient": colours.priors["ambient"]})
+            texture = texture_problem(state, views, visibility, points, config)
+            texture = replace(texture, layout=colours.layout, frames=colours.frames)
+            # Paint that the model's albedo doesn't explain is no shading: what stays unexplained counts less.
+            left = colours.energies(x)["photo"] / max(len(colours.views), 1)
+            weight = min(1.0, UNEXPLAINED / max(left, 1e-30))
+            low, high = bounds(colours.layout, model.expression_bounds)
+            solution = minimize(
+                JointProblem(colours, texture, weight, terms),
+                x,
+                lower=low,
+                upper=high,
+                max_iterations=SHADING_ITERATIONS if sweep is None else ITERATIONS,
+                energy_tolerance=ENERGY_TOLERANCE,
+            )
+            if not solution.usable or not np.isfinite(solution.value).all():
+                return geometry
+            full = State(colours.layout, colours.frames, solution.value)
+            at = full.layout.at
+            appearance = np.concatenate([full.x[at(name)] for name in ("albedo", "shading", "ambient")])
+            state = full.with_layout(state.layout)
+            number += 1
+        progress()
     layout = state.layout
     poses = [state.frames.pose(layout, state.x, k) for k in range(len(steps))]
     return replace(
@@ -230,6 +259,30 @@ def fit_model(
         vertices=visibility.world(state).astype(np.float32),
         displacement=None,
     )
+
+
+def _counterparts(
+    model: MorphableModel,
+    texels: TexelMap,
+    world: NDArray,
+    planes: Sequence[MeasuredPlanes],
+    farthest: float,
+    scale: float,
+) -> list[PlaneTerm]:
+    """The texels of the model nearest to measured planes, per timestep; planes far from all of them are left out."""
+    terms = []
+    for step, plane in enumerate(planes):
+        if not len(plane.precision):
+            continue
+        vertices = world[step]
+        position = interpolate(vertices, model.faces, texels.face, texels.weights)
+        distance, near = cKDTree(position).query(plane.position)
+        corners = texels.face[near], texels.weights[near]
+        normal = normalize(interpolate(vertex_normals(vertices, model.faces), model.faces, *corners))
+        used = (distance < farthest) & ((normal * plane.normal).sum(1) > SMALLEST_COSINE)
+        basis = PointBasis.on_faces(model, corners[0][used], corners[1][used])
+        terms.append(PlaneTerm(step, basis, plane.position[used], plane.normal[used], plane.precision[used], scale))
+    return terms
 
 
 def landmarks_are_biased(geometry: GeometryEstimate) -> bool:
