@@ -196,7 +196,7 @@ def frame_problem(
     from mifit.stages.normals.problem import NormalProblem, NormalView, residual_scale, texel_shade
 
     rotation = geometry.rotation[0]
-    surface = Surface(capture, model, geometry, cameras, texels.size)
+    surface = Surface(capture, model, geometry, cameras, texels.size, texels=texels)
     seen = surface.observe(np.arange(len(texels.index)))
     base = seen.normal[:, 0].astype(np.float64)
     rows = np.flatnonzero((seen.measured > 0).any(1))
