@@ -49,7 +49,7 @@ def change(path: Path, edit: Any) -> None:
 def made(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
     """A folder with a capture of 120 x 90 pixels, a fit of its first timestep, and a configuration of tiny maps."""
     folder = tmp_path_factory.mktemp("made")
-    (folder / "fit.toml").write_text("[reflectance]\ntexture_size = 32\n")
+    (folder / "fit.toml").write_text("[reflectance]\ntexture_size = 32\nshading = 'prefiltered'\nexponent = 40\n")
     assert run("synth", "--out", folder / "capture", *SIZE, *COARSE) == 0
     assert fit(folder, folder / "capture", folder / "result") == 0
     return folder
