@@ -107,10 +107,11 @@ def find_surface(
     # Landmarks that agree with the fit say more of a face within the model's span than shading and sweeps do.
     refit = config.refit and landmarks_are_biased(geometry)
     spanned = [*levels, *[levels[-1]] * FINEST_AGAIN] if refit else []
-    total = len(levels) + len(spanned) + SHADING_ROUNDS * refit
+    total = len(levels) + (len(levels) + len(spanned) + SHADING_ROUNDS) * refit
     search = _Search(capture, model, cameras, resolution, pairs, config, progress, total)
+    last = search.descend(geometry, levels)
     if refit:
-        geometry = fit_model(
+        fitted = fit_model(
             capture,
             model,
             geometry,
@@ -120,7 +121,10 @@ def find_surface(
             geometry_config or GeometryConfig(),
             progress=search.advance,
         )
-    last = search.descend(geometry, levels)
+        other = search.descend(fitted, levels)
+        # Colours mislead where the albedo model doesn't explain them; on the truer surface the views agree more widely.
+        refit = other.matched > last.matched
+        geometry, last = (fitted, other) if refit else (geometry, last)
     displacement, world = last.displacement, last.world
     residuals = search.epipolar_residuals(geometry, world, config.finest)
     seconds = time.perf_counter() - began
@@ -131,6 +135,7 @@ def find_surface(
         "moved_last_mm": last.moved * capture.unit_mm,
         "levels": [level for level, _ in levels],
         "matched": last.matched,
+        "refitted": refit,
         "stiffness": last.stiffness,
         "displacement_mm": float(np.sqrt(np.mean(moved**2))),
         "epipolar_pixels": residuals,

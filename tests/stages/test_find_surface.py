@@ -270,9 +270,21 @@ def test_biased_landmarks_bend_the_shape_less(model, bumpy):
     found = find_surface(biased, model, start, BOTH, SurfaceConfig(refit=True), geometry_config=QUICK)
     before = off_mm(model, bumpy, start).mean()
     assert off_mm(model, bumpy, found).mean() < 0.3 * before
+    assert found.report.details["phases"][-1]["refitted"]
     moved = found.scale * found.displacement @ found.rotation.transpose(0, 2, 1)
     alone = replace(found, vertices=found.vertices - moved)
     assert off_mm(model, bumpy, alone).mean() < 0.5 * before
+
+
+def test_a_refit_on_which_the_views_agree_less_is_dropped(model, bumpy, start, found, monkeypatch):
+    def misled(capture, model, geometry, *_, **__):
+        return replace(geometry, vertices=geometry.vertices + np.float32(0.6), translation=geometry.translation + 0.6)
+
+    monkeypatch.setattr("mifit.stages.find_surface.fit_model", misled)
+    monkeypatch.setattr("mifit.stages.find_surface.landmarks_are_biased", lambda _: True)
+    kept = find_surface(bumpy, model, start, BOTH, SurfaceConfig(refit=True))
+    assert kept.report.details["phases"][-1]["refitted"] is False
+    assert np.array_equal(kept.vertices, found.vertices)
 
 
 def test_the_outcome_tells_whether_the_last_sweep_still_moved_the_surface(model, bumpy, start, monkeypatch):
