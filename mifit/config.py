@@ -101,6 +101,7 @@ class SurfaceConfig:
         False,
         "where landmarks are biased, fit the model first by colours and by sweeps of its surface (a minute)",
     )
+    close_lips: bool = flag(False, "close the lips on the lip line where the images show a closed mouth")
     finest: int = number(0, "times that the images are halved at the finest level", least=0, most=6)
 
 

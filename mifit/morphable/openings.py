@@ -60,8 +60,13 @@ class _Piece:
 
 def holes(model: MorphableModel) -> list[NDArray[np.int64]]:
     """Vertices of each closed border of the mesh, in order."""
-    edges = np.concatenate([model.faces[:, [0, 1]], model.faces[:, [1, 2]], model.faces[:, [2, 0]]]).astype(np.int64)
-    codes = edges.min(axis=1) * model.n_vertices + edges.max(axis=1)
+    return closed_borders(model.faces)
+
+
+def closed_borders(faces: NDArray) -> list[NDArray[np.int64]]:
+    """Vertices of each closed border of some faces (F, 3), in order."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    codes = edges.min(axis=1) * (int(faces.max()) + 1) + edges.max(axis=1)
     _, first, count = np.unique(codes, return_index=True, return_counts=True)
     following = dict(edges[first[count == 1]].tolist())
     found = []

@@ -19,6 +19,7 @@ from mifit.progress import Progress, silent
 from mifit.render.gbuffer import SurfaceScene
 from mifit.solve import Outcome
 from mifit.stages.geometry.points import corner_matrix
+from mifit.stages.surface.close_lips import close_lips
 from mifit.stages.surface.displace import USUAL, Plate, solve_displacement
 from mifit.stages.surface.epipolar import epipolar_residual
 from mifit.stages.surface.local_planes import MeasuredPlanes, touching_planes
@@ -125,10 +126,13 @@ def find_surface(
         # Colours mislead where the albedo model doesn't explain them; on the truer surface the views agree more widely.
         refit = other.matched > last.matched
         geometry, last = (fitted, other) if refit else (geometry, last)
-    displacement, world = last.displacement, last.world
-    residuals = search.epipolar_residuals(geometry, world, config.finest)
+    found = replace(geometry, vertices=last.world.astype(np.float32), displacement=last.displacement.astype(np.float32))
+    lips: dict = {}
+    if config.close_lips:
+        found, lips = close_lips(capture, model, found, cameras)
+    residuals = search.epipolar_residuals(found, found.vertices.astype(np.float64), config.finest)
     seconds = time.perf_counter() - began
-    moved = np.linalg.norm(displacement, axis=1)[np.unique(model.faces[model.face_mask])] * model.unit_mm
+    moved = np.linalg.norm(last.displacement, axis=1)[np.unique(model.faces[model.face_mask])] * model.unit_mm
     phase = {
         "name": "surface",
         "outcome": last.outcome.value,
@@ -139,14 +143,10 @@ def find_surface(
         "stiffness": last.stiffness,
         "displacement_mm": float(np.sqrt(np.mean(moved**2))),
         "epipolar_pixels": residuals,
+        "lips": lips,
         "seconds": seconds,
     }
-    return replace(
-        geometry,
-        vertices=world.astype(np.float32),
-        displacement=displacement.astype(np.float32),
-        report=_extended(geometry.report, seconds, phase, epipolar_warnings(residuals)),
-    )
+    return replace(found, report=_extended(geometry.report, seconds, phase, epipolar_warnings(residuals)))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,171 @@
+"""Stage 1b's lips: a mouth that the images show closed is closed, any other is left as it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from memory_capture import MemoryCapture, look_at_head
+
+import mifit.stages.find_surface as stage
+from mifit.capture import Frame
+from mifit.config import SurfaceConfig
+from mifit.core.estimate import GeometryEstimate, Report
+from mifit.core.mesh import face_cross
+from mifit.morphable import MorphableModel
+from mifit.stages.geometry.displaced import displaced
+from mifit.stages.geometry.parameters import exponential
+from mifit.stages.surface.close_lips import COLUMNS, Margins, _Mouth, close_lips
+from mifit.stages.surface.lip_line import heights, read_strip
+from tests.morphable.intersections import intersections
+
+BOTH = ("left", "right")
+LIPS, INSIDE, TEETH = (0.35, 0.16, 0.14), (0.02, 0.006, 0.005), (0.3, 0.27, 0.24)
+ABOVE_MM = 0.6
+"""Of the true lip line above the middle between the modelled margins."""
+
+
+@pytest.fixture(scope="module")
+def model(variant):
+    return MorphableModel.load("builtin:coarse").subset(identity=10, albedo=5)
+
+
+@pytest.fixture(scope="module")
+def start(model):
+    """Two timesteps of the mean head, whose margins are about 2 mm apart."""
+    rotation = np.stack([np.eye(3), exponential(np.radians([-5.0, 8.0, 2.0]))])
+    expression = np.zeros((2, model.n_expression))
+    none = np.zeros(model.n_identity), np.zeros(model.n_albedo)
+    vertices = (model.mean.astype(np.float64) @ rotation.transpose(0, 2, 1)).astype(np.float32)
+    return GeometryEstimate(
+        (0, 1), none[0], none[1], expression, rotation, np.zeros((2, 3)), 1.0, vertices, model.mean_albedo,
+        np.zeros((9, 3)), 0.0, Report("converged"),
+    )  # fmt: skip
+
+
+def mouth_of(model, geometry, k):
+    shape = displaced(model, geometry).shape(geometry.identity, geometry.expression[k]).astype(np.float64)
+    return _Mouth.of(shape, Margins.of(model))
+
+
+def opening_mm(model, geometry, k):
+    mouth = mouth_of(model, geometry, k)
+    return (mouth.upper - mouth.lower)[:, 1] * model.unit_mm
+
+
+def true_line(model, start):
+    return mouth_of(model, start, 0).middle + np.array([0.0, ABOVE_MM / model.unit_mm, 0.0])
+
+
+def photographed(model, start, mouths):
+    """Images of nothing but lips, with a lip line (``"closed"``), a band or nothing for a mouth, per timestep."""
+    cameras = {name: look_at_head(name, angle, 850, 600) for name, angle in zip(BOTH, (-20.0, 20.0), strict=True)}
+    rng, frames, mouth = np.random.default_rng(0), {}, mouth_of(model, start, 0)
+    for k, what in enumerate(mouths):
+        for name, camera in cameras.items():
+            image = np.tile(np.float32(LIPS), (600, 850, 1))
+
+            def pixels(points, camera=camera, k=k):
+                return np.round(16 * (camera.project(points @ start.rotation[k].T) - 0.5)).astype(np.int32)
+
+            if what == "closed":
+                line = pixels(true_line(model, start))
+                cv2.polylines(image, [line], False, INSIDE, 1, cv2.LINE_AA, 4)
+            elif what != "nothing":
+                band = np.concatenate([pixels(mouth.upper), pixels(mouth.lower)[::-1]])
+                cv2.fillPoly(image, [band], TEETH if what == "teeth" else INSIDE, cv2.LINE_AA, 4)
+                cv2.polylines(image, [pixels(mouth.upper), pixels(mouth.lower)], False, INSIDE, 1, cv2.LINE_AA, 4)
+            image = cv2.GaussianBlur(image, (0, 0), 0.6) * (1 + 0.01 * rng.normal(size=image.shape))
+            everywhere = np.ones(image.shape[:2], bool)
+            marks = np.zeros((68, 2))
+            frames[name, k] = Frame(image.astype(np.float32), everywhere, ~everywhere, marks, np.zeros(68, bool))
+    return MemoryCapture(cameras, frames, start.vertices, start.rotation, start.identity)
+
+
+@pytest.fixture(scope="module")
+def closed(model, start):
+    return close_lips(photographed(model, start, ("closed", "closed")), model, start, BOTH)
+
+
+def test_lips_close_on_the_line(model, start, closed):
+    found, details = closed
+    assert details["closed"] == [0, 1]
+    for k in range(2):
+        assert np.median(opening_mm(model, start, k)) > 1.5
+        assert np.abs(opening_mm(model, found, k)).max() < 0.3
+        off = (mouth_of(model, found, k).middle - true_line(model, start))[:, 1] * model.unit_mm
+        assert np.abs(off).max() < 0.3
+
+
+def test_the_result_is_consistent_in_itself(model, closed):
+    found, _ = closed
+    carried = displaced(model, found)
+    for k in range(2):
+        shape = carried.shape(found.identity, found.expression[k])
+        np.testing.assert_allclose(found.vertices[k], shape @ found.rotation[k].T, atol=1e-4)
+
+
+def test_no_face_of_the_face_area_flips(model, start, closed):
+    found, _ = closed
+    facial = model.faces[model.face_mask]
+    for k in range(2):
+        before, after = (face_cross(g.vertices[k], facial) for g in (start, found))
+        assert ((before * after).sum(1) > 0).all()
+
+
+def test_the_face_area_does_not_intersect_itself(model, start, closed):
+    facial = model.faces[model.face_mask]
+    before, after = (intersections(10.0 * g.vertices[0], facial) for g in (start, closed[0]))
+    assert len(after) <= len(before)
+
+
+def test_the_rest_of_the_face_stays(model, start, closed):
+    marks = model.landmarks[:48]
+    assert np.linalg.norm(closed[0].vertices[:, marks] - start.vertices[:, marks], axis=2).max() < 0.02
+
+
+@pytest.mark.parametrize("what", ["inside", "teeth", "nothing"])
+def test_a_mouth_not_seen_closed_is_left_alone(model, start, what):
+    found, details = close_lips(photographed(model, start, (what, what)), model, start, BOTH)
+    assert details["closed"] == [] and found is start
+
+
+def test_an_open_timestep_stays_as_open(model, start):
+    found, details = close_lips(photographed(model, start, ("closed", "inside")), model, start, BOTH)
+    assert details["closed"] == [0]
+    assert np.abs(opening_mm(model, found, 0)).max() < 0.8
+    before, after = (np.median(opening_mm(model, g, 1)) for g in (start, found))
+    assert after > 0.7 * before
+
+
+def test_lips_that_touch_stay(model, closed):
+    found, _ = closed
+    again, _ = close_lips(photographed(model, found, ("nothing", "nothing")), model, found, BOTH)
+    assert again is found
+
+
+def test_columns_that_are_not_seen_have_no_vote():
+    strip = np.ones((len(COLUMNS), len(heights(2.0)), 3))
+    seen = np.arange(len(COLUMNS)) < 0.4 * len(COLUMNS)
+    strip[:, len(heights(2.0)) // 2] = 0.05
+    assert read_strip(strip, seen, 2.0, 0.8).closed is None
+    assert read_strip(strip, np.ones(len(seen), bool), 2.0, 0.8).closed
+
+
+def test_a_model_whose_face_area_has_no_mouth_is_left_alone(model, start):
+    whole = replace(model, face_mask=np.ones(len(model.faces), bool))
+    found, details = close_lips(photographed(model, start, ("closed", "closed")), whole, start, BOTH)
+    assert found is start and details == {}
+
+
+def test_lips_close_on_request_only(model, start, monkeypatch):
+    """What shows no texture leaves the surface where it is, so that nothing but the lips can move."""
+    capture = photographed(model, start, ("closed", "closed"))
+    asked = []
+    monkeypatch.setattr(stage, "close_lips", lambda *given: asked.append(given) or (given[2], {}))
+    stage.find_surface(capture, model, start, BOTH, SurfaceConfig(finest=2))
+    assert not asked
+    stage.find_surface(capture, model, start, BOTH, SurfaceConfig(finest=2, close_lips=True))
+    assert len(asked) == 1
