@@ -108,6 +108,11 @@ def test_a_fit_is_shown_while_it_is_fitted(variant, tiny_capture, tmp_path, monk
     problems: list[str] = []
     visits: list[threading.Thread] = []
     shown: list[tuple[str, ...]] = []
+    steps: list[np.ndarray] = []
+
+    def part(image: np.ndarray) -> np.ndarray:
+        """Beside the controls and notices."""
+        return image[200:, :560].astype(int)
 
     def look(address: str) -> None:
         def visit() -> None:
@@ -128,7 +133,12 @@ def test_a_fit_is_shown_while_it_is_fitted(variant, tiny_capture, tmp_path, monk
         shown.append(result.methods)
         view.watch(result)
         taken, limit = len(seen), time.monotonic() + 30
-        view.live.run(until=lambda: len(seen) > taken + 1 or time.monotonic() > limit)  # the page shows this step
+
+        def is_shown() -> bool:
+            return len(seen) > taken + 1 and part(seen[-1]).std() > 10
+
+        view.live.run(until=lambda: is_shown() or time.monotonic() > limit)  # the page shows this step
+        steps.append(part(seen[-1]))
 
     watched = mifit.fit(capture, model, timesteps=[0], config=config, progress=view.progress, watch=watch)
     fitting.clear()
@@ -138,8 +148,9 @@ def test_a_fit_is_shown_while_it_is_fitted(variant, tiny_capture, tmp_path, monk
     assert shown[0] == ("pca",) and "full" in shown[-1] and len(shown) >= 4
     for name, image in (("while", seen[len(seen) // 2]), ("after", seen[-1])):
         cv2.imwrite(str(tmp_path / f"{name}.png"), image[..., ::-1])
-    left = [image[200:, :560].astype(int) for image in seen]  # beside the controls and notices
+    left = [part(image) for image in seen]
     assert left[-1].std() > 10
+    assert np.abs(left[-1] - steps[1]).mean() > 0.3  # not the second step's still; the page opens during the first
     changes = [np.abs(a - b).mean() for a, b in itertools.pairwise(left)]
     assert sum(change > 0.3 for change in changes) >= 2  # pictures came while the fit went on
     alone = mifit.fit(capture, model, timesteps=[0], config=config)  # watching changes nothing
