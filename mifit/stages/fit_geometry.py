@@ -18,7 +18,7 @@ from mifit.solve import Solution
 from mifit.stages.gains import differ, estimate_gains
 from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.displaced import displaced
-from mifit.stages.geometry.faults import calibration_warnings
+from mifit.stages.geometry.faults import calibration_warnings, unseen_warnings
 from mifit.stages.geometry.landmarks import LandmarkView
 from mifit.stages.geometry.parameters import Frames, Layout
 from mifit.stages.geometry.refine import Reference, priors_of, refine_by_rendering, refine_by_texture, texture_reference
@@ -237,6 +237,8 @@ def _refine_and_pack(
     else:
         coefficients = _appearance(model, state, visibility, config, seed, journal)
     for message in visibility.warnings:
+        journal.warn(message)
+    for message in unseen_warnings(visibility.blind, cameras, len(timesteps), capture.units):
         journal.warn(message)
     return pack(
         model,

@@ -9,7 +9,13 @@ import pytest
 from memory_capture import look_at_head
 
 from mifit.morphable import MorphableModel
-from mifit.stages.geometry.faults import MISTAKES, calibration_fault, calibration_warnings, delayed_camera
+from mifit.stages.geometry.faults import (
+    MISTAKES,
+    calibration_fault,
+    calibration_warnings,
+    delayed_camera,
+    unseen_warnings,
+)
 from mifit.stages.geometry.landmarks import LandmarkView
 from mifit.stages.geometry.parameters import exponential
 from mifit.stages.geometry.points import PointBasis
@@ -103,3 +109,10 @@ def test_a_late_camera_is_named(model, lag):
 
 def test_cameras_in_step_are_not_called_late(model):
     assert delayed_camera(seen(model, 0, steps=8)) is None
+
+
+def test_a_camera_that_never_shows_the_face_is_named_with_what_to_look_at():
+    blind = {("left", 0), ("right", 0), ("right", 1)}
+    (message,) = unseen_warnings(blind, ("left", "right"), 2, "m")
+    assert message.startswith("camera right ") and "found m" in message and "left taken for right" in message
+    assert unseen_warnings({("left", 0)}, ("left", "right"), 2, "m") == []

@@ -6,7 +6,7 @@ names the mistake.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -194,3 +194,24 @@ def _all_landmarks(view: LandmarkView) -> NDArray[np.float64]:
     out = np.full((68, 2), np.nan)
     out[view.index] = view.pixels
     return out
+
+
+def unseen_warnings(blind: Collection[tuple[str, int]], cameras: Sequence[str], steps: int, units: str) -> list[str]:
+    """What to say of cameras that show nothing of the fitted face in any of the timesteps.
+
+    Parameters
+    ----------
+    blind : collection of (camera, step)
+        Images that showed nothing of the face.
+    cameras, steps
+        The cameras fitted, and the number of timesteps.
+    units : str
+        The capture's unit of length.
+    """
+    return [
+        f"camera {name} shows the front of the fitted face at no timestep. If its images do show the face: is the unit "
+        f"of length right (found {units}), is the order of the landmarks (left taken for right turns a head around), "
+        "are the cameras' poses?"
+        for name in cameras
+        if all((name, step) in blind for step in range(steps))
+    ]

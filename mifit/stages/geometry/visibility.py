@@ -68,6 +68,7 @@ class Visibility:
         self.timesteps = tuple(timesteps)
         self._scene: SurfaceScene | None = None
         self.warnings: list[str] = []
+        self.blind: set[tuple[str, int]] = set()  # images (camera, step) that showed nothing of the face once
         self._buffers: dict[tuple[int, str], GBuffer] = {}
 
     def world(self, state: State) -> NDArray[np.float64]:
@@ -95,6 +96,7 @@ class Visibility:
         return (on > 0) & frame.valid & ~frame.clipped & (frame.image.max(axis=2) > DARKEST)
 
     def _warn_unusable(self, camera: Camera, step: int) -> None:
+        self.blind.add((camera.name, step))
         self.warnings.append(
             f"camera {camera.name}, timestep {self.timesteps[step]}: no pixel of the face can be used (out of view, "
             "masked, clipped or black); only landmarks count there"
