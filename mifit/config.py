@@ -98,7 +98,7 @@ class SurfaceConfig:
         most=WEIGHT,
     )
     refit: bool = flag(
-        True,
+        False,
         "where landmarks are biased, fit the model first by colours and by sweeps of its surface (a minute)",
     )
     close_lips: bool = flag(False, "close the lips on the lip line where the images show a closed mouth")
