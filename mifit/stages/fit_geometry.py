@@ -238,7 +238,7 @@ def _refine_and_pack(
         coefficients = _appearance(model, state, visibility, config, seed, journal)
     for message in visibility.warnings:
         journal.warn(message)
-    for message in unseen_warnings(visibility.blind, cameras, len(timesteps), capture.units):
+    for message in unseen_warnings(visibility.blind, cameras, len(timesteps), capture.unit_mm):
         journal.warn(message)
     return pack(
         model,

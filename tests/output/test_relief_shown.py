@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import ball_camera, ball_result
 
 from mifit.appearance.illumination import Illumination
 from mifit.output.surface import surface_maps
 from mifit.reconstruction import Reconstruction
+from tests.output.conftest import ball_camera, ball_result
 
 
 @pytest.fixture(scope="module")

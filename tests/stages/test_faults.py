@@ -113,6 +113,6 @@ def test_cameras_in_step_are_not_called_late(model):
 
 def test_a_camera_that_never_shows_the_face_is_named_with_what_to_look_at():
     blind = {("left", 0), ("right", 0), ("right", 1)}
-    (message,) = unseen_warnings(blind, ("left", "right"), 2, "m")
-    assert message.startswith("camera right ") and "found m" in message and "left taken for right" in message
-    assert unseen_warnings({("left", 0)}, ("left", "right"), 2, "m") == []
+    (message,) = unseen_warnings(blind, ("left", "right"), 2, 1000.0)
+    assert message.startswith("camera right ") and "1000 mm" in message and "left taken for right" in message
+    assert unseen_warnings({("left", 0)}, ("left", "right"), 2, 1000.0) == []

@@ -196,7 +196,9 @@ def _all_landmarks(view: LandmarkView) -> NDArray[np.float64]:
     return out
 
 
-def unseen_warnings(blind: Collection[tuple[str, int]], cameras: Sequence[str], steps: int, units: str) -> list[str]:
+def unseen_warnings(
+    blind: Collection[tuple[str, int]], cameras: Sequence[str], steps: int, unit_mm: float
+) -> list[str]:
     """What to say of cameras that show nothing of the fitted face in any of the timesteps.
 
     Parameters
@@ -205,12 +207,12 @@ def unseen_warnings(blind: Collection[tuple[str, int]], cameras: Sequence[str], 
         Images that showed nothing of the face.
     cameras, steps
         The cameras fitted, and the number of timesteps.
-    units : str
-        The capture's unit of length.
+    unit_mm : float
+        The capture's unit of length in millimetres.
     """
     return [
         f"camera {name} shows the front of the fitted face at no timestep. If its images do show the face: is the unit "
-        f"of length right (found {units}), is the order of the landmarks (left taken for right turns a head around), "
+        f"of length right (found one of {unit_mm:g} mm), is the order of the landmarks (left taken for right turns a head around), "
         "are the cameras' poses?"
         for name in cameras
         if all((name, step) in blind for step in range(steps))
