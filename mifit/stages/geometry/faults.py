@@ -212,8 +212,8 @@ def unseen_warnings(
     """
     return [
         f"camera {name} shows the front of the fitted face at no timestep. If its images do show the face: is the unit "
-        f"of length right (found one of {unit_mm:g} mm), is the order of the landmarks (left taken for right turns a head around), "
-        "are the cameras' poses?"
+        f"of length right (found one of {unit_mm:g} mm), is the order of the landmarks (left taken for right turns a "
+        "head around), are the cameras' poses?"
         for name in cameras
         if all((name, step) in blind for step in range(steps))
     ]
