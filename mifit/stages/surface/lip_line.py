@@ -10,7 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
+
+from mifit.core.uv import bilinear
 
 STEP_MM = 0.1
 """Distance of samples across the lips."""
@@ -59,8 +61,9 @@ def heights(opening_mm: float) -> NDArray[np.float64]:
 
 def sample(image: NDArray, pixels: NDArray) -> NDArray[np.float64]:
     """Values (..., 3) of an image (H, W, 3) at pixel coordinates (..., 2)."""
-    at = [pixels[..., 1] - 0.5, pixels[..., 0] - 0.5]
-    return np.stack([map_coordinates(image[..., k], at, order=1, mode="nearest") for k in range(3)], axis=-1)
+    # Points behind a camera have no pixel; callers don't use what is read there.
+    x, y = np.moveaxis(np.nan_to_num(np.asarray(pixels, dtype=np.float64)).reshape(-1, 2) - 0.5, -1, 0)
+    return bilinear(np.asarray(image, dtype=np.float64), x, y).reshape(*pixels.shape[:-1], -1)
 
 
 def read_strip(strip: NDArray, seen: NDArray, opening_mm: float, column_mm: float) -> LipLine:
