@@ -36,7 +36,7 @@ from mifit import Capture, FitConfig, MorphableModel, Reconstruction
 from mifit.core.files import write_text
 from mifit.core.image import write_image
 from mifit.errors import MifitError
-from mifit.output.baseline import image_based
+from mifit.render.image_based import image_based
 
 ICT = str(SHARED / "models" / "ict_facekit" / "ict_facekit_head.npz")
 FITS = ("full", "refit", "paper")

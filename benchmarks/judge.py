@@ -19,7 +19,7 @@ from mifit.core.image import to_8_bit
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.metrics import psnr_from_rmse, ssim
 from mifit.core.uv import sample_map
-from mifit.output.baseline import image_based
+from mifit.render.image_based import image_based
 
 MARGIN = 48
 """Pixels around the landmarks that are rendered: more than any window of a measure reaches beyond the face."""

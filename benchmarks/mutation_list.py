@@ -10,6 +10,7 @@ CAPTURE = "mifit/capture/*.py"
 STAGES = "mifit/stages/**/*.py"
 SOLVE = "mifit/solve/*.py"
 OUTPUT = "mifit/output/*.py"
+RENDER = "mifit/render/*.py"
 ANY = "mifit/**/*.py"
 
 CONVENTIONS = [
@@ -44,10 +45,10 @@ MEASURES = [
       "COLOUR_EXPONENT, FEATURE_EXPONENT = 0.7, 1.0", "tests/core/test_flip.py"),
     M("the evaluated region isn't eroded", OUTPUT, r"^EROSION = 2$", "EROSION = 0",
       "tests/output/test_render_evaluate.py"),
-    M("the baseline takes views that are hidden", OUTPUT,
+    M("the baseline takes views that are hidden", RENDER,
       r"visible = inside & \(cosine > LEAST_COSINE\) & scene\.visible_from\(point, view\.position\)",
       "visible = inside & (cosine > LEAST_COSINE)", "tests/test_foreign.py tests/output/test_baseline_resect.py"),
-    M("the baseline ignores gains", OUTPUT, r"colour = bilinear\(frame\.image, x, y\) / gain",
+    M("the baseline ignores gains", RENDER, r"colour = bilinear\(frame\.image, x, y\) / gain",
       "colour = bilinear(frame.image, x, y)", "tests/test_foreign.py"),
     M("a placed camera keeps a guessed focal length", OUTPUT,
       r"focal = np\.exp\(x\[6\]\) if view\.intrinsics is None else 1\.0", "focal = 1.0",

@@ -15,7 +15,7 @@ import mifit
 from benchmarks import foreign, foreign_tables, judge, scan
 from benchmarks.record import SHARED
 from mifit.cli import main
-from mifit.output.baseline import image_based
+from mifit.render.image_based import image_based
 from tests.output.conftest import RADIUS, ball_camera, ball_result
 
 TOOL = SHARED / "tools" / "held_out.py"

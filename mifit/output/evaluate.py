@@ -18,10 +18,10 @@ from mifit.core.image import to_8_bit
 from mifit.core.metrics import mean_squared_error, psnr_from_rmse, ssim
 from mifit.core.npz import read_npz
 from mifit.errors import InputError
-from mifit.output.baseline import image_based
 from mifit.output.deferred import shade_methods, trace_mesh, visible_surface
 from mifit.output.resect import needs_resection, resect
 from mifit.progress import Progress, silent
+from mifit.render.image_based import image_based
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -44,7 +44,7 @@ class Comparison:
     renders : dict of method to (H, W, 4) uint8
         Colour and coverage; colour is 0 where the model covers nothing.
     baseline : (H, W, 3) uint8, optional
-        Image-based rendering from the fitted views on the fitted mesh (`output.baseline`), where asked for.
+        Image-based rendering from the fitted views on the fitted mesh (`render.image_based`), where asked for.
     seen : (H, W) bool, optional
         Pixels of the region whose point a fitted view sees: those that the baseline is compared on.
     """
@@ -88,7 +88,7 @@ def evaluate(
         ``model``: face area of the fitted model; ``truth``: face area of the capture's ground-truth mesh.
     progress : Progress
     baseline : bool
-        Compare image-based rendering on the fitted mesh as well (`output.baseline`).
+        Compare image-based rendering on the fitted mesh as well (`render.image_based`).
     watch : callable, optional
         Given the comparison of each timestep.
 

@@ -24,6 +24,7 @@ from mifit.stages.surface.displace import USUAL, Plate, solve_displacement
 from mifit.stages.surface.epipolar import epipolar_residual
 from mifit.stages.surface.local_planes import MeasuredPlanes, touching_planes
 from mifit.stages.surface.model_fit import SHADING_ROUNDS, fit_model, landmarks_are_biased
+from mifit.stages.surface.prediction_between_views import errors_between_views
 from mifit.stages.surface.sweep import Found, Posed, sweep
 from mifit.stages.surface.views import Resolution, pose_texels, texture_size
 
@@ -111,6 +112,7 @@ def find_surface(
     total = len(levels) + (len(levels) + len(spanned) + SHADING_ROUNDS) * refit
     search = _Search(capture, model, cameras, resolution, pairs, config, progress, total)
     last = search.descend(geometry, levels)
+    between: list[float] = []  # without and with it
     if refit:
         fitted = fit_model(
             capture,
@@ -123,8 +125,11 @@ def find_surface(
             progress=search.advance,
         )
         other = search.descend(fitted, levels)
-        # Colours mislead where the albedo model doesn't explain them; on the truer surface the views agree more widely.
-        refit = other.matched > last.matched
+        # Colours mislead where the albedo model doesn't explain them; through the truer surface views predict others.
+        between = errors_between_views(
+            capture, model, cameras, geometry.timesteps, [last.world, other.world], geometry.gains
+        )
+        refit = between[1] < between[0]
         geometry, last = (fitted, other) if refit else (geometry, last)
     found = replace(geometry, vertices=last.world.astype(np.float32), displacement=last.displacement.astype(np.float32))
     lips: dict = {}
@@ -140,6 +145,7 @@ def find_surface(
         "levels": [level for level, _ in levels],
         "matched": last.matched,
         "refitted": refit,
+        "between_views": between,
         "stiffness": last.stiffness,
         "displacement_mm": float(np.sqrt(np.mean(moved**2))),
         "epipolar_pixels": residuals,

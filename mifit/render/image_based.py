@@ -33,16 +33,21 @@ class ImageBased:
     ----------
     colour : (H, W, 3) float32
         Linear; 0 where nothing is hit.
-    hit : (H, W) bool
-        Pixels that see the front of the mesh.
+    face : (H, W) int32
+        Face of the mesh whose front is seen; -1 where none is.
     seen : (H, W) bool
         Pixels whose point of the mesh at least one fitted view sees. Elsewhere the colour is that of the fitted
         view that faces the point best, whatever hides it.
     """
 
     colour: NDArray[np.float32]
-    hit: NDArray[np.bool_]
+    face: NDArray[np.int32]
     seen: NDArray[np.bool_]
+
+    @property
+    def hit(self) -> NDArray[np.bool_]:
+        """(H, W) pixels that see the front of the mesh."""
+        return self.face >= 0
 
 
 def image_based(
@@ -84,7 +89,7 @@ def image_based(
     normal = normalize(face_cross(vertices, faces)[face])
     point = interpolate(np.asarray(vertices, np.float64), faces, face, buffer.weights.reshape(-1, 3)[index])
     front = np.sum(normal * (camera.position - point), axis=1) > 0
-    index, normal, point = index[front], normal[front], point[front]
+    index, face, normal, point = index[front], face[front], normal[front], point[front]
     total, weight = np.zeros((len(index), 3)), np.zeros(len(index))
     spare, best = np.zeros((len(index), 3)), np.full(len(index), -np.inf)
     for view in fitted:
@@ -105,10 +110,6 @@ def image_based(
     total = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-12)[:, None], spare)
     total *= np.asarray((gains or {}).get(camera.name, (1.0, 1.0, 1.0)))
     shape = (camera.height, camera.width)
-    image, hit, seen = (
-        np.zeros((camera.height * camera.width, 3), np.float32),
-        np.zeros(shape, bool),
-        np.zeros(shape, bool),
-    )
-    image[index], hit.ravel()[index], seen.ravel()[index] = total, True, weight > 0
-    return ImageBased(image.reshape(*shape, 3), hit, seen)
+    image, shown, seen = np.zeros((*shape, 3), np.float32), np.full(shape, -1, np.int32), np.zeros(shape, bool)
+    image.reshape(-1, 3)[index], shown.ravel()[index], seen.ravel()[index] = total, face, weight > 0
+    return ImageBased(image, shown, seen)

@@ -1,0 +1,64 @@
+"""Which of several surfaces the fitted views speak for: each view is predicted from the others through every surface.
+
+A point of the true surface has the same paint in all views; through a wrong one a view is predicted from the wrong
+places of the others. No light, no albedo and no landmark enters, so that what was fitted to those can be judged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.image import linear_to_srgb
+from mifit.render.image_based import image_based
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+
+
+def errors_between_views(
+    capture: Capture,
+    model: MorphableModel,
+    cameras: Sequence[str],
+    timesteps: Sequence[int],
+    surfaces: Sequence[NDArray],
+    gains: Mapping[str, Sequence[float]],
+) -> list[float]:
+    """Root mean square error of each fitted view as the others show it, for each candidate surface.
+
+    Parameters
+    ----------
+    capture, model
+    cameras : sequence of str
+        Fitted cameras, at least two; no other camera is touched.
+    timesteps : sequence of int
+    surfaces : sequence of (T, V, 3)
+        Candidates: the model's vertices in world space at each timestep.
+    gains : dict of camera name to (r, g, b)
+        Linear image of each camera over the first one's; 1 for cameras that aren't named.
+
+    Returns
+    -------
+    list of float
+        sRGB-encoded values, 0..1, over pixels of the face area that every candidate predicts, so that all are judged
+        on the same ones; infinite where there are none.
+    """
+    views = {name: capture.camera(name) for name in cameras}
+    total, count = np.zeros(len(surfaces)), 0
+    for k, timestep in enumerate(timesteps):
+        for name, view in views.items():
+            others = [other for key, other in views.items() if key != name]
+            frame = capture.frame(name, timestep)
+            judged = frame.valid & ~frame.clipped
+            errors = []
+            for surface in surfaces:
+                shown = image_based(capture, others, view, timestep, surface[k], model.faces, gains)
+                judged &= shown.seen & model.face_mask[shown.face]  # nothing is seen where no face is hit
+                errors.append((linear_to_srgb(shown.colour) - linear_to_srgb(frame.image)) ** 2)
+            total += [float(error[judged].sum()) for error in errors]
+            count += 3 * int(judged.sum())
+    return [float(np.sqrt(each / count)) if count else np.inf for each in total]

@@ -1,0 +1,62 @@
+"""Each fitted view predicted from the others: the truer surface predicts better, on the pixels that all share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from memory_capture import make_capture
+
+from mifit.morphable import MorphableModel
+from mifit.stages.surface.prediction_between_views import errors_between_views
+
+CAMERAS = ("left", "right")
+
+
+@pytest.fixture(scope="module")
+def model(variant):
+    return MorphableModel.load("builtin:coarse").subset(identity=10, expression=5, albedo=10)
+
+
+@pytest.fixture(scope="module")
+def capture(model):
+    return make_capture(model, [(0, 0, 0), (-6, 10, 3)], width=255, height=180)
+
+
+def nearer(capture, millimetres):
+    """The surface moved towards the middle between the cameras; a unit is a centimetre."""
+    truth = np.stack(capture.vertices)
+    towards = np.mean([capture.camera(name).position for name in CAMERAS], axis=0) - truth.mean(axis=(0, 1))
+    return truth + 0.1 * millimetres * towards / np.linalg.norm(towards)
+
+
+def errors(model, capture, surfaces, gains=None):
+    return errors_between_views(capture, model, CAMERAS, (0, 1), surfaces, gains or {})
+
+
+def test_the_true_surface_predicts_best_and_errors_grow_with_the_distance(model, capture):
+    found = errors(model, capture, [nearer(capture, mm) for mm in (0.0, 1.0, 2.0, 4.0)])
+    assert found == sorted(found) and found[3] > 2.0 * found[0]
+
+
+def test_every_candidate_is_judged_on_the_same_pixels(model, capture):
+    """What one surface doesn't cover counts for none."""
+    truth = nearer(capture, 0.0)
+    alone = errors(model, capture, [truth, truth])
+    assert alone[0] == alone[1]
+    beside = errors(model, capture, [truth, 0.6 * truth])
+    assert beside[0] != alone[0] and beside[1] > beside[0]
+
+
+def test_views_of_other_gains_predict_each_other_as_well(model, capture):
+    """One camera at half the exposure: told of it, the prediction is as good."""
+    darker = capture.changed(lambda name, t, frame: replace(frame, image=(0.5 if name == "right" else 1) * frame.image))
+    truth = [nearer(capture, 0.0)]
+    told, not_told = (errors(model, darker, truth, gains)[0] for gains in ({"right": (0.5, 0.5, 0.5)}, {}))
+    assert told < 0.3 * not_told
+
+
+def test_nothing_in_common_is_infinite(model, capture):
+    truth = nearer(capture, 0.0)
+    assert errors(model, capture, [truth, truth + 1e4]) == [np.inf, np.inf]
