@@ -98,10 +98,11 @@ class SurfaceConfig:
         most=WEIGHT,
     )
     refit: bool = flag(
-        False,
-        "where landmarks are biased, fit the model first by colours and by sweeps of its surface (a minute)",
+        True,
+        "where landmarks are biased, fit the model again by colours and by sweeps of its surface, and keep the fit if "
+        "views then predict each other better",
     )
-    close_lips: bool = flag(False, "close the lips on the lip line where the images show a closed mouth")
+    close_lips: bool = flag(True, "close the lips on the lip line where the images show a closed mouth")
     finest: int = number(0, "times that the images are halved at the finest level", least=0, most=6)
 
 

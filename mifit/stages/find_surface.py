@@ -26,6 +26,7 @@ from mifit.stages.surface.local_planes import MeasuredPlanes, touching_planes
 from mifit.stages.surface.model_fit import SHADING_ROUNDS, fit_model, landmarks_are_biased
 from mifit.stages.surface.prediction_between_views import errors_between_views
 from mifit.stages.surface.sweep import Found, Posed, sweep
+from mifit.stages.surface.thin_walls import keep_walls
 from mifit.stages.surface.views import Resolution, pose_texels, texture_size
 
 if TYPE_CHECKING:
@@ -135,6 +136,7 @@ def find_surface(
     lips: dict = {}
     if config.close_lips:
         found, lips = close_lips(capture, model, found, cameras)
+    found, crossed = keep_walls(model, found)
     residuals = search.epipolar_residuals(found, found.vertices.astype(np.float64), config.finest)
     seconds = time.perf_counter() - began
     moved = np.linalg.norm(last.displacement, axis=1)[np.unique(model.faces[model.face_mask])] * model.unit_mm
@@ -150,6 +152,7 @@ def find_surface(
         "displacement_mm": float(np.sqrt(np.mean(moved**2))),
         "epipolar_pixels": residuals,
         "lips": lips,
+        "walls_crossed": crossed,
         "seconds": seconds,
     }
     return replace(found, report=_extended(geometry.report, seconds, phase, epipolar_warnings(residuals)))

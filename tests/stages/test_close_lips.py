@@ -160,12 +160,12 @@ def test_a_model_whose_face_area_has_no_mouth_is_left_alone(model, start):
     assert found is start and details == {}
 
 
-def test_lips_close_on_request_only(model, start, monkeypatch):
+def test_lips_are_left_alone_on_request(model, start, monkeypatch):
     """What shows no texture leaves the surface where it is, so that nothing but the lips can move."""
     capture = photographed(model, start, ("closed", "closed"))
     asked = []
     monkeypatch.setattr(stage, "close_lips", lambda *given: asked.append(given) or (given[2], {}))
-    stage.find_surface(capture, model, start, BOTH, SurfaceConfig(finest=2))
+    stage.find_surface(capture, model, start, BOTH, SurfaceConfig(finest=2, close_lips=False))
     assert not asked
-    stage.find_surface(capture, model, start, BOTH, SurfaceConfig(finest=2, close_lips=True))
+    stage.find_surface(capture, model, start, BOTH, SurfaceConfig(finest=2))
     assert len(asked) == 1

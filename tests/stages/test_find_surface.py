@@ -9,7 +9,7 @@ import pytest
 import scipy.sparse as sp
 from memory_capture import make_capture
 
-from mifit.config import GeometryConfig, SurfaceConfig
+from mifit.config import GeometryConfig
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
@@ -267,7 +267,7 @@ def test_biased_landmarks_bend_the_shape_less(model, bumpy):
     biased = bumpy.changed(lambda name, t, frame: replace(frame, landmarks=frame.landmarks + offset))
     start = fitted_to(model, biased)
     assert landmarks_are_biased(start)
-    found = find_surface(biased, model, start, BOTH, SurfaceConfig(refit=True), geometry_config=QUICK)
+    found = find_surface(biased, model, start, BOTH, geometry_config=QUICK)
     before = off_mm(model, bumpy, start).mean()
     assert off_mm(model, bumpy, found).mean() < 0.3 * before
     assert found.report.details["phases"][-1]["refitted"]
@@ -282,7 +282,7 @@ def test_a_refit_on_which_the_views_agree_less_is_dropped(model, bumpy, start, f
 
     monkeypatch.setattr("mifit.stages.find_surface.fit_model", misled)
     monkeypatch.setattr("mifit.stages.find_surface.landmarks_are_biased", lambda _: True)
-    kept = find_surface(bumpy, model, start, BOTH, SurfaceConfig(refit=True))
+    kept = find_surface(bumpy, model, start, BOTH)
     last = kept.report.details["phases"][-1]
     assert last["refitted"] is False and last["between_views"][0] < last["between_views"][1]
     assert np.array_equal(kept.vertices, found.vertices)

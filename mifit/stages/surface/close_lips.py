@@ -25,7 +25,7 @@ from mifit.core.mesh import edges, face_cross, vertex_normals
 from mifit.core.mesh_update import cotangent_laplacian
 from mifit.morphable.openings import closed_borders
 from mifit.render.gbuffer import SurfaceScene
-from mifit.stages.geometry.displaced import displaced
+from mifit.stages.geometry.displaced import moved_by, object_shapes
 from mifit.stages.surface.lip_line import heights, read_strip, sample
 
 if TYPE_CHECKING:
@@ -138,8 +138,7 @@ def close_lips(
     margins = Margins.of(model)
     if margins is None:
         return geometry, {}
-    carried = displaced(model, geometry)
-    shapes = [carried.shape(geometry.identity, x).astype(np.float64) for x in geometry.expression]
+    shapes = object_shapes(model, geometry)
     mouths = [_Mouth.of(shape, margins) for shape in shapes]
     opening = [float(np.median((mouth.upper - mouth.lower) @ UP)) * model.unit_mm for mouth in mouths]
     scene = SurfaceScene(geometry.vertices[0].astype(np.float64), model.faces)
@@ -162,16 +161,11 @@ def close_lips(
     wanted = {k: region.movement(shapes[k], mouths[k], line, APART_MM / model.unit_mm) for k, line in lines.items()}
     mean = np.mean(list(wanted.values()), axis=0)
     shared = region.fade(mean)
-    displacement = shared if geometry.displacement is None else geometry.displacement + shared
     expression = geometry.expression.copy()
     for k in range(len(timesteps)):
         rest = region.fade(wanted[k] - mean) if k in wanted else -shared
         expression[k] = region.adjusted(model, expression[k], rest)
-    found = replace(geometry, displacement=displacement.astype(np.float32), expression=expression)
-    moved = displaced(model, found)
-    objects = np.stack([moved.shape(found.identity, x).astype(np.float64) for x in expression])
-    world = found.scale * objects @ found.rotation.transpose(0, 2, 1) + found.translation[:, None]
-    return replace(found, vertices=world.astype(np.float32)), details
+    return moved_by(model, replace(geometry, expression=expression), shared), details
 
 
 def _lip_line(
