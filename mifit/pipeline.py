@@ -58,8 +58,8 @@ def fit(
     cameras : sequence of str, optional
         Cameras to use; no other camera's images are read. Default: the capture's first two.
     timesteps : sequence of int or FrameChoice, optional
-        Timesteps to fit jointly; default: the first four. A choice (`mifit.choose_frames`) is kept with its reasons in
-        ``geometry.report.details["frames"]``.
+        Timesteps to fit jointly, named in any order; default: the first four. A choice (`mifit.choose_frames`) is kept
+        with its reasons in ``geometry.report.details["frames"]``.
     config : FitConfig, optional
         Settings of the stages.
     until : {"geometry", "reflectance", "normals"}
@@ -188,8 +188,13 @@ def choose(kind: str, known: Sequence[T], wanted: Sequence[T] | None, default: i
 
 
 def choose_timesteps(capture: Capture, wanted: Sequence[int] | FrameChoice | None) -> tuple[int, ...]:
-    """The timesteps of a fit, checked; the first four when none is named."""
-    return choose("timestep", capture.timesteps, wanted.timesteps if isinstance(wanted, FrameChoice) else wanted, 4)
+    """The timesteps of a fit, checked, in ascending order; the first four when none is named.
+
+    Sums over timesteps round differently in another order, and a search may then end a millimetre elsewhere where the
+    images hardly tell: the order in which a user names them must not matter.
+    """
+    named = wanted.timesteps if isinstance(wanted, FrameChoice) else wanted
+    return tuple(sorted(choose("timestep", capture.timesteps, named, 4)))
 
 
 def fitted_to(result: Result, capture: Capture) -> bool:

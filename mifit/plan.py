@@ -279,10 +279,10 @@ def _check_inputs(e: Experiment, where: str, digests: dict[tuple[str, ...], str]
             name, wanted = e.fit.capture, e.fit.timesteps
 
             def capture() -> str:
-                from mifit.pipeline import choose
+                from mifit.pipeline import choose, choose_timesteps
 
                 found = Capture.load(name)
-                steps = choose("timestep", found.timesteps, wanted, 4)
+                steps = choose_timesteps(found, wanted)
                 return found.digest(choose("camera", found.cameras, cameras, 2), steps)
 
             out["capture"] = cached(("capture", name, *cameras, str(wanted)), capture)

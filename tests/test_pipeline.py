@@ -9,7 +9,7 @@ import pytest
 import mifit
 from mifit.config import FitConfig
 from mifit.errors import InputError
-from mifit.pipeline import check_images, one_place
+from mifit.pipeline import check_images, choose_timesteps, one_place
 from mifit.steps import PARTS, Source, keys, steps
 from tests.output.conftest import ball_camera, ball_result
 
@@ -29,6 +29,14 @@ def test_an_image_without_light_is_refused():
         check_images(capture_of(image, image[..., 0] == 0), ["left"], [3])
     with pytest.raises(InputError, match="clipped"):
         check_images(capture_of(image + 1, valid, clipped=True), ["left"], [3])
+
+
+def test_the_order_in_which_timesteps_are_named_does_not_matter():
+    capture = SimpleNamespace(timesteps=(0, 1, 2, 5, 7))
+    assert choose_timesteps(capture, [5, 0, 2, 5]) == (0, 2, 5)
+    assert choose_timesteps(capture, None) == (0, 1, 2, 5)
+    with pytest.raises(InputError, match="timestep 3: not in the capture; it has 0, 1, 2, 5, 7"):
+        choose_timesteps(capture, [3, 0])
 
 
 def test_views_from_one_place_bring_a_warning():
