@@ -155,20 +155,39 @@ class SurfaceScene:
 
         if any(camera.distortion):
             raise InputError(f"camera {camera.name}: found lens distortion, expected an undistorted camera")
-        directions = camera.pixel_rays(camera.pixel_centres()).reshape(-1, 3)
+        box = self._box(camera)
+        centres = camera.pixel_centres()[box]
+        shape, part = (camera.height, camera.width), centres.shape[:2]
+        face = np.full(shape, -1, np.int32)
+        weights, depth = np.zeros((*shape, 3), np.float32), np.full(shape, np.inf, np.float32)
+        if not centres.size:
+            return GBuffer(face, weights, depth)
+        directions = camera.pixel_rays(centres.reshape(-1, 2))
         ray = mi.Ray3f(mi.Point3f(camera.position), on_device(mi.Vector3f, directions))
         hit = self.rays.ray_intersect_preliminary(ray, coherent=True)
         dr.eval(hit.t, hit.prim_uv, hit.prim_index)  # one kernel: each array read would trace the rays again
         valid = np.array(hit.is_valid()).astype(bool)
-        face = np.where(valid, np.array(hit.prim_index).astype(np.int32), -1)
+        face[box] = np.where(valid, np.array(hit.prim_index).astype(np.int32), -1).reshape(part)
         # Rays that hit nothing hold any bits in their coordinates: zeros, so that no sum of them warns.
         u, v, t = (
             np.where(valid, np.array(x, dtype=np.float32), np.float32(0)) for x in (hit.prim_uv.x, hit.prim_uv.y, hit.t)
         )
-        weights = np.where(valid[:, None], np.stack([1.0 - u - v, u, v], axis=1), 0.0).astype(np.float32)
-        depth = np.where(valid, t * (directions @ camera.rotation[2]), np.inf).astype(np.float32)
-        shape = (camera.height, camera.width)
-        return GBuffer(face.reshape(shape), weights.reshape(*shape, 3), depth.reshape(shape))
+        weights[box] = np.where(valid[:, None], np.stack([1.0 - u - v, u, v], axis=1), 0.0).reshape(*part, 3)
+        depth[box] = np.where(valid, t * (directions @ camera.rotation[2]), np.inf).reshape(part)
+        return GBuffer(face, weights, depth)
+
+    def _box(self, camera: Camera) -> tuple[slice, slice]:
+        """Rows and columns of the pixels that can show the mesh."""
+        q = camera.to_camera(np.asarray(self.vertices, dtype=np.float64))
+        if not (q[:, 2] > 1e-6 * self._diagonal).all():
+            return slice(None), slice(None)  # what lies beside or behind the camera has no outline in the image
+        x, y = camera.fx * q[:, 0] / q[:, 2] + camera.cx, camera.fy * q[:, 1] / q[:, 2] + camera.cy
+        # a pixel to spare: rays are sent at vertices in single precision
+        ends = [
+            [int(np.clip(f, 0, size)) for f in (np.floor(p.min()) - 1, np.ceil(p.max()) + 1)]
+            for p, size in ((y, camera.height), (x, camera.width))
+        ]
+        return slice(*ends[0]), slice(*ends[1])
 
     def visible_from(self, points: NDArray, origin: NDArray) -> NDArray[np.bool_]:
         """Whether nothing of the mesh lies between surface points and an origin outside the mesh.

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -42,6 +44,22 @@ def test_update_moves_the_mesh(variant: str, ball, camera: Camera) -> None:
     after = scene.gbuffer(camera)
     assert 0.2 * before < after.mask.sum() < 0.3 * before
     assert np.array_equal(after.face, SurfaceScene(vertices * 0.5, faces).gbuffer(camera).face)
+
+
+def test_rays_are_saved_where_no_vertex_projects(variant: str, ball, camera: Camera) -> None:
+    """A mesh in a corner, behind the camera in part, and out of the image."""
+    vertices, faces = ball
+    scene = SurfaceScene(vertices, faces)
+    whole = scene.gbuffer(camera)
+    moved = replace(camera, cx=camera.cx - camera.width / 2)
+    cut, columns = scene.gbuffer(moved), camera.width // 2
+    np.testing.assert_array_equal(cut.mask[:, :columns], whole.mask[:, columns:])
+    seen = cut.mask[:, :columns]
+    np.testing.assert_allclose(cut.depth[:, :columns][seen], whole.depth[:, columns:][seen], rtol=1e-5)
+    assert not scene.gbuffer(replace(camera, cx=camera.cx + 10 * camera.width)).mask.any()
+    inside = replace(camera, world_to_camera=np.eye(4))
+    around = SurfaceScene(vertices - vertices.mean(axis=0), faces).gbuffer(inside)
+    assert around.mask.all()
 
 
 def test_visibility_of_vertices(variant: str, ball, camera: Camera) -> None:

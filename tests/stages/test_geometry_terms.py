@@ -18,6 +18,7 @@ from mifit.stages.geometry.landmarks import LandmarkProblem, LandmarkTerm, Landm
 from mifit.stages.geometry.parameters import Frames, Layout, exponential, left_jacobian, rotation_angle
 from mifit.stages.geometry.points import PointBasis
 from mifit.stages.geometry.rendering import PixelView, RenderingProblem
+from mifit.stages.surface.model_fit import JointProblem
 
 
 def head(rng, n=9, identity=4, expression=3, albedo=2):
@@ -167,6 +168,21 @@ def test_texture_ignores_exposure_and_smooth_shading():
     assert np.abs(plain[inner] - lit[inner]).max() < 0.01 < 0.05 < plain[inner].std()
 
 
+def test_a_texture_is_the_same_whatever_lies_around_its_valid_pixels():
+    rng = np.random.default_rng(4)
+    image = rng.uniform(0.1, 0.9, (90, 120, 3)).astype(np.float32)
+    valid = np.zeros((90, 120), bool)
+    valid[40:60, 0:30] = True
+    valid[50, 10] = False
+    small = texture_level(image[10:, :70], valid[10:, :70], 1.0, 5.0)
+    whole = texture_level(np.where(valid[..., None], image, 7.0).astype(np.float32), valid, 1.0, 5.0)
+    log = np.log(image + 1e-3)
+    expected = blur(log, valid, 1.0) - blur(log, valid, 5.0)
+    np.testing.assert_allclose(whole.values[valid], expected[valid], atol=1e-5)
+    np.testing.assert_allclose(small.values[valid[10:, :70]], expected[valid], atol=1e-5)
+    assert texture_level(image, np.zeros((90, 120), bool), 1.0, 5.0).valid.sum() == 0
+
+
 def test_landmark_jacobian(scene):
     layout = replace(scene.layout, albedo=0, shading=0, ambient=0)
     x = np.concatenate([scene.x[scene.layout.at("identity")], scene.x[scene.layout.at("log_scale")]])
@@ -192,6 +208,52 @@ def test_rendering_jacobian(scene):
         scene.model, scene.layout, scene.frames, tuple(views), LandmarkTerm(landmark_views(scene), 50.0), 200.0, priors
     )
     check_gradient(problem, scene.x, 1e-4)
+
+
+def test_held_slopes_of_the_normals_are_those_at_the_point_where_they_are_held(scene):
+    face, weights = random_points(scene.rng, scene.model, 60)
+    view = PixelView(1, scene.cameras[0], smooth_image(scene.rng), face, weights)
+    problem = RenderingProblem(
+        scene.model, scene.layout, scene.frames, (view,), LandmarkTerm((), np.inf), 200.0, {"ambient": 1.0}
+    )
+    held, away = problem.holding_slopes(scene.x), scene.x + 0.2
+    exact = problem.linearize(scene.x)
+    np.testing.assert_array_equal(held.linearize(scene.x).dense(), exact.dense())
+    assert held.energies(away) == problem.energies(away)
+    off = held.linearize(away).gradient - problem.linearize(away).gradient
+    assert 0 < np.abs(off).max() < 0.1 * np.abs(exact.gradient).max()
+
+
+def test_joint_jacobian(scene):
+    """Colours, texture and landmarks, of which only the colours know appearance, in one vector."""
+    colours, texture = [], []
+    for step in range(2):
+        for cam in scene.cameras:
+            face, weights = random_points(scene.rng, scene.model, 40)
+            colours.append(PixelView(step, cam, smooth_image(scene.rng), face, weights))
+            points = basis_on(scene.model, face, weights)
+            texture.append(TextureView(step, cam, smooth_image(scene.rng), np.arange(40), np.ones(40), points))
+    rendering = RenderingProblem(
+        scene.model,
+        scene.layout,
+        scene.frames,
+        tuple(colours),
+        LandmarkTerm((), np.inf),
+        200.0,
+        {"albedo": 0.2, "ambient": 10.0},
+    )
+    consistency = ConsistencyProblem(
+        replace(scene.layout, albedo=0, shading=0, ambient=0),
+        scene.frames,
+        40,
+        tuple(texture),
+        0.1,
+        np.inf,
+        0.5,
+        LandmarkTerm(landmark_views(scene), 50.0),
+        {"identity": 0.3, "expression": 0.4, "log_scale": 2.0},
+    )
+    check_gradient(JointProblem(rendering, consistency, 0.3), scene.x, 1e-4)
 
 
 def test_rendering_normals_matter(scene):

@@ -106,6 +106,22 @@ def texture_level(image: NDArray, valid: NDArray, sigma: float, window: float) -
     sigma, window : float
         Fine and wide blur in pixels.
     """
-    log = np.log(np.maximum(image, 0.0) + DARKEST).astype(np.float32)
-    fine = blur(log, valid, sigma) if sigma > 0 else log
-    return SmoothImage(np.ascontiguousarray(fine - blur(log, valid, window)), valid.astype(np.float32))
+    # Blurs reach four deviations far, and what lies outside the valid pixels is never read.
+    part = box(valid, int(np.ceil(4.0 * window)) + 1)
+    shown = valid[part]
+    log = np.log(np.maximum(image[part], 0.0) + DARKEST).astype(np.float32)
+    fine = blur(log, shown, sigma) if sigma > 0 else log
+    values = np.zeros(image.shape, np.float32)
+    values[part] = fine - blur(log, shown, window)
+    return SmoothImage(values, valid.astype(np.float32))
+
+
+def box(mask: NDArray[np.bool_], margin: int = 0) -> tuple[slice, slice]:
+    """Rows and columns around the pixels of a mask (H, W), with a margin; all of them around an empty mask."""
+    ends = []
+    for axis, size in enumerate(mask.shape):
+        inside = np.flatnonzero(mask.any(axis=1 - axis))
+        ends.append(
+            slice(max(inside[0] - margin, 0), min(inside[-1] + margin + 1, size)) if len(inside) else slice(size)
+        )
+    return ends[0], ends[1]

@@ -32,7 +32,12 @@ class NormalEquations:
             Residuals and the weights of their squares.
         """
         root = np.sqrt(weight).astype(shared.dtype)[:, None]
-        rows = np.concatenate([shared, local, np.asarray(residual, shared.dtype)[:, None]], axis=1) * root
+        self.add_weighted(
+            step, np.concatenate([shared, local, np.asarray(residual, shared.dtype)[:, None]], axis=1) * root
+        )
+
+    def add_weighted(self, step: int, rows: NDArray) -> None:
+        """Add rows (m, S + P + 1) of one timestep: shared, local and residual, by the root of their weights."""
         h = rows.T @ rows
         s = self.layout.shared_size
         self.shared += h[:s, :s]

@@ -11,7 +11,8 @@ the normal's dependence on the one-ring of vertices around each corner.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross
-from mifit.core.sh import basis_gradient
+from mifit.core.sh import basis, basis_gradient
 from mifit.morphable import MorphableModel
 from mifit.solve import geman_mcclure
 from mifit.solve.systems import ArrowSystem
@@ -27,7 +28,7 @@ from mifit.stages.geometry.images import SmoothImage
 from mifit.stages.geometry.landmarks import LandmarkTerm
 from mifit.stages.geometry.normal import NormalEquations, prior_energy
 from mifit.stages.geometry.parameters import Frames, Layout, Pose, cross_matrix
-from mifit.stages.geometry.points import Projection, project
+from mifit.stages.geometry.points import PointBasis, Projection, corner_matrix, project
 
 WHITE = 255.0
 AMBIENT_PRIOR = 1e-2  # of the squared ambient term in 0..1: fixes the gauge against the constant harmonic
@@ -55,41 +56,80 @@ class PixelView:
 
 
 class Surface:
-    """The model's surface at one timestep in object space, with unnormalised vertex normals."""
+    """The model's surface at one timestep in object space, with its vertex normals before and after normalising."""
 
     def __init__(self, model: MorphableModel, identity: NDArray, expression: NDArray) -> None:
         size = 3 * len(model.mean)
         dtype = model.mean.dtype
         flat = model.mean.reshape(-1) + model.identity.reshape(size, -1) @ identity.astype(dtype)
         flat = flat + model.expression.reshape(size, -1) @ expression.astype(dtype)
-        self.faces, self.dtype = model.faces, dtype
+        self.model = model
         self.vertices = flat.reshape(-1, 3).astype(np.float64)
         cross = face_cross(self.vertices, model.faces)
-        self.normal_sum = np.stack(
+        normal_sum = np.stack(
             [
                 np.bincount(model.faces.ravel(), np.repeat(cross[:, axis], 3), minlength=len(self.vertices))
                 for axis in range(3)
             ],
             axis=1,
         )
+        self.length = np.maximum(np.linalg.norm(normal_sum, axis=1), 1e-30)
+        self.unit = normal_sum / self.length[:, None]
 
-    def normal_sum_derivative(self, touched: NDArray[np.bool_]) -> sp.csr_matrix:
-        """(3V, 3V) d normal_sum / d vertices; only the rows of touched vertices (V,) are complete."""
-        faces = self.faces[touched[self.faces].any(axis=1)]
-        a, b, c = (self.vertices[faces[:, i]] for i in range(3))
+    def normals(self, face: NDArray, weights: NDArray) -> tuple[NDArray, NDArray]:
+        """Unit normals (N, 3) at points given by face and barycentric weights, and the length (N,) before normalising.
+
+        They are mixed from the vertices' unit normals.
+        """
+        mixed = np.einsum("nk,nkc->nc", weights, self.unit[self.model.faces[face]])
+        length = np.maximum(np.linalg.norm(mixed, axis=1), 1e-30)
+        return mixed / length[:, None], length
+
+    def normal_modes(self, face: NDArray, weights: NDArray) -> NDArray:
+        """(N, 3, Ki + Ke) derivative of `normals` by the coefficients."""
+        model, dtype, n = self.model, self.model.mean.dtype, len(face)
+        touched, corners = np.unique(model.faces[face], return_inverse=True)
+        corners = corners.reshape(n, 3)
+        unit, length = self.normals(face, weights)
+        at_vertex = self.unit[touched][corners]
+        by_unit = (weights / self.length[touched][corners])[..., None, None] * (
+            np.eye(3) - at_vertex[..., :, None] * at_vertex[..., None, :]
+        )
+        tangent = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) / length[:, None, None]
+        by_sum = np.matmul(tangent[:, None], by_unit).transpose(0, 2, 1, 3).astype(dtype)
+        columns = np.broadcast_to((3 * corners[:, :, None] + np.arange(3))[:, None], by_sum.shape)
+        through = sp.csr_matrix(
+            (by_sum.ravel(), columns.ravel(), np.arange(0, 27 * n + 1, 9)), shape=(3 * n, 3 * len(touched))
+        )
+        return (through @ self._normal_sum_modes(touched)).reshape(n, 3, -1)
+
+    def _normal_sum_modes(self, vertices: NDArray) -> NDArray:
+        """(3N, Ki + Ke) derivative of the summed face normals around some vertices (N,) by the coefficients."""
+        model, dtype = self.model, self.model.mean.dtype
+        row = np.full(len(model.mean), -1)
+        row[vertices] = np.arange(len(vertices))
+        faces = model.faces[(row[model.faces] >= 0).any(axis=1)]
+        n = len(faces)
+        a, b, c = (self.vertices[faces[:, i]].astype(dtype) for i in range(3))
         # cross(b - a, c - a): its derivative by one corner is the cross matrix of the opposite edge
-        blocks = np.stack(
-            [cross_matrix(c - b), cross_matrix(a - c), cross_matrix(b - a)], axis=2
-        )  # (F, row, corner, 3)
-        blocks = blocks.astype(np.float32) if self.dtype == np.float32 else blocks
-        n, size = len(faces), self.vertices.size
-        columns = np.broadcast_to((3 * faces[:, :, None] + np.arange(3)).reshape(n, 1, 9), (n, 3, 9))
-        by_vertex = sp.csr_matrix((blocks.ravel(), columns.ravel(), np.arange(0, 27 * n + 1, 9)), shape=(3 * n, size))
-        # sums face normals around each vertex, axis by axis
-        rows = (3 * faces[:, :, None] + np.arange(3)).ravel()
-        entries = np.broadcast_to((3 * np.arange(n)[:, None] + np.arange(3))[:, None], (n, 3, 3)).ravel()
-        around = sp.csr_matrix((np.ones(len(rows), blocks.dtype), (rows, entries)), shape=(size, 3 * n))
-        return around @ by_vertex
+        opposite = np.stack([c - b, a - c, b - a], axis=1)  # (F, corner, 3)
+        x, y, z = (opposite[..., k] for k in range(3))
+        entries = np.stack([-z, y, z, -x, -y, x], axis=-1).reshape(n, 3, 3, 2).transpose(0, 2, 1, 3)
+        columns = 3 * faces[:, None, :, None] + np.array([[1, 2], [0, 2], [0, 1]])[:, None]  # (F, row, corner, 2)
+        by_vertex = sp.csr_matrix(
+            (entries.ravel(), columns.ravel(), np.arange(0, 18 * n + 1, 6)), shape=(3 * n, 3 * len(model.mean))
+        )
+        wanted, which = row[faces].ravel(), np.repeat(np.arange(n), 3)
+        around = sp.csr_matrix(
+            (np.ones((wanted >= 0).sum(), dtype), (wanted[wanted >= 0], which[wanted >= 0])), shape=(len(vertices), n)
+        )
+        return np.concatenate(
+            [
+                (around @ (by_vertex @ modes.reshape(3 * len(modes), -1)).reshape(n, -1)).reshape(3 * len(vertices), -1)
+                for modes in (model.identity, model.expression)
+            ],
+            axis=1,
+        )
 
 
 @dataclass(frozen=True)
@@ -104,9 +144,23 @@ class Observation:
     albedo: NDArray
     shade: NDArray
     basis: NDArray  # (n, 9)
-    basis_slope: NDArray  # (n, 9, 3)
-    unit: NDArray  # (n, 3) object-space normal
-    length: NDArray  # (n,) length of the interpolated normal
+    basis_slope: NDArray | None  # (n, 9, 3)
+
+
+@dataclass(frozen=True)
+class PixelRows:
+    """What the coefficients do to the points under one view's pixels, as long as those stay.
+
+    Attributes
+    ----------
+    position : (n, 3, Ki + Ke)
+        Derivative of the object-space points.
+    albedo : (n, 3), albedo_modes : (n, 3, Ka)
+    """
+
+    position: NDArray
+    albedo: NDArray
+    albedo_modes: NDArray
 
 
 @dataclass(frozen=True)
@@ -121,6 +175,9 @@ class RenderingProblem:
         least squares.
     priors : dict of str to float
         Weight of the squared coefficients per group.
+    slopes : tuple of (n, 3, Ki + Ke), optional
+        Derivatives of the normals under each view's pixels by the coefficients, held; by default found anew in every
+        linearisation.
     """
 
     model: MorphableModel
@@ -130,42 +187,35 @@ class RenderingProblem:
     landmarks: LandmarkTerm
     robust: float
     priors: dict[str, float]
+    slopes: tuple[NDArray, ...] | None = None
 
-    def _vertex_albedo(self, x: NDArray) -> NDArray:
-        modes = self.model.albedo_modes
-        flat = modes.reshape(-1, modes.shape[2]) @ x[self.layout.at("albedo")].astype(modes.dtype)
-        return self.model.mean_albedo + flat.reshape(-1, 3)
+    @cached_property
+    def _rows(self) -> list[PixelRows]:
+        """Of each view."""
+        model, out = self.model, []
+        for view in self.views:
+            n = len(view.face)
+            points = PointBasis.on_faces(model, view.face, view.weights)
+            position = np.concatenate([points.identity, points.expression], axis=1).reshape(n, 3, -1)
+            mix = corner_matrix(model.faces, view.face, view.weights, len(model.mean))
+            modes = mix @ model.albedo_modes.reshape(len(model.mean), -1)
+            out.append(PixelRows(position, mix @ model.mean_albedo, modes.reshape(n, 3, -1)))
+        return out
 
-    def _observe(self, view: PixelView, surface: Surface, albedo: NDArray, x: NDArray, gradient: bool) -> Observation:
+    def _observe(self, view: PixelView, rows: PixelRows, surface: Surface, x: NDArray, gradient: bool) -> Observation:
         pose: Pose = self.frames.pose(self.layout, x, view.step)
-        corners = self.model.faces[view.face]
         w = view.weights.astype(np.float64)
-        points = np.einsum("nk,nkc->nc", w, surface.vertices[corners])
-        sums = surface.normal_sum[corners]
-        vertex_length = np.maximum(np.linalg.norm(sums, axis=2, keepdims=True), 1e-30)
-        q = np.einsum("nk,nkc->nc", w, sums / vertex_length)
-        length = np.maximum(np.linalg.norm(q, axis=1), 1e-30)
-        unit = q / length[:, None]
-        normal = unit @ pose.rotation.T
+        points = np.einsum("nk,nkc->nc", w, surface.vertices[self.model.faces[view.face]])
+        normal = surface.normals(view.face, w)[0] @ pose.rotation.T
         projection = project(view.camera, pose, points, gradient)
         values, slope, inside = view.image.sample(projection.pixels, gradient)
-        basis, basis_slope = basis_gradient(normal, 3)
-        shade = basis @ x[self.layout.at("shading")].reshape(9, 3)
-        colour = np.einsum("nk,nkc->nc", w, albedo[corners])
+        harmonics, basis_slope = basis_gradient(normal, 3) if gradient else (basis(normal, 3), None)
+        shade = harmonics @ x[self.layout.at("shading")].reshape(9, 3)
+        modes = rows.albedo_modes
+        colour = rows.albedo + modes @ x[self.layout.at("albedo")].astype(modes.dtype)
         residual = WHITE * (x[self.layout.at("ambient")] + colour * shade - values)
-        return Observation(
-            residual,
-            inside & (projection.depth > 0),
-            slope,
-            projection,
-            normal,
-            colour,
-            shade,
-            basis,
-            basis_slope,
-            unit,
-            length,
-        )
+        ok = inside & (projection.depth > 0)
+        return Observation(residual, ok, slope, projection, normal, colour, shade, harmonics, basis_slope)
 
     def _loss(self, observation: Observation) -> tuple[float, NDArray]:
         """Mean robust square over the view's pixels, and each pixel's weight in it."""
@@ -174,121 +224,77 @@ class RenderingProblem:
         count = max(int(observation.ok.sum()), 1)
         return float(rho[observation.ok].sum()) / count, np.where(observation.ok, weight, 0.0) / count
 
-    def _touched(self, step: int) -> NDArray[np.bool_]:
-        """(V,) vertices at a corner of some pixel's face at one timestep."""
-        touched = np.zeros(len(self.model.mean), dtype=bool)
-        for view in self.views:
-            if view.step == step:
-                touched[self.model.faces[view.face]] = True
-        return touched
-
     def _surfaces(self, x: NDArray) -> list[Surface]:
         at = self.layout.at
         return [Surface(self.model, x[at("identity")], x[at("expression", k)]) for k in range(self.layout.timesteps)]
 
     def energies(self, x: NDArray) -> dict[str, float]:
         """Energy per term."""
-        surfaces, albedo = self._surfaces(x), self._vertex_albedo(x)
+        surfaces = self._surfaces(x)
         data = sum(
-            self._loss(self._observe(view, surfaces[view.step], albedo, x, gradient=False))[0] for view in self.views
+            self._loss(self._observe(view, rows, surfaces[view.step], x, gradient=False))[0]
+            for view, rows in zip(self.views, self._rows, strict=True)
         )
         prior = prior_energy(self.layout, x, self.priors)
         landmarks = self.landmarks.energy(self.layout, self.frames, x)
         return {"photo": float(data), "landmarks": landmarks, "prior": prior}
 
+    def holding_slopes(self, x: NDArray) -> RenderingProblem:
+        """The problem with the normals' derivatives by the coefficients held as they are at x.
+
+        They are the dearest part of a linearisation, and change by as much as the surface bends. Energies stay exact.
+        """
+        surfaces = self._surfaces(x)
+        slopes = [surfaces[view.step].normal_modes(view.face, view.weights.astype(np.float64)) for view in self.views]
+        return replace(self, slopes=tuple(slopes))
+
     def linearize(self, x: NDArray) -> ArrowSystem:
         """Normal equations at x."""
-        surfaces, albedo = self._surfaces(x), self._vertex_albedo(x)
-        equations = NormalEquations(self.layout)
-        derivatives: dict[int, sp.csr_matrix] = {}
-        for view in self.views:
-            surface = surfaces[view.step]
-            if view.step not in derivatives:
-                derivatives[view.step] = surface.normal_sum_derivative(self._touched(view.step))
-            observation = self._observe(view, surface, albedo, x, gradient=True)
-            _, weight = self._loss(observation)
-            shared, local = self._columns(view, surface, observation, x, derivatives[view.step])
-            equations.add(view.step, shared, local, observation.residual.reshape(-1), np.repeat(weight, 3))
+        equations, surfaces = NormalEquations(self.layout), self._surfaces(x)
+        slopes = self.slopes if self.slopes is not None else self.holding_slopes(x).slopes
+        assert slopes is not None
+        for view, rows, by_shape in zip(self.views, self._rows, slopes, strict=True):
+            observation = self._observe(view, rows, surfaces[view.step], x, gradient=True)
+            equations.add_weighted(view.step, self._weighted_rows(view, rows, by_shape, observation, x))
         self.landmarks.accumulate(equations, self.layout, self.frames, x)
         equations.add_priors(x, self.priors)
         return equations.system()
 
-    def _columns(
-        self, view: PixelView, surface: Surface, o: Observation, x: NDArray, derivative: sp.csr_matrix
-    ) -> tuple[NDArray, NDArray]:
-        """Jacobian rows (3n, shared), (3n, local) of the residuals, pixel by pixel, channel by channel."""
-        layout, model = self.layout, self.model
-        dtype = model.mean.dtype
-        n = len(view.face)
-        size = 3 * len(model.mean)
-        shared = np.zeros((3 * n, layout.shared_size), dtype=dtype)
-        local = np.zeros((3 * n, layout.local_size), dtype=dtype)
-        corners = model.faces[view.face]
-        w = view.weights.astype(np.float64)
+    def _weighted_rows(self, view: PixelView, rows: PixelRows, slopes: NDArray, o: Observation, x: NDArray) -> NDArray:
+        """Jacobian and residuals by the root of their weights, as `NormalEquations.add_weighted` takes them.
 
-        if layout.albedo:
-            data = WHITE * o.shade[:, :, None] * w[:, None, :]  # (n, channel, corner)
-            columns = 3 * corners[:, None, :] + np.arange(3)[:, None]
-            pick = sp.csr_matrix(
-                (data.astype(dtype).ravel(), columns.ravel(), np.arange(0, 9 * n + 1, 3)), shape=(3 * n, size)
-            )
-            shared[:, layout.at("albedo")] = pick @ model.albedo_modes.reshape(size, -1)
-        by_shading = np.zeros((n, 3, 9, 3), dtype=dtype)
-        for c in range(3):
-            by_shading[:, c, :, c] = WHITE * o.albedo[:, c, None] * o.basis
-        shared[:, layout.at("shading")] = by_shading.reshape(3 * n, 27)
-        shared[:, layout.at("ambient")] = WHITE
-        by_pixel, by_normal, through_position, through_normal = self.by_vertex(view, surface, o, x)
-        rows = through_position + through_normal @ derivative
-        shared[:, layout.at("identity")] = rows @ model.identity.reshape(size, -1)
-        local[:, : layout.expression] = rows @ model.expression.reshape(size, -1)
-        by_pose = by_pixel @ o.projection.by_pose
-        # a rotation d w turns the normal by d w x n
-        pose = self.frames.pose(layout, x, view.step)
-        by_pose[:, :, :3] -= by_normal @ cross_matrix(o.normal) @ pose.left_jacobian
-        local[:, layout.expression :] = by_pose.reshape(3 * n, 6)
-        if layout.log_scale:
-            by_scale = np.einsum("nci,ni->nc", by_pixel, o.projection.by_log_scale)
-            shared[:, layout.at("log_scale").start] = by_scale.ravel()
-        return shared, local
-
-    def by_vertex(
-        self, view: PixelView, surface: Surface, o: Observation, x: NDArray
-    ) -> tuple[NDArray, NDArray, sp.csr_matrix, sp.csr_matrix]:
-        """Sparse derivatives of the residuals by what lies at the three corners of each pixel's face.
-
-        Returns
-        -------
-        by_pixel (n, 3, 2), by_normal (n, 3, 3) : by the projected position and by the world-space normal
-        through_position, through_normal : (3n, 3V)
-            By the corners' object-space positions, and by their unnormalised normals.
+        Pixel by pixel, channel by channel; ``slopes`` are the derivatives of the normals by the coefficients.
         """
-        layout, model = self.layout, self.model
-        dtype = model.mean.dtype
-        n = len(view.face)
-        corners = model.faces[view.face]
-        w = view.weights.astype(np.float64)
+        layout = self.layout
+        dtype = rows.position.dtype
+        n, shared = len(view.face), layout.shared_size
+        root = np.sqrt(self._loss(o)[1])[:, None, None]
         pose = self.frames.pose(layout, x, view.step)
-        assert o.slope is not None
-        by_pixel = -WHITE * o.slope.astype(np.float64)
-        by_object = by_pixel @ o.projection.by_object
+        assert o.slope is not None and o.basis_slope is not None
+        by_pixel = -WHITE * root * o.slope.astype(np.float64)
         # shading through the world normal, each channel its own lighting
         lighting = np.einsum("nkd,kc->ncd", o.basis_slope, x[layout.at("shading")].reshape(9, 3))
-        by_normal = WHITE * o.albedo[:, :, None] * lighting
-        tangent = np.eye(3) - o.unit[:, :, None] * o.unit[:, None, :]
-        by_interpolated = (by_normal @ pose.rotation) @ tangent / o.length[:, None, None]
-        sums = surface.normal_sum[corners]
-        length = np.maximum(np.linalg.norm(sums, axis=2, keepdims=True), 1e-30)
-        unit = sums / length
-        at_corner = (np.eye(3) - unit[..., :, None] * unit[..., None, :]) / length[..., None]  # (n, corner, 3, 3)
-        by_sum = np.matmul(by_interpolated[:, None], w[:, :, None, None] * at_corner).transpose(0, 2, 1, 3)
-        by_position = by_object[:, :, None, :] * w[:, None, :, None]
-        columns = np.broadcast_to((3 * corners[:, :, None] + np.arange(3))[:, None], by_position.shape).ravel()
-        pointer = np.arange(0, 27 * n + 1, 9)
-        shape = (3 * n, 3 * len(model.mean))
-        return (
-            by_pixel,
-            by_normal,
-            sp.csr_matrix((by_position.astype(dtype).ravel(), columns, pointer), shape=shape),
-            sp.csr_matrix((by_sum.astype(dtype).ravel(), columns, pointer), shape=shape),
-        )
+        by_normal = WHITE * root * o.albedo[:, :, None] * lighting
+
+        out = np.zeros((n, 3, shared + layout.local_size + 1), dtype=dtype)
+        by_position = (by_pixel @ o.projection.by_object).astype(dtype)
+        by_shape = by_position @ rows.position
+        by_shape += (by_normal @ pose.rotation).astype(dtype) @ slopes
+        out[:, :, layout.at("identity")] = by_shape[:, :, : layout.identity]
+        out[:, :, shared : shared + layout.expression] = by_shape[:, :, layout.identity :]
+        if layout.albedo:
+            out[:, :, layout.at("albedo")] = (WHITE * root[:, 0] * o.shade).astype(dtype)[
+                :, :, None
+            ] * rows.albedo_modes
+        first = layout.at("shading").start
+        for c in range(3):
+            out[:, c, first + c : first + 27 : 3] = WHITE * root[:, 0] * o.albedo[:, c, None] * o.basis
+        out[:, :, layout.at("ambient")] = WHITE * root
+        if layout.log_scale:
+            out[:, :, layout.at("log_scale").start] = np.einsum("nci,ni->nc", by_pixel, o.projection.by_log_scale)
+        by_pose = by_pixel @ o.projection.by_pose
+        # a rotation d w turns the normal by d w x n
+        by_pose[:, :, :3] -= by_normal @ cross_matrix(o.normal) @ pose.left_jacobian
+        out[:, :, shared + layout.expression : -1] = by_pose
+        out[:, :, -1] = root[:, 0] * o.residual
+        return out.reshape(3 * n, -1)

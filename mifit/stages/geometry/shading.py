@@ -15,7 +15,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mifit.core.bend import tangent_plane
@@ -109,33 +108,14 @@ class ShadingTerm:
     def _points(self, x: NDArray, step: int) -> tuple[NDArray, Surface]:
         """World normals (N, 3) of the points at one timestep, and the surface that they are on."""
         surface = Surface(self.model, x[self.layout.at("identity")], x[self.layout.at("expression", step)])
-        sums = surface.normal_sum[self.model.faces[self.face]]
-        normal = normalize(np.einsum("nk,nkc->nc", self.weights, normalize(sums)))
+        normal, _ = surface.normals(self.face, self.weights)
         return normal @ self.frames.pose(self.layout, x, step).rotation.T, surface
 
     def _slopes(self, x: NDArray, step: int, surface: Surface, tangents: NDArray) -> NDArray[np.float32]:
         """(N, 2, Ki + Ke + 6) derivative of the normals along two tangents by the unknowns of a timestep."""
-        layout, model = self.layout, self.model
-        n, corners = len(self.face), model.faces[self.face]
-        pose = self.frames.pose(layout, x, step)
-        sums = surface.normal_sum[corners]
-        length = np.maximum(np.linalg.norm(sums, axis=2, keepdims=True), 1e-30)
-        unit = sums / length
-        reach = np.linalg.norm(np.einsum("nk,nkc->nc", self.weights, unit), axis=1)
-        at_corner = (np.eye(3) - unit[..., :, None] * unit[..., None, :]) / length[..., None]
-        along = tangents @ pose.rotation / np.maximum(reach, 1e-30)[:, None, None]
-        by_sum = np.matmul(along[:, None], self.weights[:, :, None, None] * at_corner).transpose(0, 2, 1, 3)
-        columns = np.broadcast_to((3 * corners[:, :, None] + np.arange(3))[:, None], by_sum.shape).ravel()
-        size = 3 * len(model.mean)
-        through = sp.csr_matrix(
-            (by_sum.astype(np.float32).ravel(), columns, np.arange(0, 18 * n + 1, 9)), shape=(2 * n, size)
-        )
-        touched = np.zeros(len(model.mean), dtype=bool)
-        touched[corners] = True
-        rows = through @ surface.normal_sum_derivative(touched)
-        shape = np.concatenate(
-            [rows @ modes.reshape(size, -1) for modes in (model.identity, model.expression)], axis=1
-        ).reshape(n, 2, -1)
+        pose = self.frames.pose(self.layout, x, step)
+        slopes = surface.normal_modes(self.face, self.weights)
+        shape = (tangents @ pose.rotation).astype(slopes.dtype) @ slopes
         normals = np.cross(tangents[:, 0], tangents[:, 1])
         # a rotation d w turns the normal by d w x n
         turn = -tangents @ cross_matrix(normals) @ pose.left_jacobian

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.capture import Capture, Frame
+from mifit.capture import Capture
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.morphable import MorphableModel
 from mifit.render.gbuffer import GBuffer, SurfaceScene
 from mifit.stages.geometry.consistency import TextureView
-from mifit.stages.geometry.images import DARKEST, level, texture_level
+from mifit.stages.geometry.images import DARKEST, SmoothImage, level, texture_level
 from mifit.stages.geometry.points import PointBasis
 from mifit.stages.geometry.rendering import PixelView
 from mifit.stages.geometry.start import State, object_vertices
@@ -66,10 +66,12 @@ class Visibility:
         self.capture, self.model = capture, model
         self.cameras: list[Camera] = [capture.camera(name) for name in cameras]
         self.timesteps = tuple(timesteps)
-        self._scene: SurfaceScene | None = None
+        self._scenes: dict[int, SurfaceScene] = {}
         self.warnings: list[str] = []
         self.blind: set[tuple[str, int]] = set()  # images (camera, step) that showed nothing of the face once
         self._buffers: dict[tuple[int, str], GBuffer] = {}
+        self._measured: dict[tuple[int, str], NDArray[np.bool_]] = {}
+        self._levels: dict[tuple[int, str, float], SmoothImage] = {}
 
     def world(self, state: State) -> NDArray[np.float64]:
         """(T, V, 3) world-space vertices."""
@@ -81,19 +83,38 @@ class Visibility:
             ]
         )
 
-    def _place(self, vertices: NDArray) -> SurfaceScene:
-        if self._scene is None:
-            self._scene = SurfaceScene(vertices, self.model.faces)
+    def _look(self, step: int, vertices: NDArray) -> SurfaceScene:
+        """The surface of a timestep, and what every camera sees of it in ``_buffers``: anew where it has moved."""
+        scene = self._scenes.get(step)
+        if scene is None:
+            scene = self._scenes[step] = SurfaceScene(vertices, self.model.faces)
+        elif np.array_equal(scene.vertices, vertices):
+            return scene
         else:
-            self._scene.update(vertices)
-        return self._scene
+            scene.update(vertices)
+        for camera in self.cameras:
+            self._buffers[step, camera.name] = scene.gbuffer(camera)
+        return scene
 
-    def _usable(self, buffer: GBuffer, frame: Frame, border: int) -> NDArray[np.bool_]:
+    def _usable(self, step: int, camera: Camera, border: int) -> NDArray[np.bool_]:
         """Pixels on the model, not at its outline, measured, neither clipped nor black."""
-        on = (buffer.face >= 0).astype(np.uint8)
+        at = (step, camera.name)
+        if at not in self._measured:
+            frame = self.capture.frame(camera.name, self.timesteps[step])
+            self._measured[at] = frame.valid & ~frame.clipped & (frame.image.max(axis=2) > DARKEST)
+        on = (self._buffers[at].face >= 0).astype(np.uint8)
         if border:
             on = cv2.erode(on, np.ones((2 * border + 1,) * 2, np.uint8), borderValue=0)
-        return (on > 0) & frame.valid & ~frame.clipped & (frame.image.max(axis=2) > DARKEST)
+        return (on > 0) & self._measured[at]
+
+    def _level(self, step: int, camera: Camera, sigma: float) -> SmoothImage:
+        """An image in the first camera's exposure, blurred: the same in every round."""
+        at = (step, camera.name, sigma)
+        if at not in self._levels:
+            frame = self.capture.frame(camera.name, self.timesteps[step])
+            gain = np.asarray(self._gains.get(camera.name, 1.0), dtype=np.float32)
+            self._levels[at] = level(frame.image / gain, frame.valid, sigma)
+        return self._levels[at]
 
     def _warn_unusable(self, camera: Camera, step: int) -> None:
         self.blind.add((camera.name, step))
@@ -107,7 +128,7 @@ class Visibility:
         out = []
         rows = points.basis
         for step, vertices in enumerate(self.world(state)):
-            scene = self._place(vertices)
+            scene = self._look(step, vertices)
             position = interpolate(vertices, self.model.faces, points.face, points.weights)
             normal = interpolate(
                 vertex_normals(vertices, self.model.faces), self.model.faces, points.face, points.weights
@@ -115,8 +136,7 @@ class Visibility:
             normal = normalize(normal)
             for camera in self.cameras:
                 frame = self.capture.frame(camera.name, self.timesteps[step])
-                buffer = self._buffers[step, camera.name] = scene.gbuffer(camera)
-                usable = self._usable(buffer, frame, 1)
+                usable = self._usable(step, camera, 1)
                 cosine = (normalize(camera.position - position) * normal).sum(1)
                 seen = np.flatnonzero((cosine > GRAZING_COSINE) & scene.visible_from(position, camera.position))
                 if not len(seen) or not usable.any():
@@ -138,24 +158,16 @@ class Visibility:
         out = []
         for step, vertices in enumerate(self.world(state)):
             if anew or any((step, camera.name) not in self._buffers for camera in self.cameras):
-                scene = self._place(vertices)
-                for camera in self.cameras:
-                    self._buffers[step, camera.name] = scene.gbuffer(camera)
+                self._look(step, vertices)
             for camera in self.cameras:
-                frame = self.capture.frame(camera.name, self.timesteps[step])
                 buffer = self._buffers[step, camera.name]
-                usable = self._usable(buffer, frame, 2)
+                usable = self._usable(step, camera, 2)
                 facial = np.flatnonzero(usable & self.model.face_mask[np.maximum(buffer.face, 0)])
                 if len(facial) > count:
                     facial = np.sort(rng.choice(facial, count, replace=False))
                 if not len(facial):
                     self._warn_unusable(camera, step)
                     continue
-                gain = np.asarray(self._gains.get(camera.name, 1.0), dtype=np.float32)
-                image = level(frame.image / gain, frame.valid, sigma)
-                out.append(
-                    PixelView(
-                        step, camera, image, buffer.face.reshape(-1)[facial], buffer.weights.reshape(-1, 3)[facial]
-                    )
-                )
+                face, weights = buffer.face.reshape(-1)[facial], buffer.weights.reshape(-1, 3)[facial]
+                out.append(PixelView(step, camera, self._level(step, camera, sigma), face, weights))
         return tuple(out)

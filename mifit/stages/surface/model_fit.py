@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -133,7 +134,7 @@ class JointProblem:
     colours : RenderingProblem
         Without landmarks; its priors are those of albedo and lighting.
     texture : ConsistencyProblem
-        With landmarks and the priors of the shape, in the layout of ``colours``.
+        With landmarks and the priors of the shape, and in a layout without appearance.
     weight : float
         Factor of the colours' terms.
     planes : sequence of PlaneTerm
@@ -144,28 +145,35 @@ class JointProblem:
     weight: float = 1.0
     planes: Sequence[PlaneTerm] = ()
 
+    @cached_property
+    def _shape(self) -> NDArray[np.intp]:
+        """Where the unknowns of the texture's layout lie in that of the colours."""
+        layout, steps = self.colours.layout, range(self.colours.layout.timesteps)
+        parts = [layout.at("identity"), layout.at("log_scale"), *(layout.local(k) for k in steps)]
+        return np.concatenate([np.arange(part.start, part.stop) for part in parts])
+
     def energies(self, x: NDArray) -> dict[str, float]:
         """Energy per term."""
-        layout, frames = self.colours.layout, self.colours.frames
-        terms, colours = self.texture.energies(x), self.colours.energies(x)
+        shape, layout, frames = x[self._shape], self.texture.layout, self.texture.frames
+        terms, colours = self.texture.energies(shape), self.colours.energies(x)
         return {
             **terms,
             "photo": self.weight * colours["photo"],
             "prior": terms["prior"] + self.weight * colours["prior"],
-            "surface": sum(plane.energy(layout, frames, x) for plane in self.planes),
+            "surface": sum(plane.energy(layout, frames, shape) for plane in self.planes),
         }
 
     def linearize(self, x: NDArray) -> DenseSystem:
         """Normal equations at x."""
-        layout, frames = self.colours.layout, self.colours.frames
+        shape, layout, frames = x[self._shape], self.texture.layout, self.texture.frames
         equations = NormalEquations(layout)
         for plane in self.planes:
-            plane.accumulate(equations, layout, frames, x)
-        texture, colours, planes = self.texture.linearize(x), self.colours.linearize(x), equations.system()
-        return DenseSystem(
-            texture.hessian + self.weight * colours.dense() + planes.dense(),
-            texture.gradient + self.weight * colours.gradient + planes.gradient,
-        )
+            plane.accumulate(equations, layout, frames, shape)
+        texture, colours, planes = self.texture.linearize(shape), self.colours.linearize(x), equations.system()
+        hessian, gradient = self.weight * colours.dense(), self.weight * colours.gradient
+        hessian[np.ix_(self._shape, self._shape)] += texture.hessian + planes.dense()
+        gradient[self._shape] += texture.gradient + planes.gradient
+        return DenseSystem(hessian, gradient)
 
 
 def fit_model(
@@ -227,10 +235,10 @@ def fit_model(
             colours, x = paper_problem(model, state, appearance, (), visibility, config, seed + number)
             colours = replace(colours, priors={"albedo": COLOUR, "ambient": colours.priors["ambient"]})
             texture = texture_problem(state, views, visibility, points, config)
-            texture = replace(texture, layout=colours.layout, frames=colours.frames)
             # Paint that the model's albedo doesn't explain is no shading: what stays unexplained counts less.
             left = colours.energies(x)["photo"] / max(len(colours.views), 1)
             weight = min(1.0, UNEXPLAINED / max(left, 1e-30))
+            colours = colours.holding_slopes(x)
             low, high = bounds(colours.layout, model.expression_bounds)
             solution = minimize(
                 JointProblem(colours, texture, weight, terms),
