@@ -40,8 +40,8 @@ COLUMNS = np.linspace(0.03, 0.97, 61)
 """Places along the mouth, from corner to corner, at which images are read."""
 WIDEST_MM = 6.0
 """Opening above which a mouth is open without a look: no detector is that wrong."""
-SMALLEST_PIXELS = 1.0
-"""Opening up to which the lips stay."""
+SMALLEST_PIXELS = 4.5
+"""Opening up to which the lips stay: a lip line and lips that are a little apart look alike in so few pixels."""
 REACH_MM, INSIDE_MM = 14.0, 4.0
 """Distance from the margins along the surface up to which it moves with them, on the lips and behind them."""
 HELD_MM, STEPS = 8.0, 2
