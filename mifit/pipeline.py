@@ -121,6 +121,7 @@ def fit(
             warnings=(
                 *(() if known_cameras else (ESTIMATED_CAMERAS,)),
                 *one_place(capture, cameras, estimates["geometry"]),
+                *empty_eyes(model),
             ),
             seconds=seconds,
             peak_memory=peak_memory(),
@@ -161,6 +162,15 @@ def check_images(capture: Capture, cameras: Sequence[str], timesteps: Sequence[i
                     f"camera {name}, timestep {timestep}: every usable pixel is black or clipped, expected a photo; "
                     "leave the camera or the timestep out, or check its mask"
                 )
+
+
+def empty_eyes(model: MorphableModel) -> tuple[str, ...]:
+    """A warning where renders will look through the eyes into the head."""
+    from mifit.morphable.openings import lacks_eyes
+
+    if not lacks_eyes(model):
+        return ()
+    return (f"the eyes of model {model.name} are holes; mifit model convert --eyes puts simple ones there",)
 
 
 def one_place(capture: Capture, cameras: Sequence[str], geometry: GeometryEstimate) -> tuple[str, ...]:

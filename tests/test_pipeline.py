@@ -9,7 +9,9 @@ import pytest
 import mifit
 from mifit.config import FitConfig
 from mifit.errors import InputError
-from mifit.pipeline import check_images, choose_timesteps, one_place
+from mifit.morphable import MorphableModel
+from mifit.morphable.openings import eyeballs
+from mifit.pipeline import check_images, choose_timesteps, empty_eyes, one_place
 from mifit.steps import PARTS, Source, keys, steps
 from tests.output.conftest import ball_camera, ball_result
 
@@ -37,6 +39,16 @@ def test_the_order_in_which_timesteps_are_named_does_not_matter():
     assert choose_timesteps(capture, None) == (0, 1, 2, 5)
     with pytest.raises(InputError, match="timestep 3: not in the capture; it has 0, 1, 2, 5, 7"):
         choose_timesteps(capture, [3, 0])
+
+
+def test_a_model_whose_eyes_are_holes_brings_a_warning():
+    model = MorphableModel.load("builtin:coarse").subset(identity=2, expression=2, albedo=2)
+    assert empty_eyes(model) == ()
+    seen = ~np.isin(model.faces, np.concatenate(eyeballs(model))).any(axis=1)
+    skin = dataclasses.replace(
+        model, faces=model.faces[seen], faces_uv=model.faces_uv[seen], face_mask=model.face_mask[seen]
+    )
+    assert "are holes; mifit model convert --eyes" in empty_eyes(skin)[0]
 
 
 def test_views_from_one_place_bring_a_warning():
