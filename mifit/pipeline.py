@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
     from mifit.reconstruction import Reconstruction
     from mifit.result import Result
+    from mifit.stages.calibrate_densely import DenseCalibration
 
 T = TypeVar("T")
 ESTIMATED_CAMERAS = "the capture is uncalibrated: focal length, camera poses and so the scale are estimates"
@@ -103,9 +104,10 @@ def fit(
         raise InputError(f"until: found {until!r}, expected one of {', '.join(STAGES)}")
     check_images(capture, cameras, timesteps)
     digest = capture.digest(cameras, timesteps)
-    known_cameras = capture.calibrated
-    if not known_cameras:
-        capture = calibrated(capture, model, cameras, timesteps)
+    estimated: tuple[str, ...] = ()
+    if not capture.calibrated:
+        dense = calibrated(capture, model, cameras, timesteps, progress)
+        capture, estimated = dense.capture, (ESTIMATED_CAMERAS, dense.note)
     source = Source(capture, digest, model, cameras, timesteps, seed)
 
     def result(estimates: Mapping[Part, Any], seconds: float = 0.0) -> Reconstruction:
@@ -119,7 +121,7 @@ def fit(
             units=capture.units,
             unit_mm=capture.unit_mm,
             warnings=(
-                *(() if known_cameras else (ESTIMATED_CAMERAS,)),
+                *estimated,
                 *one_place(capture, cameras, estimates["geometry"]),
                 *empty_eyes(model),
             ),
@@ -143,13 +145,21 @@ def fit(
     return result(estimates, seconds)
 
 
-def calibrated(capture: Capture, model: MorphableModel, cameras: Sequence[str], timesteps: Sequence[int]) -> Capture:
-    """An uncalibrated capture with cameras estimated from its landmarks and the model's."""
-    from mifit.capture.calibrate import calibrate
+def calibrated(
+    capture: Capture,
+    model: MorphableModel,
+    cameras: Sequence[str],
+    timesteps: Sequence[int],
+    progress: Progress = silent,
+) -> DenseCalibration:
+    """An uncalibrated capture with cameras estimated from landmarks and the model's, then from dense matches."""
+    from mifit.capture.calibrate import calibrate_heads
+    from mifit.stages.calibrate_densely import calibrate_densely
 
     scale = model.unit_mm / capture.unit_mm
     mean, modes = model.mean[model.landmarks], model.identity[model.landmarks][..., :CALIBRATION_MODES]
-    return calibrate(capture, scale * mean, scale * modes, cameras, timesteps)
+    start = calibrate_heads(capture, scale * mean, scale * modes, cameras, timesteps)
+    return calibrate_densely(start, model, cameras, timesteps, progress)
 
 
 def check_images(capture: Capture, cameras: Sequence[str], timesteps: Sequence[int]) -> None:

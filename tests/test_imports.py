@@ -36,7 +36,7 @@ MAY_IMPORT = {
     "steps": DATA | {"morphable", "capture", "checkpoint", "stages"},
     "tracking": DATA | {"morphable", "capture", "stages", "result"},
     "refinement": DATA | {"morphable", "capture", "checkpoint", "stages", "result", "tracking"},
-    "pipeline": DATA | {"morphable", "capture", "render", "steps", "reconstruction"},
+    "pipeline": DATA | {"morphable", "capture", "render", "stages", "steps", "reconstruction"},
     "fitting": DATA | {"morphable", "capture", "result", "reconstruction", "steps", "pipeline"},
     "experiment_settings": DATA | {"schema"},
     "plan": DATA | {"schema", "experiment_settings", "morphable", "capture", "checkpoint", "pipeline"},

@@ -25,8 +25,34 @@ from mifit.errors import InputError
 FOCAL_RANGE = (0.6, 8.0)
 """Focal lengths that are searched, in multiples of the longer image side."""
 
+FOCAL_PRIOR = (1.8, 0.7)
+"""Portrait lenses, loosely: focal length in multiples of the longer image side, and deviation of its logarithm."""
+
 _WEIGHT = np.concatenate([np.full(17, 0.3), np.ones(31), np.full(20, 0.4)])
 """Jaw contours slide and mouths move; brows, nose and eyes carry the pose."""
+
+
+@dataclass(frozen=True)
+class HeadCalibration:
+    """Cameras of a capture with the head that they were estimated by.
+
+    Attributes
+    ----------
+    capture : Capture
+        With the estimated cameras; the world is the first one's frame with OpenGL axes.
+    heads : (T, 4, 4)
+        Pose of the head at each timestep: from the model's frame to the first camera's, OpenCV axes.
+    shape : (K,)
+        Identity coefficients.
+    """
+
+    capture: Capture
+    heads: NDArray[np.float64]
+    shape: NDArray[np.float64]
+
+    def heads_in_world(self) -> NDArray[np.float64]:
+        """(T, 4, 4) from the model's frame to the world's."""
+        return np.asarray(OPENGL_FROM_OPENCV @ self.heads)
 
 
 @dataclass(frozen=True)
@@ -56,7 +82,25 @@ def calibrate(
     timesteps: Sequence[int] | None = None,
     noise: float = 0.004,
 ) -> Capture:
-    """Estimate the cameras of a capture that came without calibration.
+    """Estimate the cameras of a capture that came without calibration; parameters and errors of `calibrate_heads`.
+
+    Returns
+    -------
+    Capture
+        The same capture whose `camera` now answers for the named cameras; `calibrated` stays False.
+    """
+    return calibrate_heads(capture, landmarks3d, modes, cameras, timesteps, noise).capture
+
+
+def calibrate_heads(
+    capture: Capture,
+    landmarks3d: NDArray,
+    modes: NDArray | None = None,
+    cameras: Sequence[str] | None = None,
+    timesteps: Sequence[int] | None = None,
+    noise: float = 0.004,
+) -> HeadCalibration:
+    """Estimate the cameras of a capture that came without calibration, and the head's poses and shape.
 
     Parameters
     ----------
@@ -73,8 +117,8 @@ def calibrate(
 
     Returns
     -------
-    Capture
-        The same capture whose `camera` now answers for the named cameras; `calibrated` stays False.
+    HeadCalibration
+        Its capture's `camera` answers for the named cameras; `calibrated` stays False.
 
     Raises
     ------
@@ -87,14 +131,14 @@ def calibrate(
     if mean.shape != (COUNT, 3):
         raise InputError(f"landmarks3d: found shape {mean.shape}, expected (68, 3)")
     problem = _gather(capture, names, steps, mean, modes, noise)
-    focal, poses = _solve(problem)
+    focal, poses, heads, shape = _solve(problem)
     found = []
     for i, name in enumerate(names):
         view = capture.views[name]
         cx, cy = (float(value) for value in problem.centre[i])
         fx, fy = (focal[i], focal[i]) if view.intrinsics is None else view.intrinsics[:2]
         found.append(Camera(name, view.width, view.height, float(fx), float(fy), cx, cy, poses[i]))
-    return capture.with_estimate(found)
+    return HeadCalibration(capture.with_estimate(found), heads, shape)
 
 
 def _gather(
@@ -129,16 +173,16 @@ def _gather(
     return _Problem(points, weight, mean, basis, np.array(centre), side, np.array(known), noise * float(side.max()))
 
 
-def _solve(problem: _Problem) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-    """Focal lengths (C,) and world-to-camera matrices."""
+def _solve(problem: _Problem) -> tuple[NDArray, list[NDArray[np.float64]], NDArray, NDArray]:
+    """Focal lengths (C,), world-to-camera matrices, head poses (T, 4, 4) and shape coefficients (K,)."""
     grid = np.geomspace(*FOCAL_RANGE, 12)
     starts = [_start(problem, factor) for factor in (grid if np.isnan(problem.known).any() else (1.0,))]
     _, best = min(starts, key=lambda start: start[0])
     solution = least_squares(
         _residuals, best, args=(problem,), loss="soft_l1", x_scale="jac", ftol=1e-6, xtol=1e-6, max_nfev=40
     )
-    focal, cameras, _, _ = _unpack(solution.x, problem)
-    return focal, [pose @ OPENGL_FROM_OPENCV for pose in cameras]
+    focal, cameras, heads, shape = _unpack(solution.x, problem)
+    return focal, [pose @ OPENGL_FROM_OPENCV for pose in cameras], heads, shape
 
 
 def _start(problem: _Problem, factor: float) -> tuple[float, NDArray[np.float64]]:
@@ -211,5 +255,5 @@ def _residuals(x: NDArray, problem: _Problem) -> NDArray[np.float64]:
     depth = np.maximum(p[..., 2:], 1e-3)
     pixels = focal[:, None, None, None] * p[..., :2] / depth + problem.centre[:, None, None]
     error = (pixels - problem.points) * (np.sqrt(problem.weight)[..., None] / problem.noise)
-    prior_focal = (np.log(focal / problem.side) - math.log(1.8)) / 0.7  # portrait lenses, loosely
+    prior_focal = (np.log(focal / problem.side) - math.log(FOCAL_PRIOR[0])) / FOCAL_PRIOR[1]
     return np.concatenate([error.ravel(), shape, prior_focal[np.isnan(problem.known)]])

@@ -145,12 +145,16 @@ def _calibrate_from_heads(arguments: Namespace) -> None:
         raise InputError(f"{arguments.capture}: is calibrated already; nothing to do")
     cameras = choose("camera", capture.cameras, arguments.cameras, 2)
     timesteps = choose("timestep", capture.timesteps, arguments.timesteps, 4)
-    capture = calibrated(capture, mifit.MorphableModel.load(arguments.model), cameras, timesteps)
+    use_variant(arguments)
+    model = mifit.MorphableModel.load(arguments.model)
+    dense = calibrated(capture, model, cameras, timesteps, console_progress(arguments.quiet))
+    capture = dense.capture
     found = calibrate_others(capture, cameras, timesteps)
     write_cameras(arguments.capture, capture, [camera for camera, _ in found.values()])
     for name, (camera, error) in found.items():
         role = "decided" if name in cameras else "placed"
         print(f"{name}: {role}, focal length {camera.fx:.0f} pixels, landmarks {error:.1f} pixels beside the others'")
+    print(dense.note[0].upper() + dense.note[1:])
     print(f"Capture: {arguments.capture}; its scale is the model's, its cameras are estimates")
 
 

@@ -1,0 +1,229 @@
+"""Focal lengths and poses of an uncalibrated capture from dense matches, after landmarks have given a start.
+
+What a detector takes for a landmark differs from the model's by a bias, and a face model explains perspective by shape.
+Points that are matched between the images themselves know of neither: several views of a head that turns determine
+focal lengths as they do in structure from motion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.capture.calibrate import FOCAL_PRIOR, HeadCalibration
+from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
+from mifit.core.mesh import interpolate
+from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.progress import Progress, silent
+from mifit.stages.calibration.adjustment import AdjustedBundle, Bundle, Intrinsics, Sightings, adjust_bundle
+from mifit.stages.calibration.tracks import FEWEST_IMAGES, Tracks, follow_points, unwrap_image
+from mifit.stages.surface.views import texture_size
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+
+LARGEST_MAP = 320
+"""Side of the unwrapped images, texels, at most."""
+MATCH_DEVIATION = 0.3
+"""Pixels that a match errs by along an axis, for images whose longer side has `MATCH_SIDE` pixels."""
+MATCH_SIDE = 680.0
+FEWEST_TRACKS = 200
+LARGEST_DEVIATION = 0.05
+"""Relative standard deviation of a focal length beyond which matches don't decide it."""
+LARGEST_RESIDUAL = 4.0
+"""Median residual, in deviations of a match, beyond which tracks aren't those of one head."""
+
+
+@dataclass(frozen=True)
+class DenseCalibration:
+    """Cameras of a capture and how they were found.
+
+    Attributes
+    ----------
+    capture : Capture
+        With estimated cameras; those that the landmarks gave where matches don't decide.
+    note : str
+        What a person should know, in a line.
+    deviation : float or None
+        Standard deviation of the focal length relative to it, from the normal equations; None where landmarks decided.
+    residual : float or None
+        Median distance of matches from the adjusted points, pixels; None where landmarks decided.
+    """
+
+    capture: Capture
+    note: str
+    deviation: float | None = None
+    residual: float | None = None
+
+
+def calibrate_densely(
+    start: HeadCalibration,
+    model: MorphableModel,
+    cameras: Sequence[str],
+    timesteps: Sequence[int],
+    progress: Progress = silent,
+) -> DenseCalibration:
+    """Find unknown focal lengths, and the poses with them, by bundle adjustment of dense matches.
+
+    Parameters
+    ----------
+    start : HeadCalibration
+        What landmarks gave for the same cameras and timesteps.
+    model : MorphableModel
+    cameras : sequence of str
+        No other camera's images are read.
+    timesteps : sequence of int
+    progress : Progress
+
+    Returns
+    -------
+    DenseCalibration
+        Lengths are scaled so that the head is as large as the model's that landmarks gave.
+
+    Notes
+    -----
+    One focal length serves all cameras without one whose images have the same longer side; principal points of such
+    cameras are in the middle and pixels are square. Two images don't determine a focal length: both look at the head,
+    and then it is a family of solutions.
+    """
+    capture = start.capture
+    unknown = np.array([capture.views[name].intrinsics is None for name in cameras])
+    if not unknown.any():
+        return DenseCalibration(capture, "focal lengths are the capture's own")
+    images = len(cameras) * len(timesteps)
+    if images < FEWEST_IMAGES:
+        return _left(start, cameras, f"{images} image{'s' * (images > 1)} can't tell more, expected {FEWEST_IMAGES}")
+    total = images + 2
+    progress("match views", 0, total)
+    vertices = _vertices(start, model)
+    world = [vertices @ pose[:3, :3].T + pose[:3, 3] for pose in start.heads_in_world()]
+    views = [capture.camera(name) for name in cameras]
+    texels = rasterize_uv(model.uv, model.faces_uv, _size(model, world[0], views), model.face_mask)
+    unwrapped = []
+    for j, timestep in enumerate(timesteps):
+        for i, camera in enumerate(views):
+            frame = capture.frame(camera.name, timestep)
+            usable = frame.valid & ~frame.clipped
+            unwrapped.append(unwrap_image(frame.image, usable, camera, world[j], model.faces, texels, (i, j)))
+            progress("match views", len(unwrapped), total)
+    tracks = follow_points(unwrapped)
+    progress("match views", images + 1, total)
+    if len(tracks.texel) < FEWEST_TRACKS:
+        count = f"{len(tracks.texel)} points are found in {FEWEST_IMAGES} or more images"
+        return _left(start, cameras, f"{count}, expected {FEWEST_TRACKS}; add timesteps where the head turns")
+    place = np.array([(one.camera, one.timestep) for one in unwrapped])[tracks.image]
+    adjusted = _adjust(start, model, vertices, texels, views, unknown, tracks, place)
+    progress("match views", total, total)
+    side = max(max(view.width, view.height) for view in views)
+    if adjusted.deviation > LARGEST_DEVIATION:
+        found = f"matches give it to {_percent(adjusted.deviation)} only"
+        return _left(start, cameras, f"{found}, expected {_percent(LARGEST_DEVIATION)}; add timesteps where it turns")
+    if adjusted.residual > LARGEST_RESIDUAL * MATCH_DEVIATION * max(side / MATCH_SIDE, 1.0):
+        found = f"matches are {adjusted.residual:.1f} pixels from those of a moving head"
+        return _left(start, cameras, f"{found}; views may be out of step")
+    return _calibration(start, vertices, model, texels, tracks, views, adjusted)
+
+
+def _left(start: HeadCalibration, cameras: Sequence[str], why: str) -> DenseCalibration:
+    """The landmarks' cameras, and why."""
+    focal = start.capture.camera(cameras[0]).fx
+    note = f"focal length {focal:.0f} pixels is from landmarks, which may be off by a third: {why}"
+    return DenseCalibration(start.capture, note)
+
+
+def _percent(deviation: float) -> str:
+    return f"{100 * deviation:.1f} %" if math.isfinite(deviation) else "no precision"
+
+
+def _vertices(start: HeadCalibration, model: MorphableModel) -> NDArray[np.float64]:
+    """(V, 3) the head that landmarks gave, head's frame, the capture's unit."""
+    modes = len(start.shape)
+    shape = model.mean.astype(np.float64) + model.identity[..., :modes].astype(np.float64) @ start.shape
+    return shape * (model.unit_mm / start.capture.unit_mm)
+
+
+def _size(model: MorphableModel, world: NDArray, views: Sequence[Camera]) -> int:
+    """Side of the map that holds about what the images show."""
+    centre = world.mean(axis=0)
+    pixel = min(float(np.linalg.norm(centre - view.position)) / view.fx for view in views)
+    return texture_size(model, world, pixel, LARGEST_MAP)
+
+
+def _adjust(
+    start: HeadCalibration,
+    model: MorphableModel,
+    vertices: NDArray,
+    texels: TexelMap,
+    views: Sequence[Camera],
+    unknown: NDArray[np.bool_],
+    tracks: Tracks,
+    place: NDArray,
+) -> AdjustedBundle:
+    side = np.array([max(view.width, view.height) for view in views], dtype=np.float64)
+    _, group = np.unique(side[unknown], return_inverse=True)
+    numbers = np.full(len(views), -1)
+    numbers[unknown] = group
+    mean = np.array([math.log(FOCAL_PRIOR[0] * side[numbers == g][0]) for g in range(group.max() + 1)])
+    focal = np.array([math.sqrt(view.fx * view.fy) for view in views])
+    centre = np.array([(view.cx, view.cy) for view in views])
+    square = np.array([(f / view.fx, f / view.fy) for f, view in zip(focal, views, strict=True)])
+    for g in range(len(mean)):
+        focal[numbers == g] = focal[numbers == g].mean()
+    seen = Sightings(
+        (tracks.pixels - centre[place[:, 0]]) * square[place[:, 0]],
+        tracks.point,
+        place[:, 0],
+        place[:, 1],
+        MATCH_DEVIATION * max(float(side.max()) / MATCH_SIDE, 1.0),
+    )
+    at = np.searchsorted(texels.index, tracks.texel)
+    corners, weights = model.faces[texels.face[at]], texels.weights[at].astype(np.float64)
+    modes = np.einsum("nc,ncik->nik", weights, model.expression[corners].astype(np.float64))
+    modes *= model.unit_mm / start.capture.unit_mm
+    bundle = Bundle(
+        focal,
+        np.array([view.world_to_camera @ OPENGL_FROM_OPENCV for view in views]),  # the first is the world's frame
+        start.heads,
+        np.asarray(interpolate(vertices, model.faces, texels.face[at], texels.weights[at]), dtype=np.float64),
+        np.zeros((len(start.heads), modes.shape[2])),
+    )
+    return adjust_bundle(bundle, seen, Intrinsics(numbers, (mean, FOCAL_PRIOR[1])), modes)
+
+
+def _calibration(
+    start: HeadCalibration,
+    vertices: NDArray,
+    model: MorphableModel,
+    texels: TexelMap,
+    tracks: Tracks,
+    views: Sequence[Camera],
+    adjusted: AdjustedBundle,
+) -> DenseCalibration:
+    at = np.searchsorted(texels.index, tracks.texel)
+    first = interpolate(vertices, model.faces, texels.face[at], texels.weights[at])
+    bundle = adjusted.bundle
+    # images alone leave the scale open; medians, as a few points may have gone anywhere
+    sizes = [np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1)) for p in (first, bundle.points)]
+    found = []
+    for view, focal, pose in zip(views, bundle.focal, bundle.cameras, strict=True):
+        scaled = pose.copy()
+        scaled[:3, 3] *= sizes[0] / sizes[1]
+        known = start.capture.views[view.name].intrinsics is not None
+        fx, fy = (view.fx, view.fy) if known else (float(focal), float(focal))
+        found.append(replace(view, fx=fx, fy=fy, world_to_camera=scaled @ OPENGL_FROM_OPENCV))
+    free = [k for k, view in enumerate(views) if start.capture.views[view.name].intrinsics is None]
+    lengths = ", ".join(dict.fromkeys(f"{bundle.focal[k]:.0f}" for k in free))
+    before = ", ".join(dict.fromkeys(f"{views[k].fx:.0f}" for k in free))
+    note = (
+        f"focal length {lengths} pixels (+- {_percent(adjusted.deviation)}) is from {len(tracks.texel)} dense matches, "
+        f"residual {adjusted.residual:.2f} pixels; landmarks gave {before}"
+    )
+    if not adjusted.settled:
+        note += "; the adjustment hasn't settled"
+    return DenseCalibration(start.capture.with_estimate(found), note, adjusted.deviation, adjusted.residual)

@@ -1,0 +1,1 @@
+"""Parts of the dense calibration: tracks of surface points through the images, and their bundle adjustment."""

@@ -1,0 +1,297 @@
+"""Bundle adjustment of tracks on a head that moves before fixed cameras and changes its expression.
+
+Unknown are focal lengths, relative poses of the cameras, a head pose per timestep, points in the head's frame,
+free of any face model, and how each timestep's expression differs from the first one's, in the model's modes with a
+Gaussian prior. Levenberg-Marquardt on Cauchy's loss; points are eliminated by the Schur complement (Triggs et al.,
+Bundle adjustment, 2000).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+STEPS = 100
+"""Steps that are taken at most."""
+SETTLED = 1e-5
+"""Relative fall of the energy in a step below which it counts as settled."""
+NEGLIGIBLE = 0.05
+"""Energy of a match below which falling further means nothing: a third of its deviation."""
+CAUCHY = 1.5
+"""Deviations of a match where the robust loss turns."""
+EXPRESSION_DEVIATION = 0.3
+"""Prior deviation of expression coefficients' changes between timesteps."""
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Where N points are seen in images, pixels; ordered by point."""
+
+    pixels: NDArray[np.float64]  # (M, 2), minus the principal point, pixels made square
+    point: NDArray[np.int64]  # (M,) ascending, every one of 0..N-1
+    camera: NDArray[np.int64]  # (M,)
+    timestep: NDArray[np.int64]  # (M,) position among the timesteps
+    deviation: float  # of a match along an axis, pixels
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """What is known of the focal lengths."""
+
+    group: NDArray[np.int64]  # (C,) cameras of one number share an unknown focal length; -1 where it is known
+    prior: tuple[NDArray[np.float64], float]  # mean (G,) and deviation of its logarithm
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Cameras and a moving head; OpenCV axes. Camera 0 and the pose at timestep 0 stay as they are: they fix the gauge.
+
+    Attributes
+    ----------
+    focal : (C,)
+        Pixels.
+    cameras : (C, 4, 4)
+        From the first camera's frame to each camera's.
+    heads : (T, 4, 4)
+        From the head's frame to the first camera's.
+    points : (N, 3)
+        Head's frame, at timestep 0.
+    expression : (T, K)
+        Coefficients relative to timestep 0.
+    """
+
+    focal: NDArray[np.float64]
+    cameras: NDArray[np.float64]
+    heads: NDArray[np.float64]
+    points: NDArray[np.float64]
+    expression: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AdjustedBundle:
+    """A bundle at the optimum, or where `STEPS` ended.
+
+    Attributes
+    ----------
+    bundle : Bundle
+    deviation : float
+        Largest standard deviation of the logarithm of an unknown focal length, from the normal equations with all else
+        eliminated, scaled by the residuals. Errors that matches share aren't in it.
+    residual : float
+        Median distance of a point from its match, pixels.
+    settled : bool
+    """
+
+    bundle: Bundle
+    deviation: float
+    residual: float
+    settled: bool
+
+
+@dataclass(frozen=True)
+class _Projected:
+    turned: NDArray[np.float64]  # (M, 3) points turned as the head is
+    swung: NDArray[np.float64]  # (M, 3) and as the camera is
+    seen: NDArray[np.float64]  # (M, 3) in the camera's frame
+    residual: NDArray[np.float64]  # (M, 2) pixels
+
+
+def adjust_bundle(start: Bundle, seen: Sightings, intrinsics: Intrinsics, modes: NDArray) -> AdjustedBundle:
+    """Bring projections onto matches.
+
+    Parameters
+    ----------
+    start : Bundle
+    seen : Sightings
+    intrinsics : Intrinsics
+    modes : (N, 3, K)
+        How expressions move the points; K may be 0.
+
+    Returns
+    -------
+    AdjustedBundle
+    """
+    bundle, damping, settled = start, 1e-4, False
+    projected = _project(bundle, seen, modes)
+    energy = _energy(bundle, projected, seen, intrinsics)
+    for _ in range(STEPS):
+        system = _System.of(bundle, projected, seen, intrinsics, modes)
+        while damping < 1e6:
+            trial = _moved(bundle, *system.step(damping), intrinsics)
+            shown = _project(trial, seen, modes)
+            value = _energy(trial, shown, seen, intrinsics)
+            if value < energy:
+                break
+            damping *= 4.0
+        else:
+            settled = True  # no step falls further
+            break
+        settled = energy - value < SETTLED * max(energy, NEGLIGIBLE * len(seen.point))
+        bundle, projected, energy, damping = trial, shown, value, max(damping / 5.0, 1e-9)
+        if settled:
+            break
+    system = _System.of(bundle, projected, seen, intrinsics, modes)
+    lengths = np.linalg.norm(projected.residual, axis=1)
+    return AdjustedBundle(bundle, system.deviation(projected.residual), float(np.median(lengths)), settled)
+
+
+def _project(bundle: Bundle, seen: Sightings, modes: NDArray) -> _Projected:
+    points = bundle.points[seen.point]
+    if modes.shape[2]:
+        points = points + np.einsum("mck,mk->mc", modes[seen.point], bundle.expression[seen.timestep])
+    head, camera = bundle.heads[seen.timestep], bundle.cameras[seen.camera]
+    turned = np.einsum("mij,mj->mi", head[:, :3, :3], points)
+    swung = np.einsum("mij,mj->mi", camera[:, :3, :3], turned + head[:, :3, 3])
+    at = swung + camera[:, :3, 3]
+    depth = np.where(at[:, 2:] > 0, at[:, 2:], np.nan)
+    return _Projected(turned, swung, at, bundle.focal[seen.camera, None] * at[:, :2] / depth - seen.pixels)
+
+
+def _weights(residual: NDArray, seen: Sightings) -> tuple[NDArray, NDArray]:
+    """Cauchy's loss and the weight (M,) of each match."""
+    squared = np.sum(residual**2, axis=1) / (CAUCHY * seen.deviation) ** 2
+    return 0.5 * CAUCHY**2 * np.log1p(squared), 1.0 / (seen.deviation**2 * (1.0 + squared))
+
+
+def _off(bundle: Bundle, intrinsics: Intrinsics) -> NDArray[np.float64]:
+    """(G,) logarithms of the unknown focal lengths minus their prior means."""
+    mean = intrinsics.prior[0]
+    return np.array([np.log(bundle.focal[intrinsics.group == g][0]) - mean[g] for g in range(len(mean))])
+
+
+def _energy(bundle: Bundle, projected: _Projected, seen: Sightings, intrinsics: Intrinsics) -> float:
+    """Infinite where a point comes to lie behind a camera."""
+    loss = float(_weights(projected.residual, seen)[0].sum())
+    prior = np.sum((_off(bundle, intrinsics) / intrinsics.prior[1]) ** 2)
+    prior += np.sum((bundle.expression / EXPRESSION_DEVIATION) ** 2)
+    return loss + 0.5 * float(prior) if np.isfinite(loss) else np.inf
+
+
+def _cross(v: NDArray) -> NDArray[np.float64]:
+    """(M, 3, 3) derivative of turning points v (M, 3) by small rotation vectors."""
+    x, y, z = v.T
+    zero = np.zeros_like(x)
+    rows = [np.stack(row, axis=1) for row in ((zero, z, -y), (-z, zero, x), (y, -x, zero))]
+    return np.stack(rows, axis=1)
+
+
+@dataclass(frozen=True)
+class _System:
+    """Normal equations: P variables of cameras, heads and expressions; points apart."""
+
+    block: NDArray[np.float64]  # (P, P)
+    right: NDArray[np.float64]  # (P,)
+    mixed: NDArray[np.float64]  # (N, P, 3)
+    points: NDArray[np.float64]  # (N, 3, 3)
+    points_right: NDArray[np.float64]  # (N, 3)
+    weight: NDArray[np.float64]  # (M,)
+    focals: int
+
+    @classmethod
+    def of(
+        cls, bundle: Bundle, projected: _Projected, seen: Sightings, intrinsics: Intrinsics, modes: NDArray
+    ) -> _System:
+        cameras, steps, k = len(bundle.cameras), len(bundle.heads), modes.shape[2]
+        focals = len(intrinsics.prior[0])
+        head_at = focals + 6 * (cameras - 1)
+        face_at = head_at + 6 * (steps - 1)
+        jacobian = np.zeros((len(seen.point), 2, face_at + k * (steps - 1)))
+        at, residual = projected.seen, projected.residual
+        focal = bundle.focal[seen.camera]
+        slope = np.zeros((len(at), 2, 3))
+        slope[:, 0, 0] = slope[:, 1, 1] = focal / at[:, 2]
+        slope[:, :, 2] = -focal[:, None] * at[:, :2] / at[:, 2:] ** 2
+        turned = slope @ bundle.cameras[seen.camera, :3, :3]
+        by_point = turned @ bundle.heads[seen.timestep, :3, :3]
+        for g in range(focals):
+            of = intrinsics.group[seen.camera] == g
+            jacobian[of, :, g] = focal[of, None] * at[of, :2] / at[of, 2:]
+        for c in range(1, cameras):
+            of, first = seen.camera == c, focals + 6 * (c - 1)
+            jacobian[of, :, first : first + 3] = slope[of] @ _cross(projected.swung[of])
+            jacobian[of, :, first + 3 : first + 6] = slope[of]
+        for t in range(1, steps):
+            of, first = seen.timestep == t, head_at + 6 * (t - 1)
+            jacobian[of, :, first : first + 3] = turned[of] @ _cross(projected.turned[of])
+            jacobian[of, :, first + 3 : first + 6] = turned[of]
+            first = face_at + k * (t - 1)
+            jacobian[of, :, first : first + k] = by_point[of] @ modes[seen.point[of]]
+        weight = _weights(residual, seen)[1]
+        weighted = jacobian * weight[:, None, None]
+        columns = jacobian.shape[2]
+        block = weighted.reshape(-1, columns).T @ jacobian.reshape(-1, columns)
+        right = weighted.reshape(-1, columns).T @ residual.ravel()
+        diagonal = np.zeros(columns)
+        diagonal[:focals], diagonal[face_at:] = intrinsics.prior[1] ** -2.0, EXPRESSION_DEVIATION**-2.0
+        right += diagonal * np.concatenate(
+            [_off(bundle, intrinsics), np.zeros(face_at - focals), bundle.expression[1:].ravel()]
+        )
+        starts = np.flatnonzero(np.diff(seen.point, prepend=-1))
+        by_weight = by_point * weight[:, None, None]
+        return cls(
+            block + np.diag(diagonal),
+            right,
+            np.add.reduceat(weighted.transpose(0, 2, 1) @ by_point, starts),
+            np.add.reduceat(by_weight.transpose(0, 2, 1) @ by_point, starts),
+            np.add.reduceat(np.einsum("mkp,mk->mp", by_weight, residual), starts),
+            weight,
+            focals,
+        )
+
+    def _inverse(self, damping: float) -> NDArray[np.float64]:
+        trace = np.einsum("nii->n", self.points) / 3.0
+        return np.linalg.inv(self.points + ((damping + 1e-9) * trace + 1e-12)[:, None, None] * np.eye(3))
+
+    def _reduced(self, inverse: NDArray, damping: float) -> tuple[NDArray, NDArray]:
+        """The Schur complement of the points (P, P), and the mixed block times their inverse (N, P, 3)."""
+        product, size = self.mixed @ inverse, len(self.block)
+        flat = [np.ascontiguousarray(m.transpose(1, 0, 2)).reshape(size, -1) for m in (product, self.mixed)]
+        return self.block + damping * np.diag(np.diag(self.block)) - flat[0] @ flat[1].T, product
+
+    def step(self, damping: float) -> tuple[NDArray, NDArray]:
+        """Changes of the P variables and of the points (N, 3)."""
+        inverse = self._inverse(damping)
+        reduced, product = self._reduced(inverse, damping)
+        change = -np.linalg.solve(reduced, self.right - np.einsum("npq,nq->p", product, self.points_right))
+        back = self.points_right + np.einsum("npq,p->nq", self.mixed, change)
+        return change, -np.einsum("nij,nj->ni", inverse, back)
+
+    def deviation(self, residual: NDArray) -> float:
+        """As in `AdjustedBundle`; infinite where nothing determines a focal length."""
+        reduced, _ = self._reduced(self._inverse(0.0), 0.0)
+        variance = np.diag(np.linalg.pinv(reduced, hermitian=True))[: self.focals]
+        freedom = 2 * len(residual) - 3 * len(self.points) - len(self.block)
+        scale = float(self.weight @ np.sum(residual**2, axis=1)) / max(freedom, 1)
+        return float(np.sqrt(variance.max() * scale)) if freedom > 0 and variance.min() > 0 else np.inf
+
+
+def _moved(bundle: Bundle, change: NDArray, points: NDArray, intrinsics: Intrinsics) -> Bundle:
+    cameras, steps, focals = len(bundle.cameras), len(bundle.heads), len(intrinsics.prior[0])
+    free = intrinsics.group >= 0
+    focal = bundle.focal.copy()
+    focal[free] *= np.exp(np.clip(change[intrinsics.group[free]], -0.5, 0.5))
+    head_at = focals + 6 * (cameras - 1)
+    face_at = head_at + 6 * (steps - 1)
+    expression = bundle.expression.copy()
+    expression[1:] += change[face_at:].reshape(expression[1:].shape)
+    return replace(
+        bundle,
+        focal=focal,
+        cameras=_turned(bundle.cameras, change[focals:head_at]),
+        heads=_turned(bundle.heads, change[head_at:face_at]),
+        points=bundle.points + points,
+        expression=expression,
+    )
+
+
+def _turned(poses: NDArray, change: NDArray) -> NDArray[np.float64]:
+    """Poses of which all but the first are turned and shifted by ``change`` (6 numbers each)."""
+    out = poses.copy()
+    change = change.reshape(-1, 6)
+    if len(change):
+        out[1:, :3, :3] = Rotation.from_rotvec(change[:, :3]).as_matrix() @ poses[1:, :3, :3]
+        out[1:, :3, 3] += change[:, 3:]
+    return out

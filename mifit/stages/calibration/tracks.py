@@ -1,0 +1,196 @@
+"""Tracks of surface points through all images of a head, by optical flow in UV space.
+
+Every image is unwrapped through the mesh that its landmarks gave, which takes most of pose and perspective out. What
+remains, the mesh's errors among it, is found by dense inverse search (Kroeger et al., Fast optical flow using dense
+inverse search, 2016) between unwrapped images, there and back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.camera import Camera
+from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.uv import TexelMap, bilinear
+from mifit.render.gbuffer import SurfaceScene
+from mifit.stages.surface.views import shows_surface
+
+LEAST_COSINE = 0.25
+"""Cosine between view and normal below which texels aren't tracked."""
+DETAIL = 6.0
+"""Standard deviation in texels of the window whose mean and contrast are divided out."""
+BORDER = 5
+"""Side of the squares of texels that must all be visible."""
+THERE_AND_BACK = 0.5
+"""Texels that a flow may end beside its start when it is followed back."""
+WINDOW = 11
+"""Side of the windows in texels whose correlation confirms a match."""
+LEAST_CORRELATION = 0.8
+FEWEST_IMAGES = 3
+"""Images that must show a point: two can't contradict one another but across epipolar lines."""
+MOST_STARTS = 8
+"""Images from which tracks start."""
+MOST_TRACKS = 2000
+
+
+@dataclass(frozen=True)
+class Unwrapped:
+    """One image in UV space.
+
+    Attributes
+    ----------
+    camera, timestep : int
+        Positions among the cameras and timesteps.
+    detail : (S, S) uint8
+        Local contrast, 128 where nothing is seen.
+    seen : (S, S) bool
+        Texels that the image shows, away from outlines.
+    pixels : (S, S, 2) float32
+        Where in the image each texel lies.
+    """
+
+    camera: int
+    timestep: int
+    detail: NDArray[np.uint8]
+    seen: NDArray[np.bool_]
+    pixels: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """N surface points and where images show them.
+
+    Attributes
+    ----------
+    texel : (N,) int64
+        Flat index of the texel that each started from.
+    point : (M,) int64
+        Point of each sighting, ascending.
+    image : (M,) int64
+        Position among the unwrapped images.
+    pixels : (M, 2) float64
+    """
+
+    texel: NDArray[np.int64]
+    point: NDArray[np.int64]
+    image: NDArray[np.int64]
+    pixels: NDArray[np.float64]
+
+
+def unwrap_image(
+    image: NDArray,
+    usable: NDArray[np.bool_],
+    camera: Camera,
+    vertices: NDArray,
+    faces: NDArray,
+    texels: TexelMap,
+    place: tuple[int, int],
+) -> Unwrapped:
+    """Bring an image (H, W, 3), linear, into UV space.
+
+    Parameters
+    ----------
+    image : (H, W, 3)
+    usable : (H, W) bool
+        Pixels that are measurements.
+    camera : Camera
+    vertices : (V, 3)
+        World space.
+    faces : (F, 3)
+    texels : TexelMap
+    place : (int, int)
+        Camera and timestep, as in `Unwrapped`.
+    """
+    scene = SurfaceScene(vertices, faces)
+    position = interpolate(vertices, faces, texels.face, texels.weights)
+    normal = normalize(interpolate(vertex_normals(vertices, faces), faces, texels.face, texels.weights))
+    pixels = camera.project(position)
+    at = np.nan_to_num(pixels, nan=-1.0) - 0.5
+    cosine = (normalize(camera.position - position) * normal).sum(1)
+    seen = (cosine > LEAST_COSINE) & scene.visible_from(position, camera.position)
+    seen &= ((at > 0) & (at < (camera.width - 1, camera.height - 1))).all(axis=1)
+    shown = (usable & shows_surface(scene, camera)).astype(np.float32)
+    seen &= bilinear(shown, at[:, 0], at[:, 1]) > 0.99
+    grey = image.mean(axis=2)
+    floor = 0.1 * float(np.median(grey[shown > 0])) if (shown > 0).any() else 1.0
+    brightness = np.log(np.maximum(grey, 0.0) + max(floor, 1e-6)).astype(np.float32)
+    mask = texels.to_map(seen)
+    detail = _detail(texels.to_map(bilinear(brightness, at[:, 0], at[:, 1])), mask)
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((BORDER, BORDER), np.uint8)) > 0
+    return Unwrapped(*place, detail, inner, texels.to_map(at.astype(np.float32) + np.float32(0.5)))
+
+
+def _detail(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    def blur(image: NDArray) -> NDArray:
+        return cv2.GaussianBlur(image, (0, 0), DETAIL)
+
+    share = np.maximum(blur(mask.astype(np.float32)), 1e-3)
+    beside = np.where(mask, values - blur(np.where(mask, values, 0.0)) / share, 0.0)
+    contrast = np.sqrt(blur(beside**2) / share)
+    return np.where(mask, np.clip(128.0 + 45.0 * beside / (contrast + 0.01), 0, 255), 128.0).astype(np.uint8)
+
+
+def follow_points(images: Sequence[Unwrapped]) -> Tracks:
+    """Points that at least `FEWEST_IMAGES` images show."""
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow.setFinestScale(0)
+    starts = np.unique(np.linspace(0, len(images) - 1, min(len(images), MOST_STARTS)).round().astype(int))
+    covered = sum(int(images[a].seen.sum()) for a in starts)
+    stride = max(1, int(np.sqrt(covered / MOST_TRACKS)))
+    texel, sightings, count = [], [], 0
+    for a in starts:
+        one = images[a]
+        row, column = np.nonzero(one.seen)
+        some = ((row + 2 * a) % stride == 0) & ((column + a) % stride == 0)
+        row, column = row[some], column[some]
+        found = [(a, np.arange(len(row)), one.pixels[row, column])]
+        for b, other in enumerate(images):
+            if b != a:
+                there, back = _flow(flow, one.detail, other.detail), _flow(flow, other.detail, one.detail)
+                matched = _matched(one, other, there, back, row, column)
+                moved = there[row[matched], column[matched]]
+                x, y = column[matched] + moved[:, 0], row[matched] + moved[:, 1]
+                found.append((b, matched, bilinear(other.pixels, x, y)))
+        times = np.bincount(np.concatenate([which for _, which, _ in found]), minlength=len(row))
+        kept = times >= FEWEST_IMAGES
+        number = np.cumsum(kept) - 1 + count
+        for b, which, pixels in found:
+            use = kept[which]
+            sightings.append((number[which[use]], np.full(int(use.sum()), b), pixels[use]))
+        texel.append((row * one.seen.shape[1] + column)[kept])
+        count += int(kept.sum())
+    point, image, where = (np.concatenate(parts) for parts in zip(*sightings, strict=True))
+    order = np.argsort(point, kind="stable")
+    return Tracks(np.concatenate(texel), point[order], image[order], where[order].astype(np.float64))
+
+
+def _flow(method: cv2.DISOpticalFlow, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(S, S, 2) texels from each of the first to its counterpart in the second."""
+    return np.asarray(method.calc(first, second, np.zeros((*first.shape, 2), np.float32)))
+
+
+def _matched(
+    one: Unwrapped, other: Unwrapped, there: NDArray, back: NDArray, row: NDArray, column: NDArray
+) -> NDArray[np.intp]:
+    """Which of the texels the other image shows too, by the flow there and back and by correlation."""
+    x, y = column + there[row, column, 0], row + there[row, column, 1]
+    closed = np.abs(there[row, column] + bilinear(back, x, y)).max(axis=1) < THERE_AND_BACK
+    closed &= bilinear(other.seen.astype(np.float32), x, y) > 0.99
+    grid_y, grid_x = np.indices(one.seen.shape, dtype=np.float32)
+    first = one.detail.astype(np.float32)
+    second = cv2.remap(
+        other.detail.astype(np.float32), grid_x + there[..., 0], grid_y + there[..., 1], cv2.INTER_LINEAR
+    )
+
+    def mean(image: NDArray) -> NDArray:
+        return cv2.blur(image, (WINDOW, WINDOW))
+
+    a, b = mean(first), mean(second)
+    spread = (mean(first * first) - a * a) * (mean(second * second) - b * b)
+    correlation = (mean(first * second) - a * b) / np.sqrt(np.maximum(spread, 1.0))
+    return np.flatnonzero(closed & (correlation[row, column] > LEAST_CORRELATION))
