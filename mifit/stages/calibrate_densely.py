@@ -34,6 +34,8 @@ MATCH_DEVIATION = 0.3
 """Pixels that a match errs by along an axis, for images whose longer side has `MATCH_SIDE` pixels."""
 MATCH_SIDE = 680.0
 FEWEST_TRACKS = 200
+MOST_TIMESTEPS = 6
+"""Timesteps that are matched, spread evenly over more: cameras keep still, and each has its expression to find."""
 LARGEST_DEVIATION = 0.05
 """Relative standard deviation of a focal length beyond which matches don't decide it."""
 LARGEST_RESIDUAL = 4.0
@@ -96,6 +98,8 @@ def calibrate_densely(
     unknown = np.array([capture.views[name].intrinsics is None for name in cameras])
     if not unknown.any():
         return DenseCalibration(capture, "focal lengths are the capture's own")
+    some = np.unique(np.linspace(0, len(timesteps) - 1, min(len(timesteps), MOST_TIMESTEPS)).round().astype(int))
+    start, timesteps = replace(start, heads=start.heads[some]), [timesteps[k] for k in some]
     images = len(cameras) * len(timesteps)
     if images < FEWEST_IMAGES:
         return _left(start, cameras, f"{images} image{'s' * (images > 1)} can't tell more, expected {FEWEST_IMAGES}")

@@ -74,6 +74,22 @@ def test_two_images_leave_the_landmarks_value_and_say_so(model, uncalibrated) ->
     assert found.note.endswith("is from landmarks, which may be off by a third: 2 images can't tell more, expected 3")
 
 
+def test_many_sightings_are_thinned_by_whole_tracks(model, uncalibrated, monkeypatch) -> None:
+    from mifit.stages.calibration import tracks
+
+    found = []
+    follow = tracks.follow_points
+    monkeypatch.setattr("mifit.stages.calibrate_densely.follow_points", lambda images: found.append(follow(images)))
+    for most in (10**6, 3000):
+        monkeypatch.setattr(tracks, "MOST_SIGHTINGS", most)
+        with pytest.raises(AttributeError):  # nothing is handed on
+            calibrated(uncalibrated, model, BOTH, (0, 1, 2))
+    whole, thinned = found
+    assert len(whole.point) > 3000 >= 0.5 * len(thinned.point) and len(thinned.point) < 0.7 * len(whole.point)
+    assert np.bincount(thinned.point).min() >= 3
+    assert set(thinned.texel) <= set(whole.texel) and len(thinned.texel) == thinned.point.max() + 1
+
+
 def exact(turns, expressions=0.0, points=400):
     """Points of a ball's front before two cameras 40 degrees apart, and the bundle that explains their projections."""
     rng = np.random.default_rng(1)

@@ -36,6 +36,7 @@ FEWEST_IMAGES = 3
 MOST_STARTS = 8
 """Images from which tracks start."""
 MOST_TRACKS = 2000
+MOST_SIGHTINGS = 20000
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ def _detail(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.
 
 
 def follow_points(images: Sequence[Unwrapped]) -> Tracks:
-    """Points that at least `FEWEST_IMAGES` images show."""
+    """Points that at least `FEWEST_IMAGES` images show; about `MOST_TRACKS` starts, at most `MOST_SIGHTINGS`."""
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setFinestScale(0)
     starts = np.unique(np.linspace(0, len(images) - 1, min(len(images), MOST_STARTS)).round().astype(int))
@@ -165,8 +166,11 @@ def follow_points(images: Sequence[Unwrapped]) -> Tracks:
         texel.append((row * one.seen.shape[1] + column)[kept])
         count += int(kept.sum())
     point, image, where = (np.concatenate(parts) for parts in zip(*sightings, strict=True))
+    every = max(1, -(-len(point) // MOST_SIGHTINGS))
+    kept = point % every == 0
+    point, image, where = point[kept] // every, image[kept], where[kept]
     order = np.argsort(point, kind="stable")
-    return Tracks(np.concatenate(texel), point[order], image[order], where[order].astype(np.float64))
+    return Tracks(np.concatenate(texel)[::every], point[order], image[order], where[order].astype(np.float64))
 
 
 def _flow(method: cv2.DISOpticalFlow, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
