@@ -36,8 +36,8 @@ MATCH_SIDE = 680.0
 FEWEST_TRACKS = 200
 MOST_TIMESTEPS = 6
 """Timesteps that are matched, spread evenly over more: cameras keep still, and each has its expression to find."""
-LARGEST_DEVIATION = 0.05
-"""Relative standard deviation of a focal length beyond which matches don't decide it."""
+LARGEST_DEVIATION = 0.02
+"""Relative deviation of a focal length beyond which matches don't decide it; errors are some times as large."""
 LARGEST_RESIDUAL = 4.0
 """Median residual, in deviations of a match, beyond which tracks aren't those of one head."""
 
@@ -92,7 +92,7 @@ def calibrate_densely(
     -----
     One focal length serves all cameras without one whose images have the same longer side; principal points of such
     cameras are in the middle and pixels are square. Two images don't determine a focal length: both look at the head,
-    and then it is a family of solutions.
+    and then it is a family of solutions. Images of one camera leave expressions and perspective apart too badly.
     """
     capture = start.capture
     unknown = np.array([capture.views[name].intrinsics is None for name in cameras])
@@ -101,8 +101,10 @@ def calibrate_densely(
     some = np.unique(np.linspace(0, len(timesteps) - 1, min(len(timesteps), MOST_TIMESTEPS)).round().astype(int))
     start, timesteps = replace(start, heads=start.heads[some]), [timesteps[k] for k in some]
     images = len(cameras) * len(timesteps)
+    if len(cameras) < 2:
+        return _left(start, cameras, "one camera can't tell expressions from perspective, expected two")
     if images < FEWEST_IMAGES:
-        return _left(start, cameras, f"{images} image{'s' * (images > 1)} can't tell more, expected {FEWEST_IMAGES}")
+        return _left(start, cameras, f"{images} images can't tell more, expected {FEWEST_IMAGES}")
     total = images + 2
     progress("match views", 0, total)
     vertices = _vertices(start, model)

@@ -74,6 +74,12 @@ def test_two_images_leave_the_landmarks_value_and_say_so(model, uncalibrated) ->
     assert found.note.endswith("is from landmarks, which may be off by a third: 2 images can't tell more, expected 3")
 
 
+def test_one_camera_leaves_the_landmarks_value_and_says_so(model, uncalibrated) -> None:
+    found = calibrated(uncalibrated, model, ("left",), (0, 1, 2))
+    assert found.deviation is None
+    assert found.note.endswith("one camera can't tell expressions from perspective, expected two")
+
+
 def test_many_sightings_are_thinned_by_whole_tracks(model, uncalibrated, monkeypatch) -> None:
     from mifit.stages.calibration import tracks
 
