@@ -8,6 +8,7 @@ harmonic: a weak pull of the ambient term to zero.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,14 +55,20 @@ class Layout:
 
     def at(self, name: str, step: int = 0) -> slice:
         """Slice of a group in the flat vector; ``step`` is the position of the timestep for a local group."""
-        names, offset = (SHARED, 0) if name in SHARED else (LOCAL, self.shared_size + step * self.local_size)
-        offset += sum(getattr(self, before) for before in names[: names.index(name)])
-        return slice(offset, offset + getattr(self, name))
+        return _slice(self, name, step)
 
     def local(self, step: int) -> slice:
         """Slice of all unknowns of one timestep."""
         start = self.shared_size + step * self.local_size
         return slice(start, start + self.local_size)
+
+
+@lru_cache(maxsize=4096)
+def _slice(layout: Layout, name: str, step: int) -> slice:
+    """Asked for thousands of times in every fit."""
+    names, offset = (SHARED, 0) if name in SHARED else (LOCAL, layout.shared_size + step * layout.local_size)
+    offset += sum(getattr(layout, before) for before in names[: names.index(name)])
+    return slice(offset, offset + getattr(layout, name))
 
 
 @dataclass(frozen=True)

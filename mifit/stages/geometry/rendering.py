@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross
-from mifit.core.sh import basis, basis_gradient
+from mifit.core.sh import basis_gradient
 from mifit.morphable import MorphableModel
 from mifit.solve import geman_mcclure
 from mifit.solve.systems import ArrowSystem
@@ -138,13 +138,13 @@ class Observation:
 
     residual: NDArray  # (n, 3), 0..255
     ok: NDArray  # (n,) bool
-    slope: NDArray | None
+    slope: NDArray  # (n, 3, 2) of the image, by pixels
     projection: Projection
     normal: NDArray  # (n, 3) world
     albedo: NDArray
     shade: NDArray
     basis: NDArray  # (n, 9)
-    basis_slope: NDArray | None  # (n, 9, 3)
+    basis_slope: NDArray  # (n, 9, 3)
 
 
 @dataclass(frozen=True)
@@ -202,14 +202,32 @@ class RenderingProblem:
             out.append(PixelRows(position, mix @ model.mean_albedo, modes.reshape(n, 3, -1)))
         return out
 
-    def _observe(self, view: PixelView, rows: PixelRows, surface: Surface, x: NDArray, gradient: bool) -> Observation:
+    @cached_property
+    def _last(self) -> dict[bytes, list[Observation]]:
+        """The views at the x last asked for: a step that is accepted is linearised where it has been judged."""
+        return {}
+
+    def _observations(self, x: NDArray) -> list[Observation]:
+        """Of each view."""
+        key = x.tobytes()
+        if key not in self._last:
+            surfaces = self._surfaces(x)
+            self._last.clear()
+            self._last[key] = [
+                self._observe(view, rows, surfaces[view.step], x)
+                for view, rows in zip(self.views, self._rows, strict=True)
+            ]
+        return self._last[key]
+
+    def _observe(self, view: PixelView, rows: PixelRows, surface: Surface, x: NDArray) -> Observation:
         pose: Pose = self.frames.pose(self.layout, x, view.step)
         w = view.weights.astype(np.float64)
         points = np.einsum("nk,nkc->nc", w, surface.vertices[self.model.faces[view.face]])
         normal = surface.normals(view.face, w)[0] @ pose.rotation.T
-        projection = project(view.camera, pose, points, gradient)
-        values, slope, inside = view.image.sample(projection.pixels, gradient)
-        harmonics, basis_slope = basis_gradient(normal, 3) if gradient else (basis(normal, 3), None)
+        projection = project(view.camera, pose, points)
+        values, slope, inside = view.image.sample(projection.pixels)
+        assert slope is not None
+        harmonics, basis_slope = basis_gradient(normal, 3)
         shade = harmonics @ x[self.layout.at("shading")].reshape(9, 3)
         modes = rows.albedo_modes
         colour = rows.albedo + modes @ x[self.layout.at("albedo")].astype(modes.dtype)
@@ -230,11 +248,7 @@ class RenderingProblem:
 
     def energies(self, x: NDArray) -> dict[str, float]:
         """Energy per term."""
-        surfaces = self._surfaces(x)
-        data = sum(
-            self._loss(self._observe(view, rows, surfaces[view.step], x, gradient=False))[0]
-            for view, rows in zip(self.views, self._rows, strict=True)
-        )
+        data = sum(self._loss(observation)[0] for observation in self._observations(x))
         prior = prior_energy(self.layout, x, self.priors)
         landmarks = self.landmarks.energy(self.layout, self.frames, x)
         return {"photo": float(data), "landmarks": landmarks, "prior": prior}
@@ -250,11 +264,11 @@ class RenderingProblem:
 
     def linearize(self, x: NDArray) -> ArrowSystem:
         """Normal equations at x."""
-        equations, surfaces = NormalEquations(self.layout), self._surfaces(x)
+        equations = NormalEquations(self.layout)
         slopes = self.slopes if self.slopes is not None else self.holding_slopes(x).slopes
         assert slopes is not None
-        for view, rows, by_shape in zip(self.views, self._rows, slopes, strict=True):
-            observation = self._observe(view, rows, surfaces[view.step], x, gradient=True)
+        observed = self._observations(x)
+        for view, rows, by_shape, observation in zip(self.views, self._rows, slopes, observed, strict=True):
             equations.add_weighted(view.step, self._weighted_rows(view, rows, by_shape, observation, x))
         self.landmarks.accumulate(equations, self.layout, self.frames, x)
         equations.add_priors(x, self.priors)
@@ -270,7 +284,6 @@ class RenderingProblem:
         n, shared = len(view.face), layout.shared_size
         root = np.sqrt(self._loss(o)[1])[:, None, None]
         pose = self.frames.pose(layout, x, view.step)
-        assert o.slope is not None and o.basis_slope is not None
         by_pixel = -WHITE * root * o.slope.astype(np.float64)
         # shading through the world normal, each channel its own lighting
         lighting = np.einsum("nkd,kc->ncd", o.basis_slope, x[layout.at("shading")].reshape(9, 3))

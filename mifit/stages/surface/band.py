@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
+from mifit.stages.geometry.images import box
 
 DARKEST = 4e-3
 """Added before the logarithm, in linear image units: below it the noise of 8-bit images outweighs the signal."""
@@ -36,11 +37,25 @@ class FeatureImage:
     factor: float
     values: NDArray[np.float32]
 
-    def sample(self, points: NDArray) -> NDArray[np.float32]:
-        """(N, 3) feature, validity and brightness at world points (N, 3); 0 outside the image."""
-        pixels = self.camera.project(points) * self.factor - 0.5
-        pixels = np.nan_to_num(pixels, nan=-10.0).astype(np.float32)
-        return _remap(self.values, pixels)
+    def sample(self, points: NDArray, way: NDArray, offsets: NDArray) -> NDArray[np.float32]:
+        """(K, N, 3) feature, validity and brightness at world points (N, 3) moved by K offsets along their ways (N, 3).
+
+        0 outside the image. The straight lines are projected once.
+        """
+        camera = self.camera
+        start, slope = camera.to_camera(np.asarray(points, np.float64)), way.astype(np.float64) @ camera.rotation.T
+        axes = ((camera.fx, camera.cx, 0), (camera.fy, camera.cy, 1))
+        out = np.empty((len(offsets), len(start), self.values.shape[-1]), np.float32)
+        pixels = np.empty((len(start), 2), np.float32)
+        for k, offset in enumerate(offsets):
+            depth = start[:, 2] + offset * slope[:, 2]
+            front = depth > 1e-12
+            inverse = self.factor / np.where(front, depth, 1.0)
+            for focal, centre, i in axes:
+                across = (start[:, i] + offset * slope[:, i]) * (focal * inverse) + (centre * self.factor - 0.5)
+                pixels[:, i] = np.where(front, across, -10.0)
+            out[k] = _remap(self.values, pixels)
+        return out
 
 
 def feature_image(camera: Camera, image: NDArray, valid: NDArray[np.bool_], factor: float) -> FeatureImage:
@@ -55,12 +70,17 @@ def feature_image(camera: Camera, image: NDArray, valid: NDArray[np.bool_], fact
         weight = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
         luminance = cv2.resize(luminance, size, interpolation=cv2.INTER_AREA) / np.maximum(weight, 1e-3)
     usable = (weight > 0.9).astype(np.float32)
-    log = np.log(np.maximum(luminance, 0.0) + DARKEST) * usable
+    # Blurs reach four deviations far; nothing is read where nothing is usable.
+    part = box(usable > 0, int(np.ceil(4.0 * WINDOW)) + 1)
+    shown = usable[part]
+    log = np.log(np.maximum(luminance[part], 0.0) + DARKEST) * shown
     wide, fine = (
-        cv2.GaussianBlur(log, (0, 0), s) / np.maximum(cv2.GaussianBlur(usable, (0, 0), s), 1e-3) for s in (WINDOW, 0.6)
+        cv2.GaussianBlur(log, (0, 0), s) / np.maximum(cv2.GaussianBlur(shown, (0, 0), s), 1e-3) for s in (WINDOW, 0.6)
     )
     band = LARGEST * np.tanh((fine - wide) / LARGEST)
-    return FeatureImage(camera, factor, np.stack([band * usable, usable, wide * usable], axis=-1).astype(np.float32))
+    values = np.zeros((*usable.shape, 3), np.float32)
+    values[part] = np.stack([band * shown, shown, wide * shown], axis=-1)
+    return FeatureImage(camera, factor, values)
 
 
 def _remap(values: NDArray, pixels: NDArray, columns: int = 4096) -> NDArray[np.float32]:

@@ -61,10 +61,8 @@ def touching_planes(texels: TexelMap, posed: Posed, found: Found) -> MeasuredPla
     found : Found
     """
     row, column = (axis.astype(np.float64) for axis in np.divmod(texels.index, texels.size))
-    along = [posed.position[:, axis].astype(np.float64) for axis in range(3)]
-    inside = np.ones(len(row))
-    slopes = [_regress(texels, row, column, inside, value, 5, (1e-6, 1e-6)) for value in along]
-    by_column, by_row = (np.stack([slope[k] for slope in slopes], axis=1) for k in (1, 2))
+    along = posed.position.astype(np.float64).T
+    _, by_column, by_row = (part.T for part in _regress(texels, row, column, np.ones(len(row)), along, 5, (1e-6, 1e-6)))
     aa, bb, ab = (by_column**2).sum(1), (by_row**2).sum(1), (by_column * by_row).sum(1)
     tiny = 1e-12 * max(float(aa.mean()), 1e-30)
     ridge = (SLOPE**-2 / np.maximum(aa, tiny), SLOPE**-2 / np.maximum(bb, tiny))
@@ -96,17 +94,22 @@ def _regress(
     window: int,
     ridge: tuple[NDArray | float, NDArray | float],
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Weighted straight lines through values in windows: value at the centre, slopes along columns and along rows."""
+    """Weighted straight lines through values (..., N) in windows: centre, slopes along columns and along rows."""
     x, y = column - column.mean(), row - row.mean()
-    products = [weight * f for f in (1.0, x, y, value, x * x, y * y, x * y, x * value, y * value)]
-    sums = [
-        window**2 * texels.from_map(cv2.blur(texels.to_map(product), (window, window))) for product in products
-    ]  # one at a time: OpenCV blurs four channels at most
-    total = sums[0] + 1e-12 * max(float(weight.max()), 1e-30)
-    mx, my, mv = (part / total for part in sums[1:4])
-    xx = np.maximum(sums[4] - total * mx * mx, 0.0) + ridge[0]
-    yy = np.maximum(sums[5] - total * my * my, 0.0) + ridge[1]
-    xy, xv, yv = sums[6] - total * mx * my, sums[7] - total * mx * mv, sums[8] - total * my * mv
+
+    def summed(product: NDArray) -> NDArray:
+        return window**2 * texels.from_map(cv2.blur(texels.to_map(product), (window, window)))
+
+    def mean(product: NDArray) -> NDArray:
+        flat = [summed(weight * one) for one in product.reshape(-1, product.shape[-1])]
+        return np.reshape(flat, product.shape) / total
+
+    total = summed(weight) + 1e-12 * max(float(weight.max()), 1e-30)
+    mx, my, mv = mean(x), mean(y), mean(value)
+    xx = total * np.maximum(mean(x * x) - mx * mx, 0.0) + ridge[0]
+    yy = total * np.maximum(mean(y * y) - my * my, 0.0) + ridge[1]
+    xy = total * (mean(x * y) - mx * my)
+    xv, yv = total * (mean(x * value) - mx * mv), total * (mean(y * value) - my * mv)
     determinant = np.maximum(xx * yy - xy * xy, 1e-30)
     by_x, by_y = (yy * xv - xy * yv) / determinant, (xx * yv - xy * xv) / determinant
     return mv + by_x * (x - mx) + by_y * (y - my), by_x, by_y

@@ -45,6 +45,8 @@ SHADING_ROUNDS, SHADING_ITERATIONS = 5, 10
 """Rounds by colours and texture, before anything is swept: they reach farthest; and iterations of each."""
 PASSES, ITERATIONS = 2, 6
 """Times that the planes' counterparts are found anew after a sweep, and iterations of each."""
+PIXELS, FEWEST_PIXELS = 4000, 1000
+"""Pixels of all images together, drawn anew in every round, and the fewest of an image: two images need more of each."""
 POINTS, TEXTURE_POINTS = 4000, 1000
 """Planes of a timestep, and points whose texture is compared."""
 COUNTERPART_MAP = 256
@@ -213,7 +215,9 @@ def fit_model(
     """
     steps = geometry.timesteps
     noise = float(geometry.report.details.get("landmark_noise_pixels", config.landmark_noise))
-    config = replace(config, as_written=False, scale_deviation=0.0, landmark_noise=noise)
+    config = replace(
+        config, as_written=False, scale_deviation=0.0, landmark_noise=noise, pixels=min(config.pixels, PIXELS)
+    )
     views = landmark_views(capture, model, cameras, steps, biased_noise(noise, len(cameras) * len(steps)), fewest=0)
     views = slid(model, geometry, views)
     visibility = Visibility(capture, model, tuple(cameras), steps, geometry.gains)
@@ -222,26 +226,24 @@ def fit_model(
     farthest = FARTHEST_MM * float(geometry.scale) / model.unit_mm
     rng = np.random.default_rng(seed)
     state = joint_state(model, geometry)
-    pixels = visibility.pixels(state, config.pixels, 1.0, seed)
-    start = gather(model, visibility.world(state), pixels, config.robust_colour, config.albedo_prior)
+    seen = visibility.pixels(state, config.pixels, 1.0, seed)
+    start = gather(model, visibility.world(state), seen, config.robust_colour, config.albedo_prior)
     appearance = fit_appearance(start, config.max_iterations).value
-    number = 0
-    for sweep in (*[None] * SHADING_ROUNDS, *sweeps):
+    for number, sweep in enumerate((*[None] * SHADING_ROUNDS, *sweeps)):
         planes, scale = ([], 1.0) if sweep is None else measure(visibility.world(state), sweep)
         planes = [part.thinned(POINTS, rng) for part in planes]
+        state = state.recentred()
+        colours, x = paper_problem(model, state, appearance, (), visibility, config, seed + number)
+        colours = replace(colours, priors={"albedo": COLOUR, "ambient": colours.priors["ambient"]}).holding_slopes(x)
+        texture = texture_problem(state, views, visibility, points, config)
+        # Paint that the model's albedo doesn't explain is no shading: what stays unexplained counts less.
+        left = colours.energies(x)["photo"] / max(len(colours.views), 1)
+        problem = JointProblem(colours, texture, min(1.0, UNEXPLAINED / max(left, 1e-30)))
+        low, high = bounds(colours.layout, model.expression_bounds)
         for _ in range(PASSES if planes else 1):
-            state = state.recentred()
             terms = _counterparts(model, texels, visibility.world(state), planes, farthest, OUTSIDE_STEPS * scale)
-            colours, x = paper_problem(model, state, appearance, (), visibility, config, seed + number)
-            colours = replace(colours, priors={"albedo": COLOUR, "ambient": colours.priors["ambient"]})
-            texture = texture_problem(state, views, visibility, points, config)
-            # Paint that the model's albedo doesn't explain is no shading: what stays unexplained counts less.
-            left = colours.energies(x)["photo"] / max(len(colours.views), 1)
-            weight = min(1.0, UNEXPLAINED / max(left, 1e-30))
-            colours = colours.holding_slopes(x)
-            low, high = bounds(colours.layout, model.expression_bounds)
             solution = minimize(
-                JointProblem(colours, texture, weight, terms),
+                replace(problem, planes=terms),
                 x,
                 lower=low,
                 upper=high,
@@ -250,11 +252,9 @@ def fit_model(
             )
             if not solution.usable or not np.isfinite(solution.value).all():
                 return geometry
-            full = State(colours.layout, colours.frames, solution.value)
-            at = full.layout.at
-            appearance = np.concatenate([full.x[at(name)] for name in ("albedo", "shading", "ambient")])
-            state = full.with_layout(state.layout)
-            number += 1
+            x = solution.value
+            state = State(colours.layout, colours.frames, x).with_layout(state.layout)
+        appearance = np.concatenate([x[colours.layout.at(name)] for name in ("albedo", "shading", "ambient")])
         progress()
     layout = state.layout
     poses = [state.frames.pose(layout, state.x, k) for k in range(len(steps))]

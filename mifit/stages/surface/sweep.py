@@ -97,7 +97,7 @@ def sweep(texels: TexelMap, steps: Sequence[Posed], offsets: NDArray, window: in
         at = {}
         for i in {i for pair in pairs for i in pair}:
             way = step.normal if step.shift is None else step.shift[i]
-            at[i] = np.stack([step.images[i].sample(step.position + offset * way) for offset in offsets])  # (K, N, 3)
+            at[i] = step.images[i].sample(step.position, way, offsets)  # (K, N, 3)
         for a, b in pairs:
             trust = np.sqrt(step.seen[a] * step.seen[b])
             if not (trust > 0).any():
