@@ -50,6 +50,8 @@ CONTACT_MM = 1.5
 """Gap below which opposed parts of the surface, such as closed lips, move together."""
 SETTLED = 0.25
 """Part of the last sweep's step below which the surface counts as settled."""
+SETTLING = 2
+"""Further sweeps at the finest level, at the most, until it has."""
 THIN = 2
 STIFFEST = 5000.0
 """Largest stiffness."""
@@ -110,7 +112,7 @@ def find_surface(
     # Landmarks that agree with the fit say more of a face within the model's span than shading and sweeps do.
     refit = config.refit and landmarks_are_biased(geometry)
     spanned = [*levels, *[levels[-1]] * FINEST_AGAIN] if refit else []
-    total = len(levels) + (len(levels) + len(spanned) + SHADING_ROUNDS) * refit
+    total = len(levels) + SETTLING + (len(levels) + len(spanned) + SHADING_ROUNDS) * refit
     search = _Search(capture, model, cameras, resolution, pairs, config, progress, total)
     last = search.descend(geometry, levels)
     between: list[float] = []  # without and with it
@@ -132,6 +134,10 @@ def find_surface(
         )
         refit = between[1] < between[0]
         geometry, last = (fitted, other) if refit else (geometry, last)
+    again = 0
+    while again < SETTLING and last.outcome is not Outcome.CONVERGED:
+        last, again = search.descend(geometry, levels[-1:], last), again + 1
+    search.finish()
     found = replace(geometry, vertices=last.world.astype(np.float32), displacement=last.displacement.astype(np.float32))
     lips: dict = {}
     if config.close_lips:
@@ -144,7 +150,7 @@ def find_surface(
         "name": "surface",
         "outcome": last.outcome.value,
         "moved_last_mm": last.moved * capture.unit_mm,
-        "levels": [level for level, _ in levels],
+        "levels": [level for level, _ in (*levels, *levels[-1:] * again)],
         "matched": last.matched,
         "refitted": refit,
         "between_views": between,
@@ -170,6 +176,12 @@ class _Descent:
     """Root mean square of what the last sweep moved the measured texels by along their normals, world length."""
     outcome: Outcome
 
+    @classmethod
+    def before(cls, geometry: GeometryEstimate) -> _Descent:
+        """Nothing displaced yet."""
+        world = geometry.vertices.astype(np.float64)
+        return cls(np.zeros_like(world[0]), world, USUAL, 0.0, np.inf, Outcome.MAX_ITERATIONS)
+
 
 class _Search:
     """Sweeps, coarse to fine, from a fit of the model."""
@@ -189,6 +201,10 @@ class _Search:
         self._resolution, self._config, self._progress = resolution, config, progress
         self._done, self._total = 0, total
         progress("find surface", 0, total)
+
+    def finish(self) -> None:
+        """All steps are done, or were not needed."""
+        self._progress("find surface", self._total, self._total)
 
     def advance(self) -> None:
         """One more step is done."""
@@ -221,15 +237,17 @@ class _Search:
         found = replace(found, precision=found.precision / len(posed))
         return [touching_planes(texels, one, found) for one in posed], step
 
-    def descend(self, geometry: GeometryEstimate, levels: Sequence[tuple[int, int]]) -> _Descent:
-        """Displace a fitted model's surface; levels as of `sweeps`."""
+    def descend(
+        self, geometry: GeometryEstimate, levels: Sequence[tuple[int, int]], last: _Descent | None = None
+    ) -> _Descent:
+        """Displace a fitted model's surface; levels as of `sweeps`. Goes on from ``last``."""
         model, scale = self._model, float(geometry.scale)
         neutral = model.shape(geometry.identity).astype(np.float64)
         plate = Plate.of(neutral, model.faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm)
-        world = geometry.vertices.astype(np.float64)
+        last = last or _Descent.before(geometry)
+        world, displacement, stiffness = last.world, last.displacement, last.stiffness
         scene = SurfaceScene(world[0], model.faces)
-        displacement, stiffness, matched = np.zeros_like(neutral), USUAL, 0.0
-        moved, step = 0.0, 0.0
+        matched, moved, step = 0.0, 0.0, 0.0
         for level, half in levels:
             texels, posed, found, step = self._sweep(geometry.timesteps, world, scene, level, half)
             matched = float((found.precision > 0).mean())

@@ -291,11 +291,22 @@ def test_a_refit_on_which_the_views_agree_less_is_dropped(model, bumpy, start, f
 def test_the_outcome_tells_whether_the_last_sweep_still_moved_the_surface(model, bumpy, start, monkeypatch):
     """One sweep is only a start; at the level that it started at, further ones settle."""
     ends = []
+    monkeypatch.setattr("mifit.stages.find_surface.SETTLING", 0)
     for count in (1, 5):
         monkeypatch.setattr("mifit.stages.find_surface.sweeps", lambda *_, count=count: [(0, 6)] * count)
         ends.append(find_surface(bumpy, model, start, BOTH).report.details["phases"][-1])
     assert [end["outcome"] for end in ends] == ["max_iterations", "converged"]
     assert ends[1]["moved_last_mm"] < 0.3 * ends[0]["moved_last_mm"]
+
+
+def test_the_finest_sweep_is_repeated_until_the_surface_has_settled(model, bumpy, start, monkeypatch):
+    """At most twice, and not once where it has settled."""
+    ends = []
+    for count in (1, 5):
+        monkeypatch.setattr("mifit.stages.find_surface.sweeps", lambda *_, count=count: [(0, 6)] * count)
+        ends.append(find_surface(bumpy, model, start, BOTH).report.details["phases"][-1])
+    assert 1 < len(ends[0]["levels"]) <= 3 and len(ends[1]["levels"]) == 5
+    assert ends[0]["outcome"] == "converged" or len(ends[0]["levels"]) == 3
 
 
 def test_a_camera_off_its_calibration_is_told_by_the_epipolar_lines(model, bumpy, start, found):
