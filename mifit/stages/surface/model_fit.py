@@ -46,7 +46,7 @@ SHADING_ROUNDS, SHADING_ITERATIONS = 5, 10
 PASSES, ITERATIONS = 2, 6
 """Times that the planes' counterparts are found anew after a sweep, and iterations of each."""
 PIXELS, FEWEST_PIXELS = 4000, 1000
-"""Pixels of all images together, drawn anew in every round, and the fewest of an image: two images need more of each."""
+"""Pixels of all images together, drawn anew in every round, and the fewest of an image."""
 POINTS, TEXTURE_POINTS = 4000, 1000
 """Planes of a timestep, and points whose texture is compared."""
 COUNTERPART_MAP = 256
