@@ -37,7 +37,7 @@ FEWEST_TRACKS = 200
 MOST_TIMESTEPS = 6
 """Timesteps that are matched, spread evenly over more: cameras keep still, and each has its expression to find."""
 LARGEST_DEVIATION = 0.02
-"""Relative deviation of a focal length beyond which matches don't decide it; errors are some times as large."""
+"""Relative deviation of a focal length beyond which matches don't decide it; real errors are larger."""
 LARGEST_RESIDUAL = 4.0
 """Median residual, in deviations of a match, beyond which tracks aren't those of one head."""
 
