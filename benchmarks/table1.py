@@ -1,6 +1,6 @@
 """The paper's Table 1 on data that can be made: subjects, three views, the third one held out.
 
-    python -m benchmarks.table1 [--subjects 15] [--jobs 1] [--work out/table1]
+    python -m benchmarks.table1 [--subjects 15] [--jobs 1] [--no-paper] [--work out/table1]
 
 Each subject is a random identity with its own skin, path traced with detail that the fitted model doesn't have, under
 one of three set-ups of light; every third head leaves the model's span by well over half a millimetre. Landmarks are
@@ -73,7 +73,7 @@ def mifit(*arguments: object) -> None:
         raise RuntimeError(f"mifit {arguments[0]}: {(done.stderr.strip() or 'no message').splitlines()[-1]}")
 
 
-def run_subject(subject: int, work: Path, size: dict[str, int], model: str, texels: int) -> dict[str, Any]:
+def run_subject(subject: int, work: Path, size: dict[str, int], model: str, texels: int, paper: bool) -> dict[str, Any]:
     """Synthesise, fit and judge one subject in a process of its own; what is done already is kept."""
     folder = work / f"subject_{subject:02d}"
     figures = folder / "figures.json"
@@ -90,7 +90,8 @@ def run_subject(subject: int, work: Path, size: dict[str, int], model: str, texe
                   *options, *light)  # fmt: skip
     if not figures.exists():
         done = subprocess.run(
-            [sys.executable, "-m", "benchmarks.table1_subject", str(folder), model, str(texels)],
+            [sys.executable, "-m", "benchmarks.table1_subject", str(folder), model, str(texels),
+             "paper" if paper else "no-paper"],
             capture_output=True, text=True, check=False,
         )  # fmt: skip
         if done.returncode:
@@ -203,7 +204,7 @@ def _mean(table: dict[str, float], key: str, digits: int) -> str:
 
 
 def run(
-    subjects: int, jobs: int, work: Path, size: dict[str, int], model: str, texels: int, name: str
+    subjects: int, jobs: int, work: Path, size: dict[str, int], model: str, texels: int, name: str, paper: bool = True
 ) -> dict[str, Any]:
     """Run all subjects and write ``benchmarks/results/NAME.json`` and ``.md``.
 
@@ -214,7 +215,7 @@ def run(
     """
     rows, failures, before = [], {}, conditions()
     with ThreadPoolExecutor(jobs) as pool:
-        waiting = {pool.submit(run_subject, i, work, size, model, texels): i for i in range(subjects)}
+        waiting = {pool.submit(run_subject, i, work, size, model, texels, paper): i for i in range(subjects)}
         for done in as_completed(waiting):
             subject = waiting[done]
             try:
@@ -251,10 +252,11 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1, help="subjects at a time, each in processes of its own")
     parser.add_argument("--work", type=Path, default=Path("out/table1"))
     parser.add_argument("--model", default="builtin")
+    parser.add_argument("--no-paper", action="store_true", help="leave out the paper as written, most of the time")
     parser.add_argument("--reduced", action="store_true", help="small images and maps, for a quick look")
     a = parser.parse_args()
     size, name = (REDUCED, "table1_reduced") if a.reduced else (FULL_SIZE, "table1")
-    figures = run(a.subjects, a.jobs, a.work, size, a.model, TEXELS, name)
+    figures = run(a.subjects, a.jobs, a.work, size, a.model, TEXELS, name, not a.no_paper)
     print((RESULTS / f"{name}.md").read_text())
     return 1 if figures["failures"] else 0
 

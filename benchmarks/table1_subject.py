@@ -21,7 +21,9 @@ BUMP_UNIT = 0.1
 CAMERAS = ("left", "right")
 
 
-def fits(folder: Path, model: MorphableModel, config: FitConfig) -> dict[str, tuple[Reconstruction, Capture]]:
+def fits(
+    folder: Path, model: MorphableModel, config: FitConfig, paper: bool
+) -> dict[str, tuple[Reconstruction, Capture]]:
     """The reconstructions of a subject: in full, without specular reflection, by the paper, from perfect landmarks."""
     capture, perfect = Capture.load(folder / "capture"), Capture.load(folder / "perfect")
     full = mifit.fit(capture, model, CAMERAS, capture.timesteps, config)
@@ -32,10 +34,11 @@ def fits(folder: Path, model: MorphableModel, config: FitConfig) -> dict[str, tu
         "diffuse": (replace(full, reflectance=matt, normals=normals, mesh=None), capture),
         "perfect": (mifit.fit(perfect, model, CAMERAS, perfect.timesteps, config), perfect),
     }
-    if hasattr(FitConfig, "paper"):
-        paper = FitConfig.paper()
-        paper = replace(paper, reflectance=replace(paper.reflectance, texture_size=config.reflectance.texture_size))
-        found["paper"] = (mifit.fit(capture, model, CAMERAS, capture.timesteps, paper), capture)
+    if paper:
+        written = FitConfig.paper()
+        size = config.reflectance.texture_size
+        written = replace(written, reflectance=replace(written.reflectance, texture_size=size))
+        found["paper"] = (mifit.fit(capture, model, CAMERAS, capture.timesteps, written), capture)
     return found
 
 
@@ -68,7 +71,7 @@ def main() -> None:
     mifit.set_variant("auto")
     config = FitConfig()
     config = replace(config, reflectance=replace(config.reflectance, texture_size=texels))
-    found = fits(folder, MorphableModel.load(model), config)
+    found = fits(folder, MorphableModel.load(model), config, paper=sys.argv[4] == "paper")
     found["full"][0].save(folder / "result", force=True)  # `benchmarks.relight` puts it under another light
     figures = judge(folder, found)
     write_text(folder / "figures.json", json.dumps(figures, indent=2) + "\n")
