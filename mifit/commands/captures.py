@@ -138,13 +138,13 @@ def calibrate(arguments: Namespace) -> None:
 def _calibrate_from_heads(arguments: Namespace) -> None:
     import mifit
     from mifit.capture.place import calibrate_others, write_cameras
-    from mifit.pipeline import calibrated, choose
+    from mifit.pipeline import calibrated, choose, choose_timesteps
 
     capture = mifit.Capture.load(arguments.capture)
     if capture.calibrated:
         raise InputError(f"{arguments.capture}: is calibrated already; nothing to do")
     cameras = choose("camera", capture.cameras, arguments.cameras, 2)
-    timesteps = choose("timestep", capture.timesteps, arguments.timesteps, 4)
+    timesteps = choose_timesteps(capture, arguments.timesteps)
     use_variant(arguments)
     model = mifit.MorphableModel.load(arguments.model)
     dense = calibrated(capture, model, cameras, timesteps, console_progress(arguments.quiet))
