@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from mifit.core.threads import set_threads, threads
 from tests.variant import VARIANT
 
 LONGEST = (
@@ -38,23 +39,27 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--threads", type=int, help="threads of Dr.Jit")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Share the processors among xdist's workers: threads that wait for one another cost more than they bring."""
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1))
+    if workers > 1:
+        set_threads(max(1, threads() // workers))
+
+
 @pytest.fixture(scope="session")
 def variant(request: pytest.FixtureRequest) -> str:
     """Activate the variant under test once for the session."""
     import mifit
 
     name = mifit.set_variant(VARIANT)
-    target, threads = request.config.getoption("--llvm-target"), request.config.getoption("--threads")
-    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1))
-    if workers > 1 and not threads:  # share the processors: threads that wait for one another cost more than they bring
-        threads = max(2, (os.cpu_count() or 1) // workers)
+    target, count = request.config.getoption("--llvm-target"), request.config.getoption("--threads")
     if target:
         cpu, width = target.split(":")
         compile_for(cpu, int(width))
-    if threads:
+    if count:
         import drjit as dr
 
-        dr.set_thread_count(threads)
+        dr.set_thread_count(count)
     return name
 
 
