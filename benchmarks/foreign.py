@@ -35,6 +35,7 @@ from benchmarks.record import RESULTS, SHARED, record
 from mifit import Capture, FitConfig, MorphableModel, Reconstruction
 from mifit.core.files import write_text
 from mifit.core.image import write_image
+from mifit.core.threads import set_threads, threads
 from mifit.errors import MifitError
 from mifit.render.image_based import image_based
 
@@ -214,6 +215,7 @@ def cases_of(arguments: argparse.Namespace) -> tuple[list[Case], list[str]]:
 
 def run_case(case: Case, arguments: argparse.Namespace, config: FitConfig) -> dict[str, Any]:
     """Fit and judge one case; one that fails stays in the table as failing."""
+    set_threads(max(1, threads() // arguments.jobs))
     mifit.set_variant("auto")
     began, used = time.perf_counter(), time.process_time()
     try:

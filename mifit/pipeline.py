@@ -16,6 +16,7 @@ import numpy as np
 from mifit.capture.choose_frames import FrameChoice
 from mifit.config import FitConfig
 from mifit.core.estimate import GeometryEstimate
+from mifit.core.threads import one_blas_thread
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
 from mifit.steps import STAGES, Part, Source, Stage, run_steps, steps
@@ -35,6 +36,7 @@ CALIBRATION_MODES = 30
 """Identity modes that may move with the cameras when those are estimated from landmarks."""
 
 
+@one_blas_thread()
 def fit(
     capture: Capture,
     model: MorphableModel,

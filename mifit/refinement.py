@@ -21,6 +21,7 @@ from mifit.core.bend import bend, texel_neighbours
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, Report
 from mifit.core.mesh import interpolate, normalize
 from mifit.core.rows import Rows
+from mifit.core.threads import one_blas_thread
 from mifit.core.uv import TexelMap
 from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
@@ -47,6 +48,7 @@ DISAGREES, COVERED, LEAST_COVERED, BLURRED = 3.0, 2.0, 0.1, 0.7
 this part of the face; contrast of the detail below."""
 
 
+@one_blas_thread()
 def refine(
     result: R,
     capture: Capture,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
+from collections.abc import Iterator
 
 from threadpoolctl import threadpool_limits
 
@@ -42,3 +44,14 @@ def threads() -> int:
     if named.isdecimal() and int(named) > 0:
         return int(named)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextlib.contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Linear algebra on one core, as a context or a decorator; what else is set before holds again afterwards.
+
+    A fit makes many products that take milliseconds. OpenBLAS's threads wait for the next one by spinning, which takes
+    the cores from Dr.Jit and OpenCV: two threads double a fit's processor time and make it no faster.
+    """
+    with threadpool_limits(1, user_api="blas"):
+        yield

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mifit.capture.calibrate import FOCAL_PRIOR, HeadCalibration
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.core.mesh import interpolate
+from mifit.core.threads import one_blas_thread
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.progress import Progress, silent
 from mifit.stages.calibration.adjustment import AdjustedBundle, Bundle, Intrinsics, Sightings, adjust_bundle
@@ -64,6 +65,7 @@ class DenseCalibration:
     residual: float | None = None
 
 
+@one_blas_thread()
 def calibrate_densely(
     start: HeadCalibration,
     model: MorphableModel,

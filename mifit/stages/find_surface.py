@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mifit.config import GeometryConfig, SurfaceConfig
 from mifit.core.estimate import GeometryEstimate, Report
 from mifit.core.mesh import normalize, vertex_normals
+from mifit.core.threads import one_blas_thread
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.progress import Progress, silent
 from mifit.render.gbuffer import SurfaceScene
@@ -63,6 +64,7 @@ NARROWEST = 0.03
 """Least parallax; below it, about 2 degrees between the views, depth isn't measured."""
 
 
+@one_blas_thread()
 def find_surface(
     capture: Capture,
     model: MorphableModel,

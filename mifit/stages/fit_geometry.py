@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mifit.capture import Capture
 from mifit.config import GeometryConfig
 from mifit.core.estimate import GeometryEstimate
+from mifit.core.threads import one_blas_thread
 from mifit.errors import ConvergenceError, InputError
 from mifit.morphable import MorphableModel
 from mifit.progress import Progress, silent
@@ -29,6 +30,7 @@ from mifit.stages.geometry.visibility import Visibility, spread_points
 __all__ = ["fit_geometry", "fit_pose_expression", "texture_reference"]
 
 
+@one_blas_thread()
 def fit_geometry(
     capture: Capture,
     model: MorphableModel,

@@ -12,6 +12,7 @@ from mifit.config import ReflectanceConfig
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
 from mifit.core.labels import hidden
 from mifit.core.mesh import interpolate
+from mifit.core.threads import one_blas_thread
 from mifit.errors import ConvergenceError
 from mifit.progress import Progress, silent
 from mifit.solve import Outcome
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 GAUGE = "mean diffuse albedo over seen texels and channels equals that of the morphable model's mean face"
 
 
+@one_blas_thread()
 def infer_reflectance(
     capture: Capture,
     model: MorphableModel,

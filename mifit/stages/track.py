@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mifit.config import GeometryConfig, NormalsConfig
 from mifit.core.bend import bend, tangent_plane, unbend
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
+from mifit.core.threads import one_blas_thread
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
@@ -166,6 +167,7 @@ class Follower:
         self._reference = texture_reference(capture, model, self._home, cameras, geometry_config, seed)
         self._last = geometry.at(geometry.timesteps[-1:]) if last is None else last
 
+    @one_blas_thread()
     def next(self, timestep: int) -> tuple[GeometryEstimate, bool, list[str]]:
         """Geometry of a timestep, whether landmarks had to find the lost face again, and warnings.
 

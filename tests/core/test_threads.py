@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from mifit.core.threads import VARIABLES, set_threads
+import mifit
+from mifit.core.threads import VARIABLES, one_blas_thread, set_threads
 from mifit.errors import InputError
 
 ASK = """
@@ -40,3 +44,47 @@ def test_one_number_reaches_every_library(when: str) -> None:
 def test_no_threads_are_refused() -> None:
     with pytest.raises(InputError, match="found 0, expected a whole number of at least 1"):
         set_threads(0)
+
+
+def blas_threads() -> set[int]:
+    assert np.ones(2) @ np.ones(2) == 2.0  # loaded
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+
+def test_one_blas_thread_ends_with_the_call() -> None:
+    @one_blas_thread()
+    def inside(fails: bool) -> set[int]:
+        if fails:
+            raise InputError("no")
+        return blas_threads()
+
+    with threadpool_limits(2, user_api="blas"):
+        assert inside(False) == {1}
+        with pytest.raises(InputError):
+            inside(True)
+        assert blas_threads() == {2}
+
+
+LONG = ("fit", "fit_geometry", "find_surface", "infer_reflectance", "refine_normals", "refine")
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_what_takes_long_uses_one(name: str) -> None:
+    """Their first look at an argument tells, before anything is computed."""
+
+    class Seen(Exception):
+        pass
+
+    class Probe:
+        def __getattr__(self, attribute: str) -> None:
+            raise Seen(blas_threads())
+
+        def __iter__(self) -> None:
+            raise Seen(blas_threads())
+
+    mifit.set_variant("auto")
+    with threadpool_limits(2, user_api="blas"), pytest.raises(Seen) as seen:
+        function = getattr(mifit, name)
+        required = [p for p in inspect.signature(function).parameters.values() if p.default is p.empty]
+        function(*[Probe()] * len(required))
+    assert seen.value.args[0] == {1}

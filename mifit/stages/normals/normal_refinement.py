@@ -24,6 +24,7 @@ from mifit.config import NormalsConfig
 from mifit.core.bend import bend, tangent_plane, texel_neighbours
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.mesh import normalize
+from mifit.core.threads import one_blas_thread
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
@@ -42,6 +43,7 @@ OUTLIER = 3.0
 """Robust standard deviations of the residual beyond which an observation's pull stops growing."""
 
 
+@one_blas_thread()
 def refine_normals(
     capture: Capture,
     model: MorphableModel,
@@ -135,6 +137,7 @@ class FrameNormals:
     seconds: float
 
 
+@one_blas_thread()
 def refine_frame(
     capture: Capture,
     model: MorphableModel,
