@@ -20,6 +20,7 @@ from mifit.core.uv import bilinear
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
+    from mifit.render.gbuffer import SurfaceScene
 
 LEAST_COSINE = 0.15
 """Views that see a point at a flatter angle don't show it: a pixel of theirs covers too much of the surface."""
@@ -58,6 +59,7 @@ def image_based(
     vertices: NDArray,
     faces: NDArray,
     gains: Mapping[str, Sequence[float]] | None = None,
+    scene: SurfaceScene | None = None,
 ) -> ImageBased:
     """Render one view of one timestep from the photographs of other views.
 
@@ -74,6 +76,8 @@ def image_based(
         Mesh in the capture's world space.
     gains : dict of camera name to (r, g, b), optional
         Linear image of each camera over the first one's; 1 for cameras that aren't named.
+    scene : SurfaceScene, optional
+        The mesh, where one was made of it already.
 
     Raises
     ------
@@ -82,7 +86,7 @@ def image_based(
     """
     from mifit.render.gbuffer import SurfaceScene
 
-    scene = SurfaceScene(vertices, faces)
+    scene = scene or SurfaceScene(vertices, faces)
     buffer = scene.gbuffer(camera)
     index = np.flatnonzero(buffer.face.ravel() >= 0)
     face = buffer.face.ravel()[index]

@@ -114,9 +114,10 @@ def find_surface(
     # Landmarks that agree with the fit say more of a face within the model's span than shading and sweeps do.
     refit = config.refit and landmarks_are_biased(geometry)
     spanned = [*levels, *[levels[-1]] * FINEST_AGAIN] if refit else []
-    total = len(levels) + SETTLING + (len(levels) + len(spanned) + SHADING_ROUNDS) * refit
+    coarse, finest = levels[:-1], levels[-1:]
+    total = len(levels) + SETTLING + (len(coarse) + len(spanned) + SHADING_ROUNDS) * refit
     search = _Search(capture, model, cameras, resolution, pairs, config, progress, total)
-    last = search.descend(geometry, levels)
+    last = search.descend(geometry, coarse)
     between: list[float] = []  # without and with it
     if refit:
         fitted = fit_model(
@@ -129,16 +130,18 @@ def find_surface(
             geometry_config or GeometryConfig(),
             progress=search.advance,
         )
-        other = search.descend(fitted, levels)
+        other = search.descend(fitted, coarse)
         # Colours mislead where the albedo model doesn't explain them; through the truer surface views predict others.
+        # What the finest sweep adds is small beside what parts the two, and dear.
         between = errors_between_views(
             capture, model, cameras, geometry.timesteps, [last.world, other.world], geometry.gains
         )
         refit = between[1] < between[0]
         geometry, last = (fitted, other) if refit else (geometry, last)
+    last = search.descend(geometry, finest, last)
     again = 0
     while again < SETTLING and last.outcome is not Outcome.CONVERGED:
-        last, again = search.descend(geometry, levels[-1:], last), again + 1
+        last, again = search.descend(geometry, finest, last), again + 1
     search.finish()
     found = replace(geometry, vertices=last.world.astype(np.float32), displacement=last.displacement.astype(np.float32))
     lips: dict = {}
@@ -152,7 +155,7 @@ def find_surface(
         "name": "surface",
         "outcome": last.outcome.value,
         "moved_last_mm": last.moved * capture.unit_mm,
-        "levels": [level for level, _ in (*levels, *levels[-1:] * again)],
+        "levels": [level for level, _ in (*levels, *finest * again)],
         "matched": last.matched,
         "refitted": refit,
         "between_views": between,

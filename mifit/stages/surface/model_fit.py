@@ -45,7 +45,7 @@ SHADING_ROUNDS, SHADING_ITERATIONS = 5, 10
 """Rounds by colours and texture, before anything is swept: they reach farthest; and iterations of each."""
 PASSES, ITERATIONS = 2, 6
 """Times that the planes' counterparts are found anew after a sweep, and iterations of each."""
-PIXELS, FEWEST_PIXELS = 4000, 1000
+PIXELS, FEWEST_PIXELS = 4000, 500
 """Pixels of all images together, drawn anew in every round, and the fewest of an image."""
 POINTS, TEXTURE_POINTS = 4000, 1000
 """Planes of a timestep, and points whose texture is compared."""
@@ -215,10 +215,10 @@ def fit_model(
     """
     steps = geometry.timesteps
     noise = float(geometry.report.details.get("landmark_noise_pixels", config.landmark_noise))
-    config = replace(
-        config, as_written=False, scale_deviation=0.0, landmark_noise=noise, pixels=min(config.pixels, PIXELS)
-    )
-    views = landmark_views(capture, model, cameras, steps, biased_noise(noise, len(cameras) * len(steps)), fewest=0)
+    images = len(cameras) * len(steps)
+    pixels = min(config.pixels, max(PIXELS // images, FEWEST_PIXELS))
+    config = replace(config, as_written=False, scale_deviation=0.0, landmark_noise=noise, pixels=pixels)
+    views = landmark_views(capture, model, cameras, steps, biased_noise(noise, images), fewest=0)
     views = slid(model, geometry, views)
     visibility = Visibility(capture, model, tuple(cameras), steps, geometry.gains)
     points = spread_points(model, min(config.surface_points, TEXTURE_POINTS), seed)

@@ -7,17 +7,23 @@ places of the others. No light, no albedo and no landmark enters, so that what w
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.camera import Camera
 from mifit.core.image import linear_to_srgb
+from mifit.render.gbuffer import SurfaceScene
 from mifit.render.image_based import image_based
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
+
+EVERY = 2
+"""Of the pixels along rows and columns one in so many is judged: their errors are alike in neighbours."""
 
 
 def errors_between_views(
@@ -48,17 +54,35 @@ def errors_between_views(
         on the same ones; infinite where there are none.
     """
     views = {name: capture.camera(name) for name in cameras}
+    scenes = [SurfaceScene(surface[0], model.faces) for surface in surfaces]
     total, count = np.zeros(len(surfaces)), 0
     for k, timestep in enumerate(timesteps):
+        for scene, surface in zip(scenes, surfaces, strict=True):
+            scene.update(surface[k])
         for name, view in views.items():
             others = [other for key, other in views.items() if key != name]
             frame = capture.frame(name, timestep)
-            judged = frame.valid & ~frame.clipped
-            errors = []
-            for surface in surfaces:
-                shown = image_based(capture, others, view, timestep, surface[k], model.faces, gains)
-                judged &= shown.seen & model.face_mask[shown.face]  # nothing is seen where no face is hit
-                errors.append((linear_to_srgb(shown.colour) - linear_to_srgb(frame.image)) ** 2)
-            total += [float(error[judged].sum()) for error in errors]
+            judged = (frame.valid & ~frame.clipped)[::EVERY, ::EVERY]
+            some, predicted = every(view, EVERY), []
+            for scene, surface in zip(scenes, surfaces, strict=True):
+                shown = image_based(capture, others, some, timestep, surface[k], model.faces, gains, scene)
+                judged = judged & shown.seen & model.face_mask[shown.face]  # nothing is seen where no face is hit
+                predicted.append(shown.colour)
+            wanted = linear_to_srgb(frame.image[::EVERY, ::EVERY][judged])
+            total += [float(((linear_to_srgb(colour[judged]) - wanted) ** 2).sum()) for colour in predicted]
             count += 3 * int(judged.sum())
     return [float(np.sqrt(each / count)) if count else np.inf for each in total]
+
+
+def every(camera: Camera, step: int) -> Camera:
+    """A camera whose pixels are every ``step``-th row and column of another's, from the first on."""
+    shift = 0.5 * (step - 1)
+    return replace(
+        camera,
+        width=-(-camera.width // step),
+        height=-(-camera.height // step),
+        fx=camera.fx / step,
+        fy=camera.fy / step,
+        cx=(camera.cx + shift) / step,
+        cy=(camera.cy + shift) / step,
+    )

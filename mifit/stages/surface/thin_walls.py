@@ -70,12 +70,14 @@ def _opposite(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The nearest vertex across, outside (1) or inside (-1) the surface, and the vertex itself, where there is one."""
     pairs = used[cKDTree(mean[used]).query_pairs(reach, output_type="ndarray")]
+    first, second = normal[pairs[:, 0]], normal[pairs[:, 1]]
+    pairs = pairs[np.einsum("nc,nc->n", first, second) < OPPOSED]  # few of many: first of all
     here, there = np.concatenate([pairs, pairs[:, ::-1]]).T
     way = mean[there] - mean[here]
     length = np.linalg.norm(way, axis=1)
     along = side * (way * normal[here]).sum(1) > ACROSS * length
     facing = -side * (way * normal[there]).sum(1) > ACROSS * length
-    good = along & facing & ((normal[here] * normal[there]).sum(1) < OPPOSED)
+    good = along & facing
     here, there, length = here[good], there[good], length[good]
     order = np.lexsort((length, here))
     _, first = np.unique(here[order], return_index=True)
