@@ -219,6 +219,7 @@ rounds = 1
 [fit.reflectance]
 texture_size = 32
 shading = "prefiltered"
+bands = 4
 [evaluate]
 camera = "third"
 [outputs]

@@ -52,7 +52,7 @@ def test_the_page_runs(variant, tiny_capture, tmp_path, monkeypatch):
     (tmp_path / "captures" / "gloss").symlink_to(tiny_capture)
     small = {
         '"builtin"': '"builtin:coarse"', '"auto"': f'"{VARIANT}"',
-        "texture_size=256": "texture_size=64, exponent=100",  # the exponent is chosen on gloss, below
+        "texture_size=256": "texture_size=64, bands=4, exponent=100",  # the exponent is chosen on gloss, below
     }  # fmt: skip
     names, _ = run_page(tmp_path, monkeypatch, small)
     check(names)
@@ -65,9 +65,11 @@ def test_the_page_runs_on_gloss(variant, shared, tmp_path, monkeypatch):
     (tmp_path / "captures" / "gloss").symlink_to(shared / "captures" / "gloss")
     # The 36 rotations are tested on the small capture; here three show that they work on full-size photographs.
     changes = {
+        '"builtin"': '"builtin:coarse"',
         '"auto"': f'"{VARIANT}"',
         "range(0, 360, 10)": "range(0, 360, 120)",
-        "texture_size=256": "texture_size=128",
+        "texture_size=256": "texture_size=128, bands=6",
+        "FitConfig(": "FitConfig(surface=mifit.SurfaceConfig(refit=False), ",
     }
     names, seconds = run_page(tmp_path, monkeypatch, changes)
     check(names, 3)

@@ -9,7 +9,15 @@ import pytest
 
 from mifit.cli import main
 
-CONFIG = '[reflectance]\ntexture_size = 64\nshading = "prefiltered"\nexponent = 100\n'
+CONFIG = """
+[surface]
+refit = false
+[reflectance]
+texture_size = 64
+shading = "prefiltered"
+bands = 4
+exponent = 100
+"""
 
 
 @pytest.mark.slow

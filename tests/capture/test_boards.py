@@ -13,7 +13,7 @@ from board_video import Studio, pair, poses
 from scipy.spatial.transform import Rotation
 
 from mifit.capture import import_capture
-from mifit.capture.board_calibration import calibrate_boards, write_calibration
+from mifit.capture.board_calibration import BoardCalibration, calibrate_boards, write_calibration
 from mifit.capture.boards import Board
 from mifit.capture.sources import ImageFiles
 from mifit.capture.stereo import read_stereo
@@ -43,6 +43,12 @@ def charuco(tmp_path_factory: pytest.TempPathFactory) -> tuple[ImageFiles, Image
     return a, b
 
 
+@pytest.fixture(scope="module")
+def calibrated(charuco: tuple[ImageFiles, ImageFiles]) -> BoardCalibration:
+    """The cameras that those pictures give."""
+    return calibrate_boards(charuco, Board.parse(CHARUCO))
+
+
 def check_cameras(found, tolerance: float = 0.002, degrees: float = 0.1, part: float = 0.005) -> None:
     """Intrinsics, relative pose and distortion (where it acts) against the truth."""
     for camera, truth in zip(found, pair(), strict=True):
@@ -59,8 +65,8 @@ def check_cameras(found, tolerance: float = 0.002, degrees: float = 0.1, part: f
 
 
 @pytest.mark.slow
-def test_charuco_pictures_give_the_cameras(charuco, tmp_path: Path) -> None:
-    found = calibrate_boards(charuco, Board.parse(CHARUCO))
+def test_charuco_pictures_give_the_cameras(calibrated, tmp_path: Path) -> None:
+    found = calibrated
     check_cameras(found.cameras)
     assert all(seen.error < 0.3 and len(seen.used) >= 15 for seen in found.watched)
     write_calibration(found, tmp_path, "cm")
@@ -73,9 +79,8 @@ def test_charuco_pictures_give_the_cameras(charuco, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_capture_calibration_is_taken_by_an_import(charuco, tmp_path: Path) -> None:
-    found = calibrate_boards(charuco, Board.parse(CHARUCO))
-    write_calibration(found, tmp_path / "calibration", "cm")
+def test_the_capture_calibration_is_taken_by_an_import(charuco, calibrated, tmp_path: Path) -> None:
+    write_calibration(calibrated, tmp_path / "calibration", "cm")
     out = import_capture(
         tmp_path / "capture",
         images=[source.paths[0].parent for source in charuco],
@@ -90,10 +95,10 @@ def test_the_capture_calibration_is_taken_by_an_import(charuco, tmp_path: Path) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("text", ["chessboard:10x7:27", "apriltag:6x4:34:9"])
-def test_other_boards(tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize(("text", "count"), [("chessboard:10x7:27", 24), ("apriltag:6x4:34:9", 16)])
+def test_other_boards(tmp_path: Path, text: str, count: int) -> None:
     board = Board.parse(text)
-    places = poses(24, board, 470.0, seed=3)
+    places = poses(count, board, 470.0, seed=3)
     sources = [
         write(tmp_path / c.name, [Studio(board, c).render(p, 100 * k + i) for i, p in enumerate(places)])
         for k, c in enumerate(pair())

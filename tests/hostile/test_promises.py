@@ -21,6 +21,18 @@ from mifit.cli import main
 from mifit.core.image import write_image
 
 COARSE = ("--model", "builtin:coarse", "--quiet")
+CONFIG = """
+[geometry]
+rounds = 1
+camera_gains = "never"
+[surface]
+refit = false
+[reflectance]
+texture_size = 32
+shading = "prefiltered"
+bands = 4
+exponent = 40
+"""
 SIZE = ("--timesteps", "3", "--width", "120", "--height", "90", "--spp", "4")
 
 
@@ -49,7 +61,7 @@ def change(path: Path, edit: Any) -> None:
 def made(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
     """A folder with a capture of 120 x 90 pixels, a fit of its first timestep, and a configuration of tiny maps."""
     folder = tmp_path_factory.mktemp("made")
-    (folder / "fit.toml").write_text("[reflectance]\ntexture_size = 32\nshading = 'prefiltered'\nexponent = 40\n")
+    (folder / "fit.toml").write_text(CONFIG)
     assert run("synth", "--out", folder / "capture", *SIZE, *COARSE) == 0
     assert fit(folder, folder / "capture", folder / "result") == 0
     return folder
@@ -173,7 +185,8 @@ def test_going_on_with_a_fit_leaves_tracked_frames(made: Path, result: Path) -> 
 def test_a_changed_model_is_fitted_anew(made: Path, tmp_path: Path) -> None:
     def go(*more: str) -> bytes:
         arguments = ("fit", made / "capture", "--out", tmp_path / "out", "--timesteps", "0", "--until", "geometry")
-        assert run(*arguments, "--model", tmp_path / "m.npz", "--quiet", *more) == 0
+        options = ("--model", tmp_path / "m.npz", "--config", made / "fit.toml", "--quiet")
+        assert run(*arguments, *options, *more) == 0
         return (tmp_path / "out" / "geometry" / "0000.ply").read_bytes()
 
     assert run("model", "convert", "builtin:coarse", tmp_path / "m.npz") == 0

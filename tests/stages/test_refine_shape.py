@@ -116,13 +116,14 @@ def test_shape_is_found_through_unknown_paint(scene):
 @pytest.mark.slow
 def test_a_fit_with_a_round_of_shading_keeps_every_stage(tiny_capture, variant, tmp_path):
     import mifit
-    from mifit.config import FitConfig, ReflectanceConfig, ShapeConfig
+    from mifit.config import FitConfig, ReflectanceConfig, ShapeConfig, SurfaceConfig
 
     capture, model = mifit.Capture.load(tiny_capture), mifit.MorphableModel.load("builtin:coarse")
-    reflectance = ReflectanceConfig(texture_size=64, shading="prefiltered", exponent=100.0)
+    reflectance = ReflectanceConfig(texture_size=64, shading="prefiltered", bands=4, exponent=100.0)
+    surface = SurfaceConfig(refit=False)
 
     def fit(rounds):
-        config = FitConfig(reflectance=reflectance, shape=ShapeConfig(rounds))
+        config = FitConfig(surface=surface, reflectance=reflectance, shape=ShapeConfig(rounds))
         return mifit.fit(capture, model, ["left", "right"], [0, 1], config, "reflectance", checkpoints=tmp_path)
 
     plain, found = fit(0), fit(1)

@@ -10,7 +10,7 @@ import pytest
 from stages.memory_capture import make_capture
 
 from mifit.config import ReflectanceConfig
-from mifit.core.estimate import GeometryEstimate, Report
+from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
 from mifit.core.image import linear_to_srgb, srgb_to_linear
 from mifit.core.labels import Label, hidden
 from mifit.morphable import MorphableModel
@@ -165,18 +165,27 @@ def test_a_mask_file_decides_alone(head) -> None:
     assert not hidden(labels_of(head, capture)["left", 0]).any()
 
 
+MAPS = ReflectanceConfig(texture_size=64, shading="prefiltered", bands=3, max_iterations=15)
+
+
+@pytest.fixture(scope="module")
+def before(head) -> ReflectanceEstimate:
+    """Maps of the head with nothing over it."""
+    model, original = head
+    return infer_reflectance(original, model, geometry_of(model, original), CAMERAS, MAPS)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("which", ["one view", "every view"])
-def test_albedo_elsewhere_stays(head, which) -> None:
+def test_albedo_elsewhere_stays(head, before, which) -> None:
     model, original = head
     keys = [("left", 0), ("left", 1), ("right", 2)]
     kinds = dict(zip(keys, ("hand", "glasses", "fringe"), strict=True))
     if which == "every view":
         kinds = {(name, t): "fringe" for name in CAMERAS for t in range(len(ANGLES))}
     capture, areas = painted(head, kinds)
-    config = ReflectanceConfig(texture_size=64, shading="prefiltered", bands=3, max_iterations=15)
     geometry = geometry_of(model, original)
-    before, after = (infer_reflectance(c, model, geometry, CAMERAS, config) for c in (original, capture))
+    after = infer_reflectance(capture, model, geometry, CAMERAS, MAPS)
     touched = np.zeros(before.confidence.shape, bool)
     surface = Surface(original, model, geometry, CAMERAS, 64)
     for view in surface.views():
