@@ -4,12 +4,16 @@ A diffuse point sends the same light to all cameras, so between two of them its 
 start is a robust mean of the log ratios. Skin is not diffuse alone, and its sheen adds more to one camera than to
 another (4 to 9 per cent between two views 40 degrees apart of a head lit from one side), so lighting with a specular
 lobe is fitted to the corrected colours, and what it leaves unexplained per camera corrects the gains, in turns.
+What sheen adds to the log ratios is the more the darker the skin is in a channel (Shafer's dichromatic reflection), and
+in which proportion is seen in how the ratios differ from point to point, as gains don't: under light of one colour they
+scatter about a line. So of what the lighting takes for sheen, that counts which lies along the scatter.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,7 +40,7 @@ Gains = dict[str, tuple[float, float, float]]
 
 MAP_SIZE = 256
 """Texels along the side of the map whose points are compared."""
-POINTS = 1000
+POINTS = 4000
 """Points that several cameras see and that the lighting is fitted to."""
 DARKEST = 0.02
 """Linear colour below which a ratio is noise."""
@@ -91,15 +95,26 @@ def estimate_gains(
         No image shows the face.
     """
     progress("Camera gains", 0, ROUNDS)
-    surface = Surface(capture, model, replace(geometry, gains={}), cameras, MAP_SIZE)
-    parts = [surface.observe(part) for part in surface.chunks()]
-    log_gain, known = _from_ratios(parts, len(cameras))
+
+    def observe(gains: Gains) -> list[Observations]:
+        surface = Surface(capture, model, replace(geometry, gains=gains), cameras, MAP_SIZE)
+        return [surface.observe(part) for part in surface.chunks()]
+
+    log_gain, known = _from_ratios(observe({}), len(cameras))
     if len(known) > 1:
+        # Which observations agree, and so are trusted, shows only when the cameras are about equal.
+        parts = observe(_gains(log_gain, known, cameras))
+        left, _ = _from_ratios(parts, len(cameras))
         seen = _shared_points(parts, POINTS, np.random.default_rng(seed))
         albedo = interpolate(geometry.vertex_albedo, model.faces, seen.face, seen.barycentric)
         albedo = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float32)
-        log_gain = _from_lighting(seen, albedo, log_gain, known, progress)
+        log_gain = log_gain + _from_lighting(seen, albedo, left, known, progress)
     progress("Camera gains", ROUNDS, ROUNDS)
+    return _gains(log_gain, known, cameras)
+
+
+def _gains(log_gain: NDArray, known: Sequence[int], cameras: Sequence[str]) -> Gains:
+    """Gains of the known cameras from logarithms (C, 3)."""
     return {cameras[i]: (float(r), float(g), float(b)) for i in known for r, g, b in [np.exp(log_gain[i])]}
 
 
@@ -159,7 +174,8 @@ def _shared_points(parts: Sequence[Observations], count: int, rng: np.random.Gen
 def _from_lighting(
     seen: Observations, albedo: NDArray, log_gain: NDArray, known: list[int], progress: Progress
 ) -> NDArray[np.float64]:
-    """(C, 3) log gains with which lighting and both albedos explain all cameras alike."""
+    """(C, 3) log gains with which lighting and both albedos explain all cameras alike, as far as sheen has the tint."""
+    ratios = log_gain
     model = models.get("prefiltered")
     forward = Forward.of(model, BANDS, Lobe(EXPONENT, model.fresnel))
     problem = lighting_problem(seen, forward, np.zeros((BANDS**2, 3)), albedo, ReflectanceConfig().robust)
@@ -175,10 +191,31 @@ def _from_lighting(
         tried.append(log_gain)
         shown.append(left)
         step = _accelerated(tried, shown) - log_gain
-        log_gain = log_gain + np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+        log_gain = log_gain + step * min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-12))
         if np.abs(step).max() < SETTLED:
             break
-    return log_gain
+    return ratios + (log_gain - ratios) @ _sheen_tint(seen)
+
+
+def _sheen_tint(seen: Observations) -> NDArray[np.float64]:
+    """(3, 3) symmetric: the part of a change of log colours that is of the tints of sheen.
+
+    Standard deviations of the cameras' log ratios over the surface, relative to the largest: 1 along the tint in which
+    they scatter most, and little across it where the light has one colour.
+    """
+    usable = _usable(seen)
+    level = np.log(np.maximum(seen.colour, DARKEST)).astype(np.float64)
+    around = []
+    for i, j in combinations(range(len(seen.step)), 2):
+        both = usable[:, i] & usable[:, j]
+        if seen.step[i] == seen.step[j] and both.any():
+            ratio = level[both, j] - level[both, i]
+            around.append(ratio - np.median(ratio, axis=0))
+    offset = np.concatenate(around)
+    square = (offset**2).sum(axis=1)
+    weight = 1.0 / (1.0 + square / max(float(np.median(square)), 1e-12)) ** 2
+    values, axes = np.linalg.eigh((offset * weight[:, None]).T @ offset)
+    return np.asarray((axes * np.sqrt(np.maximum(values, 0.0) / max(float(values[-1]), 1e-12))) @ axes.T)
 
 
 def _accelerated(tried: list[NDArray], shown: list[NDArray], depth: int = 4) -> NDArray[np.float64]:
