@@ -12,8 +12,9 @@ from mifit.core.threads import set_threads, threads
 from tests.variant import VARIANT
 
 LONGEST = (
-    "tests/test_experiment_page.py", "tests/test_foreign.py", "tests/test_resume.py", "tests/output/test_live_view.py",
-    "tests/test_experiment.py", "tests/capture/test_boards.py", "tests/hostile/test_promises.py", "tests/test_cli.py",
+    "tests/docs/test_commands.py", "tests/stages/test_find_surface.py", "tests/capture/test_boards.py",
+    "tests/test_experiment_page.py", "tests/stages/test_fit_geometry.py", "tests/test_experiment.py",
+    "tests/test_foreign.py", "tests/hostile/test_promises.py", "tests/test_resume.py",
 )  # fmt: skip
 """Files that take longest, in that order: with two processes they go first, or one would work on after the other."""
 SHARED = Path(__file__).resolve().parents[2] / "shared"
