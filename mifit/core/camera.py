@@ -191,6 +191,12 @@ class Camera:
         rows = max(1, math.ceil(self.height * ratio - 1e-6))
         return replace(self, height=rows, fy=self.fx, cy=self.cy * ratio)
 
+    def resized(self, factor: float) -> Camera:
+        """This camera with an image of another size: ``factor`` pixels per pixel, to the nearest whole number."""
+        width, height = (max(round(n * factor), 1) for n in (self.width, self.height))
+        x, y = width / self.width, height / self.height
+        return replace(self, width=width, height=height, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y)
+
     def to_camera(self, points: NDArray) -> NDArray:
         """World points (..., 3) -> camera points (..., 3)."""
         return points @ self.rotation.T + self.translation

@@ -25,6 +25,7 @@ from mifit.stages.surface.displace import USUAL, Plate, solve_displacement
 from mifit.stages.surface.epipolar import epipolar_residual
 from mifit.stages.surface.local_planes import MeasuredPlanes, touching_planes
 from mifit.stages.surface.model_fit import SHADING_ROUNDS, fit_model, landmarks_are_biased
+from mifit.stages.surface.outline import Borders, find_borders, joined
 from mifit.stages.surface.prediction_between_views import errors_between_views
 from mifit.stages.surface.sweep import Found, Posed, sweep
 from mifit.stages.surface.thin_walls import keep_walls
@@ -188,6 +189,27 @@ class _Descent:
         return cls(np.zeros_like(world[0]), world, USUAL, 0.0, np.inf, Outcome.MAX_ITERATIONS)
 
 
+@dataclass(frozen=True)
+class _Swept:
+    """What one sweep saw and found.
+
+    Attributes
+    ----------
+    texels : TexelMap
+    posed, borders : list
+        Views of the texels, and outlines of the surface in them, per timestep.
+    found : Found
+    step : float
+        Between offsets, world length.
+    """
+
+    texels: TexelMap
+    posed: list[Posed]
+    borders: list[Borders]
+    found: Found
+    step: float
+
+
 class _Search:
     """Sweeps, coarse to fine, from a fit of the model."""
 
@@ -217,30 +239,35 @@ class _Search:
         self._progress("find surface", self._done, self._total)
 
     def _sweep(
-        self, timesteps: Sequence[int], world: NDArray, scene: SurfaceScene, level: int, half: int
-    ) -> tuple[TexelMap, list[Posed], Found, float]:
-        """One sweep of a surface (T, V, 3): texels, the views of them, what was found, and the step (world length)."""
+        self, timesteps: Sequence[int], world: NDArray, scene: SurfaceScene, level: int, half: int, outlined: bool
+    ) -> _Swept:
+        """One sweep of a surface (T, V, 3), with its outlines if asked for."""
         model = self._model
         pixel = self._resolution.pixel * 2.0**level
         size = texture_size(model, world[0], pixel, LARGEST_MAP)
         texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
-        posed = []
+        posed, borders, factor = [], [], 0.5**level
         for vertices, timestep in zip(world, timesteps, strict=True):
             scene.update(vertices)
             posed.append(
-                pose_texels(self._capture, scene, vertices, model.faces, texels, self._cameras, timestep, 0.5**level)
+                pose_texels(self._capture, scene, vertices, model.faces, texels, self._cameras, timestep, factor)
+            )
+            seen_by = self._cameras if outlined else ()
+            borders.append(
+                joined([find_borders(self._capture, scene, model.face_mask, c, timestep, factor) for c in seen_by])
             )
         step = STEP_PIXELS * pixel / self._resolution.parallax
-        return texels, posed, sweep(texels, posed, step * np.arange(-half, half + 1), WINDOW, self._pairs), step
+        found = sweep(texels, posed, step * np.arange(-half, half + 1), WINDOW, self._pairs)
+        return _Swept(texels, posed, borders, found, step)
 
     def planes(
         self, timesteps: Sequence[int], world: NDArray, level: int, half: int
     ) -> tuple[list[MeasuredPlanes], float]:
         """Planes that touch what a sweep finds, per timestep, which share its precision, and the sweep's step."""
         scene = SurfaceScene(world[0], self._model.faces)
-        texels, posed, found, step = self._sweep(timesteps, world, scene, level, half)
-        found = replace(found, precision=found.precision / len(posed))
-        return [touching_planes(texels, one, found) for one in posed], step
+        swept = self._sweep(timesteps, world, scene, level, half, outlined=False)
+        shared = replace(swept.found, precision=swept.found.precision / len(swept.posed))
+        return [touching_planes(swept.texels, one, shared) for one in swept.posed], swept.step
 
     def descend(
         self, geometry: GeometryEstimate, levels: Sequence[tuple[int, int]], last: _Descent | None = None
@@ -254,16 +281,20 @@ class _Search:
         scene = SurfaceScene(world[0], model.faces)
         matched, moved, step = 0.0, 0.0, 0.0
         for level, half in levels:
-            texels, posed, found, step = self._sweep(geometry.timesteps, world, scene, level, half)
+            swept = self._sweep(geometry.timesteps, world, scene, level, half, outlined=True)
+            texels, found, step = swept.texels, swept.found, swept.step
             matched = float((found.precision > 0).mean())
-            objects = [p.normal @ rotation for p, rotation in zip(posed, geometry.rotation, strict=True)]
-            some = thinned(texels)
+            objects = [p.normal @ rotation for p, rotation in zip(swept.posed, geometry.rotation, strict=True)]
+            some, outline = thinned(texels), joined(swept.borders)
+            turned = [b.normal @ rotation for b, rotation in zip(swept.borders, geometry.rotation, strict=True)]
+            face = np.concatenate([texels.face[some], outline.face])
+            weights = np.concatenate([texels.weights[some], outline.weights])
             solved = solve_displacement(
                 plate,
-                corner_matrix(model.faces, texels.face[some], texels.weights[some], len(neutral)),
-                normalize(np.mean(objects, axis=0))[some],
-                found.offset[some] / scale,
-                found.precision[some] * (THIN * scale) ** 2,
+                corner_matrix(model.faces, face, weights, len(neutral)),
+                np.concatenate([normalize(np.mean(objects, axis=0))[some], *turned]),
+                np.concatenate([found.offset[some], outline.offset]) / scale,
+                np.concatenate([found.precision[some] * THIN**2, outline.precision]) * scale**2,
                 displacement,
                 stiffness,
                 ROBUST_STEPS * step / scale,

@@ -54,7 +54,7 @@ class FeatureImage:
             for focal, centre, i in axes:
                 across = (start[:, i] + offset * slope[:, i]) * (focal * inverse) + (centre * self.factor - 0.5)
                 pixels[:, i] = np.where(front, across, -10.0)
-            out[k] = _remap(self.values, pixels)
+            out[k] = look_up(self.values, pixels)
         return out
 
 
@@ -83,7 +83,7 @@ def feature_image(camera: Camera, image: NDArray, valid: NDArray[np.bool_], fact
     return FeatureImage(camera, factor, values)
 
 
-def _remap(values: NDArray, pixels: NDArray, columns: int = 4096) -> NDArray[np.float32]:
+def look_up(values: NDArray, pixels: NDArray, columns: int = 4096) -> NDArray[np.float32]:
     """Bilinear look-up at integer-centred (N, 2) positions; OpenCV wants them as an image of limited width."""
     count = len(pixels)
     padded = np.full((-(-max(count, 1) // columns) * columns, 2), -10.0, np.float32)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import cv2
@@ -56,11 +56,7 @@ def pose_texels(
 
 def shows_surface(scene: SurfaceScene, camera: Camera) -> NDArray[np.bool_]:
     """(H, W) pixels that show the surface, away from its outlines against the background and against itself."""
-    width, height = (max(round(n * OUTLINE_SCALE), 1) for n in (camera.width, camera.height))
-    x, y = width / camera.width, height / camera.height
-    small = replace(
-        camera, width=width, height=height, fx=camera.fx * x, cx=camera.cx * x, fy=camera.fy * y, cy=camera.cy * y
-    )
+    small = camera.resized(OUTLINE_SCALE)
     buffer = scene.gbuffer(small)
     depth = np.where(buffer.mask, buffer.depth, np.float32(0))
     around = np.ones((3, 3), np.uint8)

@@ -1,0 +1,223 @@
+"""Where the outline of the head lies in an image, along the silhouettes of the fitted surface.
+
+Matching says least where a surface turns away from a view, and nothing where only one view sees it; there the outline
+tells. Across the silhouette of the fitted surface the image shows skin on one side and what lies behind on the other.
+Every position of the border is judged by how well the pixels before it are explained by the colours deeper inside
+and those beyond it by the colours farther outside, and neighbours along the silhouette agree (a hidden Markov chain,
+solved exactly by one pass in either direction).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.render.gbuffer import SurfaceScene
+from mifit.stages.surface.band import look_up
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+
+REACH = 8
+"""Farthest that the border is looked for to either side of the fitted silhouette, pixels of the level."""
+STRIP = 6
+"""Width of the strips that tell the colours of either side, pixels."""
+ALONG = 25
+"""Pixels along the silhouette that share their colours."""
+DARKEST = 4e-3
+"""Added to linear colours before the logarithm."""
+SPREAD = 0.06
+"""Least deviation of the logarithm of a colour within a strip."""
+STRAY = 0.05
+"""Part of the pixels of either side that neither colour explains."""
+RANGE = 6.0
+"""Of the logarithm of a colour, over which stray ones are even."""
+EVIDENCE = 0.3
+"""Weight of a pixel's evidence: neighbours err alike."""
+BEND = 0.5
+"""Deviation of the border's change from one pixel of the silhouette to the next, pixels."""
+BLUR = 0.7
+"""Least deviation of a border, pixels: borders are soft, and a silhouette of the mesh is known to half a pixel."""
+DOUBT = 0.5
+"""Deviation of a border, in terms of the reach, above which it isn't known."""
+SHORTEST = 12
+"""Pixels of a piece of the silhouette below which it is left out."""
+EDGE_ON = 0.5
+"""Cosine between normal and line of sight above which the mesh ends there, as at the neck, rather than turns away."""
+EVERY = 2
+"""Pixels of the silhouette per border that counts, whose precision is theirs together."""
+INDEPENDENT = 0.1
+"""Part of the borders that count as measured on their own."""
+
+
+@dataclass(frozen=True)
+class Borders:
+    """Points of the fitted surface on its silhouette in one view, and where the image has them.
+
+    Attributes
+    ----------
+    face : (N,) int
+    weights : (N, 3)
+        Barycentric.
+    position, normal : (N, 3)
+        World space; the normal is across the line of sight.
+    offset : (N,)
+        Of the border along the normal, world length.
+    precision : (N,)
+        Inverse variance of it.
+    """
+
+    face: NDArray[np.intp]
+    weights: NDArray[np.float64]
+    position: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    precision: NDArray[np.float64]
+
+
+def find_borders(
+    capture: Capture, scene: SurfaceScene, used: NDArray[np.bool_], name: str, timestep: int, factor: float
+) -> Borders:
+    """Borders of the surface that ``scene`` holds in one image.
+
+    Parameters
+    ----------
+    capture : Capture
+    scene : SurfaceScene
+        World space.
+    used : (F,) bool
+        Faces whose silhouettes count.
+    name : str
+        Camera.
+    timestep : int
+    factor : float
+        Pixels of the level per pixel of the image, at most 1.
+    """
+    camera, frame = capture.camera(name).resized(factor), capture.frame(name, timestep)
+    image, valid = (
+        cv2.resize(values.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        for values in (frame.image, frame.valid)
+    )
+    log = np.log(image + np.float32(DARKEST))
+    buffer = scene.gbuffer(camera)
+    vertices, faces = scene.vertices, scene.faces
+    pieces = _pieces(buffer.mask, used[np.maximum(buffer.face, 0)])
+    normals = vertex_normals(vertices, faces)
+    found = []
+    for pixels in pieces:
+        at = pixels[:, 1], pixels[:, 0]
+        face, weights = buffer.face[at], buffer.weights[at].astype(np.float64)
+        position = interpolate(vertices, faces, face, weights)
+        ray = normalize(position - camera.position)
+        normal = normalize(interpolate(normals, faces, face, weights))
+        turned = np.abs((normal * ray).sum(1)) < EDGE_ON
+        normal = normalize(normal - (normal * ray).sum(1, keepdims=True) * ray)
+        across = normal @ camera.rotation.T
+        length = np.linalg.norm(across[:, :2], axis=1)
+        way = across[:, :2] / np.maximum(length, 1e-9)[:, None]
+        shift, deviation = _border(log, valid, buffer.mask, pixels, way)
+        pixel = buffer.depth[at].astype(np.float64) / (np.sqrt(camera.fx * camera.fy) * np.maximum(length, 0.5))
+        known = np.flatnonzero(turned & (deviation < DOUBT * REACH) & (length > 0.5))
+        known = known[known % EVERY == 0]
+        precision = INDEPENDENT * EVERY / ((deviation**2 + BLUR**2) * pixel**2)
+        found.append(
+            Borders(
+                face[known], weights[known], position[known], normal[known], (shift * pixel)[known], precision[known]
+            )
+        )
+    return joined(found)
+
+
+def joined(parts: list[Borders]) -> Borders:
+    """All of several in one."""
+    if not parts:
+        none = np.zeros((0, 3))
+        return Borders(np.zeros(0, np.intp), none, none, none, np.zeros(0), np.zeros(0))
+    return Borders(*(np.concatenate([getattr(p, f) for p in parts]) for f in Borders.__dataclass_fields__))
+
+
+def _pieces(mask: NDArray[np.bool_], used: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """(N, 2) pixels x, y along the outer outline of a mask, in order, where used."""
+    lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    pieces = []
+    height, width = mask.shape
+    for line in lines:
+        line = line[:, 0]
+        inner = (line > 0).all(1) & (line[:, 0] < width - 1) & (line[:, 1] < height - 1)
+        good = used[line[:, 1], line[:, 0]] & inner
+        if not good.all():  # begin at a gap, so that no piece is cut
+            start = int(np.flatnonzero(~good)[0])
+            line, good = np.roll(line, -start, axis=0), np.roll(good, -start)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
+        pieces += [line[a:b].astype(np.intp) for a, b in edges.reshape(-1, 2) if b - a >= SHORTEST]
+    return pieces
+
+
+def _border(
+    log: NDArray, valid: NDArray, mask: NDArray[np.bool_], pixels: NDArray, way: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Offset of the border from the silhouette and its deviation, pixels, for each of (N, 2) silhouette pixels.
+
+    From logarithms of colours (H, W, 3), the part of each pixel that is valid, the pixels that show the surface and
+    the ways (N, 2) out of it in the image.
+    """
+    steps = np.arange(-REACH - STRIP, REACH + STRIP, dtype=np.float64) + 0.5  # centres of pixels across
+    # The silhouette passes half a pixel outside the last pixel that shows the surface.
+    at = (pixels[:, None] + (0.5 + steps)[:, None] * way[:, None]).reshape(-1, 2)
+    sides = np.stack([valid, mask], axis=-1).astype(np.float32)
+    colour, both = (look_up(layer, at).reshape(len(pixels), len(steps), -1) for layer in (log, sides))
+    shown, surface = both[..., 0], both[..., 1]
+    usable, covered = shown > 0.99, surface > 0.5  # 0 outside the image
+    inside = usable & covered & (steps < -REACH)
+    outside = usable & ~covered & (steps > REACH)
+    evidence = np.where(usable, _likelihood(colour, inside) - _likelihood(colour, outside), 0.0)
+    # Border at position j: pixels before it are skin, those from it on are not.
+    some = evidence[:, STRIP:-STRIP]
+    score = EVIDENCE * np.concatenate([np.zeros((len(some), 1)), np.cumsum(some, axis=1)], axis=1)
+    position = np.arange(-REACH, REACH + 1, dtype=np.float64)
+    belief = _chain(score, position)
+    mean = belief @ position
+    deviation = np.sqrt(np.maximum(belief @ position**2 - mean**2, 0.0))
+    told = (inside.sum(1) > STRIP / 2) & (outside.sum(1) > STRIP / 2)
+    return mean, np.where(told, deviation, np.inf)
+
+
+def _likelihood(colour: NDArray, strip: NDArray[np.bool_]) -> NDArray:
+    """(N, S) log density of colours (N, S, 3) under a normal of those of a strip and its neighbours' along the line."""
+    weight = strip.sum(1).astype(np.float64)
+
+    def along(values: NDArray) -> NDArray:
+        return uniform_filter1d(values, ALONG, axis=0, mode="nearest")
+
+    count = np.maximum(along(weight), 1e-6)
+    shown = np.where(strip[..., None], colour, 0.0)
+    mean = along(shown.sum(1)) / count[:, None]
+    second = along(np.einsum("nsi,nsj->nij", shown, shown)) / count[:, None, None]
+    covariance = second - mean[:, :, None] * mean[:, None, :] + SPREAD**2 * np.eye(3)
+    difference = colour - mean[:, None]
+    distance = np.einsum("nsi,nij,nsj->ns", difference, np.linalg.inv(covariance), difference)
+    density = np.exp(-0.5 * distance) / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(covariance))[:, None]
+    return np.log((1.0 - STRAY) * density + STRAY / RANGE**3)
+
+
+def _chain(score: NDArray, position: NDArray) -> NDArray:
+    """(N, K) posterior of N neighbours' positions from log evidence (N, K), by the forward-backward recursion."""
+    move = np.exp(-0.5 * ((position[:, None] - position) / BEND) ** 2)
+    move /= move.sum(1, keepdims=True)
+    local = np.exp(score - score.max(1, keepdims=True))
+    forward, backward = np.empty_like(local), np.ones_like(local)
+    forward[0] = local[0] / local[0].sum()
+    for i in range(1, len(local)):
+        now = local[i] * (forward[i - 1] @ move)
+        forward[i] = now / max(now.sum(), 1e-300)
+    for i in range(len(local) - 2, -1, -1):
+        now = move @ (local[i + 1] * backward[i + 1])
+        backward[i] = now / max(now.sum(), 1e-300)
+    belief = forward * backward
+    return belief / np.maximum(belief.sum(1, keepdims=True), 1e-300)
