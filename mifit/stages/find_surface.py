@@ -247,6 +247,7 @@ class _Search:
         size = texture_size(model, world[0], pixel, LARGEST_MAP)
         texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
         posed, borders, factor = [], [], 0.5**level
+        finer = min(2.0 * factor, 1.0)  # where the image mixes skin and background in a pixel the border is doubtful
         for vertices, timestep in zip(world, timesteps, strict=True):
             scene.update(vertices)
             posed.append(
@@ -254,7 +255,7 @@ class _Search:
             )
             seen_by = self._cameras if outlined else ()
             borders.append(
-                joined([find_borders(self._capture, scene, model.face_mask, c, timestep, factor) for c in seen_by])
+                joined([find_borders(self._capture, scene, model.face_mask, c, timestep, finer) for c in seen_by])
             )
         step = STEP_PIXELS * pixel / self._resolution.parallax
         found = sweep(texels, posed, step * np.arange(-half, half + 1), WINDOW, self._pairs)
