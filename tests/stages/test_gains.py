@@ -11,7 +11,7 @@ from stages.test_infer_reflectance import held_out, infer
 
 from mifit.core.estimate import GeometryEstimate
 from mifit.stages.gains import estimate_gains
-from mifit.stages.observations import Surface
+from mifit.stages.observations import Observations, Surface
 from mifit.synth.compose import expose
 
 SCALE = (1.25, 0.9, 1.1)
@@ -38,6 +38,12 @@ def gains(dome):
 def test_gains_are_found_on_a_glossy_surface(gains):
     assert gains["left"] == (1.0, 1.0, 1.0)
     assert np.allclose(gains["right"], SCALE, rtol=0.02)
+
+
+def test_scaling_a_camera_scales_its_gains_and_no_more(dome, gains):
+    """What is trusted and chosen doesn't depend on how unequal the cameras are."""
+    equal = estimate_gains(dome, dome.model, dome.geometry, ("left", "right"))
+    assert np.allclose(np.divide(gains["right"], equal["right"]), SCALE, rtol=0.005)
 
 
 def test_the_fit_is_as_good_as_without_the_scaling(dome):
@@ -76,6 +82,38 @@ def test_a_camera_that_shares_nothing_is_left_out(dome):
         },
     )
     assert set(estimate_gains(blind, dome.model, dome.geometry, ("left", "right"))) == {"left"}
+
+
+def test_the_tint_of_sheen_is_the_line_along_which_ratios_scatter() -> None:
+    from mifit.stages.gains import _sheen_tint
+
+    rng = np.random.default_rng(0)
+    line, across = np.array([0.3, 0.5, 0.8]), np.array([0.5, -0.3, 0.0])
+    line, across = line / np.linalg.norm(line), across / np.linalg.norm(across)
+    ratio = (
+        np.array([0.2, -0.1, 0.1])
+        + rng.normal(size=(4000, 1)) * 0.1 * line
+        + rng.normal(size=(4000, 1)) * 0.02 * across
+    )
+    towards = np.tile(np.float32([0, 0, 1]), (4000, 2, 1))
+    seen = Observations(
+        texel=np.arange(4000),
+        face=np.zeros(4000, np.int32),
+        barycentric=np.zeros((4000, 3), np.float32),
+        step=np.zeros(2, np.int64),
+        camera=np.arange(2),
+        colour=np.exp(np.stack([np.full_like(ratio, np.log(0.3)), np.log(0.3) + ratio], axis=1)).astype(np.float32),
+        weight=np.ones((4000, 2), np.float32),
+        clipped=np.zeros((4000, 2), bool),
+        right=np.ones((4000, 2), np.float32),
+        point=towards[:, :1],
+        normal=towards[:, :1],
+        view=towards,
+    )
+    tint = _sheen_tint(seen)
+    assert np.allclose(tint @ line, line, atol=0.02)
+    assert 0.15 < across @ tint @ across < 0.45  # a fifth, and more where far ratios along the line count less
+    assert abs(np.linalg.eigvalsh(tint)[0]) < 0.01
 
 
 def test_gains_are_one_unless_known(dome):
