@@ -17,9 +17,9 @@ from mifit.core.mesh import normalize, vertex_normals
 from mifit.core.threads import one_blas_thread
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.progress import Progress, silent
-from mifit.render.gbuffer import SurfaceScene
 from mifit.solve import Outcome
 from mifit.stages.geometry.points import corner_matrix
+from mifit.stages.geometry.scenes import Scenes
 from mifit.stages.surface.close_lips import close_lips
 from mifit.stages.surface.displace import USUAL, Plate, solve_displacement
 from mifit.stages.surface.epipolar import epipolar_residual
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
+SLACK = 0.01
+"""Pixels that the surface may move by before what rays meet is built anew."""
 STEP_PIXELS = 0.7
 """Parallax between neighbouring offsets of a sweep, pixels of the level."""
 WINDOW = 11
@@ -130,6 +132,7 @@ def find_surface(
             spanned,
             geometry_config or GeometryConfig(),
             progress=search.advance,
+            scenes=search.scenes,
         )
         other = search.descend(fitted, coarse)
         # Colours mislead where the albedo model doesn't explain them; through the truer surface views predict others.
@@ -227,6 +230,7 @@ class _Search:
         self._capture, self._model, self._cameras, self._pairs = capture, model, cameras, pairs
         self._resolution, self._config, self._progress = resolution, config, progress
         self._done, self._total = 0, total
+        self.scenes = Scenes(model.faces, np.unique(model.faces[model.face_mask]), SLACK * resolution.pixel)
         progress("find surface", 0, total)
 
     def finish(self) -> None:
@@ -238,9 +242,7 @@ class _Search:
         self._done += 1
         self._progress("find surface", self._done, self._total)
 
-    def _sweep(
-        self, timesteps: Sequence[int], world: NDArray, scene: SurfaceScene, level: int, half: int, outlined: bool
-    ) -> _Swept:
+    def _sweep(self, timesteps: Sequence[int], world: NDArray, level: int, half: int, outlined: bool) -> _Swept:
         """One sweep of a surface (T, V, 3), with its outlines if asked for."""
         model = self._model
         pixel = self._resolution.pixel * 2.0**level
@@ -249,7 +251,7 @@ class _Search:
         posed, borders, factor = [], [], 0.5**level
         finer = min(2.0 * factor, 1.0)  # where the image mixes skin and background in a pixel the border is doubtful
         for vertices, timestep in zip(world, timesteps, strict=True):
-            scene.update(vertices)
+            scene = self.scenes.at(timestep, vertices)
             posed.append(
                 pose_texels(self._capture, scene, vertices, model.faces, texels, self._cameras, timestep, factor)
             )
@@ -265,8 +267,7 @@ class _Search:
         self, timesteps: Sequence[int], world: NDArray, level: int, half: int
     ) -> tuple[list[MeasuredPlanes], float]:
         """Planes that touch what a sweep finds, per timestep, which share its precision, and the sweep's step."""
-        scene = SurfaceScene(world[0], self._model.faces)
-        swept = self._sweep(timesteps, world, scene, level, half, outlined=False)
+        swept = self._sweep(timesteps, world, level, half, outlined=False)
         shared = replace(swept.found, precision=swept.found.precision / len(swept.posed))
         return [touching_planes(swept.texels, one, shared) for one in swept.posed], swept.step
 
@@ -279,10 +280,9 @@ class _Search:
         plate = Plate.of(neutral, model.faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm)
         last = last or _Descent.before(geometry)
         world, displacement, stiffness = last.world, last.displacement, last.stiffness
-        scene = SurfaceScene(world[0], model.faces)
         matched, moved, step = 0.0, 0.0, 0.0
         for level, half in levels:
-            swept = self._sweep(geometry.timesteps, world, scene, level, half, outlined=True)
+            swept = self._sweep(geometry.timesteps, world, level, half, outlined=True)
             texels, found, step = swept.texels, swept.found, swept.step
             matched = float((found.precision > 0).mean())
             objects = [p.normal @ rotation for p, rotation in zip(swept.posed, geometry.rotation, strict=True)]
@@ -327,7 +327,7 @@ class _Search:
         posed = [
             pose_texels(
                 self._capture,
-                SurfaceScene(world[k], model.faces),
+                self.scenes.at(geometry.timesteps[k], world[k]),
                 world[k],
                 model.faces,
                 texels,

@@ -17,7 +17,7 @@ from mifit.stages.geometry.initial import align, pose_candidates, reprojection, 
 from mifit.stages.geometry.landmarks import LandmarkProblem, LandmarkTerm, LandmarkView
 from mifit.stages.geometry.parameters import Frames, Layout, exponential, left_jacobian, rotation_angle
 from mifit.stages.geometry.points import PointBasis
-from mifit.stages.geometry.rendering import PixelView, RenderingProblem
+from mifit.stages.geometry.rendering import Patch, PixelView, RenderingProblem, Surface
 from mifit.stages.surface.model_fit import JointProblem
 
 
@@ -367,3 +367,16 @@ def test_triangulation_and_pose_are_exact_without_noise():
         error = [reprojection(cams, 10 * points, pix, 0.1, pose) for pose in candidates]
         best = candidates[int(np.argmin(error))]
         assert rotation_angle(best[0], rotation) < 1e-3 and np.abs(best[1] - translation).max() < 1e-3
+
+
+def test_a_patch_of_the_model_has_the_same_points_normals_and_derivatives(scene):
+    face, weights = random_points(scene.rng, scene.model, 30)
+    identity, expression = (0.3 * scene.rng.normal(size=n) for n in (scene.layout.identity, scene.layout.expression))
+    patch, number = Patch.around(scene.model, face)
+    assert len(patch.mean) < len(scene.model.mean)
+    whole, part = (Surface(model, identity, expression) for model in (scene.model, patch))
+    at_whole, at_part = (s.vertices[s.model.faces[f]] for s, f in ((whole, face), (part, number)))
+    np.testing.assert_allclose(at_part, at_whole, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(part.normals(number, weights)[0], whole.normals(face, weights)[0], atol=1e-5)
+    slopes, expected = part.normal_modes(number, weights), whole.normal_modes(face, weights)
+    np.testing.assert_allclose(slopes, expected, atol=1e-4 * np.abs(expected).max())

@@ -55,14 +55,40 @@ class PixelView:
     weights: NDArray
 
 
+@dataclass(frozen=True)
+class Patch:
+    """The part of a model that decides positions and normals on some of its faces.
+
+    Attributes
+    ----------
+    mean, identity, expression, faces
+        As of the model, of these vertices and the faces around the wanted ones' corners alone.
+    """
+
+    mean: NDArray
+    identity: NDArray
+    expression: NDArray
+    faces: NDArray
+
+    @classmethod
+    def around(cls, model: MorphableModel, face: NDArray) -> tuple[Patch, NDArray]:
+        """Around faces (n,) of a model, and their numbers (n,) in the patch."""
+        corner = np.zeros(len(model.mean), bool)
+        corner[model.faces[face]] = True
+        kept = np.flatnonzero(corner[model.faces].any(axis=1))
+        vertices, faces = np.unique(model.faces[kept], return_inverse=True)
+        patch = cls(model.mean[vertices], model.identity[vertices], model.expression[vertices], faces.reshape(-1, 3))
+        return patch, np.searchsorted(kept, face)
+
+
 class Surface:
     """The model's surface at one timestep in object space, with its vertex normals before and after normalising."""
 
-    def __init__(self, model: MorphableModel, identity: NDArray, expression: NDArray) -> None:
+    def __init__(self, model: MorphableModel | Patch, identity: NDArray, expression: NDArray) -> None:
         size = 3 * len(model.mean)
         dtype = model.mean.dtype
-        flat = model.mean.reshape(-1) + model.identity.reshape(size, -1) @ identity.astype(dtype)
-        flat = flat + model.expression.reshape(size, -1) @ expression.astype(dtype)
+        flat = model.mean.reshape(-1) + model.identity.reshape(size, len(identity)) @ identity.astype(dtype)
+        flat = flat + model.expression.reshape(size, len(expression)) @ expression.astype(dtype)
         self.model = model
         self.vertices = flat.reshape(-1, 3).astype(np.float64)
         cross = face_cross(self.vertices, model.faces)
@@ -214,16 +240,17 @@ class RenderingProblem:
             surfaces = self._surfaces(x)
             self._last.clear()
             self._last[key] = [
-                self._observe(view, rows, surfaces[view.step], x)
-                for view, rows in zip(self.views, self._rows, strict=True)
+                self._observe(view, rows, surfaces[view.step], face, x)
+                for view, rows, face in zip(self.views, self._rows, self._patches[1], strict=True)
             ]
         return self._last[key]
 
-    def _observe(self, view: PixelView, rows: PixelRows, surface: Surface, x: NDArray) -> Observation:
+    def _observe(self, view: PixelView, rows: PixelRows, surface: Surface, face: NDArray, x: NDArray) -> Observation:
+        """One view; ``face`` are its pixels' faces on the surface's patch."""
         pose: Pose = self.frames.pose(self.layout, x, view.step)
         w = view.weights.astype(np.float64)
-        points = np.einsum("nk,nkc->nc", w, surface.vertices[self.model.faces[view.face]])
-        normal = surface.normals(view.face, w)[0] @ pose.rotation.T
+        points = np.einsum("nk,nkc->nc", w, surface.vertices[surface.model.faces[face]])
+        normal = surface.normals(face, w)[0] @ pose.rotation.T
         projection = project(view.camera, pose, points)
         values, slope, inside = view.image.sample(projection.pixels)
         assert slope is not None
@@ -242,9 +269,24 @@ class RenderingProblem:
         count = max(int(observation.ok.sum()), 1)
         return float(rho[observation.ok].sum()) / count, np.where(observation.ok, weight, 0.0) / count
 
+    @cached_property
+    def _patches(self) -> tuple[list[Patch], list[NDArray]]:
+        """What the pixels of each timestep are on, and the numbers of their faces there, per view."""
+        patches, faces = [], [np.zeros(0, np.intp)] * len(self.views)
+        for step in range(self.layout.timesteps):
+            own = [i for i, view in enumerate(self.views) if view.step == step]
+            together = np.concatenate([np.zeros(0, np.intp), *(self.views[i].face for i in own)])
+            patch, numbers = Patch.around(self.model, together)
+            patches.append(patch)
+            ends = np.cumsum([len(self.views[i].face) for i in own])[:-1]
+            for i, part in zip(own, np.split(numbers, ends), strict=False):
+                faces[i] = part
+        return patches, faces
+
     def _surfaces(self, x: NDArray) -> list[Surface]:
         at = self.layout.at
-        return [Surface(self.model, x[at("identity")], x[at("expression", k)]) for k in range(self.layout.timesteps)]
+        patches = self._patches[0]
+        return [Surface(patch, x[at("identity")], x[at("expression", k)]) for k, patch in enumerate(patches)]
 
     def energies(self, x: NDArray) -> dict[str, float]:
         """Energy per term."""
@@ -259,7 +301,10 @@ class RenderingProblem:
         They are the dearest part of a linearisation, and change by as much as the surface bends. Energies stay exact.
         """
         surfaces = self._surfaces(x)
-        slopes = [surfaces[view.step].normal_modes(view.face, view.weights.astype(np.float64)) for view in self.views]
+        slopes = [
+            surfaces[view.step].normal_modes(face, view.weights.astype(np.float64))
+            for view, face in zip(self.views, self._patches[1], strict=True)
+        ]
         return replace(self, slopes=tuple(slopes))
 
     def linearize(self, x: NDArray) -> ArrowSystem:

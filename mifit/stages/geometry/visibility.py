@@ -18,6 +18,7 @@ from mifit.stages.geometry.consistency import TextureView
 from mifit.stages.geometry.images import DARKEST, SmoothImage, level, texture_level
 from mifit.stages.geometry.points import PointBasis
 from mifit.stages.geometry.rendering import PixelView
+from mifit.stages.geometry.scenes import Scenes
 from mifit.stages.geometry.start import State, object_vertices
 
 GRAZING_COSINE = 0.25  # beyond about 75 degrees a pixel covers too much surface to place it well
@@ -61,12 +62,14 @@ class Visibility:
         cameras: Sequence[str],
         timesteps: Sequence[int],
         gains: Mapping[str, Sequence[float]] | None = None,
+        scenes: Scenes | None = None,
     ) -> None:
         self._gains = gains or {}
+        self._scenes = scenes or Scenes(model.faces)
         self.capture, self.model = capture, model
         self.cameras: list[Camera] = [capture.camera(name) for name in cameras]
         self.timesteps = tuple(timesteps)
-        self._scenes: dict[int, SurfaceScene] = {}
+        self._shown: dict[int, NDArray] = {}  # vertices that the buffers show
         self.warnings: list[str] = []
         self.blind: set[tuple[str, int]] = set()  # images (camera, step) that showed nothing of the face once
         self._buffers: dict[tuple[int, str], GBuffer] = {}
@@ -84,16 +87,12 @@ class Visibility:
         )
 
     def _look(self, step: int, vertices: NDArray) -> SurfaceScene:
-        """The surface of a timestep, and what every camera sees of it in ``_buffers``: anew where it has moved."""
-        scene = self._scenes.get(step)
-        if scene is None:
-            scene = self._scenes[step] = SurfaceScene(vertices, self.model.faces)
-        elif np.array_equal(scene.vertices, vertices):
-            return scene
-        else:
-            scene.update(vertices)
-        for camera in self.cameras:
-            self._buffers[step, camera.name] = scene.gbuffer(camera)
+        """The surface of a timestep, and what every camera sees of it in ``_buffers``: anew where its scene is."""
+        scene = self._scenes.at(self.timesteps[step], vertices)
+        if self._shown.get(step) is not scene.vertices:
+            self._shown[step] = scene.vertices
+            for camera in self.cameras:
+                self._buffers[step, camera.name] = scene.gbuffer(camera)
         return scene
 
     def _usable(self, step: int, camera: Camera, border: int) -> NDArray[np.bool_]:

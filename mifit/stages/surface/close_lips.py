@@ -145,7 +145,8 @@ def close_lips(
     lines: dict[int, NDArray[np.float64]] = {}
     pixel = np.inf
     for k, mouth in enumerate(mouths):
-        scene.update(geometry.vertices[k].astype(np.float64))
+        if k:
+            scene.update(geometry.vertices[k].astype(np.float64))
         line, length = _lip_line(capture, scene, geometry, k, mouth, cameras, opening[k], model.unit_mm)
         pixel = min(pixel, length)
         if line is not None:

@@ -33,6 +33,7 @@ from mifit.stages.geometry.parameters import Frames, Layout, cross_matrix
 from mifit.stages.geometry.points import PointBasis
 from mifit.stages.geometry.refine import ENERGY_TOLERANCE, joint_state, paper_problem, texture_problem
 from mifit.stages.geometry.rendering import RenderingProblem
+from mifit.stages.geometry.scenes import Scenes
 from mifit.stages.geometry.start import State, bounds, landmark_views, object_vertices
 from mifit.stages.geometry.visibility import Visibility, spread_points
 from mifit.stages.surface.local_planes import MeasuredPlanes
@@ -188,6 +189,7 @@ def fit_model(
     config: GeometryConfig,
     seed: int = 0,
     progress: Callable[[], None] = lambda: None,
+    scenes: Scenes | None = None,
 ) -> GeometryEstimate:
     """Identity, expressions and poses by colours and texture first, then with sweeps of the model's surface.
 
@@ -207,6 +209,8 @@ def fit_model(
         Of the choice of points and pixels.
     progress : callable
         Called after each round.
+    scenes : Scenes, optional
+        Kept by who sweeps the same surfaces.
 
     Returns
     -------
@@ -220,7 +224,7 @@ def fit_model(
     config = replace(config, as_written=False, scale_deviation=0.0, landmark_noise=noise, pixels=pixels)
     views = landmark_views(capture, model, cameras, steps, biased_noise(noise, images), fewest=0)
     views = slid(model, geometry, views)
-    visibility = Visibility(capture, model, tuple(cameras), steps, geometry.gains)
+    visibility = Visibility(capture, model, tuple(cameras), steps, geometry.gains, scenes)
     points = spread_points(model, min(config.surface_points, TEXTURE_POINTS), seed)
     texels = rasterize_uv(model.uv, model.faces_uv, COUNTERPART_MAP, model.face_mask)
     farthest = FARTHEST_MM * float(geometry.scale) / model.unit_mm

@@ -58,7 +58,8 @@ def errors_between_views(
     total, count = np.zeros(len(surfaces)), 0
     for k, timestep in enumerate(timesteps):
         for scene, surface in zip(scenes, surfaces, strict=True):
-            scene.update(surface[k])
+            if k:
+                scene.update(surface[k])
         for name, view in views.items():
             others = [other for key, other in views.items() if key != name]
             frame = capture.frame(name, timestep)
