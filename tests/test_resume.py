@@ -14,17 +14,7 @@ import pytest
 
 from mifit.core.image import read_image
 
-CONFIG = """
-[geometry]
-camera_gains = "never"
-[surface]
-refit = false
-[reflectance]
-texture_size = 64
-shading = "prefiltered"
-bands = 4
-exponent = 100
-"""
+CONFIG = '[reflectance]\ntexture_size = 64\nshading = "prefiltered"\nexponent = 100\n'
 
 
 def mifit(*arguments):
