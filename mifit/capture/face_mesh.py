@@ -50,6 +50,11 @@ EYE_CONTOURS = (
     (263, 249, 390, 373, 374, 380, 381, 382, 362, 466, 388, 387, 386, 385, 384, 398),
 )
 """Mesh points on the rim of each eye, as the iris network lists them."""
+LIDS = (((37, 41, 160, 144), (38, 40, 158, 153)), ((43, 47, 385, 380), (44, 46, 387, 373)))
+"""Of each eye, two landmarks on the upper lid with those below them, and the mesh points of the rim at both."""
+CLOSED = 0.12
+"""Opening of an eye, relative to its width, below which the lids are closed: the iris network has 0.05 to 0.10 on
+closed lids and 0.2 to 0.4 on open ones, the table of landmarks, which is fitted on open eyes, 0.22 and more on both."""
 SIDES, TOP_CHIN = (234, 454), (10, 152)
 """Mesh points at the ears, and at the hairline and chin."""
 
@@ -104,8 +109,17 @@ class Face:
 
     @property
     def landmarks(self) -> NDArray[np.float64]:
-        """(68, 2) iBUG points."""
-        return landmark_map() @ self.points[:, :2]
+        """(68, 2) iBUG points; those on closed lids lie as far apart as the iris network has them."""
+        flat = self.points[:, :2]
+        marks = landmark_map() @ flat
+        for pairs, (one, other) in zip(LIDS, EYE_CORNERS, strict=True):
+            gaps = [flat[above] - flat[below] for _, _, above, below in pairs]
+            width = float(np.linalg.norm(flat[one] - flat[other]))
+            if np.mean([np.linalg.norm(gap) for gap in gaps]) < CLOSED * width:
+                for (upper, lower, _, _), gap in zip(pairs, gaps, strict=True):
+                    middle = 0.5 * (marks[upper] + marks[lower])
+                    marks[upper], marks[lower] = middle + 0.5 * gap, middle - 0.5 * gap
+        return np.asarray(marks)
 
     @property
     def iris(self) -> NDArray[np.float64]:

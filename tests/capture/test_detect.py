@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mifit.capture import Capture, detect_landmarks
 from mifit.capture.detectors import open_detector
-from mifit.capture.face_mesh import FaceMesh, _Square, landmark_map
+from mifit.capture.face_mesh import CLOSED, EYE_CORNERS, LIDS, Face, FaceMesh, _Square, landmark_map
 from mifit.capture.face_networks import FILES, install_networks, missing, networks_folder
 from mifit.capture.outliers import epipolar_outliers, fundamental_matrix, temporal_outliers
 from mifit.core.image import load_image, to_8_bit
@@ -234,3 +234,27 @@ def test_the_table_file_is_plain_json() -> None:
     table = json.loads((resources.files("mifit.capture") / "face_mesh_68.json").read_text())
     assert {len(row) for row in table["index"]} == {len(row) for row in table["weight"]}
     assert max(max(row) for row in table["index"]) < 478
+
+
+def eyes_opened(by: float) -> Face:
+    """A face of random points whose eyes are 100 pixels wide and open by a part of it."""
+    points = np.random.default_rng(4).uniform(200, 400, (478, 3))
+    for pairs, (one, other), x in zip(LIDS, EYE_CORNERS, (100.0, 400.0), strict=True):
+        points[one, :2], points[other, :2] = (x, 300.0), (x + 100.0, 300.0)
+        for k, (_, _, above, below) in enumerate(pairs):
+            points[above, :2] = (x + 30.0 + 40.0 * k, 300.0 - 50.0 * by)
+            points[below, :2] = (x + 30.0 + 40.0 * k, 300.0 + 50.0 * by)
+    return Face(points, 1.0)
+
+
+def test_landmarks_of_closed_lids_close() -> None:
+    """The table is fitted on open eyes and would leave a gap."""
+    pairs = [pair for eye in LIDS for pair in eye]
+    closed, opened = eyes_opened(0.5 * CLOSED), eyes_opened(2.0 * CLOSED)
+    assert np.allclose(opened.landmarks, landmark_map() @ opened.points[:, :2])
+    marks, table = closed.landmarks, landmark_map() @ closed.points[:, :2]
+    for upper, lower, _, _ in pairs:
+        assert np.allclose(marks[lower] - marks[upper], (0.0, 50.0 * CLOSED))
+        assert np.allclose(marks[upper] + marks[lower], table[upper] + table[lower])
+    others = np.setdiff1d(np.arange(68), [i for pair in pairs for i in pair[:2]])
+    assert np.array_equal(marks[others], table[others])
