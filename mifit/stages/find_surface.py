@@ -256,9 +256,7 @@ class _Search:
                 pose_texels(self._capture, scene, vertices, model.faces, texels, self._cameras, timestep, factor)
             )
             seen_by = self._cameras if outlined else ()
-            borders.append(
-                joined([find_borders(self._capture, scene, model.face_mask, c, timestep, finer) for c in seen_by])
-            )
+            borders.append(joined([find_borders(self._capture, scene, c, timestep, finer) for c in seen_by]))
         step = STEP_PIXELS * pixel / self._resolution.parallax
         found = sweep(texels, posed, step * np.arange(-half, half + 1), WINDOW, self._pairs)
         return _Swept(texels, posed, borders, found, step)

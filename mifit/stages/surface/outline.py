@@ -81,9 +81,7 @@ class Borders:
     precision: NDArray[np.float64]
 
 
-def find_borders(
-    capture: Capture, scene: SurfaceScene, used: NDArray[np.bool_], name: str, timestep: int, factor: float
-) -> Borders:
+def find_borders(capture: Capture, scene: SurfaceScene, name: str, timestep: int, factor: float) -> Borders:
     """Borders of the surface that ``scene`` holds in one image.
 
     Parameters
@@ -91,8 +89,6 @@ def find_borders(
     capture : Capture
     scene : SurfaceScene
         World space.
-    used : (F,) bool
-        Faces whose silhouettes count.
     name : str
         Camera.
     timestep : int
@@ -107,7 +103,7 @@ def find_borders(
     log = np.log(image + np.float32(DARKEST))
     buffer = scene.gbuffer(camera)
     vertices, faces = scene.vertices, scene.faces
-    pieces = _pieces(buffer.mask, used[np.maximum(buffer.face, 0)])
+    pieces = _pieces(buffer.mask)
     normals = vertex_normals(vertices, faces)
     found = []
     for pixels in pieces:
@@ -142,15 +138,14 @@ def joined(parts: list[Borders]) -> Borders:
     return Borders(*(np.concatenate([getattr(p, f) for p in parts]) for f in Borders.__dataclass_fields__))
 
 
-def _pieces(mask: NDArray[np.bool_], used: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
-    """(N, 2) pixels x, y along the outer outline of a mask, in order, where used."""
+def _pieces(mask: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """(N, 2) pixels x, y along the outer outline of a mask, in order, inside the image."""
     lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     pieces = []
     height, width = mask.shape
     for line in lines:
         line = line[:, 0]
-        inner = (line > 0).all(1) & (line[:, 0] < width - 1) & (line[:, 1] < height - 1)
-        good = used[line[:, 1], line[:, 0]] & inner
+        good = (line > 0).all(1) & (line[:, 0] < width - 1) & (line[:, 1] < height - 1)
         if not good.all():  # begin at a gap, so that no piece is cut
             start = int(np.flatnonzero(~good)[0])
             line, good = np.roll(line, -start, axis=0), np.roll(good, -start)
