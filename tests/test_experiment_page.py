@@ -39,7 +39,8 @@ def check(names: dict, frames: int = 36) -> None:
     assert len(losses) == 30 and losses[-1] < losses[0]
     assert names["better"] != result
     fitted, tanned, found = (names[n].reflectance.diffuse for n in ("result", "tanned", "better"))
-    touched = np.abs(found - tanned).max(axis=-1) > 1e-4  # texels that a camera sees
+    touched = np.abs(found - tanned).max(axis=-1) > 1e-4  # texels that a camera sees, and sees well
+    touched &= names["result"].reflectance.confidence > 0.9
     away, again = (np.abs((x - fitted)[touched].mean(axis=0)).max() for x in (tanned, found))
     assert touched.any() and again < 0.5 * away  # the colour of the photographs is found again
     height, width = names["camera"].height, names["camera"].width
