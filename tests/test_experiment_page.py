@@ -42,7 +42,7 @@ def check(names: dict, frames: int = 36) -> None:
     touched = np.abs(found - tanned).max(axis=-1) > 1e-4  # texels that a camera sees, and sees well
     touched &= names["result"].reflectance.confidence > 0.9
     away, again = (np.abs((x - fitted)[touched].mean(axis=0)).max() for x in (tanned, found))
-    assert touched.any() and again < 0.5 * away  # the colour of the photographs is found again
+    assert touched.any() and again < 0.3 * away  # the colour of the photographs is found again
     height, width = names["camera"].height, names["camera"].width
     assert names["picture"].shape == (height, width, 4) and names["picture"][..., :3].max() > 0.1
 
