@@ -50,8 +50,8 @@ class Candidates:
         Derivative of the image by the lighting, per channel.
     weight, residual, diffuse_light, specular_light : (n, J, 3)
     diffuse : (n, 3), specular_albedo : (n,)
-    inverse : (n, 4, 4), cross : (n, 4, 3K), own_right : (n, 4)
-        The texels' blocks of the normal equations.
+    inverse : (n, 4, 4), diffuse_cross : (3, n, K), specular_cross : (n, 3K), own_right : (n, 4)
+        The texels' blocks of the normal equations (`LightingEquations`).
     factor : (3K, 3K), right : (3K,)
         Inverse and right-hand side of the equations for the lighting with the texels eliminated.
     """
@@ -66,7 +66,8 @@ class Candidates:
     diffuse: NDArray
     specular_albedo: NDArray
     inverse: NDArray
-    cross: NDArray
+    diffuse_cross: NDArray
+    specular_cross: NDArray
     own_right: NDArray
     factor: NDArray
     right: NDArray
@@ -84,10 +85,19 @@ class Candidates:
         plain = replace(problem, diffuse=problem.diffuse[..., :k], specular=problem.specular[..., :k])
         diffuse_light, specular_light = plain.diffuse @ light[:k], plain.specular @ light[:k]
         residual = problem.colour - form_image(0.0, x, diffuse_light, y, specular_light)
+        there = plain.seen
         normal = linearize(
-            plain, found.light[:k], found.diffuse, found.specular, diffuse_light, specular_light, residual, weight
+            plain,
+            plain.rows(),
+            found.light[:k],
+            found.diffuse,
+            found.specular,
+            diffuse_light[there],
+            specular_light[there],
+            residual[there],
+            weight[there],
         )
-        inverse, reduced, right = normal.eliminate(3 * k, 1e-4)
+        remaining = normal.eliminate(False, 1e-4)
         rows = [(x[..., c : c + 1] * plain.diffuse + y * plain.specular).reshape(-1, k) for c in range(3)]
         return cls(
             seen,
@@ -99,11 +109,12 @@ class Candidates:
             specular_light,
             found.diffuse,
             found.specular,
-            inverse,
-            normal.cross[:, :, : 3 * k],
+            remaining.inverse(),
+            normal.diffuse_cross,
+            normal.specular_cross,
             normal.own_right,
-            np.linalg.inv(reduced),
-            right,
+            np.linalg.inv(remaining.reduced),
+            remaining.right,
         )
 
     def explained(self, direction: NDArray, radius: float, open_sky: NDArray[np.uint32] | None = None) -> float:
@@ -127,7 +138,10 @@ class Candidates:
         moved = np.matmul(self.inverse, own)
         system -= np.tensordot(own, moved, ([0, 1], [0, 1]))
         right -= np.tensordot(moved, self.own_right, ([0, 1], [0, 1]))
-        across -= np.tensordot(moved, self.cross, ([0, 1], [0, 1]))
+        single = moved.astype(np.float32)
+        across -= single[:, 3].T @ self.specular_cross
+        for c in range(3):
+            across[:, c * k : (c + 1) * k] -= single[:, c].T @ self.diffuse_cross[c]
         system -= across @ self.factor @ across.T
         right -= across @ (self.factor @ self.right)
         floor = 1e-9 * float(np.trace(system)) + 1e-12

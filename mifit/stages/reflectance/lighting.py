@@ -9,6 +9,7 @@ determine a few hundred coefficients, so a random subset is enough; the maps are
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from mifit.stages.reflectance.lighting_equations import (
     LightingEquations,
     LightingPriors,
     LightingProblem,
+    SeenRows,
     expected_specular,
 )
 
@@ -97,22 +99,21 @@ def solve_lighting(
         Stop when the energy changes by less than this part.
     """
     n = len(problem.specular)
+    rows = problem.rows()
+    prior_weight = problem.weight.sum(axis=1)
     diffuse = problem.albedo.astype(np.float32).copy()
     specular_albedo = np.full(n, specular, dtype=np.float32)
-    light = _initial(problem, diffuse, specular_albedo) if start is None else np.array(start, dtype=np.float64)
+    light = _initial(problem, rows, diffuse, specular_albedo) if start is None else np.array(start, dtype=np.float64)
     energy: list[float] = []
     ambient, sigma, unexplained, damping, outcome = 0.0, 0.0, np.inf, 1e-3, Outcome.MAX_ITERATIONS
     state = light, ambient, diffuse, specular_albedo
     best = state
     for _ in range(iterations):
         light, ambient, diffuse, specular_albedo = state
-        diffuse_light = np.einsum("njk,kc->njc", problem.diffuse, light.astype(np.float32))
-        specular_light = np.einsum("njk,kc->njc", problem.specular, light.astype(np.float32))
-        shown = form_image(
-            np.float32(ambient), diffuse[:, None], diffuse_light, specular_albedo[:, None, None], specular_light
-        )
-        residual = problem.colour - shown
-        weight, deviation = active_weight(problem.weight, problem.clipped, residual, robust)
+        diffuse_light, specular_light = (t @ light.astype(np.float32) for t in (rows.diffuse, rows.specular))
+        maps = diffuse[rows.texel], specular_albedo[rows.texel, None]
+        residual = rows.colour - form_image(np.float32(ambient), maps[0], diffuse_light, maps[1], specular_light)
+        weight, deviation = active_weight(rows.weight, rows.clipped, residual, robust)
         current = float((weight * residual**2).sum())
         if not energy and not np.isfinite(current):
             outcome = Outcome.DIVERGED
@@ -127,11 +128,14 @@ def solve_lighting(
                 outcome = Outcome.CONVERGED
             energy.append(current)
             best, sigma = state, deviation
-            bounded = float((bounded_weight(problem, residual) * residual**2).sum())
-            unexplained = float(np.sqrt(bounded / max(float(problem.weight.sum()), 1e-12)))
+            bounded = float((bounded_weight(rows, residual) * residual**2).sum())
+            unexplained = float(np.sqrt(bounded / max(float(rows.weight.sum()), 1e-12)))
             damping = max(0.1 * damping, DAMPING)
+            if outcome is Outcome.CONVERGED:
+                break
             system = linearize(
                 problem,
+                rows,
                 light,
                 diffuse,
                 specular_albedo,
@@ -142,15 +146,13 @@ def solve_lighting(
                 priors,
                 deviation,
             )
-            if outcome is Outcome.CONVERGED:
-                break
         step = system.solve(with_ambient, damping)
         light, ambient, diffuse, specular_albedo = best
         light = light + step.light
         ambient = max(ambient + step.ambient, 0.0)
         diffuse = np.clip(diffuse + step.diffuse, 0.0, 1.5).astype(np.float32)
         specular_albedo = np.clip(specular_albedo + step.specular_albedo, 0.0, 1.0).astype(np.float32)
-        gain = gauge(diffuse, problem.albedo, problem.weight)
+        gain = gauge(diffuse, problem.albedo, prior_weight)
         state = light * gain, ambient, (diffuse / gain).astype(np.float32), (specular_albedo / gain).astype(np.float32)
     light, ambient, diffuse, specular_albedo = best
     return LightingSolution(light, ambient, diffuse, specular_albedo, sigma, unexplained, energy, outcome)
@@ -158,6 +160,7 @@ def solve_lighting(
 
 def linearize(
     problem: LightingProblem,
+    rows: SeenRows,
     light: NDArray,
     diffuse: NDArray,
     specular_albedo: NDArray,
@@ -168,19 +171,28 @@ def linearize(
     priors: LightingPriors = PRIORS,
     sigma: float = 0.0,
 ) -> LightingEquations:
-    """Normal equations about a state, with priors beside residuals of standard deviation `sigma`."""
+    """Normal equations about a state, with priors beside residuals of standard deviation `sigma`.
+
+    Light, residual and weight (M, 3) are those of a problem's rows.
+    """
     k, order = problem.specular.shape[-1], problem.order
     system = LightingEquations.accumulate(
-        problem, diffuse, specular_albedo, diffuse_light, specular_light, residual, weight
+        rows, diffuse, specular_albedo, diffuse_light, specular_light, residual, weight
     )
     extra = k - order * order  # compact lights are kept from negative values one by one
-    directions = np.pad(basis(fibonacci_sphere(NEGATIVE_DIRECTIONS), order), ((0, extra), (0, extra)))
+    directions = np.pad(_sphere(order), ((0, extra), (0, extra)))
     directions[NEGATIVE_DIRECTIONS:, order * order :] = np.eye(extra)
-    expected = expected_specular(specular_albedo, (problem.weight > 0).any(axis=2))
+    expected = expected_specular(specular_albedo, problem.seen)
     system.add_priors(
         priors, light, diffuse, specular_albedo, problem.albedo, _stiffness(order, k), directions, sigma, expected
     )
     return system
+
+
+@cache
+def _sphere(order: int) -> NDArray[np.float64]:
+    """Basis functions at the directions in which radiance is kept from being negative."""
+    return basis(fibonacci_sphere(NEGATIVE_DIRECTIONS), order)
 
 
 def _stiffness(order: int, count: int) -> NDArray[np.float64]:
@@ -189,9 +201,11 @@ def _stiffness(order: int, count: int) -> NDArray[np.float64]:
     return np.pad((band * (band + 1.0)) ** 2, (0, count - order * order))
 
 
-def gauge(diffuse: NDArray, albedo: NDArray, weight: NDArray) -> float:
-    """Factor between lighting and albedo that makes the mean seen diffuse albedo, over all channels, the model's."""
-    seen = weight.sum(axis=1)
+def gauge(diffuse: NDArray, albedo: NDArray, seen: NDArray) -> float:
+    """Factor between lighting and albedo that makes the mean diffuse albedo, over all channels, the model's.
+
+    ``seen`` (n, 3) is the weight of each texel's observations.
+    """
     return float((seen * diffuse).sum() / max((seen * albedo).sum(), 1e-12)) or 1.0
 
 
@@ -210,24 +224,25 @@ def active_weight(
     return active.astype(np.float32), sigma
 
 
-def bounded_weight(problem: LightingProblem, residual: NDArray) -> NDArray[np.float32]:
+def bounded_weight(problem: LightingProblem | SeenRows, residual: NDArray) -> NDArray[np.float32]:
     """Weights under which each residual counts `GROSS` at the most, the same whatever the others are."""
     weight = problem.weight / (1.0 + (residual / GROSS) ** 2)
     return np.where(problem.clipped[..., None] & (residual <= 0), np.float32(0.0), weight)
 
 
-def _initial(problem: LightingProblem, diffuse: NDArray, specular_albedo: NDArray) -> NDArray[np.float64]:
+def _initial(
+    problem: LightingProblem, rows: SeenRows, diffuse: NDArray, specular_albedo: NDArray
+) -> NDArray[np.float64]:
     """Linear least squares for the lighting with fixed maps."""
     k = problem.specular.shape[-1]
     stiffness = _stiffness(problem.order, k)
     light = np.zeros((k, 3))
+    glossy = specular_albedo[rows.texel, None] * rows.specular
     for c in range(3):
-        rows = (
-            diffuse[:, None, None, c] * problem.diffuse + specular_albedo[:, None, None] * problem.specular
-        ).reshape(-1, k)
-        w = np.where(problem.clipped, 0, problem.weight[..., c]).ravel()
-        h = (rows * w[:, None]).T @ rows
+        root = np.sqrt(np.where(rows.clipped, np.float32(0), rows.weight[:, c]))
+        slope = (diffuse[rows.texel, c, None] * rows.diffuse + glossy) * root[:, None]
+        h = slope.T @ slope
         scale = max(float(np.trace(h)) / k, 1e-12)
-        g = (rows * w[:, None]).T @ problem.colour[..., c].ravel()
+        g = (root * rows.colour[:, c]) @ slope
         light[:, c] = np.linalg.solve(h.astype(np.float64) + np.diag(scale * (1e-6 + 1e-4 * stiffness)), g)
     return light

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 SPECULAR_SPREAD = 0.15
@@ -14,6 +16,8 @@ SPECULAR_LIMIT = 0.03
 incidence (index of refraction 1.4)."""
 FEW_IMAGES = 4
 """Images of a texel from which its four albedos are told by the images."""
+BLOCK = 1 << 20
+"""Derivatives that are held at a time: they stay in the cache."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,80 @@ class LightingProblem:
     specular: NDArray[np.float32]
     albedo: NDArray[np.float32]
     order: int
+
+    @cached_property
+    def seen(self) -> NDArray[np.bool_]:
+        """(n, J) observations that there are."""
+        return np.asarray((self.weight > 0).any(axis=2))
+
+    def rows(self) -> SeenRows:
+        """The observations that there are, texel after texel: a third of all texels and images face one another not."""
+        seen = self.seen
+        start = np.concatenate([[0], np.cumsum(seen.sum(axis=1))])
+        every = (getattr(self, name)[seen] for name in ("colour", "weight", "clipped", "diffuse", "specular"))
+        return SeenRows(np.nonzero(seen)[0], start, *every)
+
+
+@dataclass(frozen=True)
+class SeenRows:
+    """The M observations of n texels that count, in the order of the texels.
+
+    Attributes
+    ----------
+    texel : (M,)
+        Which texel each shows.
+    start : (n + 1,)
+        Where the observations of each texel begin.
+    colour, weight : (M, 3)
+    clipped : (M,)
+    diffuse, specular : (M, K)
+        As in `LightingProblem`.
+    """
+
+    texel: NDArray[np.intp]
+    start: NDArray[np.intp]
+    colour: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    clipped: NDArray[np.bool_]
+    diffuse: NDArray[np.float32]
+    specular: NDArray[np.float32]
+
+    def sums(self, values: NDArray) -> NDArray:
+        """Per texel (n, ...) the sum of values (M, ...)."""
+        return _per_texel(self.start) @ values
+
+    @cached_property
+    def blocks(self) -> list[Block]:
+        """All of them in parts, each of whole texels."""
+        found, first, n = [], 0, len(self.start) - 1
+        step = max(BLOCK // self.diffuse.shape[1], 1)
+        while first < n:
+            last = max(int(np.searchsorted(self.start, self.start[first] + step, side="right")) - 1, first + 1)
+            start = self.start[first : last + 1]
+            found.append(Block(slice(first, last), slice(int(start[0]), int(start[-1])), _per_texel(start)))
+            first = last
+        return found
+
+
+@dataclass(frozen=True)
+class Block:
+    """Some of the texels and their observations, with the matrix (texels, observations) that tells whose they are."""
+
+    texels: slice
+    rows: slice
+    matrix: sp.csr_matrix
+
+    def sums(self, factor: NDArray, values: NDArray) -> NDArray:
+        """Per texel the sum of values (M, K), each observation's times its factor (M,)."""
+        self.matrix.data = factor
+        return np.asarray(self.matrix @ values)
+
+
+def _per_texel(start: NDArray) -> sp.csr_matrix:
+    """(n, M) with a 1 for each observation in the row of its texel."""
+    count = int(start[-1] - start[0])
+    shape = len(start) - 1, count
+    return sp.csr_matrix((np.ones(count, np.float32), np.arange(count), start - start[0]), shape=shape)
 
 
 def specular_pull(expected: float, sigma: float) -> float:
@@ -100,18 +178,38 @@ class LightingStep:
 
 @dataclass
 class LightingEquations:
-    """Normal equations: lighting (3K) and ambient (1) against the texels' own blocks of four."""
+    """Normal equations: lighting (3K) and ambient (1) against the texels' own blocks of three diffuse albedos and one
+    specular one. Diffuse albedos touch one another only by the specular one, and each only its own channel's light.
 
-    system: NDArray[np.float64]  # (3K + 1, 3K + 1)
+    Attributes
+    ----------
+    system : (3K + 1, 3K + 1), right : (3K + 1,)
+        Of lighting and ambient.
+    diffuse, both : (n, 3), specular : (n,)
+        Blocks: curvature of the diffuse albedos, theirs with the specular one, and its own.
+    own_right : (n, 4)
+    diffuse_cross : (3, n, K)
+        Diffuse albedos against the light of their channel.
+    specular_cross : (n, 3K)
+        Specular albedo against the light.
+    ambient_cross : (n, 4)
+        Albedos against ambient.
+    """
+
+    system: NDArray[np.float64]
     right: NDArray[np.float64]
-    own: NDArray[np.float32]  # (n, 4, 4)
-    own_right: NDArray[np.float32]
-    cross: NDArray[np.float32]  # (n, 4, 3K + 1)
+    diffuse: NDArray[np.float64]
+    both: NDArray[np.float64]
+    specular: NDArray[np.float64]
+    own_right: NDArray[np.float64]
+    diffuse_cross: NDArray[np.float32]
+    specular_cross: NDArray[np.float32]
+    ambient_cross: NDArray[np.float64]
 
     @classmethod
     def accumulate(
         cls,
-        problem: LightingProblem,
+        rows: SeenRows,
         diffuse: NDArray,
         specular_albedo: NDArray,
         diffuse_light: NDArray,
@@ -119,33 +217,47 @@ class LightingEquations:
         residual: NDArray,
         weight: NDArray,
     ) -> LightingEquations:
-        """Sums over the observations (n, J, 3) of a problem, linearised about maps and shading."""
-        n, _, k = problem.specular.shape
+        """Sums over the observations of a problem, linearised about maps (n, 3), (n,) and shading (M, 3)."""
+        n, k = len(diffuse), rows.specular.shape[1]
+        by_diffuse, by_specular = weight * diffuse_light, weight * specular_light
+        own = rows.sums(
+            np.concatenate(
+                [
+                    by_diffuse * diffuse_light,
+                    by_diffuse * specular_light,
+                    by_specular * specular_light,
+                    by_diffuse * residual,
+                    by_specular * residual,
+                    by_diffuse,
+                    by_specular,
+                ],
+                axis=1,
+            )
+        ).astype(np.float64)
+        dd, ds, ss, dr, sr, da, sa = (own[:, 3 * i : 3 * i + 3] for i in range(7))
         system, right = np.zeros((3 * k + 1, 3 * k + 1)), np.zeros(3 * k + 1)
-        own, own_right = np.zeros((n, 4, 4), np.float32), np.zeros((n, 4), np.float32)
-        cross = np.zeros((n, 4, 3 * k + 1), np.float32)
-        for c in range(3):
-            block = slice(c * k, (c + 1) * k)
-            rows = diffuse[:, None, None, c] * problem.diffuse + specular_albedo[:, None, None] * problem.specular
-            w, r = weight[..., c], residual[..., c]
-            jd, js = diffuse_light[..., c], specular_light[..., c]
-            weighted = rows * w[..., None]
-            flat = weighted.reshape(-1, k)
-            system[block, block] = flat.T @ rows.reshape(-1, k)
-            system[block, -1] = system[-1, block] = flat.sum(0)
-            system[-1, -1] += w.sum()
-            right[block] = flat.T @ r.ravel()
-            right[-1] += (w * r).sum()
-            own[:, c, c] = (w * jd * jd).sum(1)
-            own[:, c, 3] = own[:, 3, c] = (w * jd * js).sum(1)
-            own[:, 3, 3] += (w * js * js).sum(1)
-            own_right[:, c] = (w * jd * r).sum(1)
-            own_right[:, 3] += (w * js * r).sum(1)
-            cross[:, c, block] = np.matmul(jd[:, None], weighted)[:, 0]
-            cross[:, 3, block] = np.matmul(js[:, None], weighted)[:, 0]
-            cross[:, c, -1] = (w * jd).sum(1)
-            cross[:, 3, -1] += (w * js).sum(1)
-        return cls(system, right, own, own_right, cross)
+        system[-1, -1], right[-1] = weight.sum(dtype=np.float64), (weight * residual).sum(dtype=np.float64)
+        diffuse_cross, specular_cross = np.empty((3, n, k), np.float32), np.empty((n, 3 * k), np.float32)
+        root = np.sqrt(weight)
+        for each in rows.blocks:
+            texels, part = each.texels, each.rows
+            of = rows.texel[part]
+            glossy = specular_albedo[of, None] * rows.specular[part]
+            slope = np.empty_like(glossy)
+            for c in range(3):
+                block, r = slice(c * k, (c + 1) * k), root[part, c]
+                np.multiply(diffuse[of, c, None], rows.diffuse[part], out=slope)
+                slope += glossy
+                slope *= r[:, None]
+                system[block, block] += slope.T @ slope
+                system[block, -1] += r @ slope
+                right[block] += (r * residual[part, c]) @ slope
+                diffuse_cross[c, texels] = each.sums(r * diffuse_light[part, c], slope)
+                specular_cross[texels, block] = each.sums(r * specular_light[part, c], slope)
+        system[-1, :-1] = system[:-1, -1]
+        own_right = np.concatenate([dr, sr.sum(1, keepdims=True)], axis=1)
+        ambient = np.concatenate([da, sa.sum(1, keepdims=True)], axis=1)
+        return cls(system, right, dd, ds, ss.sum(1), own_right, diffuse_cross, specular_cross, ambient)
 
     def add_priors(
         self,
@@ -165,43 +277,99 @@ class LightingEquations:
         """
         k = len(stiffness)
         scale = float(np.trace(self.system[:-1, :-1])) / (3 * k)
-        for c in range(3):
-            pull = priors.albedo * float(np.median(self.own[:, c, c]))
-            self.own[:, c, c] += pull
-            self.own_right[:, c] += pull * (albedo[:, c] - diffuse[:, c])
-        pull = max(priors.specular * float(np.median(self.own[:, 3, 3])), specular_pull(expected, sigma))
-        self.own[:, 3, 3] += pull
-        self.own_right[:, 3] += pull * (expected - specular_albedo)
+        pull = priors.albedo * np.median(self.diffuse, axis=0)
+        self.diffuse += pull
+        self.own_right[:, :3] += pull * (albedo - diffuse)
+        strong = max(priors.specular * float(np.median(self.specular)), specular_pull(expected, sigma))
+        self.specular += strong
+        self.own_right[:, 3] += strong * (expected - specular_albedo)
         radiance = sphere_basis @ light
         for c in range(3):
             block = slice(c * k, (c + 1) * k)
             negative = radiance[:, c] < 0
             rows = sphere_basis[negative]
-            pull = priors.negative * scale * 4.0 * np.pi / len(sphere_basis)
+            force = priors.negative * scale * 4.0 * np.pi / len(sphere_basis)
             smooth = priors.roughness * scale * stiffness
-            self.system[block, block] += pull * rows.T @ rows + np.diag(smooth)
-            self.right[block] -= pull * rows.T @ radiance[negative, c] + smooth * light[:, c]
+            self.system[block, block] += force * rows.T @ rows + np.diag(smooth)
+            self.right[block] -= force * rows.T @ radiance[negative, c] + smooth * light[:, c]
 
-    def eliminate(self, count: int, damping: float) -> tuple[NDArray, NDArray, NDArray]:
-        """Inverse blocks of the texels (n, 4, 4), and what remains for the first ``count`` lights."""
-        diagonal = np.einsum("nii->ni", self.own)
-        floor = 1e-6 * float(np.median(diagonal)) + 1e-12
-        damped = self.own + np.eye(4, dtype=np.float32) * (damping * diagonal + floor)[:, :, None]
-        inverse = np.linalg.inv(damped)
-        cross = self.cross[:, :, :count]
-        eliminated = np.matmul(inverse, cross)
+    def eliminate(self, with_ambient: bool, damping: float) -> Eliminated:
+        """What remains for the light, and for ambient if asked for, once the texels follow it."""
+        k = self.diffuse_cross.shape[2]
+        floor = 1e-6 * float(np.median(np.concatenate([self.diffuse, self.specular[:, None]], axis=1))) + 1e-12
+        pivot = (1.0 + damping) * self.diffuse + floor
+        slope = self.both / pivot
+        last = (1.0 + damping) * self.specular + floor - (slope * self.both).sum(1)
+        size = len(self.right)
+        taken, right = np.zeros((size, size)), self.right.copy()
+        own = self.own_right[:, :3] / pivot
+        left = (self.own_right[:, 3] - (slope * self.own_right[:, :3]).sum(1)) / last
+        across = self.ambient_cross[:, 3] - (slope * self.ambient_cross[:, :3]).sum(1)
+        taken[-1, -1] = (self.ambient_cross[:, :3] ** 2 / pivot).sum() + (across**2 / last).sum()
+        right[-1] -= (own * self.ambient_cross[:, :3]).sum() + left @ across
+        root = np.sqrt(last).astype(np.float32)[:, None]
+        rest = np.empty_like(self.specular_cross)
+        for c in range(3):
+            block, cross = slice(c * k, (c + 1) * k), self.diffuse_cross[c]
+            np.multiply(cross, -slope[:, c, None].astype(np.float32), out=rest[:, block])
+            rest[:, block] += self.specular_cross[:, block]
+            part = cross / np.sqrt(pivot[:, c, None]).astype(np.float32)
+            taken[block, block] = part.T @ part
+            sums = np.stack([own[:, c], self.ambient_cross[:, c] / pivot[:, c]]).astype(np.float32) @ cross
+            right[block] -= sums[0]
+            taken[block, -1] = sums[1]
+        sums = np.stack([left, across / last]).astype(np.float32) @ rest
+        right[:-1] -= sums[0]
+        taken[:-1, -1] += sums[1]
+        rest /= root
+        taken[:-1, :-1] += rest.T @ rest
+        taken[-1, :-1] = taken[:-1, -1]
+        count = size if with_ambient else size - 1
         own_diagonal = np.diag(self.system)[:count]
-        reduced = self.system[:count, :count] - cross.reshape(-1, count).T @ eliminated.reshape(-1, count)
+        reduced = self.system[:count, :count] - taken[:count, :count]
         reduced += np.diag(damping * own_diagonal + 1e-8 * own_diagonal.mean())
-        return inverse, reduced, self.right[:count] - np.einsum("nak,na->k", eliminated, self.own_right)
+        return Eliminated(pivot, slope, last, reduced, right[:count])
 
     def solve(self, with_ambient: bool, damping: float) -> LightingStep:
         """Eliminate the texels, solve for lighting and ambient, and substitute back."""
-        size = len(self.right)
-        count = size if with_ambient else size - 1
-        inverse, reduced, right = self.eliminate(count, damping)
-        move = np.linalg.solve(reduced, right)
-        left = self.own_right - self.cross[:, :, :count] @ move.astype(np.float32)
-        own_move = np.einsum("nab,nb->na", inverse, left)
-        light = move[: size - 1].reshape(3, -1).T
-        return LightingStep(light, float(move[-1]) if with_ambient else 0.0, own_move[:, :3], own_move[:, 3])
+        remaining = self.eliminate(with_ambient, damping)
+        move = np.linalg.solve(remaining.reduced, remaining.right)
+        size = len(self.right) - 1
+        ambient = float(move[size]) if with_ambient else 0.0
+        light = np.asarray(move[:size], dtype=np.float64).reshape(3, -1)
+        left = self.own_right - ambient * self.ambient_cross
+        single = light.astype(np.float32)
+        for c in range(3):
+            left[:, c] -= self.diffuse_cross[c] @ single[c]
+        left[:, 3] -= self.specular_cross @ single.ravel()
+        own = remaining.follow(left).astype(np.float32)
+        return LightingStep(light.T, ambient, own[:, :3], own[:, 3])
+
+
+@dataclass(frozen=True)
+class Eliminated:
+    """`LightingEquations` with the texels eliminated.
+
+    Attributes
+    ----------
+    pivot, slope : (n, 3), last : (n,)
+        Of the texels' blocks: curvature of the diffuse albedos, how they follow the specular one, and its curvature
+        once they do.
+    reduced : (C, C), right : (C,)
+        What remains for lighting and ambient.
+    """
+
+    pivot: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    last: NDArray[np.float64]
+    reduced: NDArray[np.float64]
+    right: NDArray[np.float64]
+
+    def follow(self, right: NDArray) -> NDArray[np.float64]:
+        """Albedos (n, 4) that right-hand sides (n, 4) ask for."""
+        specular = (right[:, 3] - (self.slope * right[:, :3]).sum(1)) / self.last
+        return np.concatenate([right[:, :3] / self.pivot - self.slope * specular[:, None], specular[:, None]], axis=1)
+
+    def inverse(self) -> NDArray[np.float64]:
+        """(n, 4, 4) inverse blocks of the texels."""
+        return np.stack([self.follow(np.broadcast_to(unit, (len(self.last), 4))) for unit in np.eye(4)], axis=2)

@@ -7,12 +7,14 @@ were left out are compared with what should be seen there. Cameras that are not 
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.formation import form_image
+from mifit.core.threads import threads
 from mifit.stages.observations import Observations
 from mifit.stages.reflectance.lighting import bounded_weight, solve_lighting
 from mifit.stages.reflectance.lighting_equations import LightingProblem
@@ -69,12 +71,12 @@ def predict(seen: Observations, problem: LightingProblem, specular: float, robus
         As in `solve_lighting`.
     """
     name, groups = folds(seen)
-    errors = []
-    for out in groups:
+
+    def error(out: NDArray[np.bool_]) -> float | None:
         rest = replace(problem, weight=np.where(out[:, None], np.float32(0.0), problem.weight))
         known = np.any((rest.weight > 0).any(axis=2) & ~rest.clipped, axis=1)
         if known.sum() < LEAST:
-            continue  # a camera that sees next to nothing can't predict the others
+            return None  # a camera that sees next to nothing can't predict the others
         solved = solve_lighting(rest, specular=specular, robust=robust, iterations=ITERATIONS)
         judged = replace(
             problem,
@@ -92,6 +94,9 @@ def predict(seen: Observations, problem: LightingProblem, specular: float, robus
         )
         residual = judged.colour - shown
         total = float(judged.weight.sum())
-        if total > 0:
-            errors.append(float(np.sqrt((bounded_weight(judged, residual) * residual**2).sum() / total)))
+        return float(np.sqrt((bounded_weight(judged, residual) * residual**2).sum() / total)) if total > 0 else None
+
+    # What is left out in turn is as much work each time and knows nothing of the others.
+    with ThreadPoolExecutor(threads()) as pool:
+        errors = [found for found in pool.map(error, groups) if found is not None]
     return Prediction(name, tuple(errors)) if errors else None
