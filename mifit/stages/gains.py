@@ -96,14 +96,15 @@ def estimate_gains(
     """
     progress("Camera gains", 0, ROUNDS)
 
-    def observe(gains: Gains) -> list[Observations]:
-        surface = Surface(capture, model, replace(geometry, gains=gains), cameras, MAP_SIZE)
+    surface = Surface(capture, model, replace(geometry, gains={}), cameras, MAP_SIZE)
+
+    def observe(surface: Surface) -> list[Observations]:
         return [surface.observe(part) for part in surface.chunks()]
 
-    log_gain, known = _from_ratios(observe({}), len(cameras))
+    log_gain, known = _from_ratios(observe(surface), len(cameras))
     if len(known) > 1:
         # Which observations agree, and so are trusted, shows only when the cameras are about equal.
-        parts = observe(_gains(log_gain, known, cameras))
+        parts = observe(surface.exposed(_gains(log_gain, known, cameras)))
         left, _ = _from_ratios(parts, len(cameras))
         seen = _shared_points(parts, POINTS, np.random.default_rng(seed))
         albedo = interpolate(geometry.vertex_albedo, model.faces, seen.face, seen.barycentric)

@@ -9,7 +9,7 @@ no more than the probability that it shows the point (`stages.trust`).
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from mifit.appearance.occlusion import OccludingMesh
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate
-from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
+from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, bilinear, rasterize_uv
 from mifit.errors import InputError
-from mifit.stages.trust import agreement, background, elsewhere, outline_distance
+from mifit.stages.shown import face_pixels, footprint, texel_area
+from mifit.stages.trust import agreement, background, elsewhere
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -32,10 +33,6 @@ CHUNK_VALUES = 1 << 22
 """Texels x images that are held at a time."""
 GRAZING = (0.1, 0.3)
 """Cosines between which the weight of an observation fades in: below, interpolated normals and footprints mislead."""
-EDGE_STEP = 0.01
-"""Second difference of depth, relative to the diagonal of the mesh, that makes a pixel part of an occlusion edge."""
-EDGE_PIXELS = 2.0
-"""Distance to an occlusion edge within which pixels hold colours of both sides."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +174,7 @@ class Surface:
             raise InputError(
                 f"found {len(cameras)} cameras and {len(geometry.timesteps)} timesteps, expected 1 or more of both"
             )
-        from mifit.render.gbuffer import SurfaceScene
+        from mifit.render.occluders import occluding_mesh
 
         shown = model.mapped if whole else model.face_mask
         self.texels: TexelMap = rasterize_uv(model.uv, model.faces_uv, size, shown) if texels is None else texels
@@ -188,19 +185,20 @@ class Surface:
         self.faces = model.faces
         self.vertices = [np.asarray(v, dtype=np.float64) for v in geometry.vertices]
         self.normals = [vertex_normals(v, model.faces) for v in self.vertices]
-        self.scenes = [SurfaceScene(v, model.faces) for v in self.vertices]
-        self.meshes = tuple(OccludingMesh(scene) for scene in self.scenes)
-        texel_area = _texel_area(model.uv, model.faces_uv, size)
+        self.meshes: tuple[OccludingMesh, ...] = tuple(occluding_mesh(v, model.faces) for v in self.vertices)
+        self.scenes = [mesh.scene for mesh in self.meshes]
+        area = texel_area(model.uv, model.faces_uv, size)
         self._kept: Observations | None = None
         self._images: list[_Image] = []
         for i, timestep in enumerate(geometry.timesteps):
             for k, name in enumerate(cameras):
                 camera, frame = capture.camera(name), capture.frame(name, timestep)
-                covered, edge, outline = _face_pixels(self.scenes[i], self.vertices[i], model.faces, shown, camera)
+                covered, edge, outline, facial = face_pixels(
+                    self.scenes[i], self.vertices[i], model.faces, shown, camera, model.face_mask
+                )
                 colour = frame.image / geometry.gain(name)
                 unusable = edge | ~covered | ~frame.valid | ~np.isfinite(frame.image).all(-1)
                 if whole:
-                    facial = _face_pixels(self.scenes[i], self.vertices[i], model.faces, model.face_mask, camera)[0]
                     unusable |= background(frame.image, outline > 0, facial)
                 self._images.append(
                     _Image(
@@ -210,7 +208,7 @@ class Surface:
                         np.where(unusable[..., None], 0, colour).astype(np.float32),
                         unusable.astype(np.float32),
                         frame.clipped.astype(np.float32),
-                        _footprint(self.vertices[i], model.faces, camera, texel_area),
+                        footprint(self.vertices[i], model.faces, camera, area),
                         (outline * (model.unit_mm / geometry.scale)).astype(np.float32),
                     )
                 )
@@ -238,6 +236,16 @@ class Surface:
             for image, left_out in zip(self._images, hidden, strict=True)
         ]
         return less
+
+    def exposed(self, gains: Mapping[str, Sequence[float]]) -> Surface:
+        """The same surface with the images over gains of the cameras, where it was made without."""
+        other = copy.copy(self)
+        other._kept, other.geometry = None, replace(self.geometry, gains=gains)
+        other._images = [
+            replace(image, colour=(image.colour / other.geometry.gain(image.camera.name)).astype(np.float32))
+            for image in self._images
+        ]
+        return other
 
     @property
     def image_count(self) -> int:
@@ -367,33 +375,3 @@ class Surface:
             depth = np.sum((point[rows] - camera.position) * camera.rotation[2], axis=1)
             wrong[rows] = elsewhere(cosine[rows], bilinear(image.outline, x, y) * depth / camera.fx)
         return colour, weight, clipped, wrong
-
-
-def _texel_area(uv: NDArray, faces_uv: NDArray, size: int) -> NDArray[np.float64]:
-    """(F,) area of each face in texels."""
-    a, b, c = (uv[faces_uv[:, i]].astype(np.float64) * size for i in range(3))
-    return 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
-
-
-def _footprint(vertices: NDArray, faces: NDArray, camera: Camera, texel_area: NDArray) -> NDArray[np.float32]:
-    """(F,) pixels that a texel of each face covers; 0 for faces that face away or lie behind the camera."""
-    pixel = camera.project(vertices)[faces]
-    a, b, c = (pixel[:, i] for i in range(3))
-    # Image rows run down, so a face that shows its front has a negative area here.
-    area = -0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
-    area = np.where(np.isfinite(area), np.maximum(area, 0.0), 0.0)
-    return (area / np.maximum(texel_area, 1e-9)).astype(np.float32)
-
-
-def _face_pixels(
-    scene, vertices: NDArray, faces: NDArray, shown: NDArray, camera: Camera
-) -> tuple[NDArray, NDArray, NDArray]:
-    """Pixels that show the front of the faces (F,) ``shown``, pixels at occlusion edges, and pixels to the outline."""
-    buffer = scene.gbuffer(camera)
-    face = buffer.face
-    toward = camera.position - vertices[faces[:, 0]]
-    front = np.sum(face_cross(vertices, faces) * toward, axis=1) > 0
-    covered = (face >= 0) & (front & shown)[np.maximum(face, 0)]
-    step = EDGE_STEP * float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    outline = outline_distance(np.where((face >= 0) & front[np.maximum(face, 0)], buffer.depth, np.inf), step)
-    return covered, outline < EDGE_PIXELS, outline

@@ -154,6 +154,31 @@ def test_the_background_beside_a_mesh_that_is_too_wide_counts_for_little(variant
     assert surface.quality()[edge] < surface.quality()[middle]
 
 
+def test_images_over_gains_are_those_of_a_surface_that_has_them(variant):
+    from mifit.stages.observations import Surface
+
+    shot, model, gains = capture((0.0, 0.3)), quad(), {"left": (1.0, 1.0, 1.0), "right": (1.25, 0.9, 1.1)}
+    plain = Surface(shot, model, geometry(), ("left", "right"), SIZE)
+    plain.observe(np.arange(len(plain)))
+    found = plain.exposed(gains).observe(np.arange(len(plain)))
+    wanted = Surface(shot, model, replace(geometry(), gains=gains), ("left", "right"), SIZE).observe(
+        np.arange(len(plain))
+    )
+    for name in ("colour", "weight", "right", "clipped"):
+        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-5)
+    assert not np.allclose(found.colour, plain.observe(np.arange(len(plain))).colour)
+
+
+def test_equal_meshes_are_made_and_their_shadows_traced_once(variant):
+    from mifit.stages.observations import Surface
+
+    shot, model = capture(), quad()
+    first, second = (Surface(shot, model, geometry(), ("left",), SIZE) for _ in range(2))
+    assert second.meshes[0] is first.meshes[0]
+    moved = Surface(shot, model, geometry(VERTICES + 0.1), ("left",), SIZE)
+    assert moved.meshes[0] is not first.meshes[0]
+
+
 def test_only_named_cameras_are_read(variant):
     shot = capture((-0.3, 0.3, 0.0))
     observe(shot, cameras=("left", "right"))
