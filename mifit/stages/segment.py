@@ -110,25 +110,33 @@ def consensus(surface: Surface, seed: int = 0) -> Consensus:
         levels.append(np.log(np.maximum(seen.colour, DARKEST)) @ OPPONENT.T.astype(np.float32))
         weights.append(seen.measured)
         bases.append(basis(seen.image_normal, 3).astype(np.float32))
-    level, weight, waves = np.concatenate(levels), np.concatenate(weights), np.concatenate(bases)
+    # Channels first: medians and sums along three neighbours in memory are slow.
+    level, waves = (np.concatenate(parts).reshape(-1, parts[0].shape[-1]).T.copy() for parts in (levels, bases))
+    weight = np.concatenate(weights)
+    level, waves = level.reshape(3, *weight.shape), waves.reshape(9, *weight.shape)
     seen_at = weight > 0
     shading = np.zeros((9, 3))
     share, deviation = np.ones_like(weight), FLOOR
-    centre = np.zeros((len(facial), 3), np.float32)
+    centre = np.zeros((3, len(facial)), np.float32)
     rng = np.random.default_rng(seed)
     places = np.argwhere(seen_at)
     for _ in range(ROUNDS if len(places) else 0):
-        flat = level - (waves @ shading).astype(np.float32)
-        centre = np.stack([_median(flat[..., k], weight * share) for k in range(3)], axis=-1)
-        departure = flat - centre[:, None]
-        deviation = np.maximum(1.4826 * np.median(np.abs(departure[seen_at].astype(np.float64)), axis=0), FLOOR)
-        share = (1.0 / (1.0 + ((departure / deviation) ** 2).mean(axis=-1))).astype(np.float32)
+        flat = level - np.tensordot(shading.T.astype(np.float32), waves, 1)
+        centre = np.stack([_median(channel, weight * share) for channel in flat])
+        departure = flat - centre[..., None]
+        off = [1.4826 * float(np.median(np.abs(channel[seen_at]))) for channel in departure]
+        deviation = np.maximum(off, FLOOR)
+        departure /= deviation.astype(np.float32)[:, None, None]
+        share = 1.0 / (1.0 + np.einsum("kij,kij->ij", departure, departure) / np.float32(3))
         i, j = places[rng.choice(len(places), min(SAMPLES, len(places)), replace=False)].T
-        scale = (share[i, j] * np.sqrt(weight[i, j]))[:, None]
-        rows = waves[i, j] * scale
+        scale = (share[i, j] * np.sqrt(weight[i, j])).astype(np.float64)
+        rows = (waves[:, i, j] * scale).T
         damping = SMOOTH * float(scale.sum()) * np.eye(9)
-        shading = np.linalg.solve(rows.T @ rows + damping, rows.T @ ((level[i, j] - centre[i]) * scale))
+        shading = np.linalg.solve(
+            rows.T @ rows + damping, rows.T @ ((level[:, i, j] - centre[:, i]) * scale).T.astype(np.float64)
+        )
         shading[0] = 0.0  # a constant belongs to the colours
+    centre = centre.T
     known = seen_at.any(axis=1)
     size = surface.texels.size
     colour, mask = np.zeros((size * size, 3), np.float32), np.zeros(size * size, np.float32)
