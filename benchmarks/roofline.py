@@ -278,16 +278,15 @@ def stage2(capture: Capture, model: MorphableModel, truth: Any, size: int) -> di
     def iterations(count: int) -> float:
         return shortest(lambda: solve_lighting(problem, iterations=count, tolerance=0.0), 3)
 
-    n, j, k = problem.specular.shape
-    system = 3.0 * k
+    n, _, k = problem.specular.shape
+    m, system = int(problem.seen.sum()), 3.0 * k
     once = (iterations(8) - iterations(2)) / 6
     lighting = Kernel(
         once,
-        4.0 * (2 * n * j * k + 2 * 3 * n * j + 2 * 4 * n * system),
+        4.0 * (2 * m * k + 2 * 3 * m + 2 * 2 * n * system),
         # reflections; rows; symmetric products; coupling; elimination (symmetric); dense solve
-        2 * 2 * 3 * n * j * k + 9 * n * j * k + 3 * n * j * k**2 + 12 * n * j * k + 32 * n * system
-        + 4 * n * system**2 + system**3 / 3,
-    )  # fmt: skip
+        2 * 2 * 3 * m * k + 9 * m * k + 3 * m * k**2 + 12 * m * k + 3 * n * k**2 + n * system**2 + system**3 / 3,
+    )
     whole = surface.observe(np.arange(len(surface)))
     shade, glint = forward.shade(whole, np.eye(100, 3) * 3.0)
     blocks = TexelSystems.accumulate(
