@@ -45,6 +45,5 @@ def specular_matrix(normals, view, radiance, exponent, model, diffuse_transfer=N
 
 def light_columns(normals, view, visible, light, exponent, fresnel=None):
     """Diffuse and specular radiance (N,) at unit albedo per unit of a light's colour."""
-    return appearance(np.zeros((1, 3)), exponent, "prefiltered", True, fresnel).light_transfer(
-        light, normals, view, visible
-    )
+    look = appearance(np.zeros((1, 3)), exponent, "prefiltered", True, fresnel)
+    return look.light_transfer(normals, view)(light, visible)

@@ -6,6 +6,7 @@ at unit albedo from smooth and from compact lights. `form_image` is the only pla
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -23,6 +24,7 @@ from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion
 from mifit.errors import InputError
 
 OPEN = Occlusion()
+LightTransfer = Callable[[Light, NDArray[np.uint32]], tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 
 def form_image(ambient: Any, albedo: Any, diffuse: Any, specular_albedo: Any, specular: Any) -> Any:
@@ -146,22 +148,27 @@ class Appearance:
         both = stored([*diffuse, *specular], scene.count)
         return both[:, : len(diffuse)], both[:, len(diffuse) :]
 
-    def light_transfer(
-        self, light: Light, normals: ArrayLike, view: ArrayLike, visible: NDArray, points: ArrayLike | None = None
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Diffuse and specular radiance (N,) at unit albedo per unit of a compact light's colour.
+    def light_transfer(self, normals: ArrayLike, view: ArrayLike, points: ArrayLike | None = None) -> LightTransfer:
+        """What compact lights, one after the other, send off points: parameters as in `shade`.
 
-        ``visible`` (N,) uint32 tells which of the light's samples each point sees (``Light.visible``).
+        Returns
+        -------
+        callable
+            ``(light, visible)`` -> diffuse and specular radiance (N,) at unit albedo per unit of the light's colour;
+            ``visible`` (N,) uint32 tells which of the light's samples each point sees (``Light.visible``).
         """
         import mitsuba as mi
 
-        scene = _Scene(
-            Appearance(self.model, Illumination.dark(1), self.lobe), normals, view, Occlusion(), points, shadows=False
-        )
-        if not scene.count:
-            return np.zeros(0, np.float32), np.zeros(0, np.float32)
-        both = stored(list(scene.light(light, mi.UInt(visible))(scene.n, scene.v)), scene.count)
-        return both[:, 0], both[:, 1]
+        dark = Appearance(self.model, Illumination.dark(1), self.lobe)
+        scene = _Scene(dark, normals, view, Occlusion(), points, shadows=False)
+
+        def transfer(light: Light, visible: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+            if not scene.count:
+                return np.zeros(0, np.float32), np.zeros(0, np.float32)
+            both = stored(list(scene.light(light, mi.UInt(visible))(scene.n, scene.v)), scene.count)
+            return both[:, 0], both[:, 1]
+
+        return transfer
 
     def _smooth(self, scene: _Scene) -> Shade:
         return lambda n, v: self.model.shade(n, v, scene.lobe, scene.coefficients, scene.shadowed)

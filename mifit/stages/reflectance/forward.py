@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from mifit.appearance.models import ShadingModel
 from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion
 from mifit.stages.observations import Observations
 
+LightColumns = Callable[..., tuple[NDArray[np.float32], NDArray[np.float32]]]
 CHUNK = 1 << 19
 """Points shaded at a time: bounds the memory of the basis functions."""
 
@@ -124,18 +126,23 @@ class Forward:
         ]
         return np.stack(steps, axis=1)
 
-    def light_columns(
-        self, seen: Observations, light: Light, visible: NDArray[np.uint32] | None = None
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Diffuse and specular radiance (N, J) at unit albedo per unit of a compact light's colour.
+    def light_columns(self, seen: Observations) -> LightColumns:
+        """Diffuse and specular radiance (N, J) at unit albedo per unit of a compact light's colour, light after light.
 
         Shadows are traced unless (N, T) bits tell which of the light's samples the texels see.
         """
-        if visible is None:
-            steps = [light.visible(m.scene, seen.point[:, t], seen.normal[:, t]) for t, m in enumerate(self.meshes)]
-            visible = np.stack(steps, axis=1)
-        found = self.appearance.light_transfer(light, *_flat(seen), visible[:, seen.step].ravel(), _points(seen))
-        return found[0].reshape(seen.weight.shape), self._gloss(found[1].reshape(seen.weight.shape))
+        transfer = self.appearance.light_transfer(*_flat(seen), _points(seen))
+
+        def columns(
+            light: Light, visible: NDArray[np.uint32] | None = None
+        ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+            if visible is None:
+                steps = [light.visible(m.scene, seen.point[:, t], seen.normal[:, t]) for t, m in enumerate(self.meshes)]
+                visible = np.stack(steps, axis=1)
+            found = transfer(light, visible[:, seen.step].ravel())
+            return found[0].reshape(seen.weight.shape), self._gloss(found[1].reshape(seen.weight.shape))
+
+        return columns
 
 
 def _flat(seen: Observations) -> tuple[NDArray, NDArray]:

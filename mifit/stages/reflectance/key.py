@@ -16,7 +16,7 @@ from mifit.appearance.formation import form_image
 from mifit.appearance.illumination import DistantLight
 from mifit.appearance.reception import fibonacci_sphere
 from mifit.stages.observations import Observations
-from mifit.stages.reflectance.forward import Forward
+from mifit.stages.reflectance.forward import Forward, LightColumns
 from mifit.stages.reflectance.lighting import LightingSolution, bounded_weight, linearize
 from mifit.stages.reflectance.lighting_equations import LightingProblem
 
@@ -46,6 +46,8 @@ class Candidates:
         n texels in J images.
     forward : Forward
         The model without a compact light.
+    columns : callable
+        What a compact light sends off the texels, `Forward.light_columns`.
     rows : three of (n * J, K)
         Derivative of the image by the lighting, per channel.
     weight, residual, diffuse_light, specular_light : (n, J, 3)
@@ -58,6 +60,7 @@ class Candidates:
 
     seen: Observations
     forward: Forward
+    columns: LightColumns
     rows: list[NDArray]
     weight: NDArray
     residual: NDArray
@@ -99,9 +102,11 @@ class Candidates:
         )
         remaining = normal.eliminate(False, 1e-4)
         rows = [(x[..., c : c + 1] * plain.diffuse + y * plain.specular).reshape(-1, k) for c in range(3)]
+        alone = forward.with_lights(())
         return cls(
             seen,
-            forward.with_lights(()),
+            alone,
+            alone.light_columns(seen),
             rows,
             weight,
             residual,
@@ -123,7 +128,7 @@ class Candidates:
         Its shadows are traced, unless bits tell which directions of its disc the texels (n, T) see.
         """
         light = DistantLight(direction, radius, np.zeros(3))
-        by_diffuse, by_specular = self.forward.light_columns(self.seen, light, open_sky)
+        by_diffuse, by_specular = self.columns(light, open_sky)
         k = self.rows[0].shape[1]
         own = np.zeros((len(by_diffuse), 4, 3), np.float32)
         system, right, across = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3 * k))
