@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 import mifit
 from mifit.commands import arguments
 from mifit.console import drop_chatter
+from mifit.core.allocator import keep_freed_memory
 from mifit.core.files import FULL
 from mifit.core.limits import MAX_RENDERED_PIXELS, MAX_SAMPLES, MAX_SEED
 from mifit.errors import InputError, MifitError
@@ -333,8 +334,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         if word.startswith("--") and word.endswith("=--"):  # argparse would make an empty list of it
             parser.error(f"argument {word[:-3]}: found '--', expected a value")
     arguments = parser.parse_args(argv)
-    if argv is None and not arguments.debug:
-        drop_chatter()
+    if argv is None:
+        keep_freed_memory()
+        if not arguments.debug:
+            drop_chatter()
     try:
         if arguments.threads:
             from mifit.core.threads import set_threads
