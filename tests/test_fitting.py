@@ -159,7 +159,8 @@ def test_the_demo_shows_a_picture_of_the_first_step_and_reports_once(variant, tm
     result, reports, events = ball_result(), [], []
     early = dataclasses.replace(result, reflectance=None, normals=None, mesh=None)
 
-    def fit_into(folder, capture, model, watch, **options):
+    def fit_into(folder, capture, model, watch, config, **options):
+        assert config.reflectance.texture_size <= commands.fits.DEMO["width"]  # a texel shows in a pixel of its own
         ownership.claim(folder)
         watch(early)
         events.append((folder / "first.png").read_bytes())
