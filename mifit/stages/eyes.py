@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.estimate import GeometryEstimate
-from mifit.core.mesh import face_cross, vertex_normals
+from mifit.core.mesh import vertex_normals
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs
 
@@ -20,6 +20,8 @@ SEARCH_MM = 12.0
 """Depth of an eyeball outside the skin up to which it is found."""
 GAP_MM = 0.5
 """Distance that is left between lid and eyeball."""
+BLOCK = 1 << 17
+"""Rays times faces that are looked at together: they stay in the cache."""
 PASSES = 2
 """Vertices that have moved have other normals, along which a few more stand out."""
 
@@ -53,22 +55,24 @@ def behind_lids(model: MorphableModel, geometry: GeometryEstimate) -> GeometryEs
 
 
 def _depth_outside(points: NDArray, normals: NDArray, vertices: NDArray, faces: NDArray, reach: float) -> NDArray:
-    """(n,) distance from points along minus their normals to the deepest front of the faces within reach; 0: none."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    e1, e2, outward = b - a, c - a, face_cross(vertices, faces)
+    """(n,) distance from points along minus their normals to the deepest front of the faces within reach; 0: none.
+
+    Moeller and Trumbore (1997) for rays from p along -n, its triple products taken apart into what belongs to the ray
+    and what to the face: all rays against all faces are products of matrices.
+    """
+    centre = points.mean(axis=0)  # far from the origin the products would cancel
+    points = points - centre
+    a, b, c = (vertices[faces[:, i]] - centre for i in range(3))
+    e1, e2 = b - a, c - a
+    outward, across, along = np.cross(e1, e2), np.cross(e2, a), np.cross(a, e1)
+    turned, height = np.cross(normals, points), (a * outward).sum(axis=1)
     depth = np.zeros(len(points))
-    for i, (p, n) in enumerate(zip(points, normals, strict=True)):
-        # Moeller and Trumbore (1997), for the ray from p along -n.
-        h = np.cross(-n, e2)
-        det = np.einsum("fk,fk->f", e1, h)
-        s = p - a
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = np.einsum("fk,fk->f", s, h) / det
-            q = np.cross(s, e1)
-            v = q @ -n / det
-            t = np.einsum("fk,fk->f", e2, q) / det
-        front = outward @ n > 0
-        hit = front & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < reach)
-        if hit.any():
-            depth[i] = t[hit].max()
+    step = max(1, BLOCK // max(len(faces), 1))
+    for rays in (slice(at, at + step) for at in range(0, len(points), step)):
+        n, p, m = normals[rays], points[rays], turned[rays]
+        det = n @ outward.T
+        u, v = m @ e2.T + n @ across.T, n @ along.T - m @ e1.T
+        t = p @ outward.T - height
+        hit = (det > 0) & (u >= 0) & (v >= 0) & (u + v <= det) & (t > 0) & (t < reach * det)
+        depth[rays] = np.divide(t, det, out=np.zeros_like(t), where=hit).max(axis=1, initial=0.0)
     return depth
