@@ -154,6 +154,25 @@ def test_auto_takes_it_where_it_explains_the_images(walled):
     assert choice["chosen"] == "keyed"
 
 
+def test_it_is_looked_for_beside_smoother_lighting_too(walled, monkeypatch):
+    from mifit.stages.reflectance import choice
+    from mifit.stages.reflectance.lighting_equations import PRIORS
+
+    search, tried = choice._with_light, []
+
+    def hidden_at_first(trials, chosen, priors):
+        tried.append(priors.roughness / PRIORS.roughness)
+        return None if priors is PRIORS else search(trials, chosen, priors)
+
+    monkeypatch.setattr(choice, "_with_light", hidden_at_first)
+    part = replace(CONFIG, texture_size=24, shading="auto")
+    estimate = infer_reflectance(walled, walled.model, walled.geometry, ("left", "right"), part)
+    assert tried == [1.0, 10.0]
+    assert estimate.report.details["shading"]["chosen"] == "keyed"
+    (key,) = estimate.illumination.lights
+    assert np.degrees(np.arccos(key.direction @ KEY.direction)) < 2.0
+
+
 def test_without_a_compact_light_none_is_made_up(variant):
     dome = turning_dome(steps=2)
     estimate = infer_reflectance(dome, dome.model, dome.geometry, ("left", "right"), replace(CONFIG, texture_size=24))

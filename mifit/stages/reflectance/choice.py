@@ -18,7 +18,7 @@ from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.key import RADII, STEPS, TEXELS, Candidates, find_lights, search
 from mifit.stages.reflectance.lighting import LightingSolution, solve_lighting
-from mifit.stages.reflectance.lighting_equations import LightingProblem
+from mifit.stages.reflectance.lighting_equations import PRIORS, LightingPriors, LightingProblem
 from mifit.stages.reflectance.prediction import Prediction, predict
 from mifit.stages.reflectance.priors import EXPONENT, NORMAL_REFLECTANCE
 
@@ -38,6 +38,9 @@ FAINT = 0.2
 """Irradiance of a compact light, relative to that of all other light: below, it is taken for a flaw of the model."""
 START_ITERATIONS = 5
 """Gauss-Newton iterations where they are only a start: the objective over all texels is minimised afterwards."""
+SMOOTH = LightingPriors(roughness=10.0 * PRIORS.roughness)
+"""Where no compact light helps beside lighting with the usual priors, one is looked for beside smoother lighting: on a
+mesh that is millimetres off, ten bands twist themselves until they leave nothing for it to explain."""
 TRIAL_ITERATIONS = 8
 """Gauss-Newton iterations of a way to explain the images that is only compared with others."""
 
@@ -109,13 +112,15 @@ def choose_lighting(
         chosen = trials.best_exponent(chosen)
     why = "as configured"
     if auto or way.lights:
-        lit = _with_light(trials.seen, chosen.forward, chosen.found, trials.albedo, config)
-        if lit is None:
-            why = "no compact light explains enough"
-        else:
-            keyed = trials.add("keyed", lit)
+        why = "no compact light explains enough"
+        for priors in (PRIORS, SMOOTH):
+            lit = _with_light(trials, chosen, priors)
+            if lit is None:
+                continue
+            keyed, why = trials.add("keyed", lit), "as configured"
             if not auto or keyed.error < (1.0 - MARGIN) * chosen.error:
                 chosen = trials.best_exponent(keyed) if free else keyed
+                break
     if auto:
         why = f"predicts images left out better than others by more than {MARGIN:.0%}, or is the likeliest beforehand"
         if chosen.prediction is not None:
@@ -211,31 +216,28 @@ class _Trials:
         return {"residuals": residuals, "predicted": predicted, "left_out": left_out}
 
 
-def _with_light(
-    seen: Observations,
-    forward: Forward,
-    found: LightingSolution,
-    albedo: NDArray,
-    config: ReflectanceConfig,
-) -> Forward | None:
+def _with_light(trials: _Trials, chosen: Trial, priors: LightingPriors) -> Forward | None:
     """A model with a compact light where one explains enough, found on some of the texels.
 
     The search starts from the fit without the light, which had to make up for it; a second one starts from the fit
     with it.
     """
+    seen, config, forward, found = trials.seen, trials.config, chosen.forward, chosen.found
+    if priors is not PRIORS:
+        found = fit_lighting(seen, forward, trials.albedo, config, TRIAL_ITERATIONS, priors=priors)
     step = max(1, len(seen.texel) // TEXELS)
-    part, expected = seen.take(slice(0, None, step)), albedo[::step]
+    part, expected = seen.take(slice(0, None, step)), trials.albedo[::step]
     found = replace(found, diffuse=found.diffuse[::step], specular=found.specular[::step])
     problem = lighting_problem(part, forward, found.light, expected, config.robust)
-    for light in find_lights(Candidates.about(part, forward, problem, found)):
+    for light in find_lights(Candidates.about(part, forward, problem, found, priors)):
         lit = forward.with_lights((light,))
-        fitted = fit_lighting(part, lit, expected, config, 8)
+        fitted = fit_lighting(part, lit, expected, config, 8, priors=priors)
         mean = np.sqrt(np.pi) / 2.0 * fitted.light[0]  # irradiance from everywhere, pi times the mean radiance
         (irradiance,) = (light.colour for light in lit.under(fitted.light).illumination.lights)
         if irradiance @ LUMINANCE < FAINT * mean @ LUMINANCE:
             continue
         problem = lighting_problem(part, lit, fitted.light, expected, config.robust)
-        candidates = Candidates.about(part, lit, problem, fitted)
+        candidates = Candidates.about(part, lit, problem, fitted, priors)
         _, light = search(candidates, light.direction, light.radius, 0.25 * STEPS[0])
         if light.radius < RADII[1]:
             return forward.with_lights((light,))
@@ -265,6 +267,7 @@ def fit_lighting(
     config: ReflectanceConfig,
     iterations: int,
     specular: float = NORMAL_REFLECTANCE,
+    priors: LightingPriors = PRIORS,
 ) -> LightingSolution:
     """Lighting and the subset's albedos; a model that turns with the lighting is linearised anew."""
     light = np.zeros((forward.unknowns, 3))
@@ -274,6 +277,7 @@ def fit_lighting(
         return solve_lighting(
             problem,
             specular=specular,
+            priors=priors,
             robust=config.robust,
             with_ambient=forward.model.has_ambient,
             iterations=iterations,
@@ -281,15 +285,17 @@ def fit_lighting(
     # Without highlights first, so that there is lighting to linearise about.
     problem = lighting_problem(seen, forward, light, albedo, config.robust)
     problem = replace(problem, specular=np.zeros_like(problem.specular))
-    found = solve_lighting(problem, robust=config.robust, with_ambient=forward.model.has_ambient, iterations=6)
+    ambient = forward.model.has_ambient
+    found = solve_lighting(problem, priors=priors, robust=config.robust, with_ambient=ambient, iterations=6)
     energy = list(found.energy)
     for _ in range(4):
         problem = lighting_problem(seen, forward, found.light, albedo, config.robust)
         found = solve_lighting(
             problem,
             found.light,
+            priors=priors,
             robust=config.robust,
-            with_ambient=forward.model.has_ambient,
+            with_ambient=ambient,
             iterations=max(2, iterations // 4),
         )
         energy += found.energy

@@ -18,7 +18,7 @@ from mifit.appearance.reception import fibonacci_sphere
 from mifit.stages.observations import Observations
 from mifit.stages.reflectance.forward import Forward, LightColumns
 from mifit.stages.reflectance.lighting import LightingSolution, bounded_weight, linearize
-from mifit.stages.reflectance.lighting_equations import LightingProblem
+from mifit.stages.reflectance.lighting_equations import PRIORS, LightingPriors, LightingProblem
 
 TEXELS = 1000
 """Texels that judge candidates."""
@@ -77,7 +77,12 @@ class Candidates:
 
     @classmethod
     def about(
-        cls, seen: Observations, forward: Forward, problem: LightingProblem, found: LightingSolution
+        cls,
+        seen: Observations,
+        forward: Forward,
+        problem: LightingProblem,
+        found: LightingSolution,
+        priors: LightingPriors = PRIORS,
     ) -> Candidates:
         """Linearise about a solution, whose own compact light, if any, is taken away: candidates are to replace it."""
         k = forward.order**2
@@ -99,6 +104,7 @@ class Candidates:
             specular_light[there],
             residual[there],
             weight[there],
+            priors,
         )
         remaining = normal.eliminate(False, 1e-4)
         rows = [(x[..., c : c + 1] * plain.diffuse + y * plain.specular).reshape(-1, k) for c in range(3)]
