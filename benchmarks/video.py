@@ -163,7 +163,7 @@ def _curves(axes: Any, figures: dict[str, Any], titles: dict[str, str], counts: 
         axis.plot([int(n) for n in counts], [figures["means"][n][key] for n in counts], "o-", ms=3)
         axis.axhline(figures["means"]["fit"][key], color="tab:orange", lw=1, ls="--")
         axis.set(title=title, xlabel="frames", xscale="log")
-        axis.set_xticks([1, 4, 10, 40], ["1", "4", "10", "40"])
+        axis.set_xticks([1, 4, 10, 30], ["1", "4", "10", "30"])
         axis.minorticks_off()
 
 

@@ -16,9 +16,10 @@ from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, solv
 
 ROUNDS = 4
 """Of maps and normals in turn."""
-IMAGES = 8.0
+IMAGES = 60.0
 """Independent images at the most: what further ones add is their poses, not weight against the maps' smoothness, as the
-errors of normals and light are the same in all of them."""
+errors of normals and light are the same in all of them. Chosen by how well every second frame
+predicts the others."""
 
 
 @dataclass(frozen=True)
