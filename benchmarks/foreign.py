@@ -102,7 +102,11 @@ def fits_of(case: Case, wanted: Sequence[str], config: FitConfig) -> dict[str, R
     if "refit" in wanted:
         matt = infer_matt(capture, model, full.geometry, case.fitted, as_chosen(full, config.reflectance), SEED)
         normals = mifit.refine_normals(capture, model, full.geometry, matt, case.fitted, config.normals, seed=SEED)
-        found["refit"] = replace(full, reflectance=matt, normals=normals, mesh=None)
+        residual = full.residual  # of the refit's own, so that both rows show what theirs leaves unexplained
+        if residual is not None:
+            given = full.geometry, matt, normals, case.fitted
+            residual = mifit.find_residual(capture, model, *given, config.residual, SEED)
+        found["refit"] = replace(full, reflectance=matt, normals=normals, mesh=None, residual=residual)
     if "paper" in wanted and hasattr(FitConfig, "paper"):
         paper = replace_size(FitConfig.paper(), config.reflectance.texture_size)
         found["paper"] = mifit.fit(capture, model, case.fitted, case.timesteps, paper, seed=SEED)
@@ -118,10 +122,11 @@ def rows_of(fits: dict[str, Reconstruction]) -> dict[str, tuple[Reconstruction, 
     """Rows of a table: reconstruction and method."""
     rows: dict[str, tuple[Reconstruction, Any]] = {}
     for name, result in fits.items():
-        if name == "refit":
-            rows["refit"] = (result, "diffuse")
-            continue
         rows[name] = (result, "full")
+        if name == "refit":
+            continue
+        if result.residual is not None:
+            rows[f"{name}: model alone"] = (replace(result, residual=None), "full")
         rows[f"{name}: pca"] = (result, "pca")
         rows[f"{name}: specular dropped"] = (result, "diffuse")
     return {label: row for label, row in rows.items() if row[1] in row[0].methods}
@@ -137,7 +142,7 @@ def judge_case(
     found: dict[str, Any] = {"label": case.label, "model": case.model if case.model == "builtin" else "ICT"}
     if "views" in parts:
         found["held_out"] = judge.judge_views(rows, capture, case.held_out, case.timesteps, case.fitted)
-        some = {label: row for label, row in rows.items() if not label.endswith("dropped")}
+        some = {label: row for label, row in rows.items() if not label.endswith(("dropped", "alone"))}
         found["fitted"] = judge.judge_views(some, capture, case.fitted, case.timesteps, case.fitted, perceptual=False)
         found["fitted"] = {k: v for k, v in found["fitted"].items() if not k.startswith("image-based")}
     if "mesh" in parts and has_scan:
@@ -146,7 +151,8 @@ def judge_case(
     if "surface" in parts and has_scan:
         found["surface"] = {name: judge.judge_surface(r, capture, case.fitted) for name, r in fits.items()}
     if "relit" in parts and judge.scan.relit_truths(capture):
-        lit = {label: row for label, row in rows.items() if not label.endswith(("pca", "paper: specular dropped"))}
+        alike = ("pca", "alone", "paper: specular dropped")  # under another light there is no residual
+        lit = {label: row for label, row in rows.items() if not label.endswith(alike)}
         found["relit"] = judge.judge_relit(
             lit, capture, case.held_out[0], case.timesteps[0], ("local", "path"), samples
         )

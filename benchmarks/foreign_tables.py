@@ -31,6 +31,7 @@ HELD_OUT: Columns = {
     "pca": lambda c: _psnr(c, "held_out", "full: pca"),
     "diffuse, refitted": lambda c: _psnr(c, "held_out", "refit"),
     "`full`": lambda c: _psnr(c, "held_out", "full"),
+    "`full`, model alone": lambda c: _psnr(c, "held_out", "full: model alone"),
     "paper's settings": lambda c: _psnr(c, "held_out", "paper"),
     "image-based, our mesh": lambda c: _psnr(c, "held_out", "image-based, mesh of full"),
     "image-based, scan's mesh": lambda c: _psnr(c, "held_out", "image-based, scan"),
@@ -120,6 +121,7 @@ def short(cases: list[Case]) -> str:
     """One table for the front page, worst rows included."""
     columns: Columns = {
         "`full`": HELD_OUT["`full`"],
+        "`full`, model alone": HELD_OUT["`full`, model alone"],
         "diffuse, refitted": HELD_OUT["diffuse, refitted"],
         "image-based, our mesh": HELD_OUT["image-based, our mesh"],
         "image-based, scan's mesh": HELD_OUT["image-based, scan's mesh"],

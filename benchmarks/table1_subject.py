@@ -29,9 +29,10 @@ def fits(
     full = mifit.fit(capture, model, CAMERAS, capture.timesteps, config)
     matt = infer_matt(capture, model, full.geometry, CAMERAS, as_chosen(full, config.reflectance))
     normals = mifit.refine_normals(capture, model, full.geometry, matt, CAMERAS, config.normals)
+    residual = mifit.find_residual(capture, model, full.geometry, matt, normals, CAMERAS, config.residual)
     found = {
         "full": (full, capture),
-        "diffuse": (replace(full, reflectance=matt, normals=normals, mesh=None), capture),
+        "diffuse": (replace(full, reflectance=matt, normals=normals, mesh=None, residual=residual), capture),
         "perfect": (mifit.fit(perfect, model, CAMERAS, perfect.timesteps, config), perfect),
     }
     if paper:
@@ -49,7 +50,7 @@ def judge(folder: Path, found: dict[str, tuple[Reconstruction, Capture]]) -> dic
         measured = evaluate(result, capture, "third", region="truth")["methods"]
         if name == "full":
             methods["pca"], methods["dropped"] = measured["pca"], measured["diffuse"]
-        methods[name] = measured["diffuse" if name == "diffuse" else "full"]
+        methods[name] = measured["full"]
     return {
         "methods": methods,
         "truth": {name: truth_errors(result, folder / "capture", BUMP_UNIT) for name, (result, _) in found.items()},

@@ -202,6 +202,24 @@ class MeshConfig:
 
 
 @settings
+class ResidualConfig:
+    """What the images of each timestep show beyond the model (``stages.find_residual``)."""
+
+    enabled: bool = flag(
+        True,
+        "keep, for views of fitted timesteps in the capture's own light, what their images show beyond the model: "
+        "edges of shadows, interreflection",
+    )
+    prior: float = number(
+        0.5,
+        "views without any residual that count against those of a timestep: of what two views agree on, 0.5 keeps four "
+        "fifths",
+        above=0,
+        most=1000,
+    )
+
+
+@settings
 class FitConfig:
     """All settings of ``mifit.fit``."""
 
@@ -211,6 +229,7 @@ class FitConfig:
     normals: NormalsConfig = part(NormalsConfig)
     mesh: MeshConfig = part(MeshConfig)
     shape: ShapeConfig = part(ShapeConfig)
+    residual: ResidualConfig = part(ResidualConfig)
 
     @classmethod
     def load(cls, path: str | Path) -> FitConfig:
@@ -236,6 +255,7 @@ class FitConfig:
                 max_iterations=60,
             ),
             normals=NormalsConfig(solver="adam", magnitude_weight=0.3, robust=False),
+            residual=ResidualConfig(enabled=False),
         )
 
 

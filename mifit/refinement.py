@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit import checkpoint
-from mifit.config import GeometryConfig, ReflectanceConfig, from_mapping
+from mifit.config import GeometryConfig, ReflectanceConfig, ResidualConfig, from_mapping
 from mifit.core.bend import bend, texel_neighbours
-from mifit.core.estimate import GeometryEstimate, NormalsEstimate, Report
+from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report, ResidualEstimate
 from mifit.core.mesh import interpolate, normalize
 from mifit.core.rows import Rows
 from mifit.core.threads import one_blas_thread
@@ -29,6 +29,7 @@ from mifit.result.record import R, Result
 from mifit.stages.absorb.frame import Absorber, FrameFit, carried_offsets
 from mifit.stages.absorb.information import Information
 from mifit.stages.absorb.solve_sums import Solved, solve_sums
+from mifit.stages.find_residual import find_residual
 from mifit.stages.normals.carried import CarriedTangents
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.fill import blend_unseen
@@ -227,6 +228,17 @@ class Refinement(Generic[R]):
         self._last, _, _ = self._follower.next(timestep)
         return self._last
 
+    def _residual(self, reflectance: ReflectanceEstimate, normals: NormalsEstimate) -> ResidualEstimate | None:
+        """What the new maps leave unexplained, for the timesteps that had a residual before."""
+        result = self._result
+        if result.residual is None:
+            return None
+        geometry = result.geometry.at(result.residual.timesteps)
+        settings = from_mapping(ResidualConfig, result.config.get("residual", {}), "result.json: config: residual")
+        names = [camera.name for camera in result.cameras]
+        given = self._capture, result.model, geometry, reflectance, normals, names
+        return find_residual(*given, settings, self._seed)
+
     def _with(self, found: Solved) -> R:
         """The result with what was found."""
         result, absorber, information = self._result, self._absorber, self._information
@@ -264,7 +276,12 @@ class Refinement(Generic[R]):
         lines = tuple(f"timestep {t}: left out of the refinement, {why}" for t, why in self.left_out.items())
         report = replace(before, outcome=found.outcome.value, warnings=(*before.warnings, *lines), details=details)
         normals_estimate = NormalsEstimate(result.timesteps, shown.all, report)
-        refined = replace(result, reflectance=reflectance, normals=normals_estimate)
+        refined = replace(
+            result,
+            reflectance=reflectance,
+            normals=normals_estimate,
+            residual=self._residual(reflectance, normals_estimate),
+        )
         return replace(refined, mesh=_mesh(refined)) if result.mesh is not None else refined
 
 

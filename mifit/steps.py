@@ -27,10 +27,17 @@ from mifit.config import (
     MeshConfig,
     NormalsConfig,
     ReflectanceConfig,
+    ResidualConfig,
     ShapeConfig,
     SurfaceConfig,
 )
-from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate
+from mifit.core.estimate import (
+    GeometryEstimate,
+    MeshEstimate,
+    NormalsEstimate,
+    ReflectanceEstimate,
+    ResidualEstimate,
+)
 from mifit.progress import Progress
 
 if TYPE_CHECKING:
@@ -39,12 +46,13 @@ if TYPE_CHECKING:
 
 Stage = Literal["geometry", "reflectance", "normals"]
 STAGES: tuple[Stage, ...] = ("geometry", "reflectance", "normals")
-Part = Literal["geometry", "reflectance", "normals", "mesh"]
+Part = Literal["geometry", "reflectance", "normals", "mesh", "residual"]
 PARTS: dict[Part, type] = {
     "geometry": GeometryEstimate,
     "reflectance": ReflectanceEstimate,
     "normals": NormalsEstimate,
     "mesh": MeshEstimate,
+    "residual": ResidualEstimate,
 }
 
 
@@ -132,11 +140,14 @@ def steps(config: FitConfig, until: Stage = "normals") -> list[Step]:
         ]
     if until == "reflectance":
         return found
-    return [
-        *found,
+    found += [
         Step("normals", "normals", ("geometry", "reflectance"), (config.normals,), _refine_normals),
         Step("mesh", "mesh", ("geometry", "normals"), (config.mesh,), _refine_mesh),
     ]
+    if config.residual.enabled:
+        given: tuple[Part, ...] = ("geometry", "reflectance", "normals")
+        found.append(Step("residual", "residual", given, (config.residual,), _find_residual))
+    return found
 
 
 def keys(listed: Sequence[Step], source: Source) -> dict[str, str]:
@@ -284,3 +295,19 @@ def _refine_mesh(source: Source, inputs: Inputs, progress: Progress, config: Mes
     from mifit.stages.normals.mesh_refinement import refine_mesh
 
     return refine_mesh(source.model, inputs["geometry"], inputs["normals"], config, progress)
+
+
+def _find_residual(source: Source, inputs: Inputs, progress: Progress, config: ResidualConfig) -> Any:
+    from mifit.stages.find_residual import find_residual
+
+    return find_residual(
+        source.capture,
+        source.model,
+        inputs["geometry"],
+        inputs["reflectance"],
+        inputs["normals"],
+        source.cameras,
+        config,
+        seed=source.seed,
+        progress=progress,
+    )

@@ -8,6 +8,7 @@ import pytest
 
 import mifit
 from mifit.config import FitConfig
+from mifit.core.estimate import Report, ResidualEstimate
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs
@@ -64,8 +65,8 @@ def test_views_from_one_place_bring_a_warning():
 
 
 pytestmark = pytest.mark.usefixtures("variant")
-ORDER = ("geometry", "surface", "reflectance", "geometry_1", "reflectance_1", "normals", "mesh")
-FIRST = {"geometry": 0, "surface": 1, "reflectance": 2, "shape": 3, "normals": 5, "mesh": 6}
+ORDER = ("geometry", "surface", "reflectance", "geometry_1", "reflectance_1", "normals", "mesh", "residual")
+FIRST = {"geometry": 0, "surface": 1, "reflectance": 2, "shape": 3, "normals": 5, "mesh": 6, "residual": 7}
 """Section of the settings -> the first step that reads it; all later ones depend on that one's estimate."""
 
 
@@ -102,12 +103,13 @@ class Stages:
 
     def __init__(self, monkeypatch):
         self.ran = []
-        result = ball_result()
+        residual = ResidualEstimate((0,), np.zeros((1, 32, 32, 3), np.float32), Report("converged"))
+        result = dataclasses.replace(ball_result(), residual=residual)
         for module, name, part in (
             ("fit_geometry", "fit_geometry", "geometry"), ("find_surface", "find_surface", "geometry"),
             ("infer_reflectance", "infer_reflectance", "reflectance"), ("refine_shape", "refine_shape", "geometry"),
             ("normals.normal_refinement", "refine_normals", "normals"),
-            ("normals.mesh_refinement", "refine_mesh", "mesh"),
+            ("normals.mesh_refinement", "refine_mesh", "mesh"), ("find_residual", "find_residual", "residual"),
         ):  # fmt: skip
             monkeypatch.setattr(f"mifit.stages.{module}.{name}", self.stand_in(name, getattr(result, part)))
 
@@ -153,6 +155,7 @@ RUNS = (
     "infer_reflectance",
     "refine_normals",
     "refine_mesh",
+    "find_residual",
 )
 
 
@@ -163,7 +166,11 @@ def test_a_changed_setting_reruns_the_steps_that_depend_on_it(fitted, tmp_path, 
     ran = fitted(changed_config(section, name), tmp_path)
     if (section, name) == ("shape", "rounds"):
         # One round more: those that were done serve, the new one and what comes after it run.
-        assert ran == ["refine_shape", "infer_reflectance", "refine_normals", "refine_mesh"]
+        assert ran == ["refine_shape", "infer_reflectance", "refine_normals", "refine_mesh", "find_residual"]
+    elif section == "mesh":
+        assert ran == ["refine_mesh"]  # the residual is that of the fitted mesh
+    elif (section, name) == ("residual", "enabled"):
+        assert ran == []
     elif (section, name) == ("surface", "enabled"):
         assert ran == list(RUNS[2:])
     else:
@@ -186,7 +193,7 @@ def test_a_changed_source_reruns_everything(change):
 def test_stages_that_a_shorter_fit_ran_serve_a_longer_one(fitted, tmp_path):
     assert fitted(BASE, tmp_path, until="geometry") == list(RUNS[:2])
     assert fitted(BASE, tmp_path, until="reflectance") == list(RUNS[2:5])
-    assert fitted(BASE, tmp_path) == ["refine_normals", "refine_mesh"]
+    assert fitted(BASE, tmp_path) == ["refine_normals", "refine_mesh", "find_residual"]
 
 
 def test_a_step_is_given_what_its_key_is_made_of():

@@ -178,6 +178,26 @@ class NormalsEstimate:
 
 
 @dataclass(frozen=True)
+class ResidualEstimate:
+    """What the images of fitted timesteps show beyond reflectance and light (`stages.find_residual`).
+
+    Attributes
+    ----------
+    timesteps : tuple of int
+    radiance : (T, S, S, 3) float32
+        Linear, added to what the model shows of a texel, alike towards all sides; either sign, 0 where nothing is seen.
+    """
+
+    timesteps: tuple[int, ...]
+    radiance: NDArray
+    report: Report
+
+    def at(self, timestep: int) -> NDArray | None:
+        """(S, S, 3) of one timestep; None for one that has none."""
+        return self.radiance[self.timesteps.index(timestep)] if timestep in self.timesteps else None
+
+
+@dataclass(frozen=True)
 class MeshEstimate:
     """Meshes with the refined normals as shape, on one topology.
 

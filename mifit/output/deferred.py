@@ -184,8 +184,20 @@ def shade_methods(
         ambient = np.float32(reflectance.illumination.ambient)
         for method in finer:
             specular = material.specular[:, None] if method == "full" else np.float32(0.0)
-            out[method] = surface.image(form_image(ambient, material.diffuse, shaded[0], specular, shaded[1]))
+            colour = form_image(ambient, material.diffuse, shaded[0], specular, shaded[1])
+            out[method] = surface.image(_with_residual(reconstruction, surface, timestep, colour, method))
     return {m: out[m] for m in methods}
+
+
+def _with_residual(
+    reconstruction: Result, surface: VisibleSurface, timestep: int, colour: NDArray, method: Method
+) -> NDArray:
+    """Colours (N, 3) with what the fitted images of the timestep show beyond the model, which ``full`` alone has."""
+    residual = None if reconstruction.residual is None else reconstruction.residual.at(timestep)
+    if residual is None or method != "full":
+        return colour
+    inside = mapped_faces(reconstruction)[surface.face, None]
+    return np.where(inside, np.maximum(colour + _look_up(reconstruction.model, surface, residual), 0), colour)
 
 
 def _vertex_albedo(reconstruction: Result) -> NDArray[np.float32]:

@@ -88,7 +88,7 @@ def under(result: Result, turn: float, environment: Path | None) -> Result:
         return result
     rotation = Rotation.from_rotvec(np.radians(turn) * vertical(result)).as_matrix()
     illumination = result.reflectance.illumination.rotated(rotation)
-    return replace(result, reflectance=replace(result.reflectance, illumination=illumination))
+    return result.with_illumination(illumination)
 
 
 def vertical(result: Result) -> NDArray[np.float64]:

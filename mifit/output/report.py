@@ -44,7 +44,13 @@ NAMES = {
     "diffuse": "Diffuse only",
     "full": "Full",
 }
-STAGES = {"geometry": "1 Geometry", "reflectance": "2 Reflectance", "normals": "3 Normals", "mesh": "3 Mesh"}
+STAGES = {
+    "geometry": "1 Geometry",
+    "reflectance": "2 Reflectance",
+    "normals": "3 Normals",
+    "mesh": "3 Mesh",
+    "residual": "3 Residual",
+}
 SHOWN_TIMESTEPS = 4
 """Timesteps whose pictures a report holds, so that it stays small enough for a phone."""
 
@@ -314,6 +320,12 @@ def _maps(result: Result, timestep: int) -> str:
                 "normal map",
             )
         )
+    residual = None if result.residual is None else result.residual.at(timestep)
+    if residual is not None:
+        white = max(float(np.quantile(np.abs(residual), 0.999)), 1e-6)
+        codes = np.round(127.5 * (1 + np.clip(residual / white, -1, 1))).astype(np.uint8)
+        caption = f"What images show beyond the model, timestep {timestep} (mid-grey: nothing, white = {white:.2g})"
+        figures.append(_figure(jpeg_uri(codes), caption, "residual"))
     if result.mesh is not None and timestep in result.mesh.timesteps:
         shift = result.displacement(timestep) * result.unit_mm
         white = max(float(np.quantile(np.abs(shift), 0.999)), 1e-6)

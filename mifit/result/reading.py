@@ -16,7 +16,14 @@ from mifit.appearance.illumination import Illumination, light_from
 from mifit.appearance.lobe import Lobe
 from mifit.config import MeshConfig
 from mifit.core.camera import Camera
-from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
+from mifit.core.estimate import (
+    GeometryEstimate,
+    MeshEstimate,
+    NormalsEstimate,
+    ReflectanceEstimate,
+    Report,
+    ResidualEstimate,
+)
 from mifit.core.files import read_text
 from mifit.core.image import read_image, to_8_bit
 from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_PIXELS
@@ -46,14 +53,16 @@ def load(cls: type[R], folder: Path, model: MorphableModel | None = None) -> R:
                 f"{model.name!r} (digest {model.digest}); fit again, or bring the model back"
             )
         geometry = _geometry(folder, document, model)
+        reflectance = _reflectance(folder, document)
         capture = document["capture"]
         return cls(
             model=model,
             model_source=document["model"]["source"],
             geometry=geometry,
-            reflectance=_reflectance(folder, document),
+            reflectance=reflectance,
             normals=_normals(folder, document),
             mesh=_mesh(folder, document, model, geometry),
+            residual=None if reflectance is None else _residual(folder, document, len(reflectance.diffuse)),
             config=document["config"],
             cameras=tuple(_camera(entry) for entry in capture["cameras"]),
             capture_digest=capture["digest"],
@@ -273,6 +282,15 @@ def _normals(folder: Path, document: dict[str, Any]) -> NormalsEstimate | None:
     timesteps = [int(s["timestep"]) for s in document["timesteps"] if s["refined_normals"]]
     paths = [folder / "maps" / f"normal_object_{t:04d}.exr" for t in timesteps]
     return NormalsEstimate(tuple(timesteps), _read_maps(paths, 3), _report(document, "normals"))
+
+
+def _residual(folder: Path, document: dict[str, Any], size: int) -> ResidualEstimate | None:
+    if "residual" not in document["stages"]:
+        return None
+    timesteps = [int(s["timestep"]) for s in document["timesteps"] if s["residual"]]
+    radiance = Rows(len(timesteps), (size, size, 3), np.float32)
+    radiance.extend(_read_map(folder / "maps" / f"residual_{t:04d}.exr", 3, size) for t in timesteps)
+    return ResidualEstimate(tuple(timesteps), radiance.all, _report(document, "residual"))
 
 
 def _mesh(

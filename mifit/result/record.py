@@ -11,7 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from mifit.appearance.illumination import Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.core.camera import Camera
-from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, Report
+from mifit.core.estimate import (
+    GeometryEstimate,
+    MeshEstimate,
+    NormalsEstimate,
+    ReflectanceEstimate,
+    Report,
+    ResidualEstimate,
+)
 from mifit.core.sh import SHLighting, radiance_of_shading
 from mifit.core.subdivision import split_faces
 from mifit.core.values import same
@@ -39,6 +46,9 @@ class Result:
     mesh : MeshEstimate or None
         Meshes with the refined normals as shape; None when stage 3 did not run. Renders and relighting use the
         fitted mesh with the refined normals instead, as the fit did.
+    residual : ResidualEstimate or None
+        What the images of fitted timesteps show beyond the model; ``full`` renders add it. None where it wasn't looked
+        for, and for a face that is edited, or in another light.
     config : dict
         Settings as used (``dataclasses.asdict`` of the FitConfig, and the seed).
     cameras : tuple of Camera
@@ -79,6 +89,7 @@ class Result:
     warnings: tuple[str, ...] = ()
     environment: NDArray[np.float32] | None = field(default=None, repr=False)
     mesh: MeshEstimate | None = field(default=None, repr=False)
+    residual: ResidualEstimate | None = field(default=None, repr=False)
     environment_rotation: NDArray[np.float64] | None = field(default=None, repr=False)
 
     def __eq__(self, other: object) -> bool:
@@ -135,12 +146,12 @@ class Result:
                 f"{name}: found shape {array.shape} with values {np.min(array):g} to {np.max(array):g}, "
                 f"expected {before.shape} with reflectances 0 to 1"
             )
-        return replace(self, reflectance=replace(self.reflectance, **{name: array}))
+        return replace(self, reflectance=replace(self.reflectance, **{name: array}), residual=None)
 
     def with_illumination(self: R, illumination: Illumination) -> R:
         """The same face in another light, taken as it is; see `Reconstruction.relight` for environment maps.
 
-        What the capture's own light left unexplained (``reflectance.relief``) is gone with it.
+        What the capture's own light left unexplained (``reflectance.relief``, ``residual``) is gone with it.
 
         Raises
         ------
@@ -150,7 +161,7 @@ class Result:
         if self.reflectance is None:
             raise InputError("illumination: this result has no reflectance; fit with --until reflectance")
         reflectance = replace(self.reflectance, illumination=illumination, relief=None)
-        return replace(self, reflectance=reflectance, environment=None, environment_rotation=None)
+        return replace(self, reflectance=reflectance, residual=None, environment=None, environment_rotation=None)
 
     @property
     def timesteps(self) -> tuple[int, ...]:
@@ -170,6 +181,7 @@ class Result:
             "reflectance": self.reflectance,
             "normals": self.normals,
             "mesh": self.mesh,
+            "residual": self.residual,
         }
         return {name: stage.report for name, stage in stages.items() if stage is not None}
 

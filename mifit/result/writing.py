@@ -111,6 +111,9 @@ def _write_timestep(result: Result, folder: Path, timestep: int, surfaces: Seque
         )
         write_image(folder / "maps" / f"normal_object_{timestep:04d}.exr", refined)
         write_data_png(folder / "maps" / f"normal_tangent_{timestep:04d}.png", 0.5 + 0.5 * tangent)
+    residual = None if result.residual is None else result.residual.at(timestep)
+    if residual is not None:
+        write_image(folder / "maps" / f"residual_{timestep:04d}.exr", residual)
     if result.mesh is not None and timestep in result.mesh.timesteps:
         k = result.mesh.timesteps.index(timestep)
         vertices = result.mesh.vertices[k]
@@ -171,6 +174,7 @@ def _document(result: Result) -> dict[str, Any]:
                     "expression": geometry.expression[i].tolist(),
                     "refined_normals": result.refined_normal(t) is not None,
                     "refined_mesh": result.mesh is not None and t in result.mesh.timesteps,
+                    "residual": result.residual is not None and t in result.residual.timesteps,
                 }
                 for i, t in enumerate(result.timesteps)
             ],

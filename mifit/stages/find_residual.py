@@ -1,0 +1,140 @@
+"""What the photographs of a timestep show beyond the model: kept as radiance on the surface, for that timestep alone.
+
+Edges of shadows, interreflection and scattering are no albedo, and no smooth light makes them. They do lie on the skin,
+though, and a camera between the fitted ones sees them as well. So each texel keeps, per timestep, the weighted mean of
+what its views show beyond ambient, diffuse and specular reflection, held towards 0 by a prior (ridge regression), since
+one view's residual is its own noise and highlight as much as the skin's. Image-based rendering keeps all of a
+photograph in this way; here only what nothing else explains is left to it. It belongs to the capture's own light and to
+the timesteps that were fitted: another light or another albedo has none.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.appearance.formation import Appearance, form_image
+from mifit.appearance.occlusion import MeshPoints
+from mifit.config import ResidualConfig
+from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report, ResidualEstimate
+from mifit.core.labels import hidden
+from mifit.core.mesh import normalize
+from mifit.core.threads import one_blas_thread
+from mifit.errors import InputError
+from mifit.progress import Progress, silent
+from mifit.stages.observations import Surface
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+
+
+@one_blas_thread()
+def find_residual(
+    capture: Capture,
+    model: MorphableModel,
+    geometry: GeometryEstimate,
+    reflectance: ReflectanceEstimate,
+    normals: NormalsEstimate | None,
+    cameras: Sequence[str],
+    config: ResidualConfig | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> ResidualEstimate:
+    """Find what the images of each timestep show beyond reflectance and light.
+
+    Parameters
+    ----------
+    capture, model
+        Images, and the model that was fitted.
+    geometry : GeometryEstimate
+        Its timesteps are those that are looked at.
+    reflectance : ReflectanceEstimate
+        Stage 2.
+    normals : NormalsEstimate or None
+        Stage 3; without it the mesh's normals are shaded.
+    cameras : sequence of str
+        Cameras to read; no other camera of the capture is touched.
+    config : ResidualConfig, optional
+    seed : int
+        Of the tracing of shadows.
+    progress : Progress
+
+    Returns
+    -------
+    ResidualEstimate
+        ``report.details`` has the root mean square of the images' deviation from the model over the face's texels,
+        before and after (``residual``, ``left``), linear.
+
+    Raises
+    ------
+    InputError
+        No camera or timestep, or normals of another size than the maps.
+    """
+    started, config = time.perf_counter(), config or ResidualConfig()
+    size = len(reflectance.diffuse)
+    if normals is not None and normals.normal_object.shape[1] != size:
+        raise InputError(
+            f"residual: found normals of {normals.normal_object.shape[1]} texels a side, expected {size} as the maps"
+        )
+    texels = None
+    radiance = np.zeros((len(geometry.timesteps), size, size, 3), dtype=np.float32)
+    before = after = count = 0.0
+    progress("find residual", 0, len(geometry.timesteps))
+    for i, timestep in enumerate(geometry.timesteps):
+        surface = Surface(capture, model, geometry.at([timestep]), cameras, size, whole=True, texels=texels)
+        texels = surface.texels
+        labels = [reflectance.label(camera, timestep) for camera in cameras]
+        if any(label is not None for label in labels):
+            shape = [(camera.height, camera.width) for camera in map(capture.camera, cameras)]
+            surface = surface.without(
+                [np.zeros(s, bool) if label is None else hidden(label) for label, s in zip(labels, shape, strict=True)]
+            )
+        refined = None
+        if normals is not None and timestep in normals.timesteps:
+            refined = texels.from_map(normals.normal_object[normals.timesteps.index(timestep)])
+        rows, difference, weight = _difference(surface, reflectance, refined, geometry.rotation[i], seed)
+        found = (weight[..., None] * difference).sum(1) / (config.prior + weight.sum(1))[:, None]
+        values = np.zeros((len(texels.index), 3), dtype=np.float32)
+        values[rows] = found
+        radiance[i] = texels.to_map(values)
+        face = weight * surface.facial[rows, None]
+        before += float((face * (difference**2).mean(-1)).sum())
+        after += float((face * ((difference - found[:, None]) ** 2).mean(-1)).sum())
+        count += float(face.sum())
+        progress("find residual", i + 1, len(geometry.timesteps))
+    details = {"residual": float(np.sqrt(before / max(count, 1.0))), "left": float(np.sqrt(after / max(count, 1.0)))}
+    report = Report("converged", {}, time.perf_counter() - started, (), details)
+    return ResidualEstimate(geometry.timesteps, radiance, report)
+
+
+def _difference(
+    surface: Surface, reflectance: ReflectanceEstimate, refined: NDArray | None, rotation: NDArray, seed: int
+) -> tuple[NDArray, NDArray[np.float32], NDArray[np.float32]]:
+    """Texels (n,) that images of one timestep measure, what each shows beyond the model (n, J, 3), and its weight.
+
+    The weight is the probability that the image shows the point: 1 for a view that does for sure, however it sees it.
+    """
+    every = surface.observe(np.arange(len(surface)))
+    rows = np.flatnonzero((every.measured > 0).any(1))
+    seen, texels = every.take(rows), surface.texels
+    base = seen.normal[:, 0]
+    normal = base
+    if refined is not None:
+        known = np.any(refined[rows] != 0, axis=1)
+        normal = np.where(known[:, None], normalize(refined[rows] @ rotation.T), base).astype(np.float32)
+    diffuse, specular = (texels.from_map(m)[rows] for m in (reflectance.lit_diffuse, reflectance.specular))
+    appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: texels.from_map(m)[rows]))
+    points = MeshPoints(seen.point[:, 0], base, seen.face, seen.barycentric)
+    occlusion = appearance.trace(surface.meshes[0], points, seed)
+    ambient = np.float32(appearance.illumination.ambient)
+    difference = np.empty(seen.colour.shape, dtype=np.float32)
+    for j in range(len(seen.step)):
+        d, s = appearance.shade_bent(normal, base, seen.view[:, j], occlusion, points.position)
+        difference[:, j] = seen.colour[:, j] - form_image(ambient, diffuse, d, specular[:, None], s)
+    weight = np.where(seen.measured > 0, seen.right, np.float32(0.0)).astype(np.float32)
+    return rows, np.where(weight[..., None] > 0, difference, np.float32(0.0)), weight
