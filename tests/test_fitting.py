@@ -21,7 +21,7 @@ from tests.test_pipeline import Stages, made_up_capture
 from tests.variant import VARIANT
 
 pytestmark = pytest.mark.usefixtures("variant")
-ALL = ["fit_geometry", "find_surface", "infer_reflectance", "refine_normals", "refine_mesh"]
+ALL = ["fit_geometry", "find_surface", "infer_reflectance", "refine_normals", "refine_mesh", "find_residual"]
 
 
 @pytest.fixture
