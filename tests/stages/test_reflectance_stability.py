@@ -150,13 +150,13 @@ def test_an_image_that_is_not_a_number_counts_for_nothing(dome):
     assert errors(dome, estimate)[0] < 0.02
 
 
-def test_two_equal_views_are_worth_one(dome):
-    twins, one = infer(dome, cameras=("left", "left")), infer(dome, cameras=("left",))
-    np.testing.assert_allclose(
-        twins.illumination.radiance, one.illumination.radiance, atol=0.02 * np.abs(one.illumination.radiance).max()
-    )
+def test_views_that_are_there_twice_are_worth_one(dome):
+    """Both cameras: what a single one leaves undetermined, such as the sheen's side, may end anywhere."""
+    twins, one = infer(dome, cameras=("left", "right", "left", "right")), infer(dome, cameras=("left", "right"))
+    largest = np.abs(one.illumination.radiance).max()
+    np.testing.assert_allclose(twins.illumination.radiance, one.illumination.radiance, atol=0.002 * largest)
     good = one.confidence > 0.9
-    assert rms(twins.diffuse - one.diffuse, good) < 0.005 and rms(twins.specular - one.specular, good) < 0.01
+    assert rms(twins.diffuse - one.diffuse, good) < 0.001 and rms(twins.specular - one.specular, good) < 0.002
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
