@@ -352,12 +352,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("mifit: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output has gone; nothing is left to say
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _give_up_unwritten()
         return 1
     except Exception as error:
         if arguments.debug:
             raise
+        _give_up_unwritten()
         return _report(error)
+
+
+def _give_up_unwritten() -> None:
+    """Drop output that can't be written: the interpreter would try again at its end, and fail in words of its own."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _run(command: Callable[[Any], int | None], arguments: argparse.Namespace) -> int:
