@@ -108,6 +108,7 @@ def find_residual(
         count += float(face.sum())
         progress("find residual", i + 1, len(geometry.timesteps))
     details = {"residual": float(np.sqrt(before / max(count, 1.0))), "left": float(np.sqrt(after / max(count, 1.0)))}
+    # A closed form: there is nothing that could fail to converge.
     report = Report("converged", {}, time.perf_counter() - started, (), details)
     return ResidualEstimate(geometry.timesteps, radiance, report)
 
