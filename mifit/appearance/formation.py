@@ -20,7 +20,7 @@ from mifit.appearance.kernels import PreparedLobe, diffuse_transfer, prepare
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
 from mifit.appearance.models.base import Shade
-from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion
+from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, VertexTransfer
 from mifit.errors import InputError
 
 OPEN = Occlusion()
@@ -203,8 +203,7 @@ class _Scene:
                 raise InputError(
                     f"shading model {self.model.name!r}: found no transfer vectors, expected those of trace_transfer"
                 )
-            rows = expect(occlusion.transfer, (self.count, order * order), "shadowed transfer")
-            self.shadowed = [mi.Float(aligned(column)) for column in rows.T]
+            self.shadowed = _read_transfer(occlusion.transfer, self.count, order)
         if len(occlusion.visible) != len(illumination.lights):
             raise InputError(
                 f"compact lights: found visibility of {len(occlusion.visible)}, expected it of "
@@ -253,6 +252,32 @@ class _Scene:
         d, s = (mi.Color3f(part) for part in shaded)
         both = stored([d.x, d.y, d.z, s.x, s.y, s.z], self.count)
         return both[:, :3], both[:, 3:]
+
+
+def _read_transfer(transfer: VertexTransfer | NDArray, count: int, order: int) -> list[Any]:
+    """B*B Floats, not evaluated: kernels gather them from rows in memory, four at a time."""
+    import drjit as dr
+    import mitsuba as mi
+
+    size = order * order
+    if isinstance(transfer, VertexTransfer):
+        values = expect(transfer.values, (len(transfer.values), size), "shadowed transfer")
+        expect(transfer.weights, (count, 3), "shadowed transfer: weights")
+        rows = [mi.UInt32(aligned(column, np.uint32)) for column in transfer.corners.T]
+        weights = [mi.Float(aligned(column)) for column in transfer.weights.T]
+    else:
+        values = expect(transfer, (count, size), "shadowed transfer")
+        rows, weights = [dr.arange(mi.UInt32, count)], [mi.Float(1.0)]
+    packets = -(-size // 4)
+    flat = mi.Float(aligned(np.pad(values, ((0, 0), (0, 4 * packets - size)))).ravel())
+    found: list[Any] = []
+    for packet in range(packets):
+        read = [dr.gather(mi.Vector4f, flat, row * packets + packet) for row in rows]
+        found += [
+            sum((w * r[i] for w, r in zip(weights[1:], read[1:], strict=True)), weights[0] * read[0][i])
+            for i in range(4)
+        ]
+    return found[:size]
 
 
 def diffuse_matrix(normals: ArrayLike, order: int) -> NDArray[np.float32]:

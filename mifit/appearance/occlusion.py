@@ -6,6 +6,7 @@ their extent that a point sees, found at the points themselves.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -73,18 +74,60 @@ class OccludingMesh:
 
 
 @dataclass(frozen=True)
+class VertexTransfer:
+    """Shadowed diffuse transfer of N points: what was traced at the corners of the faces that they lie on.
+
+    Shading reads the corners' values itself: those of every point are some hundred numbers, which take longer to write
+    down and read again than all that is done with them.
+
+    Attributes
+    ----------
+    values : (V, B*B) float32
+        At the vertices.
+    corners : (N, 3) int
+        Vertices.
+    weights : (N, 3) float32
+        Barycentric.
+    """
+
+    values: NDArray[np.float32]
+    corners: NDArray
+    weights: NDArray[np.float32]
+
+    @classmethod
+    def joined(cls, parts: Sequence[VertexTransfer], step: NDArray[np.int64]) -> VertexTransfer:
+        """Of points that were looked up on several meshes: for each of ``step`` its mesh's, side by side per point."""
+        starts = np.cumsum([0, *(len(part.values) for part in parts)])
+        corners = np.stack([parts[s].corners + starts[s] for s in step], axis=1).reshape(-1, 3)
+        weights = np.stack([parts[s].weights for s in step], axis=1).reshape(-1, 3)
+        return cls(np.concatenate([part.values for part in parts]), corners, weights)
+
+    def __len__(self) -> int:
+        return len(self.corners)
+
+    @property
+    def rows(self) -> NDArray[np.float32]:
+        """(N, B*B) written out."""
+        return interpolate(self.values, self.corners, np.arange(len(self)), self.weights)
+
+    def take(self, rows: NDArray | slice) -> VertexTransfer:
+        """Those of some of the points."""
+        return VertexTransfer(self.values, self.corners[rows], self.weights[rows])
+
+
+@dataclass(frozen=True)
 class Occlusion:
     """Shadows of a mesh on N points of it; the default is none.
 
     Attributes
     ----------
-    transfer : (N, B*B) float32 or None
+    transfer : VertexTransfer, (N, B*B) float32 or None
         Shadowed diffuse transfer, for models that need it.
     visible : tuple of (N,) uint32
         Per compact light, which of its samples each point sees.
     """
 
-    transfer: NDArray[np.float32] | None = None
+    transfer: VertexTransfer | NDArray[np.float32] | None = None
     visible: tuple[NDArray[np.uint32], ...] = ()
 
     @classmethod
@@ -112,13 +155,21 @@ class Occlusion:
         transfer = None
         if smooth:
             at_vertices = mesh.transfer(illumination.order, seed)
-            transfer = interpolate(at_vertices, mesh.scene.faces, points.face, points.barycentric)
+            transfer = VertexTransfer(at_vertices, mesh.scene.faces[points.face], points.barycentric)
         lights = illumination.lights
         return cls(transfer, tuple(light.visible(mesh.scene, points.position, points.normal) for light in lights))
 
+    @property
+    def rows(self) -> NDArray[np.float32] | None:
+        """(N, B*B) transfer written out."""
+        return self.transfer.rows if isinstance(self.transfer, VertexTransfer) else self.transfer
+
     def take(self, rows: NDArray | slice) -> Occlusion:
         """Those of some of the points."""
-        transfer = None if self.transfer is None else self.transfer[rows]
+        if isinstance(self.transfer, VertexTransfer):
+            transfer: VertexTransfer | NDArray[np.float32] | None = self.transfer.take(rows)
+        else:
+            transfer = None if self.transfer is None else self.transfer[rows]
         return Occlusion(transfer, tuple(bits[rows] for bits in self.visible))
 
 

@@ -12,7 +12,7 @@ from mifit.appearance.formation import Appearance
 from mifit.appearance.illumination import Illumination, Light
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
-from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion
+from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, VertexTransfer
 from mifit.stages.observations import Observations
 
 LightColumns = Callable[..., tuple[NDArray[np.float32], NDArray[np.float32]]]
@@ -112,8 +112,7 @@ class Forward:
         steps = [self.appearance.trace(mesh, _surface_points(seen, t)) for t, mesh in enumerate(self.meshes)]
         transfer = None
         if self.model.needs_shadows:
-            transfer = np.stack([s.transfer for s in steps], axis=1)[:, seen.step]
-            transfer = transfer.reshape(-1, transfer.shape[-1])
+            transfer = VertexTransfer.joined([s.transfer for s in steps], seen.step)
         visible = tuple(
             np.stack(bits, axis=1)[:, seen.step].ravel() for bits in zip(*(s.visible for s in steps), strict=True)
         )

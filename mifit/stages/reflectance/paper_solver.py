@@ -88,7 +88,6 @@ def gather_samples(
         both = (row[:, a] >= 0) & (row[:, b] >= 0)
         first.append(row[both, a])
         second.append(row[both, b])
-    traced = forward.occlusion(seen).transfer
     colour = seen.colour[texel, image]
     return Samples(
         seen.normal[texel, seen.step[image]],
@@ -101,5 +100,5 @@ def gather_samples(
         surface.texels.index,
         surface.texels.size,
         albedo,
-        None if traced is None else traced[texel * len(seen.step) + image],
+        forward.occlusion(seen).take(texel * len(seen.step) + image).rows,
     )
