@@ -46,4 +46,5 @@ def specular_matrix(normals, view, radiance, exponent, model, diffuse_transfer=N
 def light_columns(normals, view, visible, light, exponent, fresnel=None):
     """Diffuse and specular radiance (N,) at unit albedo per unit of a light's colour."""
     look = appearance(np.zeros((1, 3)), exponent, "prefiltered", True, fresnel)
-    return look.light_transfer(normals, view)(light, visible)
+    matt, glossy = look.light_transfer(normals, view)([light], np.asarray(visible)[None])
+    return matt[0], glossy[0]

@@ -6,7 +6,7 @@ at unit albedo from smooth and from compact lights. `form_image` is the only pla
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mifit.appearance import models
 from mifit.appearance.arrays import aligned, expect, on_device, stored
-from mifit.appearance.illumination import Illumination, Light
+from mifit.appearance.illumination import DistantLight, Illumination, Light
 from mifit.appearance.kernels import PreparedLobe, diffuse_transfer, prepare
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
@@ -24,7 +24,7 @@ from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, Ver
 from mifit.errors import InputError
 
 OPEN = Occlusion()
-LightTransfer = Callable[[Light, NDArray[np.uint32]], tuple[NDArray[np.float32], NDArray[np.float32]]]
+LightTransfer = Callable[[Sequence[DistantLight], NDArray[np.uint32]], tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 
 def form_image(ambient: Any, albedo: Any, diffuse: Any, specular_albedo: Any, specular: Any) -> Any:
@@ -148,25 +148,41 @@ class Appearance:
         both = stored([*diffuse, *specular], scene.count)
         return both[:, : len(diffuse)], both[:, len(diffuse) :]
 
-    def light_transfer(self, normals: ArrayLike, view: ArrayLike, points: ArrayLike | None = None) -> LightTransfer:
-        """What compact lights, one after the other, send off points: parameters as in `shade`.
+    def light_transfer(self, normals: ArrayLike, view: ArrayLike) -> LightTransfer:
+        """What distant compact lights, several at a time, send off points: parameters as in `shade`.
 
         Returns
         -------
         callable
-            ``(light, visible)`` -> diffuse and specular radiance (N,) at unit albedo per unit of the light's colour;
-            ``visible`` (N,) uint32 tells which of the light's samples each point sees (``Light.visible``).
+            ``(lights, visible)`` -> diffuse and specular radiance (M, N) at unit albedo and light;
+            ``visible`` (M, N) uint32 tells which of a light's samples each point sees (``DistantLight.visible``).
         """
+        import drjit as dr
         import mitsuba as mi
 
         dark = Appearance(self.model, Illumination.dark(1), self.lobe)
-        scene = _Scene(dark, normals, view, Occlusion(), points, shadows=False)
+        scene = _Scene(dark, normals, view, Occlusion(), None, shadows=False)
 
-        def transfer(light: Light, visible: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-            if not scene.count:
-                return np.zeros(0, np.float32), np.zeros(0, np.float32)
-            both = stored(list(scene.light(light, mi.UInt(visible))(scene.n, scene.v)), scene.count)
-            return both[:, 0], both[:, 1]
+        def transfer(
+            lights: Sequence[DistantLight], visible: NDArray
+        ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+            shape = len(lights), scene.count
+            if not shape[0] * shape[1]:
+                return np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+            samples = np.stack([light.samples() for light in lights])
+            towards, rays = mi.Float(aligned(samples).ravel()), samples.shape[1]
+            number = dr.arange(mi.UInt32, shape[0] * shape[1])
+            count = dr.opaque(mi.UInt32, scene.count)
+            light, point = number // count, number % count
+
+            def direction(ray: int) -> Any:
+                return mi.Vector3f(*(dr.gather(mi.Float, towards, light * (3 * rays) + 3 * ray + i) for i in range(3)))
+
+            n, v = (dr.gather(mi.Vector3f, x, point) for x in (scene.n, scene.v))
+            seen = mi.UInt(aligned(visible, np.uint32).ravel())
+            found = self.model.light(n, v, scene.lobe, [direction(ray) for ray in range(rays)], 1.0, seen)
+            both = stored(list(found), shape[0] * shape[1])
+            return both[:, 0].reshape(shape), both[:, 1].reshape(shape)
 
         return transfer
 

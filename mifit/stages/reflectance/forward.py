@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.formation import Appearance
-from mifit.appearance.illumination import Illumination, Light
+from mifit.appearance.illumination import DistantLight, Illumination, Light
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
 from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, VertexTransfer
@@ -126,22 +126,33 @@ class Forward:
         return np.stack(steps, axis=1)
 
     def light_columns(self, seen: Observations) -> LightColumns:
-        """Diffuse and specular radiance (N, J) at unit albedo per unit of a compact light's colour, light after light.
+        """Diffuse and specular radiance (M, N, J) at unit albedo per unit of the colours of M compact lights.
 
-        Shadows are traced unless (N, T) bits tell which of the light's samples the texels see.
+        Shadows are traced unless (M, N, T) bits tell which of each light's samples the texels see.
         """
-        transfer = self.appearance.light_transfer(*_flat(seen), _points(seen))
+        transfer = self.appearance.light_transfer(*_flat(seen))
 
         def columns(
-            light: Light, visible: NDArray[np.uint32] | None = None
+            lights: Sequence[DistantLight], visible: NDArray[np.uint32] | None = None
         ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
             if visible is None:
-                steps = [light.visible(m.scene, seen.point[:, t], seen.normal[:, t]) for t, m in enumerate(self.meshes)]
-                visible = np.stack(steps, axis=1)
-            found = transfer(light, visible[:, seen.step].ravel())
-            return found[0].reshape(seen.weight.shape), self._gloss(found[1].reshape(seen.weight.shape))
+                visible = self._visible(seen, lights)
+            shape = len(lights), *seen.weight.shape
+            matt, glossy = transfer(lights, visible[..., seen.step].reshape(len(lights), -1))
+            return matt.reshape(shape), self._gloss(glossy.reshape(shape))
 
         return columns
+
+    def _visible(self, seen: Observations, lights: Sequence[DistantLight]) -> NDArray[np.uint32]:
+        """(M, N, T) which of each light's samples the texels see; a word of bits holds those of two lights."""
+        out = np.empty((len(lights), *seen.point.shape[:2]), np.uint32)
+        for first in range(0, len(lights), 2):
+            pair = [light.samples() for light in lights[first : first + 2]]
+            both = self.open_towards(seen, np.concatenate(pair))
+            out[first] = both & np.uint32((1 << len(pair[0])) - 1)
+            if len(pair) > 1:
+                out[first + 1] = both >> np.uint32(len(pair[0]))
+        return out
 
 
 def _flat(seen: Observations) -> tuple[NDArray, NDArray]:

@@ -7,6 +7,7 @@ candidate costs its shadow rays and a few products instead of a solve.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -128,36 +129,39 @@ class Candidates:
             remaining.right,
         )
 
-    def explained(self, direction: NDArray, radius: float, open_sky: NDArray[np.uint32] | None = None) -> float:
-        """Drop of the energy that a compact light brings, everything else adapting.
+    def explained(self, lights: Sequence[DistantLight], open_sky: NDArray[np.uint32] | None = None) -> NDArray:
+        """(M,) drop of the energy that each of some compact lights brings on its own, everything else adapting.
 
-        Its shadows are traced, unless bits tell which directions of its disc the texels (n, T) see.
+        Their shadows are traced, unless bits tell which directions of their discs the texels see (M, n, T).
         """
-        light = DistantLight(direction, radius, np.zeros(3))
-        by_diffuse, by_specular = self.columns(light, open_sky)
-        k = self.rows[0].shape[1]
-        own = np.zeros((len(by_diffuse), 4, 3), np.float32)
-        system, right, across = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3 * k))
+        by_diffuse, by_specular = self.columns(lights, open_sky)
+        m, n, k = len(by_diffuse), len(self.diffuse), self.rows[0].shape[1]
+        system, right = np.zeros((m, 3, 3)), np.zeros((m, 3))
+        across, moved = np.zeros((m, 3, 3 * k)), np.zeros((m, n, 4, 3))
+        own = np.zeros((m, n, 4, 3), np.float32)
         for c in range(3):
             column = self.diffuse[:, None, c] * by_diffuse + self.specular_albedo[:, None] * by_specular
             weighted = self.weight[..., c] * column
-            system[c, c] = (weighted * column).sum()
-            right[c] = (weighted * self.residual[..., c]).sum()
-            across[c, c * k : (c + 1) * k] = weighted.ravel() @ self.rows[c]
-            own[:, c, c] = (weighted * self.diffuse_light[..., c]).sum(1)
-            own[:, 3, c] = (weighted * self.specular_light[..., c]).sum(1)
-        moved = np.matmul(self.inverse, own)
-        system -= np.tensordot(own, moved, ([0, 1], [0, 1]))
-        right -= np.tensordot(moved, self.own_right, ([0, 1], [0, 1]))
-        single = moved.astype(np.float32)
-        across -= single[:, 3].T @ self.specular_cross
+            system[:, c, c] = np.einsum("mnj,mnj->m", weighted, column)
+            right[:, c] = np.tensordot(weighted, self.residual[..., c], 2)
+            across[:, c, c * k : (c + 1) * k] = weighted.reshape(m, -1) @ self.rows[c]
+            own[:, :, c, c] = np.einsum("mnj,nj->mn", weighted, self.diffuse_light[..., c])
+            own[:, :, 3, c] = np.einsum("mnj,nj->mn", weighted, self.specular_light[..., c])
+            for unknown in (c, 3):  # a channel's light touches no other channel's albedo
+                moved[..., c] += self.inverse[:, :, unknown] * own[:, :, unknown, c, None]
+        system -= np.einsum("mnia,mnib->mab", own, moved, optimize=True)
+        right -= np.tensordot(moved, self.own_right, ([1, 2], [0, 1]))
+        single = moved.astype(np.float32).transpose(2, 0, 3, 1)  # (4, M, 3, n)
+        across -= (single[3].reshape(-1, n) @ self.specular_cross).reshape(m, 3, -1)
         for c in range(3):
-            across[:, c * k : (c + 1) * k] -= single[:, c].T @ self.diffuse_cross[c]
-        system -= across @ self.factor @ across.T
-        right -= across @ (self.factor @ self.right)
-        floor = 1e-9 * float(np.trace(system)) + 1e-12
-        irradiance = np.maximum(np.linalg.solve(system + floor * np.eye(3), right), 0.0)
-        return float(2 * right @ irradiance - irradiance @ system @ irradiance)
+            across[..., c * k : (c + 1) * k] -= (single[c].reshape(-1, n) @ self.diffuse_cross[c]).reshape(m, 3, -1)
+        adapted = across @ self.factor
+        system -= adapted @ across.transpose(0, 2, 1)
+        right -= adapted @ self.right
+        floor = 1e-9 * np.trace(system, axis1=1, axis2=2) + 1e-12
+        damped = system + floor[:, None, None] * np.eye(3)
+        irradiance = np.maximum(np.linalg.solve(damped, right[..., None])[..., 0], 0.0)
+        return 2.0 * (right * irradiance).sum(1) - np.einsum("mi,mij,mj->m", irradiance, system, irradiance)
 
 
 def scan(candidates: Candidates) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -170,11 +174,12 @@ def scan(candidates: Candidates) -> tuple[NDArray[np.float64], NDArray[np.float6
     for start in range(0, len(directions), 32):
         part = directions[start : start + 32]
         bits = candidates.forward.open_towards(candidates.seen, part)
-        for number, direction in enumerate(part):
-            visible = (bits >> np.uint32(number)) & 1
-            if visible.mean() > LEAST:
-                bit = np.where(visible, np.uint32(0xFFFFFFFF), np.uint32(0))
-                gains[start + number] = candidates.explained(direction, WIDE, bit)
+        visible = (bits[None] >> np.arange(len(part), dtype=np.uint32)[:, None, None]) & np.uint32(1)
+        reached = np.flatnonzero(visible.mean((1, 2)) > LEAST)
+        if len(reached):
+            lights = [DistantLight(part[i], WIDE, np.zeros(3)) for i in reached]
+            every = np.where(visible[reached], np.uint32(0xFFFFFFFF), np.uint32(0))
+            gains[start + reached] = candidates.explained(lights, every)
     return directions, gains
 
 
@@ -206,18 +211,18 @@ def search(
     candidates: Candidates, direction: NDArray[np.float64], radius: float, step: float
 ) -> tuple[float, DistantLight]:
     """The light near a direction and an angular radius that explains most, and how much; `step` is the first one."""
-    gain = candidates.explained(direction, radius)
+    (gain,) = candidates.explained([DistantLight(direction, radius, np.zeros(3))])
     widen = 1.5
     while step > STEPS[1]:
         around = [(d, radius) for d in _ring(direction, step)]
         around += [(direction, float(np.clip(radius * f, *RADII))) for f in (widen, 1.0 / widen)]
-        gains = [candidates.explained(*c) for c in around]
+        gains = candidates.explained([DistantLight(*c, np.zeros(3)) for c in around])
         best = int(np.argmax(gains))
         if gains[best] > gain:
             (direction, radius), gain = around[best], gains[best]
         else:
             step, widen = 0.5 * step, np.sqrt(widen)
-    return gain, DistantLight(direction, float(radius), np.zeros(3))
+    return float(gain), DistantLight(direction, float(radius), np.zeros(3))
 
 
 def _ring(direction: NDArray, angle: float, count: int = 6) -> NDArray[np.float64]:
