@@ -6,10 +6,15 @@ u = (column + 0.5) / S, v = 1 - (row + 0.5) / S.
 
 from __future__ import annotations
 
+import hashlib
+from collections import OrderedDict
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+KEPT_MAPS, LARGEST_KEPT = 8, 1 << 20
+"""Maps whose texels are remembered, for the stages of a fit that read the same one, and texels of the largest."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,9 @@ class TexelMap:
         return out.reshape(self.size, self.size)
 
 
+_kept: OrderedDict[bytes, TexelMap] = OrderedDict()
+
+
 def rasterize_uv(uv: NDArray, faces_uv: NDArray, size: int, face_mask: NDArray | None = None) -> TexelMap:
     """Find the face and the barycentric weights under the centre of every texel.
 
@@ -65,6 +73,21 @@ def rasterize_uv(uv: NDArray, faces_uv: NDArray, size: int, face_mask: NDArray |
     face_mask : (F,) bool, optional
         Faces to rasterise; all by default. Faces that reach outside [0, 1] are clipped to the map.
     """
+    digest = hashlib.blake2b(str(size).encode())
+    for array in (uv, faces_uv, *([] if face_mask is None else [face_mask])):
+        digest.update(f"{array.shape}{array.dtype}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    key = digest.digest()
+    found = _kept.pop(key, None) or _rasterize(uv, faces_uv, size, face_mask)
+    if len(found.index) <= LARGEST_KEPT:
+        _kept[key] = found
+    while len(_kept) > KEPT_MAPS:
+        _kept.popitem(last=False)
+    return found
+
+
+def _rasterize(uv: NDArray, faces_uv: NDArray, size: int, face_mask: NDArray | None) -> TexelMap:
+    """`rasterize_uv`, where it isn't known yet; arrays that can't be written to, since others read them as well."""
     selected = np.arange(len(faces_uv)) if face_mask is None else np.flatnonzero(face_mask)
     corners = uv[faces_uv[selected]].astype(np.float64) * (size, -size) + (0.0, size)  # pixel x, y
     low = np.clip(np.ceil(corners.min(1) - 0.5), 0, size).astype(np.int64)
@@ -84,7 +107,10 @@ def rasterize_uv(uv: NDArray, faces_uv: NDArray, size: int, face_mask: NDArray |
         w = np.stack([1.0 - w1 - w2, w1, w2], axis=1)  # degenerate faces give NaN or infinity, refused below
     inside = (w >= -1e-9).all(1) & np.isfinite(w).all(1)
     flat, first = np.unique((y * size + x)[inside], return_index=True)
-    return TexelMap(size, flat, selected[tri[inside][first]].astype(np.int32), w[inside][first].astype(np.float32))
+    found = flat, selected[tri[inside][first]].astype(np.int32), w[inside][first].astype(np.float32)
+    for array in found:
+        array.flags.writeable = False
+    return TexelMap(size, *found)
 
 
 def sample_map(image: NDArray, uv: NDArray) -> NDArray:
@@ -104,6 +130,10 @@ def bilinear(image: NDArray, x: NDArray, y: NDArray) -> NDArray:
     x1, y1 = np.minimum(x0 + 1, w - 1), np.minimum(y0 + 1, h - 1)
     shape = (-1,) + (1,) * (image.ndim - 2)
     fx, fy = (x - x0).reshape(shape).astype(image.dtype), (y - y0).reshape(shape).astype(image.dtype)
-    top = image[y0, x0] * (1 - fx) + image[y0, x1] * fx
-    bottom = image[y1, x0] * (1 - fx) + image[y1, x1] * fx
+    # Pixels by one number: NumPy takes three times as long to find them by two.
+    pixels, at, below = image.reshape(h * w, *image.shape[2:]), y0 * w + x0, (y1 - y0) * w
+    right = x1 - x0
+    top = pixels.take(at, 0) * (1 - fx) + pixels.take(at + right, 0) * fx
+    at += below
+    bottom = pixels.take(at, 0) * (1 - fx) + pixels.take(at + right, 0) * fx
     return top * (1 - fy) + bottom * fy

@@ -21,6 +21,11 @@ MESH_BUFFERS = (MESH_POSITIONS, MESH_FACES, MESH_TEXCOORDS, MESH_NORMALS)
 SHADOW_EPSILON = 1e-3
 """Part of a ray's far end, relative to the scene's diagonal, in which hits count as the surface point itself."""
 
+KEPT_VIEWS, LARGEST_KEPT = 4, 1 << 20
+"""Cameras that a scene remembers what they see of it, and pixels of the largest."""
+_Hits = tuple[tuple[slice, slice], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+"""Pixels, and for each of them face, two barycentric weights and depth."""
+
 
 @dataclass(frozen=True)
 class GBuffer:
@@ -129,6 +134,7 @@ class SurfaceScene:
         self._parameters = mi.traverse(self.rays)
         self._key = next(k for k in self._parameters.keys() if k.endswith(MESH_POSITIONS))
         self._diagonal = _diagonal(vertices)
+        self._kept: dict[tuple, _Hits] = {}
 
     def update(self, vertices: NDArray) -> None:
         """Move the mesh to new positions (V, 3) and rebuild what rays are traced against."""
@@ -141,6 +147,7 @@ class SurfaceScene:
         self._parameters.update()
         self.vertices = vertices
         self._diagonal = _diagonal(vertices)
+        self._kept = {}
 
     def gbuffer(self, camera: Camera) -> GBuffer:
         """Intersect the rays through all pixel centres of an undistorted camera.
@@ -150,31 +157,51 @@ class SurfaceScene:
         InputError
             The camera has lens distortion; undistort the images first.
         """
-        import drjit as dr
-        import mitsuba as mi
 
         if any(camera.distortion):
             raise InputError(f"camera {camera.name}: found lens distortion, expected an undistorted camera")
+        box, face, u, v, depth = self._hits(camera)
+        shape = (camera.height, camera.width)
+        out = GBuffer(
+            np.full(shape, -1, np.int32), np.zeros((*shape, 3), np.float32), np.full(shape, np.inf, np.float32)
+        )
+        out.face[box], out.depth[box] = face, depth
+        valid = face >= 0
+        out.weights[box][valid] = np.stack([1.0 - u[valid] - v[valid], u[valid], v[valid]], axis=1)
+        return out
+
+    def _hits(self, camera: Camera) -> _Hits:
+        """What a camera's rays hit; the last ones are kept, since stages, pictures and masks ask for the same."""
+        import drjit as dr
+        import mitsuba as mi
+
+        key = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        full = (*key, camera.rotation.tobytes(), camera.position.tobytes())
+        if full in self._kept:
+            return self._kept[full]
         box = self._box(camera)
         centres = camera.pixel_centres()[box]
-        shape, part = (camera.height, camera.width), centres.shape[:2]
-        face = np.full(shape, -1, np.int32)
-        weights, depth = np.zeros((*shape, 3), np.float32), np.full(shape, np.inf, np.float32)
+        part = centres.shape[:2]
         if not centres.size:
-            return GBuffer(face, weights, depth)
+            nothing = np.zeros(part, np.float32)
+            return box, np.full(part, -1, np.int32), nothing, nothing, nothing
         directions = camera.pixel_rays(centres.reshape(-1, 2))
         ray = mi.Ray3f(mi.Point3f(camera.position), on_device(mi.Vector3f, directions))
         hit = self.rays.ray_intersect_preliminary(ray, coherent=True)
         dr.eval(hit.t, hit.prim_uv, hit.prim_index)  # one kernel: each array read would trace the rays again
-        valid = np.array(hit.is_valid()).astype(bool)
-        face[box] = np.where(valid, np.array(hit.prim_index).astype(np.int32), -1).reshape(part)
+        t = np.array(hit.t, dtype=np.float32)
+        valid = np.isfinite(t)
+        face = np.where(valid, np.array(hit.prim_index).astype(np.int32), -1)
         # Rays that hit nothing hold any bits in their coordinates: zeros, so that no sum of them warns.
-        u, v, t = (
-            np.where(valid, np.array(x, dtype=np.float32), np.float32(0)) for x in (hit.prim_uv.x, hit.prim_uv.y, hit.t)
-        )
-        weights[box] = np.where(valid[:, None], np.stack([1.0 - u - v, u, v], axis=1), 0.0).reshape(*part, 3)
-        depth[box] = np.where(valid, t * (directions @ camera.rotation[2]), np.inf).reshape(part)
-        return GBuffer(face, weights, depth)
+        u, v = (np.where(valid, np.array(x, dtype=np.float32), np.float32(0)) for x in hit.prim_uv)
+        depth = np.full(t.shape, np.inf, np.float32)
+        depth[valid] = t[valid] * (directions[valid] @ camera.rotation[2])
+        found = (box, *(x.reshape(part) for x in (face, u, v, depth)))
+        while self._kept and len(self._kept) >= KEPT_VIEWS:
+            self._kept.pop(next(iter(self._kept)))
+        if t.size <= LARGEST_KEPT:
+            self._kept[full] = found
+        return found
 
     def _box(self, camera: Camera) -> tuple[slice, slice]:
         """Rows and columns of the pixels that can show the mesh."""

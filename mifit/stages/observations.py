@@ -235,7 +235,23 @@ class Surface:
             )
             for image, left_out in zip(self._images, hidden, strict=True)
         ]
+        if self._kept is not None:
+            less._kept = self._reread(self._kept, less)
         return less
+
+    def _reread(self, kept: Observations, less: Surface) -> Observations:
+        """Observations of all texels with those read anew that are near pixels that another surface leaves out."""
+        touched = np.zeros(len(kept.texel), dtype=bool)
+        for k, (image, other) in enumerate(zip(self._images, less._images, strict=True)):
+            rows = np.flatnonzero(kept.weight[:, k] > 0)
+            pixel = image.camera.project(kept.point[rows, image.step].astype(np.float64)) - 0.5
+            touched[rows] |= bilinear(other.unusable - image.unusable, pixel[:, 0], pixel[:, 1]) > 0
+        rows = np.flatnonzero(touched)
+        again = less._observe(rows)
+        changed = {name: getattr(kept, name).copy() for name in ("colour", "weight", "clipped", "right")}
+        for name, values in changed.items():
+            values[rows] = getattr(again, name)
+        return replace(kept, **changed)
 
     def exposed(self, gains: Mapping[str, Sequence[float]]) -> Surface:
         """The same surface with the images over gains of the cameras, where it was made without."""

@@ -141,16 +141,19 @@ def agreement(
         if not len(rows):
             continue
         here = np.ix_(rows, images)
-        use, prior, shown = use[rows], 1.0 - wrong[here], level[here]
+        use, prior = use[rows], 1.0 - wrong[here]
+        shown = [level[..., channel][here] for channel in range(3)]  # sums along three neighbours in memory are slow
         trust = np.where(use, weight[here] * prior, 0.0)
         best = trust.argmax(axis=1)
-        centre = shown[np.arange(len(rows)), best]
+        centre = [channel[np.arange(len(rows)), best] for channel in shown]
         posterior = prior
         for _ in range(ROUNDS):
-            departure = ((shown - centre[:, None]) ** 2).mean(axis=2)
+            red, green, blue = ((channel - c[:, None]) ** 2 for channel, c in zip(shown, centre, strict=True))
+            departure = (red + green + blue) / np.float32(3)
             likely = prior / (np.pi * SPREAD * (1.0 + departure / SPREAD**2))
             posterior = likely / (likely + (1.0 - prior) / RANGE)
             share = trust * posterior
-            centre = (share[..., None] * shown).sum(axis=1) / share.sum(axis=1)[:, None]
+            total = share.sum(axis=1)
+            centre = [(share * channel).sum(axis=1) / total for channel in shown]
         right[here] = np.where(use, posterior, right[here])
     return right

@@ -94,3 +94,12 @@ def test_bilinear_of_a_single_pixel():
 def test_the_map_is_a_plain_record():
     texels = TexelMap(2, np.array([0, 3]), np.zeros(2, np.int32), np.zeros((2, 3), np.float32))
     assert_array_equal(texels.mask, [[True, False], [False, True]])
+
+
+def test_an_equal_map_is_found_once_and_cannot_be_written_to():
+    first = rasterize_uv(SQUARE, HALVES, 12)
+    assert rasterize_uv(SQUARE.copy(), HALVES.copy(), 12) is first
+    assert rasterize_uv(SQUARE, HALVES, 12, np.array([True, False])) is not first
+    assert rasterize_uv(0.5 * SQUARE, HALVES, 12) is not first
+    with pytest.raises(ValueError, match="read-only"):
+        first.weights[0] = 0.0

@@ -102,3 +102,20 @@ def test_bad_meshes_are_refused(variant: str, ball, camera: Camera) -> None:
     bent = Camera("bent", 8, 8, 9, 9, 4, 4, np.eye(4), (0.1, 0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="distortion"):
         scene.gbuffer(bent)
+
+
+def test_what_a_camera_saw_is_kept_until_the_mesh_moves(variant: str, ball, camera: Camera, monkeypatch) -> None:
+    vertices, faces = ball
+    scene = SurfaceScene(vertices, faces)
+    first = scene.gbuffer(camera)
+    first.face[:] = 7  # the caller's own
+    monkeypatch.setattr(Camera, "pixel_rays", lambda *_: pytest.fail("rays were sent again"))
+    again = scene.gbuffer(camera)
+    monkeypatch.undo()
+    fresh = SurfaceScene(vertices, faces).gbuffer(camera)
+    for name in ("face", "weights", "depth"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
+    turned = scene.gbuffer(replace(camera, cx=70.0))
+    assert not np.array_equal(turned.face, fresh.face)
+    scene.update(vertices + np.array([0.0, 0.0, 5.0]))
+    assert scene.gbuffer(camera).depth[45, 60] > fresh.depth[45, 60] + 4.0

@@ -9,6 +9,7 @@ import pytest
 from stages.reflectance_scene import EXPONENT, SIZE, TurningDome, turning_dome
 
 from mifit.appearance.illumination import DistantLight, disc
+from mifit.appearance.models import get
 from mifit.appearance.occlusion import trace_transfer
 from mifit.appearance.reference import specular_brdf
 from mifit.config import ReflectanceConfig
@@ -17,6 +18,9 @@ from mifit.core.uv import sample_map
 from mifit.errors import InputError
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.infer_reflectance import infer_reflectance
+from mifit.stages.observations import Surface
+from mifit.stages.reflectance.choice import fit_lighting, lighting_problem, plain_forward
+from mifit.stages.reflectance.key import Candidates
 from tests.shaded import light_columns, shade_points
 
 CONFIG = ReflectanceConfig(texture_size=SIZE, shading="keyed", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
@@ -183,3 +187,21 @@ def test_without_a_compact_light_none_is_made_up(variant):
 def test_adam_refuses_it(walled):
     with pytest.raises(InputError, match="use solver 'als'"):
         replace(CONFIG, solver="adam")
+
+
+def test_lights_judged_together_are_judged_as_each_alone(walled):
+    surface = Surface(walled, walled.model, walled.geometry, ("left", "right"), 32)
+    seen = surface.observe(surface.sample(300, np.random.default_rng(0)))
+    albedo = np.full((len(seen.texel), 3), 0.4, np.float32)
+    forward = plain_forward(get("shadowed"), 30.0, replace(CONFIG, bands=4), surface)
+    found = fit_lighting(seen, forward, albedo, CONFIG, 4)
+    problem = lighting_problem(seen, forward, found.light, albedo, True)
+    candidates = Candidates.about(seen, forward, problem, found)
+    towards = KEY.direction + 0.4 * np.random.default_rng(1).normal(size=(5, 3))
+    lights = [DistantLight(d / np.linalg.norm(d), 0.05 * (i + 1), np.zeros(3)) for i, d in enumerate(towards)]
+    together = candidates.explained(lights)
+    assert np.ptp(together) > 0.1 * together.max() > 0.0
+    np.testing.assert_allclose(together, [candidates.explained([light])[0] for light in lights], rtol=1e-4)
+    bits = np.stack([np.stack([light.visible(m.scene, seen.point[:, t], seen.normal[:, t])
+                               for t, m in enumerate(forward.meshes)], axis=1) for light in lights])  # fmt: skip
+    np.testing.assert_allclose(candidates.explained(lights, bits), together, rtol=1e-6)

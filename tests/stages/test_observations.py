@@ -169,6 +169,23 @@ def test_images_over_gains_are_those_of_a_surface_that_has_them(variant):
     assert not np.allclose(found.colour, plain.observe(np.arange(len(plain))).colour)
 
 
+def test_pixels_left_out_are_read_as_if_they_had_never_been_there(variant):
+    from mifit.stages.observations import Surface
+
+    shot, everywhere = capture((-0.2, 0.2)), np.arange(SIZE * SIZE)
+    hidden = [np.zeros((48, 48), bool) for _ in range(2)]
+    hidden[0][14:22, 20:30] = True
+    fresh = Surface(shot, quad(), geometry(), ("left", "right"), SIZE).without(hidden)
+    read = Surface(shot, quad(), geometry(), ("left", "right"), SIZE)
+    before = read.observe(everywhere)
+    after, expected = read.without(hidden).observe(everywhere), fresh.observe(everywhere)
+    for name in ("colour", "weight", "clipped", "right"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(expected, name))
+    assert ((before.weight > 0) & (after.weight == 0))[:, 0].any()
+    assert (before.right != after.right)[:, 1].any()  # what the other view confirmed
+    np.testing.assert_array_equal(read.observe(everywhere).weight, before.weight)
+
+
 def test_equal_meshes_are_made_and_their_shadows_traced_once(variant):
     from mifit.stages.observations import Surface
 
