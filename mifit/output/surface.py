@@ -6,6 +6,7 @@ albedo that continues the maps without a seam, by the mesh's normals.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from mifit.core.membrane import membrane
+from mifit.core.membrane import sheet
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, rasterize_uv, sample_map
 
@@ -90,24 +91,22 @@ def vertex_materials(reconstruction: Result, skin: bool = False) -> NDArray[np.f
     expected = np.column_stack([albedo, np.zeros(len(albedo))])
     if reflectance is None:
         return np.clip(expected, 0.0, 1.0).astype(np.float32)
-    inside = mapped_faces(reconstruction)
-    known = np.unique(model.faces[inside])
-    uv = np.zeros((len(albedo), 2))
-    uv[model.faces[inside].ravel()] = model.uv[model.faces_uv[inside].ravel()]
+    known, uv, continued = _continuation(model, _whole(reconstruction))
     _, nearest = _shown_texels(reconstruction, len(reflectance.diffuse))
     diffuse = reflectance.diffuse if skin else reflectance.lit_diffuse
     values = np.concatenate([diffuse, reflectance.specular[..., None]], axis=2)[nearest]
-    offset = sample_map(values, uv[known]) - expected[known]
-    if len(known) < len(albedo):
-        where = sp.csr_matrix((np.ones(len(known)), (np.arange(len(known)), known)), (len(known), len(albedo)))
-        expected += membrane(model.mean, model.faces, where, offset, np.ones(len(known)), STIFFNESS)
+    offset = sample_map(values, uv) - expected[known]
+    expected += continued(offset)
     expected[known] = offset + np.column_stack([albedo, np.zeros(len(albedo))])[known]
     return np.clip(expected, 0.0, 1.0).astype(np.float32)
 
 
 def _shown_texels(reconstruction: Result, size: int) -> tuple[TexelMap, tuple[NDArray, NDArray]]:
-    model = reconstruction.model
-    return _texels(model, size, np.array_equal(mapped_faces(reconstruction), model.mapped))
+    return _texels(reconstruction.model, size, _whole(reconstruction))
+
+
+def _whole(reconstruction: Result) -> bool:
+    return np.array_equal(mapped_faces(reconstruction), reconstruction.model.mapped)
 
 
 def mapped_faces(reconstruction: Result) -> NDArray[np.bool_]:
@@ -126,3 +125,19 @@ def _texels(model: MorphableModel, size: int, whole: bool) -> tuple[TexelMap, tu
     texels = rasterize_uv(model.uv, model.faces_uv, size, model.mapped if whole else model.face_mask)
     rows, columns = distance_transform_edt(~texels.mask, return_distances=False, return_indices=True)
     return texels, (rows, columns)
+
+
+@lru_cache(maxsize=2)
+def _continuation(model: MorphableModel, whole: bool) -> tuple[NDArray, NDArray, Callable[[NDArray], NDArray]]:
+    """Vertices of the faces with maps, where in the maps they are, and what continues values there over all vertices.
+
+    Every picture of a result asks for it, and it is the same for all of them.
+    """
+    inside, count = model.mapped if whole else model.face_mask, len(model.mean)
+    known = np.unique(model.faces[inside])
+    uv = np.zeros((count, 2))
+    uv[model.faces[inside].ravel()] = model.uv[model.faces_uv[inside].ravel()]
+    if len(known) == count:
+        return known, uv[known], lambda values: values
+    where = sp.csr_matrix((np.ones(len(known)), (np.arange(len(known)), known)), (len(known), count))
+    return known, uv[known], sheet(model.mean, model.faces, where, np.ones(len(known)), STIFFNESS)
