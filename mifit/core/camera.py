@@ -214,9 +214,8 @@ class Camera:
         """Pixel coordinates (..., 2) -> unit world-space directions (..., 3) away from the camera."""
         x = (pixels[..., 0] - self.cx) / self.fx
         y = (pixels[..., 1] - self.cy) / self.fy
-        d = np.stack([x, y, np.ones_like(x)], axis=-1)
-        d /= np.linalg.norm(d, axis=-1, keepdims=True)
-        return d @ self.rotation
+        length = np.sqrt(x * x + y * y + 1.0)
+        return np.stack([x / length, y / length, 1.0 / length], axis=-1) @ self.rotation
 
     def pixel_centres(self) -> NDArray[np.float64]:
         """(H, W, 2) coordinates of all pixel centres."""

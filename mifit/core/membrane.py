@@ -42,10 +42,10 @@ def membrane(
     -------
     (V, C) float64
     """
-    return sheet(vertices, faces, where, weight, stiffness)(values)
+    return factored_membrane(vertices, faces, where, weight, stiffness)(values)
 
 
-def sheet(
+def factored_membrane(
     vertices: NDArray, faces: NDArray, where: sp.spmatrix, weight: NDArray, stiffness: float
 ) -> Callable[[NDArray], NDArray[np.float64]]:
     """`membrane` as a function of the values alone: nearly all of its time goes into what doesn't depend on them."""

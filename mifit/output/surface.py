@@ -16,7 +16,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from mifit.core.membrane import sheet
+from mifit.core.membrane import factored_membrane
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, rasterize_uv, sample_map
 
@@ -140,4 +140,4 @@ def _continuation(model: MorphableModel, whole: bool) -> tuple[NDArray, NDArray,
     if len(known) == count:
         return known, uv[known], lambda values: values
     where = sp.csr_matrix((np.ones(len(known)), (np.arange(len(known)), known)), (len(known), count))
-    return known, uv[known], sheet(model.mean, model.faces, where, np.ones(len(known)), STIFFNESS)
+    return known, uv[known], factored_membrane(model.mean, model.faces, where, np.ones(len(known)), STIFFNESS)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mifit.appearance.arrays import aligned, on_device
 from mifit.core.camera import Camera
+from mifit.core.mesh import lengths
 from mifit.errors import InputError
 
 MESH_POSITIONS = "vertex_positions"
@@ -240,7 +241,7 @@ class SurfaceScene:
         if not len(points):
             return np.zeros(0, dtype=bool)
         direction = points - np.asarray(origin, dtype=np.float64)
-        distance = np.linalg.norm(direction, axis=1)
+        distance = lengths(direction)
         direction /= np.maximum(distance, 1e-30)[:, None]
         reach = np.maximum(distance - SHADOW_EPSILON * self._diagonal, 0.0)
         ray = mi.Ray3f(mi.Point3f(np.asarray(origin, dtype=np.float64)), on_device(mi.Vector3f, direction))
