@@ -100,12 +100,13 @@ def fits_of(case: Case, wanted: Sequence[str], config: FitConfig) -> dict[str, R
     if "full" in wanted:
         found["full"] = full
     if "refit" in wanted:
-        matt = infer_matt(capture, model, full.geometry, case.fitted, as_chosen(full, config.reflectance), SEED)
-        normals = mifit.refine_normals(capture, model, full.geometry, matt, case.fitted, config.normals, seed=SEED)
+        whole = full.model  # with eyes, if it had none
+        matt = infer_matt(capture, whole, full.geometry, case.fitted, as_chosen(full, config.reflectance), SEED)
+        normals = mifit.refine_normals(capture, whole, full.geometry, matt, case.fitted, config.normals, seed=SEED)
         residual = full.residual  # of the refit's own, so that both rows show what theirs leaves unexplained
         if residual is not None:
             given = full.geometry, matt, normals, case.fitted
-            residual = mifit.find_residual(capture, model, *given, config.residual, SEED)
+            residual = mifit.find_residual(capture, whole, *given, config.residual, SEED)
         found["refit"] = replace(full, reflectance=matt, normals=normals, mesh=None, residual=residual)
     if "paper" in wanted and hasattr(FitConfig, "paper"):
         paper = replace_size(FitConfig.paper(), config.reflectance.texture_size)

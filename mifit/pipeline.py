@@ -57,7 +57,8 @@ def fit(
     capture : Capture
         Images with cameras and landmarks.
     model : MorphableModel
-        The face model to fit.
+        The face model to fit. One whose eyes are holes gets simple ones (``[geometry] eyes``): the result's ``model``,
+        whose vertices begin with this one's.
     cameras : sequence of str, optional
         Cameras to use; no other camera's images are read. Default: the capture's first two.
     timesteps : sequence of int or FrameChoice, optional
@@ -94,6 +95,7 @@ def fit(
     The three stages of Song, Zheng, Cai, Cham, "Recovering Facial Reflectance and Geometry from Multi-view
     Images", sections 4 to 6. A Mitsuba variant must be active (``mifit.set_variant``).
     """
+    from mifit.morphable.openings import lacks_eyes, with_eyes
     from mifit.reconstruction import Reconstruction
     from mifit.render.variant import check_active_variant
 
@@ -106,6 +108,8 @@ def fit(
         raise InputError(f"until: found {until!r}, expected one of {', '.join(STAGES)}")
     check_images(capture, cameras, timesteps)
     digest = capture.digest(cameras, timesteps)
+    if config.geometry.eyes and lacks_eyes(model):
+        model = with_eyes(model)
     estimated: tuple[str, ...] = ()
     if not capture.calibrated:
         dense = calibrated(capture, model, cameras, timesteps, progress)
@@ -182,7 +186,7 @@ def empty_eyes(model: MorphableModel) -> tuple[str, ...]:
 
     if not lacks_eyes(model):
         return ()
-    return (f"the eyes of model {model.name} are holes; mifit model convert --eyes puts simple ones there",)
+    return (f"the eyes of model {model.name} are holes; [geometry] eyes = true puts simple ones there",)
 
 
 def one_place(capture: Capture, cameras: Sequence[str], geometry: GeometryEstimate) -> tuple[str, ...]:

@@ -8,10 +8,10 @@ import pytest
 
 import mifit
 from mifit.config import FitConfig
-from mifit.core.estimate import Report, ResidualEstimate
+from mifit.core.estimate import GeometryEstimate, Report, ResidualEstimate
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
-from mifit.morphable.openings import eyeballs
+from mifit.morphable.openings import eyeballs, with_eyes
 from mifit.pipeline import check_images, choose_timesteps, empty_eyes, one_place
 from mifit.steps import PARTS, Source, keys, steps
 from tests.output.conftest import ball_camera, ball_result
@@ -45,11 +45,53 @@ def test_the_order_in_which_timesteps_are_named_does_not_matter():
 def test_a_model_whose_eyes_are_holes_brings_a_warning():
     model = MorphableModel.load("builtin:coarse").subset(identity=2, expression=2, albedo=2)
     assert empty_eyes(model) == ()
+    assert "[geometry] eyes = true puts simple ones there" in empty_eyes(without_eyes(model))[0]
+
+
+def without_eyes(model):
     seen = ~np.isin(model.faces, np.concatenate(eyeballs(model))).any(axis=1)
-    skin = dataclasses.replace(
+    return dataclasses.replace(
         model, faces=model.faces[seen], faces_uv=model.faces_uv[seen], face_mask=model.face_mask[seen]
     )
-    assert "are holes; mifit model convert --eyes" in empty_eyes(skin)[0]
+
+
+def test_a_fit_gives_a_model_eyes_that_has_none(monkeypatch):
+    """What runs sees the model with eyes, unless the settings say otherwise; one that has eyes is left alone."""
+    seen = []
+    monkeypatch.setattr("mifit.pipeline.run_steps", lambda steps, source, *_: seen.append(source.model) or 1 / 0)
+    model = MorphableModel.load("builtin:coarse").subset(identity=2, expression=2, albedo=2)
+    skin = without_eyes(model)
+    empty = FitConfig(geometry=mifit.GeometryConfig(eyes=False))
+    for given, config in ((skin, None), (skin, empty), (model, None)):
+        with pytest.raises(ZeroDivisionError):
+            mifit.fit(made_up_capture(), given, config=config)
+    assert len(eyeballs(seen[0])) == 2 and seen[0].n_vertices > skin.n_vertices
+    assert seen[1] is skin and seen[2] is model
+
+
+def test_a_result_with_added_eyes_is_read_with_the_model_that_was_given(tmp_path):
+    """From the model's file, or with the model as it was before the fit."""
+    skin = without_eyes(MorphableModel.load("builtin:coarse").subset(identity=2, expression=2, albedo=2))
+    skin.save(tmp_path / "skin.npz")
+    whole = with_eyes(MorphableModel.load(tmp_path / "skin.npz"))
+    assert whole.source == f"{tmp_path / 'skin.npz'}+eyes"
+    n, k = len(whole.mean), (whole.n_identity, whole.n_albedo, whole.n_expression)
+    geometry = GeometryEstimate(
+        (0,), np.zeros(k[0]), np.zeros(k[1]), np.zeros((1, k[2])), np.eye(3)[None], np.zeros((1, 3)), 1.0,
+        whole.mean[None], np.full((n, 3), 0.3, np.float32), np.zeros((9, 3)), 0.0, Report("converged"),
+    )  # fmt: skip
+    result = dataclasses.replace(
+        ball_result(), model=whole, model_source=whole.source, geometry=geometry, reflectance=None, normals=None,
+        mesh=None, residual=None,
+    )  # fmt: skip
+    result.save(tmp_path / "result")
+    for model in (None, skin, whole):
+        again = mifit.Reconstruction.load(tmp_path / "result", model=model)
+        assert again.model.digest == whole.digest
+        np.testing.assert_allclose(again.geometry.vertices[0], whole.mean, atol=1e-4)
+    other = without_eyes(MorphableModel.load("builtin:coarse").subset(identity=3, expression=2, albedo=2))
+    with pytest.raises(InputError, match="was made with model"):
+        mifit.Reconstruction.load(tmp_path / "result", model=other)
 
 
 def test_views_from_one_place_bring_a_warning():

@@ -43,6 +43,10 @@ SMALLEST = 20
 """Vertices of an eyeball at the least."""
 EYES, CORNERS, INNER_LIPS = (slice(36, 42), slice(42, 48)), ((36, 39), (45, 42)), slice(60, 68)
 """iBUG points; corners from the outer to the inner one."""
+SUFFIX = "+eyes"
+"""After a model's file: with these pieces."""
+VERSION = 1
+"""Of the pieces; a result that was made with others has another model."""
 
 
 @dataclass(frozen=True)
@@ -120,6 +124,7 @@ def with_eyes(model: MorphableModel) -> MorphableModel:
     """The model with eyeballs in the holes of its eyes and a pouch in that of its mouth.
 
     New vertices come after the old ones, whose order, shape and modes stay; texture coordinates move up by a strip.
+    `MorphableModel.load` makes the same of ``"FILE+eyes"``, which is the ``source`` of the model returned.
 
     Raises
     ------
@@ -157,7 +162,7 @@ def with_eyes(model: MorphableModel) -> MorphableModel:
     added = int(starts[-1] - count)
     symmetry = None if model.symmetry is None else np.concatenate([model.symmetry, *mirror])
     modes = model.albedo_modes
-    return replace(
+    found = replace(
         model,
         name=f"{model.name} with eyes",
         mean=np.concatenate(mean),
@@ -170,8 +175,12 @@ def with_eyes(model: MorphableModel) -> MorphableModel:
         albedo_modes=np.concatenate([modes, np.zeros((added, *modes.shape[1:]), modes.dtype)]),
         face_mask=np.concatenate([model.face_mask, np.zeros(sum(map(len, faces[1:])), bool)]),
         symmetry=symmetry,
-        fingerprint="",
+        # The ball's centre is searched for, whose last digit differs between machines.
+        fingerprint=f"{model.digest}-eyes{VERSION}",
     )
+    if model.source:
+        found._set("_source", model.source + SUFFIX)
+    return found
 
 
 def _openings(model: MorphableModel) -> tuple[list[NDArray[np.int64]], NDArray[np.int64] | None]:

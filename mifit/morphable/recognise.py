@@ -23,6 +23,7 @@ from mifit.morphable.formats.mat5 import is_mat5, mat_names
 from mifit.morphable.formats.own import FORMAT_KEY, load_own
 from mifit.morphable.formats.pickles import is_pickle
 from mifit.morphable.model import MorphableModel, provides
+from mifit.morphable.openings import SUFFIX, with_eyes
 
 BUILTIN = ("builtin", "builtin:coarse")
 
@@ -47,7 +48,7 @@ FLATTEST = 0.02
 
 @provides("load")
 def load_model(path: str | Path, kind: str | None = None) -> MorphableModel:
-    """Load ``"builtin"``, ``"builtin:coarse"``, or a file or folder of a known kind.
+    """Load ``"builtin"``, ``"builtin:coarse"``, or a file or folder of a known kind, with ``+eyes`` behind or without.
 
     Parameters
     ----------
@@ -62,6 +63,9 @@ def load_model(path: str | Path, kind: str | None = None) -> MorphableModel:
     """
     if str(path) in BUILTIN:
         return builtin_model(coarse=str(path) == "builtin:coarse")
+    base = str(path).removesuffix(SUFFIX)
+    if base != str(path) and base and not Path(path).exists():
+        return with_eyes(MorphableModel.load(base, kind))
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such model; expected {', '.join(BUILTIN)} or an existing file or folder")

@@ -34,6 +34,7 @@ from mifit.core.split_mesh import SplitMesh, split_at_seams
 from mifit.core.subdivision import split_faces
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
+from mifit.morphable.openings import lacks_eyes, with_eyes
 from mifit.result.ownership import finish
 from mifit.result.record import R
 from mifit.result.writing import FORMAT_VERSION, label_file
@@ -46,6 +47,9 @@ def load(cls: type[R], folder: Path, model: MorphableModel | None = None) -> R:
     try:
         if model is None:
             model = _load_model(document["model"], path)
+        if model.digest != document["model"]["digest"] and lacks_eyes(model):
+            whole = with_eyes(model)  # as a fit has it
+            model = whole if whole.digest == document["model"]["digest"] else model
         if model.digest != document["model"]["digest"]:
             raise InputError(
                 f"{path}: was made with model {document['model']['name']!r} "
