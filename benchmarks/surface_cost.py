@@ -44,7 +44,7 @@ PARTS = {
     "texels as the views see them": ("views.py", "pose_texels"),
     "borders of the head": ("outline.py", "find_borders"),
     "displacements": ("displace.py", "solve_displacement"),
-    "lips": ("close_lips.py", "close_lips"),
+    "openings": ("close_openings.py", "close_openings"),
     "rays: scenes built": ("scenes.py", "at"),
     "rays: pixels": ("gbuffer.py", "gbuffer"),
 }

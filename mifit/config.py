@@ -104,6 +104,7 @@ class SurfaceConfig:
         "views then predict each other better",
     )
     close_lips: bool = flag(True, "close the lips on the lip line where the images show a closed mouth")
+    close_lids: bool = flag(True, "close the lids where the images show closed eyes")
     finest: int = number(0, "times that the images are halved at the finest level", least=0, most=6)
 
 

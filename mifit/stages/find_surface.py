@@ -20,7 +20,7 @@ from mifit.progress import Progress, silent
 from mifit.solve import Outcome
 from mifit.stages.geometry.points import corner_matrix
 from mifit.stages.geometry.scenes import Scenes
-from mifit.stages.surface.close_lips import close_lips
+from mifit.stages.surface.close_openings import LIDS, LIPS, close_openings
 from mifit.stages.surface.displace import USUAL, Plate, solve_displacement
 from mifit.stages.surface.epipolar import epipolar_residual
 from mifit.stages.surface.local_planes import MeasuredPlanes, touching_planes
@@ -148,9 +148,8 @@ def find_surface(
         last, again = search.descend(geometry, finest, last), again + 1
     search.finish()
     found = replace(geometry, vertices=last.world.astype(np.float32), displacement=last.displacement.astype(np.float32))
-    lips: dict = {}
-    if config.close_lips:
-        found, lips = close_lips(capture, model, found, cameras)
+    openings = LIPS * config.close_lips + LIDS * config.close_lids
+    found, closed = close_openings(capture, model, found, cameras, openings)
     found, crossed = keep_walls(model, found)
     residuals = search.epipolar_residuals(found, found.vertices.astype(np.float64), config.finest)
     seconds = time.perf_counter() - began
@@ -166,7 +165,7 @@ def find_surface(
         "stiffness": last.stiffness,
         "displacement_mm": float(np.sqrt(np.mean(moved**2))),
         "epipolar_pixels": residuals,
-        "lips": lips,
+        "openings": closed,
         "walls_crossed": crossed,
         "seconds": seconds,
     }

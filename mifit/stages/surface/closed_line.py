@@ -1,11 +1,14 @@
-"""Whether an image shows a closed mouth, and where its lip line runs.
+"""Whether an image shows a closed mouth or eye, and where the line runs in which lips or lids meet.
 
 The lips of a closed mouth meet in one thin line, darker and redder than they are. An open mouth shows a band instead
-that is as high as the opening: teeth, which are less red than lips, or the dark inside.
+that is as high as the opening: teeth, which are less red than lips, or the dark inside. Closed lids meet in such a line
+too, under their lashes; between the margins of an open eye lies what is less red than skin, the white, or far darker,
+iris and pupil.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +28,14 @@ DARKER = 0.15
 """Least median depth of the line below both sides, log of linear green and blue."""
 TEETH_MM, LESS_RED, TEETH = 1.0, 0.3, 0.25
 """Teeth: so near the line red over green falls by this (log) below the lips', in this part of the columns at least."""
+WITHIN, BESIDE_MM = 0.35, (1.0, 4.0)
+"""An eye is looked at so far from the middle, in parts of the opening, and compared with the skin so far beyond."""
+PALE, DARK, EYE = 0.15, 1.2, 0.45
+"""An eye is open where red over green falls by ``PALE`` (log) below the skin's, as the white's does, or colours by
+``DARK``, as those of iris and pupil, in this part of it at least. Closed eyes of a scan have 0.3 at the most, Digital
+Emily's open ones 0.75 at least, painted ones 0.6."""
+MARGINAL = 0.2
+"""Part of the columns at either corner of an eye that doesn't tell: the corner's tissue shows there."""
 FEWEST = 0.5
 """Part of the columns that an image must show to have a vote."""
 BEND = 0.01
@@ -35,8 +46,8 @@ DARKEST = 1e-3
 
 
 @dataclass(frozen=True)
-class LipLine:
-    """What one image says of the mouth.
+class ClosedLine:
+    """What one image says of a mouth or an eye.
 
     Attributes
     ----------
@@ -66,22 +77,78 @@ def sample(image: NDArray, pixels: NDArray) -> NDArray[np.float64]:
     return bilinear(np.asarray(image, dtype=np.float64), x, y).reshape(*pixels.shape[:-1], -1)
 
 
-def read_strip(strip: NDArray, seen: NDArray, opening_mm: float, column_mm: float) -> LipLine:
-    """The lip line in an image that was straightened along the lips.
+@dataclass(frozen=True)
+class Strip:
+    """An image that was straightened along the opening, blurred by `BLUR_MM`.
+
+    Attributes
+    ----------
+    dark, red : (C, R)
+        Logs of green and blue, their mean, and of red over green, in columns at the `heights` of the opening.
+    seen : (C,) bool
+        Columns that the image shows.
+    row : (C,)
+        Of the darkest line along the opening.
+    opening_mm : (C,)
+        Height of the modelled opening.
+    """
+
+    dark: NDArray[np.float64]
+    red: NDArray[np.float64]
+    seen: NDArray[np.bool_]
+    row: NDArray[np.intp]
+    opening_mm: NDArray[np.float64]
+
+
+def shows_teeth(strip: Strip) -> bool:
+    """Whether the line runs along teeth rather than between lips."""
+    red, seen = strip.red, strip.seen
+    window = np.abs(np.arange(red.shape[1])[None] - strip.row[:, None]) <= round(TEETH_MM / STEP_MM)
+    least = np.where(window, red, np.inf).min(axis=1)
+    return float((least[seen] < np.median(red[seen]) - LESS_RED).mean()) >= TEETH
+
+
+def shows_an_eye(strip: Strip) -> bool:
+    """Whether white, iris or pupil lie between the modelled lids."""
+    count = len(strip.seen)
+    inner = np.abs(np.arange(count) / (count - 1) - 0.5) < 0.5 - MARGINAL
+    columns = np.flatnonzero(strip.seen & inner)
+    if not len(columns):
+        columns = np.flatnonzero(strip.seen)
+    off = np.abs(heights(float(np.median(strip.opening_mm))))[None] - 0.5 * strip.opening_mm[columns, None]
+    within = off < (WITHIN - 0.5) * strip.opening_mm[columns, None]
+    beside = np.where((off > BESIDE_MM[0]) & (off < BESIDE_MM[1]), 1.0, np.nan)
+    dark, red = strip.dark[columns], strip.red[columns]
+    pale = red < np.nanmedian(beside * red) - PALE
+    black = dark < np.nanmedian(beside * dark, axis=1, keepdims=True) - DARK  # shading changes along the eye
+    return bool((pale | black)[within].mean() > EYE) if within.any() else True
+
+
+def read_strip(
+    strip: NDArray,
+    seen: NDArray,
+    opening_mm: NDArray,
+    column_mm: float,
+    shows_inside: Callable[[Strip], bool] = shows_teeth,
+) -> ClosedLine:
+    """The line in which lips or lids meet, in an image that was straightened along them.
 
     Parameters
     ----------
     strip : (C, R, 3)
-        Linear colour in columns along the lips, at the `heights` of the opening.
+        Linear colour in columns along the lips, at the `heights` of the median opening.
     seen : (C,) bool
         Columns that the image shows.
-    opening_mm : float
+    opening_mm : (C,)
         Height of the modelled opening.
     column_mm : float
         Distance between columns.
+    shows_inside : callable
+        Whether what lies between says that it is open.
     """
-    height = heights(opening_mm)
-    nothing = LipLine(None, np.zeros(len(strip)), np.zeros(len(strip)))
+    opening = float(np.median(opening_mm))
+    height = heights(opening)
+    nothing = ClosedLine(None, np.zeros(len(strip)), np.zeros(len(strip)))
     if seen.mean() < FEWEST:
         return nothing
     colour = gaussian_filter(
@@ -90,7 +157,7 @@ def read_strip(strip: NDArray, seen: NDArray, opening_mm: float, column_mm: floa
         mode="nearest",
     )
     dark, red = 0.5 * (colour[..., 1] + colour[..., 2]), colour[..., 0] - colour[..., 1]
-    apart = round(float(np.clip(PART * opening_mm, NARROWEST_MM, WIDEST_MM)) / STEP_MM)
+    apart = round(float(np.clip(PART * opening, NARROWEST_MM, WIDEST_MM)) / STEP_MM)
     depth = np.full(dark.shape, -np.inf)
     inner = slice(apart, dark.shape[1] - apart)
     sides = np.minimum(dark[:, 2 * apart :], dark[:, : dark.shape[1] - 2 * apart])
@@ -101,13 +168,11 @@ def read_strip(strip: NDArray, seen: NDArray, opening_mm: float, column_mm: floa
     found = np.where(seen, depth[columns, row], 0.0)
     if np.median(found[seen]) < DARKER:
         return nothing
-    window = np.abs(np.arange(dark.shape[1])[None] - row[:, None]) <= round(TEETH_MM / STEP_MM)
-    least = np.where(window, red, np.inf).min(axis=1)
-    closed = float((least[seen] < np.median(red[seen]) - LESS_RED).mean()) < TEETH
+    closed = not shows_inside(Strip(dark, red, seen, row, np.minimum(opening_mm, opening + BEYOND_MM)))
     weight = np.where(found > FAINT, found, 0.0)
     clear = np.flatnonzero(weight)
     smooth = gaussian_filter1d(np.interp(columns, clear, height[row[clear]]), 1.5, mode="nearest")
-    return LipLine(closed, smooth, weight)
+    return ClosedLine(closed, smooth, weight)
 
 
 def _seam(value: NDArray) -> NDArray[np.intp]:

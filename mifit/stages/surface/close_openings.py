@@ -1,0 +1,212 @@
+"""Lips and lids that touch where the images show a closed mouth or closed eyes.
+
+Detectors place the points of the inner lips and of the lids with a bias, and windows that span mouth or eye measure
+nothing in between: a fit leaves a slit, through which the inside of the mouth shows, or an eye that stares. Where the
+fitted images show either closed (`closed_line`), both margins move onto the line in which they meet.
+
+What the closed timesteps have in common moves the neutral surface; what remains goes into their expressions, and the
+expressions of the other timesteps undo the movement there, so that what is open stays as open as it was found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.estimate import GeometryEstimate
+from mifit.morphable.openings import EYES
+from mifit.render.gbuffer import SurfaceScene
+from mifit.stages.geometry.displaced import moved_by, object_shapes
+from mifit.stages.surface.closed_line import Strip, heights, read_strip, sample, shows_an_eye, shows_teeth
+from mifit.stages.surface.margins import UP, Gap, Margins, Region
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+
+SMALLEST_PIXELS = 4.5
+"""Opening up to which margins stay: the line and margins that are a little apart look alike in so few pixels."""
+DEPTH_MM, HEIGHT_MM = 0.5, 0.15
+"""Standard deviations of the line's depth about the middle between the margins, and of its height in an image."""
+FORWARD_MM = 3.0
+"""A column is seen where the point so far in front of it is."""
+FORWARD = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What may be closed.
+
+    Attributes
+    ----------
+    name : str
+    marks : slice
+        iBUG points along its margins.
+    widest_mm : float
+        Height above which it is open without a look: no detector is that wrong.
+    apart_mm : float
+        What is left between its margins.
+    moves : bool
+        Whether it closes by expression alone where other timesteps show it open: expressions that undo a movement of
+        the neutral surface leave a part of it, and a blink shouldn't make all others squint.
+    shows_inside : callable
+        Whether a strip of an image says that it is open.
+    """
+
+    name: str
+    marks: slice
+    widest_mm: float
+    apart_mm: float
+    moves: bool
+    shows_inside: Callable[[Strip], bool]
+
+
+LIPS = (Opening("mouth", slice(60, 68), 6.0, 0.08, False, shows_teeth),)
+LIDS = tuple(
+    Opening(name, marks, 8.0, 0.04, True, shows_an_eye)
+    for name, marks in zip(("right eye", "left eye"), EYES, strict=True)
+)
+
+
+def close_openings(
+    capture: Capture,
+    model: MorphableModel,
+    geometry: GeometryEstimate,
+    cameras: Sequence[str],
+    openings: Sequence[Opening] = LIPS + LIDS,
+) -> tuple[GeometryEstimate, dict]:
+    """Close mouth and eyes in the timesteps whose images show them closed.
+
+    Parameters
+    ----------
+    capture, model
+        Images, and the model that was fitted.
+    geometry : GeometryEstimate
+        Fit, with or without displacement.
+    cameras : sequence of str
+        Cameras to read; no other camera of the capture is touched.
+    openings : sequence of Opening
+        What to look at.
+
+    Returns
+    -------
+    geometry : GeometryEstimate
+        With ``displacement``, ``expression`` and ``vertices`` changed where there was something to close; otherwise
+        the input.
+    details : dict
+        By opening, those that the model has: ``closed`` and ``opening_mm``, timesteps seen closed, and the median
+        opening of each timestep before.
+    """
+    known = [(opening, margins) for opening in openings if (margins := Margins.of(model, opening.marks)) is not None]
+    seen: list[_Seen] = [_Seen() for _ in known]
+    shapes = object_shapes(model, geometry)
+    scene = SurfaceScene(geometry.vertices[0].astype(np.float64), model.faces) if known else None
+    for k, shape in enumerate(shapes):
+        if scene is None:
+            break
+        if k:
+            scene.update(geometry.vertices[k].astype(np.float64))
+        for (opening, margins), found in zip(known, seen, strict=True):
+            gap = Gap.of(shape, margins)
+            line, pixel = _closed_line(capture, scene, geometry, k, gap, cameras, opening, model.unit_mm)
+            found.heights_mm.append(gap.height(model.unit_mm))
+            found.pixel = min(found.pixel, pixel)
+            if line is not None:
+                found.lines[k] = line
+    details = {}
+    for (opening, margins), found in zip(known, seen, strict=True):
+        details[opening.name] = {
+            "closed": [int(geometry.timesteps[k]) for k in found.lines],
+            "opening_mm": dict(zip(map(str, geometry.timesteps), found.heights_mm, strict=True)),
+        }
+        if found.lines and np.mean([found.heights_mm[k] for k in found.lines]) >= SMALLEST_PIXELS * found.pixel:
+            geometry = _closed(model, geometry, margins, found.lines, opening)
+    return geometry, details
+
+
+@dataclass
+class _Seen:
+    """What the images show of one opening: by index of the timestep, lines (C, 3) where it is closed."""
+
+    lines: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    heights_mm: list[float] = field(default_factory=list)
+    pixel: float = np.inf
+
+
+def _closed(
+    model: MorphableModel, geometry: GeometryEstimate, margins: Margins, lines: dict[int, NDArray], opening: Opening
+) -> GeometryEstimate:
+    """The surface with margins that lie on lines, in the timesteps that have one."""
+    shapes = object_shapes(model, geometry)
+    region = Region.of(np.mean([shapes[k] for k in lines], axis=0), model, margins)
+    apart = 0.5 * opening.apart_mm / model.unit_mm
+    wanted = {k: region.movement(shapes[k], Gap.of(shapes[k], margins), line, apart) for k, line in lines.items()}
+    mean = np.mean(list(wanted.values()), axis=0) * (len(lines) == len(shapes) or not opening.moves)
+    shared = region.fade(mean)
+    expression = geometry.expression.copy()
+    for k in range(len(shapes)):
+        # What a timestep has beyond the others is small, or expressions follow it roughly anyway: one step does.
+        rest = region.fade(wanted[k] - mean, steps=1) if k in wanted else -shared
+        expression[k] = region.adjusted(model, expression[k], rest)
+    return moved_by(model, replace(geometry, expression=expression), shared)
+
+
+def _closed_line(
+    capture: Capture,
+    scene: SurfaceScene,
+    geometry: GeometryEstimate,
+    k: int,
+    gap: Gap,
+    cameras: Sequence[str],
+    opening: Opening,
+    unit_mm: float,
+) -> tuple[NDArray[np.float64] | None, float]:
+    """(C, 3) line in object space, None where the images don't show the opening closed; and mm of a pixel there."""
+    rotation, middle = geometry.rotation[k], gap.middle
+    median = gap.height(unit_mm)
+    if median > opening.widest_mm:
+        return None, np.inf
+    height = heights(median) / unit_mm
+
+    def world(points: NDArray) -> NDArray:
+        return geometry.scale * points @ rotation.T + geometry.translation[k]
+
+    column_mm = float(np.linalg.norm(np.diff(middle, axis=0), axis=1).mean()) * unit_mm
+    points = world(middle[:, None] + height[None, :, None] * UP)
+    front = world(middle + FORWARD_MM / unit_mm * FORWARD)
+    opening_mm = (gap.upper - gap.lower) @ UP * unit_mm
+    votes, rows, pixel = [], [], np.inf
+    for name in cameras:
+        camera, frame = capture.camera(name), capture.frame(name, geometry.timesteps[k])
+        pixels = camera.project(points.reshape(-1, 3)).reshape(*points.shape[:2], 2)
+        spacing = float(np.median(np.linalg.norm(np.diff(pixels, axis=1), axis=2)))
+        pixel = min(pixel, (height[1] - height[0]) * unit_mm / max(spacing, 1e-9))
+        x, y = pixels[..., 0], pixels[..., 1]
+        inside = np.all((x > 1) & (x < camera.width - 1) & (y > 1) & (y < camera.height - 1), axis=1)
+        seen = inside & scene.visible_from(front, camera.position)
+        good = (frame.valid & ~frame.clipped).astype(np.float32)[..., None].repeat(3, axis=2)
+        seen &= sample(good, np.where(inside[:, None, None], pixels, 1.0))[..., 0].mean(axis=1) > 0.5
+        read = read_strip(sample(frame.image, pixels), seen, opening_mm, column_mm, opening.shows_inside)
+        if read.closed is None:
+            continue
+        votes.append(read.closed)
+        # Depth moves what a view shows at a height: by how much, across the line.
+        at, up, deep = (camera.project(world(middle + d * 0.1 / unit_mm)) for d in (0.0 * UP, UP, FORWARD))
+        tangent = np.gradient(at, axis=0)
+        across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+        rows.append((read.height, read.weight, ((deep - at) * across).sum(1) / ((up - at) * across).sum(1)))
+    if not votes or 2 * sum(votes) <= len(votes):
+        return None, pixel
+    h, weight, slope = (np.stack(part) for part in zip(*rows, strict=True))
+    precision = weight / weight.max() / HEIGHT_MM**2
+    a, b, c = (precision.sum(0) + 1e-6, (precision * slope).sum(0), (precision * slope**2).sum(0) + DEPTH_MM**-2.0)
+    p, q = (precision * h).sum(0), (precision * slope * h).sum(0)
+    determinant = a * c - b**2
+    up, deep = (c * p - b * q) / determinant, (a * q - b * p) / determinant
+    clear = np.flatnonzero(precision.sum(0) > 0)
+    up, deep = (np.interp(np.arange(len(v)), clear, v[clear]) / unit_mm for v in (up, deep))
+    return middle + up[:, None] * UP + deep[:, None] * FORWARD, pixel
