@@ -50,9 +50,10 @@ class Opening:
         Height above which it is open without a look: no detector is that wrong.
     apart_mm : float
         What is left between its margins.
-    moves : bool
-        Whether it closes by expression alone where other timesteps show it open: expressions that undo a movement of
-        the neutral surface leave a part of it, and a blink shouldn't make all others squint.
+    blinks : bool
+        Whether it opens and closes with the others that do: where one is seen open none closes. Where other timesteps
+        show it open it closes by expression alone: expressions that undo a movement of the neutral surface leave a
+        part of it, and a blink shouldn't make all others squint.
     shows_inside : callable
         Whether a strip of an image says that it is open.
     """
@@ -61,7 +62,7 @@ class Opening:
     marks: slice
     widest_mm: float
     apart_mm: float
-    moves: bool
+    blinks: bool
     shows_inside: Callable[[Strip], bool]
 
 
@@ -103,6 +104,7 @@ def close_openings(
     """
     known = [(opening, margins) for opening in openings if (margins := Margins.of(model, opening.marks)) is not None]
     seen: list[_Seen] = [_Seen() for _ in known]
+    open_eyed: set[int] = set()
     shapes = object_shapes(model, geometry)
     scene = SurfaceScene(geometry.vertices[0].astype(np.float64), model.faces) if known else None
     for k, shape in enumerate(shapes):
@@ -112,11 +114,16 @@ def close_openings(
             scene.update(geometry.vertices[k].astype(np.float64))
         for (opening, margins), found in zip(known, seen, strict=True):
             gap = Gap.of(shape, margins)
-            line, pixel = _closed_line(capture, scene, geometry, k, gap, cameras, opening, model.unit_mm)
+            closed, line, pixel = _closed_line(capture, scene, geometry, k, gap, cameras, opening, model.unit_mm)
             found.heights_mm.append(gap.height(model.unit_mm))
             found.pixel = min(found.pixel, pixel)
             if line is not None:
                 found.lines[k] = line
+            elif closed is False and opening.blinks:
+                open_eyed.add(k)
+    for (opening, _), found in zip(known, seen, strict=True):
+        if opening.blinks:
+            found.lines = {k: line for k, line in found.lines.items() if k not in open_eyed}
     details = {}
     for (opening, margins), found in zip(known, seen, strict=True):
         details[opening.name] = {
@@ -145,7 +152,7 @@ def _closed(
     region = Region.of(np.mean([shapes[k] for k in lines], axis=0), model, margins)
     apart = 0.5 * opening.apart_mm / model.unit_mm
     wanted = {k: region.movement(shapes[k], Gap.of(shapes[k], margins), line, apart) for k, line in lines.items()}
-    mean = np.mean(list(wanted.values()), axis=0) * (len(lines) == len(shapes) or not opening.moves)
+    mean = np.mean(list(wanted.values()), axis=0) * (len(lines) == len(shapes) or not opening.blinks)
     shared = region.fade(mean)
     expression = geometry.expression.copy()
     for k in range(len(shapes)):
@@ -164,12 +171,15 @@ def _closed_line(
     cameras: Sequence[str],
     opening: Opening,
     unit_mm: float,
-) -> tuple[NDArray[np.float64] | None, float]:
-    """(C, 3) line in object space, None where the images don't show the opening closed; and mm of a pixel there."""
+) -> tuple[bool | None, NDArray[np.float64] | None, float]:
+    """Whether the images show the opening closed, None where they don't tell; (C, 3) line; and mm of a pixel there.
+
+    The line is in object space and None but for what is closed.
+    """
     rotation, middle = geometry.rotation[k], gap.middle
     median = gap.height(unit_mm)
     if median > opening.widest_mm:
-        return None, np.inf
+        return False, None, np.inf
     height = heights(median) / unit_mm
 
     def world(points: NDArray) -> NDArray:
@@ -199,8 +209,8 @@ def _closed_line(
         tangent = np.gradient(at, axis=0)
         across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
         rows.append((read.height, read.weight, ((deep - at) * across).sum(1) / ((up - at) * across).sum(1)))
-    if not votes or 2 * sum(votes) <= len(votes):
-        return None, pixel
+    if 2 * sum(votes) <= len(votes):
+        return (False if votes else None), None, pixel
     h, weight, slope = (np.stack(part) for part in zip(*rows, strict=True))
     precision = weight / weight.max() / HEIGHT_MM**2
     a, b, c = (precision.sum(0) + 1e-6, (precision * slope).sum(0), (precision * slope**2).sum(0) + DEPTH_MM**-2.0)
@@ -209,4 +219,4 @@ def _closed_line(
     up, deep = (c * p - b * q) / determinant, (a * q - b * p) / determinant
     clear = np.flatnonzero(precision.sum(0) > 0)
     up, deep = (np.interp(np.arange(len(v)), clear, v[clear]) / unit_mm for v in (up, deep))
-    return middle + up[:, None] * UP + deep[:, None] * FORWARD, pixel
+    return True, middle + up[:, None] * UP + deep[:, None] * FORWARD, pixel
