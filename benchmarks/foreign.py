@@ -1,6 +1,6 @@
 """Faces that this project did not make: measured and scanned heads, photographed or path traced elsewhere.
 
-    python -m benchmarks.foreign [--captures emily scan_city ...] [--rows full refit ...] [--size 256]
+    python -m benchmarks.foreign [--captures emily scan_city ...] [--rows full refit ...] [--size 512]
         [--timesteps 0,1] [--cameras left,right] [--config FILE.toml] [--judge RESULT] [--pictures DIR]
     python -m benchmarks.foreign --captures FOLDER --cameras a,b --held-out c [--model M]
 
@@ -43,8 +43,8 @@ ICT = str(SHARED / "models" / "ict_facekit" / "ict_facekit_head.npz")
 FITS = ("full", "refit", "paper")
 JUDGED = ("views", "mesh", "surface", "relit")
 RELIT_SAMPLES = 64
-SIZE = 256
-"""Texels along the side of the maps, unless --size says otherwise: more show little at these pictures' sizes."""
+SIZE = FitConfig().reflectance.texture_size
+"""Texels along the side of the maps, unless --size says otherwise: what a user gets who says nothing."""
 SEED = 0
 
 
