@@ -184,7 +184,7 @@ class EnvironmentLight:
         count = len(normals)
         if not len(directions) or not count:
             return np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
-        bits = mi.UInt(scene.open_towards(points.position, points.normal, directions))
+        bits = mi.UInt(aligned(scene.open_towards(points.position, points.normal, directions), np.uint32))
         n, v = (on_device(mi.Vector3f, x) for x in (normals, view))
         exponent = mi.Float(aligned(np.broadcast_to(np.asarray(lobe.exponent, np.float32), (count,))))
         prepared = prepare_exponent(exponent, 1, lobe.normalized, lobe.fresnel)
@@ -236,12 +236,14 @@ class EnvironmentLight:
         )
         n, v, base = (on_device(mi.Vector3f, x) for x in (normals, view, points.normal))
         exponent = mi.Float(aligned(np.broadcast_to(np.asarray(lobe.exponent, np.float32), (count,))))
-        origin = on_device(mi.Point3f, points.position) + OFFSET * _diagonal(scene) * base
+        # Opaque: the kernel is compiled once, not once for every mesh and every turn of the light.
+        offset = dr.opaque(mi.Float, OFFSET * _diagonal(scene))
+        back = [[dr.opaque(mi.Float, float(x)) for x in row] for row in self.rotation.T]
+        origin = on_device(mi.Point3f, points.position) + offset * base
         cosine = dr.dot(n, v)
         mirror = dr.normalize(2.0 * cosine * n - v)
         frame = mi.Frame3f(mirror)
         peak = normalization(exponent) if lobe.normalized else mi.Float(1.0 / np.pi)
-        back = [[float(x) for x in row] for row in self.rotation.T]
         colours, indices = mi.Float(aligned(radiosity).ravel()), mi.UInt(aligned(scene.faces, np.uint32).ravel())
         total = mi.Color3f(0.0)
         for k in range(LOOKS):

@@ -225,7 +225,7 @@ class _Scene:
                 f"compact lights: found visibility of {len(occlusion.visible)}, expected it of "
                 f"{len(illumination.lights)}; trace it with Occlusion.trace"
             )
-        self.visible = [mi.UInt(np.asarray(bits, dtype=np.uint32)) for bits in occlusion.visible]
+        self.visible = [mi.UInt(aligned(bits, np.uint32)) for bits in occlusion.visible]
         # Inputs of the kernel instead of constants in it, so that it is compiled once.
         self.coefficients = [mi.Color3f(*map(float, row)) for row in illumination.radiance]
         dr.make_opaque(self.coefficients)

@@ -7,7 +7,7 @@ that each light, and each rotation of one, costs a product.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -93,14 +93,16 @@ def _exchange(scene: SurfaceScene, positions: NDArray, normals: NDArray) -> csr_
     import mitsuba as mi
 
     count = len(positions)
-    diagonal = float(np.linalg.norm(np.ptp(positions, axis=0)))
+    # Opaque: the kernel is compiled once, not once for every mesh.
+    offset: Any = dr.opaque(mi.Float, OFFSET * float(np.linalg.norm(np.ptp(positions, axis=0))))
     number = dr.arange(mi.UInt, count * GATHERS)
     vertex, look = number // GATHERS, mi.Float(number % GATHERS)
     n = dr.gather(mi.Vector3f, on_device(mi.Vector3f, normals), vertex)
-    origin = dr.gather(mi.Vector3f, on_device(mi.Vector3f, positions), vertex) + OFFSET * diagonal * n
+    origin = dr.gather(mi.Vector3f, on_device(mi.Vector3f, positions), vertex) + offset * n
     u, v = dr.fma(look, 0.7548776662466927, 0.5), dr.fma(look, 0.5698402909980532, 0.5)
     d = mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u - dr.floor(u), v - dr.floor(v))))
     hit = scene.rays.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(origin), d))
+    dr.eval(hit.t, hit.prim_uv, hit.prim_index)  # one kernel: each array read would trace the rays again
     met = np.flatnonzero(np.asarray(hit.is_valid()))
     faces = np.asarray(scene.faces)[np.asarray(hit.prim_index)[met]]
     x, y = (np.asarray(part)[met].astype(np.float64) for part in (hit.prim_uv.x, hit.prim_uv.y))

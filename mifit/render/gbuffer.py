@@ -245,7 +245,7 @@ class SurfaceScene:
         direction /= np.maximum(distance, 1e-30)[:, None]
         reach = np.maximum(distance - SHADOW_EPSILON * self._diagonal, 0.0)
         ray = mi.Ray3f(mi.Point3f(np.asarray(origin, dtype=np.float64)), on_device(mi.Vector3f, direction))
-        ray.maxt = mi.Float(reach.astype(np.float32))
+        ray.maxt = mi.Float(aligned(reach))
         hit = self.rays.ray_test(ray)
         return ~np.array(hit).astype(bool)
 
@@ -275,7 +275,8 @@ class SurfaceScene:
         if not len(points):
             return np.zeros(0, np.uint32)
         n = on_device(mi.Vector3f, normals)
-        origin = on_device(mi.Vector3f, points) + SHADOW_EPSILON * self._diagonal * n
+        # Opaque: the kernel is compiled once, not once for every mesh.
+        origin = on_device(mi.Vector3f, points) + dr.opaque(mi.Float, SHADOW_EPSILON * self._diagonal) * n
         toward = mi.Float(aligned(directions).ravel())
 
         def body(i: Any, bits: Any) -> tuple[Any, Any]:

@@ -128,3 +128,22 @@ def test_a_mesh_that_moves_is_traced_again(variant) -> None:
     after = reception(scene)
     assert after is not before
     assert np.abs(after.normals - before.normals).max() > 0.1
+
+
+def test_neither_a_turn_of_the_light_nor_another_mesh_is_another_kernel(ball) -> None:
+    import drjit as dr
+
+    ours, points, view = ball
+    albedo = np.full((len(ours.vertices), 3), 0.4)
+
+    def kernels(angle: float, size: float) -> set[str]:
+        scene = SurfaceScene(size * np.asarray(ours.vertices), ours.faces)
+        dr.kernel_history_clear()
+        EnvironmentLight(lamp()[0] + np.float32(0.1), sh_rotation(angle)).shade(
+            scene, points, points.normal, view, Lobe(30.0, 1.0), albedo
+        )
+        return {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        first = kernels(0.3, 1.0)
+        assert first and kernels(0.9, 1.3) == first

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.arrays import aligned, on_device
+from mifit.appearance.arrays import aligned, on_device, stored
 from mifit.appearance.formation import Appearance, form_image
 from mifit.appearance.occlusion import Occlusion
 from mifit.stages.normals.chart import bent_normal, bent_normal_jacobian, conjugate_gradients, solve_blocks
@@ -333,8 +333,8 @@ def residual_scale(views: Sequence[NormalView], shade: TexelShade) -> float:
 
     lengths = []
     for k, view in enumerate(views):
-        shown = shade(on_device(mi.Vector3f, view.normal), on_device(mi.Vector3f, view.direction), k)
-        residual = view.colour - np.array(mi.Color3f(shown)).T
+        shown = mi.Color3f(shade(on_device(mi.Vector3f, view.normal), on_device(mi.Vector3f, view.direction), k))
+        residual = view.colour - stored([shown.x, shown.y, shown.z], len(view.colour))
         lengths.append(np.linalg.norm(residual, axis=1)[np.asarray(view.weight) > 0])
     every = np.concatenate(lengths) if lengths else np.zeros(0)
     return 1.48 * float(np.median(every)) if len(every) else 0.0
