@@ -274,7 +274,9 @@ class _Search:
         """Displace a fitted model's surface; levels as of `sweeps`. Goes on from ``last``."""
         model, scale = self._model, float(geometry.scale)
         neutral = model.shape(geometry.identity).astype(np.float64)
-        plate = Plate.of(neutral, model.faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm)
+        plate = Plate.of(
+            neutral, model.faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm, symmetry=model.symmetry
+        )
         last = last or _Descent.before(geometry)
         world, displacement, stiffness = last.world, last.displacement, last.stiffness
         matched, moved, step = 0.0, 0.0, 0.0

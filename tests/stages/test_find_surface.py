@@ -22,7 +22,7 @@ from mifit.stages.geometry.normal import NormalEquations
 from mifit.stages.geometry.parameters import Frames, Layout, exponential
 from mifit.stages.geometry.points import PointBasis
 from mifit.stages.geometry.visibility import spread_points
-from mifit.stages.surface.displace import USUAL, Displaced, Plate, solve_displacement
+from mifit.stages.surface.displace import SIDED, USUAL, Displaced, Plate, solve_displacement
 from mifit.stages.surface.local_planes import touching_planes
 from mifit.stages.surface.model_fit import PlaneTerm, landmarks_are_biased
 from mifit.stages.surface.outline import joined
@@ -197,6 +197,50 @@ def test_the_solution_is_the_minimum(model):
     trace = np.trace(np.linalg.solve(0.5 * plate.matrix.toarray() + data, data))
     assert abs(solved.measured / trace - 1.0) < 0.3  # random probes
     assert np.isclose(solved.energy, np.einsum("vc,vw,wc->", got, plate.matrix.toarray(), got))
+
+
+def test_what_one_half_alone_shows_holds_for_the_other():
+    """A bump of both halves, measured on one of them, is found on both; one that only one half has stays there."""
+    side = 41
+    across, up = (v.ravel() for v in np.meshgrid(*[np.arange(side) - side // 2.0] * 2, indexing="ij"))
+    corner = (side * np.arange(side - 1)[:, None] + np.arange(side - 1)).ravel()
+    faces = np.concatenate([corner[:, None] + (0, side, side + 1), corner[:, None] + (0, side + 1, 1)])
+    grid = np.column_stack([across, up, np.zeros(side * side)])
+    symmetry = np.arange(side * side).reshape(side, side)[::-1].ravel().astype(np.int32)
+    right, left = (np.exp(-0.5 * ((across - x) ** 2 + up**2) / 9.0) for x in (10.0, -10.0))
+    normals = np.tile([0.0, 0.0, 1.0], (len(grid), 1))
+
+    def found(height: np.ndarray, seen: np.ndarray, mirror: np.ndarray | None) -> np.ndarray:
+        plate, d = Plate.of(grid, faces, longest=200.0, symmetry=mirror), np.zeros((len(grid), 3))
+        for _ in range(6):  # sweeps
+            offsets, precision = height - d[:, 2], np.where(seen, 25.0, 0.0)
+            d = solve_displacement(
+                plate, sp.identity(len(grid), format="csr"), normals, offsets, precision, d, 0.5, robust=1e9
+            ).displacement
+        return d[:, 2]
+
+    here, there = right > 0.5, left > 0.5
+    half = across > 0  # nothing is measured beyond the middle
+    alone = found(right + left, half, None)
+    alike = found(right + left, half, symmetry)
+    assert np.abs(alike - left)[there].mean() < 0.3 < np.abs(alone - left)[there].mean()
+    both = found(right, np.ones_like(half), symmetry)
+    assert np.abs(both - right)[here].mean() < 0.1 and np.abs(both)[there].mean() < 0.1
+
+
+def test_the_energy_counts_what_the_halves_do_not_share():
+    rng = np.random.default_rng(4)
+    vertices, faces = np.array([[-1.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0.2]]), np.array([[0, 1, 2], [1, 0, 3]])
+    plate = Plate.of(vertices, faces, longest=10.0, symmetry=np.array([1, 0, 2, 3], np.int32))
+    np.testing.assert_array_equal(plate.mirrored(vertices)[:2], vertices[:2])  # mirror images of each other
+    alike = rng.normal(size=(4, 3))
+    alike = alike + plate.mirrored(alike)
+    np.testing.assert_allclose(plate.mirrored(alike), alike)
+    bare = replace(plate, symmetry=None)
+    assert np.isclose(plate.energy(alike), bare.energy(alike))
+    sided = rng.normal(size=(4, 3))
+    apart = sided - plate.mirrored(sided)
+    assert np.isclose(plate.energy(sided), bare.energy(sided) + SIDED * bare.energy(apart))
 
 
 def test_noise_stiffens_and_a_signal_softens():

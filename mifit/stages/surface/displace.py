@@ -2,11 +2,15 @@
 
 Minimised over vectors d at the vertices (object space):
 
-    sum_i p_i rho(n_i . (W d)_i - o_i) + stiffness * sum_v (|(L d)_v|^2 / a_v + (2 pi / longest)^4 a_v |d_v|^2)
+    sum_i p_i rho(n_i . (W d)_i - o_i) + stiffness * (E(d) + sided E(d - m))
+    E(d) = sum_v (|(L d)_v|^2 / a_v + (2 pi / longest)^4 a_v |d_v|^2)
 
 with the measured points W (barycentric), their normals n, offsets o and precisions p, the cotangent Laplacian L and
-areas a of the rest mesh. Only the normal component of d is measured: a point that slides on the surface costs
-nothing, so that what the views show decides where the surface lies and the prior decides how the mesh lies on it.
+areas a of the rest mesh. Faces are nearly symmetric: m is the displacement of the other half, mirrored, so that a flank
+of the nose that no two views show follows the one that they do rather than the cheek beside it. It is that of the
+round before, which leaves one plate, stiffer, and all axes apart. Only the normal component of d is measured: a point
+that slides on the surface costs nothing, so that what the views show decides where the surface lies and the prior
+decides how the mesh lies on it.
 The system couples x, y, z through the normals; it is solved by conjugate gradients with the decoupled system as
 preconditioner, whose one sparse factorisation serves all three axes and all reweightings. That one is in single
 precision: it steers the iterations, whose residuals are double.
@@ -27,6 +31,8 @@ from mifit.core.mesh_update import cotangent_laplacian
 
 CONTACT_WEIGHT = 30.0
 """Of vertices that nearly touch, times the squared distance at which they do."""
+SIDED = 10.0
+"""Stiffness against bending unlike the other half, relative to that against bending at all."""
 USUAL, KNOWN = 8.0, 4.0
 """Stiffness of the displacements that heads beyond a model's span ask for, and degrees of freedom that it counts as."""
 PROBES = 16
@@ -48,16 +54,26 @@ class Plate:
     matrix : (V, V) sparse
         Thin-plate energy, scale free: the energy of a displacement doesn't change when mesh and displacement are
         scaled together.
+    symmetry : (V,) int or None
+        For each vertex its mirror image's index in x -> -x; None where halves aren't compared.
     """
 
     matrix: sp.csr_matrix
+    symmetry: NDArray[np.int32] | None = None
 
     @classmethod
-    def of(cls, vertices: NDArray, faces: NDArray, longest: float, contact: float = 0.0) -> Plate:
+    def of(
+        cls,
+        vertices: NDArray,
+        faces: NDArray,
+        longest: float,
+        contact: float = 0.0,
+        symmetry: NDArray[np.int32] | None = None,
+    ) -> Plate:
         """Of a rest mesh (V, 3), (F, 3).
 
         Waves longer than ``longest`` are held by their height rather than by their bending; sheets closer than
-        ``contact``, such as closed lips, move together.
+        ``contact``, such as closed lips, move together; halves that mirror each other by ``symmetry`` move alike.
         """
         rest = np.asarray(vertices, dtype=np.float64)
         laplacian = cotangent_laplacian(rest, faces)
@@ -67,7 +83,23 @@ class Plate:
         matrix = laplacian.T @ sp.diags(1.0 / area) @ laplacian + (2.0 * np.pi / longest) ** 4 * sp.diags(area)
         if contact > 0:
             matrix = matrix + CONTACT_WEIGHT / contact**2 * _contacts(rest, faces, contact)
-        return cls(matrix.tocsr())
+        return cls(matrix.tocsr(), symmetry)
+
+    @property
+    def sided(self) -> float:
+        """Weight of the bending that the other half doesn't have."""
+        return 0.0 if self.symmetry is None else SIDED
+
+    def mirrored(self, displacement: NDArray) -> NDArray[np.float64]:
+        """(V, 3) what the other half's displacement is on this one."""
+        return displacement if self.symmetry is None else displacement[self.symmetry] * (-1.0, 1.0, 1.0)
+
+    def energy(self, displacement: NDArray) -> float:
+        """Of a displacement (V, 3), at stiffness 1."""
+        parts = [(1.0, displacement)]
+        if self.symmetry is not None:
+            parts.append((self.sided, displacement - self.mirrored(displacement)))
+        return sum(weight * float((d * (self.matrix @ d)).sum()) for weight, d in parts)
 
 
 def _contacts(vertices: NDArray, faces: NDArray, distance: float) -> sp.csr_matrix:
@@ -157,7 +189,7 @@ def solve_displacement(
     normal_start = (at_start * normals).sum(1)
     target = normal_start + offsets[used]
     held = at_start - normal_start[:, None] * normals
-    prior = stiffness * plate.matrix
+    prior = (1.0 + plate.sided) * stiffness * plate.matrix
     factor = spl.splu(
         (prior + points.T @ sp.diags(precision) @ points).tocsc().astype(np.float32),
         permc_spec="MMD_AT_PLUS_A",
@@ -170,15 +202,17 @@ def solve_displacement(
         scale = robust * 2.0 ** (rounds - 1 - number)
         residual = ((points @ d) * normals).sum(1) - target
         weight = precision / (1.0 + (residual / scale) ** 2) ** 2
-        d = _solve(prior, points, transposed, normals, weight, target, held, d, factor, slide)
+        alike = plate.sided / (1.0 + plate.sided) * (prior @ plate.mirrored(d))
+        d = _solve(prior, alike, points, transposed, normals, weight, target, held, d, factor, slide)
     probes = np.random.default_rng(0).choice((-1.0, 1.0), (plate.matrix.shape[0], PROBES))
     weighted = transposed @ (weight[:, None] * (points @ probes))
     measured = float((probes * factor.solve(weighted.astype(np.float32))).sum()) / PROBES
-    return Displaced(d, measured, float((d * (plate.matrix @ d)).sum()))
+    return Displaced(d, measured, plate.energy(d))
 
 
 def _solve(
     prior: sp.csr_matrix,
+    alike: NDArray,
     points: sp.csr_matrix,
     transposed: sp.csr_matrix,
     normals: NDArray,
@@ -189,7 +223,7 @@ def _solve(
     factor: spl.SuperLU,
     slide: float,
 ) -> NDArray[np.float64]:
-    """The minimum for given weights, by conjugate gradients from ``start``."""
+    """The minimum for given weights, by conjugate gradients from ``start``; ``alike`` (V, 3) pulls to the mirror."""
     along = slide * weight[:, None]
     across = weight[:, None] - along
 
@@ -199,7 +233,7 @@ def _solve(
         normal = (at * normals).sum(1, keepdims=True) * normals
         return (prior @ x + transposed @ (across * normal + along * at)).ravel()
 
-    right = transposed @ ((weight * target)[:, None] * normals + along * held)
+    right = transposed @ ((weight * target)[:, None] * normals + along * held) + alike
     size = start.size
     d, _ = spl.cg(
         spl.LinearOperator((size, size), matvec=apply),
