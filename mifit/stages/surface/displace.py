@@ -2,8 +2,8 @@
 
 Minimised over vectors d at the vertices (object space):
 
-    sum_i p_i rho(n_i . (W d)_i - o_i) + stiffness * (E(d) + sided E(d - m))
-    E(d) = sum_v (|(L d)_v|^2 / a_v + (2 pi / longest)^4 a_v |d_v|^2)
+    sum_i p_i rho(n_i . (W d)_i - o_i) + stiffness * (E(d) + B(d) + sided B(d - m))
+    B(d) = sum_v |(L d)_v|^2 / a_v,    E(d) = sum_v (2 pi / longest)^4 a_v |d_v|^2
 
 with the measured points W (barycentric), their normals n, offsets o and precisions p, the cotangent Laplacian L and
 areas a of the rest mesh. Faces are nearly symmetric: m is the displacement of the other half, mirrored, so that a flank
@@ -54,11 +54,14 @@ class Plate:
     matrix : (V, V) sparse
         Thin-plate energy, scale free: the energy of a displacement doesn't change when mesh and displacement are
         scaled together.
+    bending : (V, V) sparse
+        The part of it that no shift and hardly a turn of the whole adds to: a pose that is off isn't symmetric.
     symmetry : (V,) int or None
         For each vertex its mirror image's index in x -> -x; None where halves aren't compared.
     """
 
     matrix: sp.csr_matrix
+    bending: sp.csr_matrix
     symmetry: NDArray[np.int32] | None = None
 
     @classmethod
@@ -80,15 +83,16 @@ class Plate:
         size = np.linalg.norm(face_cross(rest, faces), axis=1) / 6.0
         area = np.bincount(faces.ravel(), np.repeat(size, 3), minlength=len(rest))
         area = np.maximum(area, 1e-3 * max(float(np.median(area)), 1e-12))
-        matrix = laplacian.T @ sp.diags(1.0 / area) @ laplacian + (2.0 * np.pi / longest) ** 4 * sp.diags(area)
+        bending = (laplacian.T @ sp.diags(1.0 / area) @ laplacian).tocsr()
+        matrix = bending + (2.0 * np.pi / longest) ** 4 * sp.diags(area)
         if contact > 0:
             matrix = matrix + CONTACT_WEIGHT / contact**2 * _contacts(rest, faces, contact)
-        return cls(matrix.tocsr(), symmetry)
+        return cls(matrix.tocsr(), bending, symmetry)
 
     @property
-    def sided(self) -> float:
-        """Weight of the bending that the other half doesn't have."""
-        return 0.0 if self.symmetry is None else SIDED
+    def sided(self) -> sp.csr_matrix:
+        """(V, V) of what the halves don't share."""
+        return (0.0 if self.symmetry is None else SIDED) * self.bending
 
     def mirrored(self, displacement: NDArray) -> NDArray[np.float64]:
         """(V, 3) what the other half's displacement is on this one."""
@@ -96,10 +100,9 @@ class Plate:
 
     def energy(self, displacement: NDArray) -> float:
         """Of a displacement (V, 3), at stiffness 1."""
-        parts = [(1.0, displacement)]
-        if self.symmetry is not None:
-            parts.append((self.sided, displacement - self.mirrored(displacement)))
-        return sum(weight * float((d * (self.matrix @ d)).sum()) for weight, d in parts)
+        apart = displacement - self.mirrored(displacement)
+        parts = (self.matrix, displacement), (self.sided, apart)
+        return sum(float((d * (matrix @ d)).sum()) for matrix, d in parts)
 
 
 def _contacts(vertices: NDArray, faces: NDArray, distance: float) -> sp.csr_matrix:
@@ -189,7 +192,8 @@ def solve_displacement(
     normal_start = (at_start * normals).sum(1)
     target = normal_start + offsets[used]
     held = at_start - normal_start[:, None] * normals
-    prior = (1.0 + plate.sided) * stiffness * plate.matrix
+    sided = stiffness * plate.sided
+    prior = stiffness * plate.matrix + sided
     factor = spl.splu(
         (prior + points.T @ sp.diags(precision) @ points).tocsc().astype(np.float32),
         permc_spec="MMD_AT_PLUS_A",
@@ -202,8 +206,9 @@ def solve_displacement(
         scale = robust * 2.0 ** (rounds - 1 - number)
         residual = ((points @ d) * normals).sum(1) - target
         weight = precision / (1.0 + (residual / scale) ** 2) ** 2
-        alike = plate.sided / (1.0 + plate.sided) * (prior @ plate.mirrored(d))
-        d = _solve(prior, alike, points, transposed, normals, weight, target, held, d, factor, slide)
+        d = _solve(
+            prior, sided @ plate.mirrored(d), points, transposed, normals, weight, target, held, d, factor, slide
+        )
     probes = np.random.default_rng(0).choice((-1.0, 1.0), (plate.matrix.shape[0], PROBES))
     weighted = transposed @ (weight[:, None] * (points @ probes))
     measured = float((probes * factor.solve(weighted.astype(np.float32))).sum()) / PROBES
