@@ -57,8 +57,8 @@ def fit(
     capture : Capture
         Images with cameras and landmarks.
     model : MorphableModel
-        The face model to fit. One whose eyes are holes gets simple ones (``[geometry] eyes``): the result's ``model``,
-        whose vertices begin with this one's.
+        The face model to fit. With ``[geometry] eyes`` one whose eyes are holes gets simple ones: the result's
+        ``model``, whose vertices begin with this one's.
     cameras : sequence of str, optional
         Cameras to use; no other camera's images are read. Default: the capture's first two.
     timesteps : sequence of int or FrameChoice, optional

@@ -56,13 +56,13 @@ def without_eyes(model):
 
 
 def test_a_fit_gives_a_model_eyes_that_has_none(monkeypatch):
-    """What runs sees the model with eyes, unless the settings say otherwise; one that has eyes is left alone."""
+    """What runs sees the model with eyes, if the settings say so; one that has eyes is left alone."""
     seen = []
     monkeypatch.setattr("mifit.pipeline.run_steps", lambda steps, source, *_: seen.append(source.model) or 1 / 0)
     model = MorphableModel.load("builtin:coarse").subset(identity=2, expression=2, albedo=2)
     skin = without_eyes(model)
-    empty = FitConfig(geometry=mifit.GeometryConfig(eyes=False))
-    for given, config in ((skin, None), (skin, empty), (model, None)):
+    eyed = FitConfig(geometry=mifit.GeometryConfig(eyes=True))
+    for given, config in ((skin, eyed), (skin, None), (model, eyed)):
         with pytest.raises(ZeroDivisionError):
             mifit.fit(made_up_capture(), given, config=config)
     assert len(eyeballs(seen[0])) == 2 and seen[0].n_vertices > skin.n_vertices

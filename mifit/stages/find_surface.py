@@ -115,11 +115,12 @@ def find_surface(
         return _unchanged(geometry, "views from nearly one place: the surface stays in the model's span", began)
     levels = sweeps(resolution, config, capture.unit_mm)
     # Landmarks that agree with the fit say more of a face within the model's span than shading and sweeps do.
-    refit = config.refit and landmarks_are_biased(geometry)
+    beyond = landmarks_are_biased(geometry)
+    refit = config.refit and beyond
     spanned = [*levels, *[levels[-1]] * FINEST_AGAIN] if refit else []
     coarse, finest = levels[:-1], levels[-1:]
     total = len(levels) + SETTLING + (len(coarse) + len(spanned) + SHADING_ROUNDS) * refit
-    search = _Search(capture, model, cameras, resolution, pairs, config, progress, total)
+    search = _Search(capture, model, cameras, resolution, pairs, config, progress, total, beyond)
     last = search.descend(geometry, coarse)
     between: list[float] = []  # without and with it
     if refit:
@@ -225,7 +226,9 @@ class _Search:
         config: SurfaceConfig,
         progress: Progress,
         total: int,
+        beyond: bool,
     ) -> None:
+        self._beyond = beyond
         self._capture, self._model, self._cameras, self._pairs = capture, model, cameras, pairs
         self._resolution, self._config, self._progress = resolution, config, progress
         self._done, self._total = 0, total
@@ -274,9 +277,9 @@ class _Search:
         """Displace a fitted model's surface; levels as of `sweeps`. Goes on from ``last``."""
         model, scale = self._model, float(geometry.scale)
         neutral = model.shape(geometry.identity).astype(np.float64)
-        plate = Plate.of(
-            neutral, model.faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm, symmetry=model.symmetry
-        )
+        # A head that the model spans is as symmetric as its modes make it.
+        halves = model.symmetry if self._beyond else None
+        plate = Plate.of(neutral, model.faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm, symmetry=halves)
         last = last or _Descent.before(geometry)
         world, displacement, stiffness = last.world, last.displacement, last.stiffness
         matched, moved, step = 0.0, 0.0, 0.0

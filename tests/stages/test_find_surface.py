@@ -9,7 +9,7 @@ import pytest
 import scipy.sparse as sp
 from memory_capture import make_capture
 
-from mifit.config import GeometryConfig
+from mifit.config import GeometryConfig, SurfaceConfig
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
@@ -351,7 +351,7 @@ def test_biased_landmarks_bend_the_shape_less(model, bumpy):
     assert off_mm(model, bumpy, alone).mean() < 0.5 * before
 
 
-def test_a_refit_on_which_the_views_agree_less_is_dropped(model, bumpy, start, found, monkeypatch):
+def test_a_refit_on_which_the_views_agree_less_is_dropped(model, bumpy, start, monkeypatch):
     def misled(capture, model, geometry, *_, **__):
         return replace(geometry, vertices=geometry.vertices + np.float32(0.6), translation=geometry.translation + 0.6)
 
@@ -360,7 +360,19 @@ def test_a_refit_on_which_the_views_agree_less_is_dropped(model, bumpy, start, f
     kept = find_surface(bumpy, model, start, BOTH)
     last = kept.report.details["phases"][-1]
     assert last["refitted"] is False and last["between_views"][0] < last["between_views"][1]
-    assert np.array_equal(kept.vertices, found.vertices)
+    alone = find_surface(bumpy, model, start, BOTH, SurfaceConfig(refit=False))
+    assert np.array_equal(kept.vertices, alone.vertices)
+
+
+def test_halves_are_compared_where_landmarks_are_biased_alone(model, bumpy, start, monkeypatch):
+    """A head within the model's span is as symmetric as its modes make it."""
+    given = []
+    plate = Plate.of
+    monkeypatch.setattr(Plate, "of", lambda *a, **k: given.append(k["symmetry"]) or plate(*a, **k))
+    for biased in (False, True):
+        monkeypatch.setattr("mifit.stages.find_surface.landmarks_are_biased", lambda _, biased=biased: biased)
+        find_surface(bumpy, model, start, BOTH, SurfaceConfig(refit=False, finest=2))
+        assert (given[-1] is model.symmetry) if biased else (given[-1] is None)
 
 
 def test_the_outcome_tells_whether_the_last_sweep_still_moved_the_surface(model, bumpy, start, monkeypatch):
