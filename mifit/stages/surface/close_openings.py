@@ -103,13 +103,13 @@ def close_openings(
         opening of each timestep before.
     """
     known = [(opening, margins) for opening in openings if (margins := Margins.of(model, opening.marks)) is not None]
+    if not known:
+        return geometry, {}
     seen: list[_Seen] = [_Seen() for _ in known]
     open_eyed: set[int] = set()
     shapes = object_shapes(model, geometry)
-    scene = SurfaceScene(geometry.vertices[0].astype(np.float64), model.faces) if known else None
+    scene = SurfaceScene(geometry.vertices[0].astype(np.float64), model.faces)
     for k, shape in enumerate(shapes):
-        if scene is None:
-            break
         if k:
             scene.update(geometry.vertices[k].astype(np.float64))
         for (opening, margins), found in zip(known, seen, strict=True):
