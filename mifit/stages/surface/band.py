@@ -42,18 +42,24 @@ class FeatureImage:
 
         0 outside the image. The straight lines are projected once.
         """
-        camera = self.camera
+        camera, factor = self.camera, self.factor
         start, slope = camera.to_camera(np.asarray(points, np.float64)), way.astype(np.float64) @ camera.rotation.T
-        axes = ((camera.fx, camera.cx, 0), (camera.fy, camera.cy, 1))
+        # Single precision places a point to a ten thousandth of a pixel, in half the time.
+        x, y, z = (start * (camera.fx * factor, camera.fy * factor, 1.0)).T.astype(np.float32)
+        dx, dy, dz = (slope * (camera.fx * factor, camera.fy * factor, 1.0)).T.astype(np.float32)
+        middle = np.float32(camera.cx * factor - 0.5), np.float32(camera.cy * factor - 0.5)
         out = np.empty((len(offsets), len(start), self.values.shape[-1]), np.float32)
         pixels = np.empty((len(start), 2), np.float32)
-        for k, offset in enumerate(offsets):
-            depth = start[:, 2] + offset * slope[:, 2]
-            front = depth > 1e-12
-            inverse = self.factor / np.where(front, depth, 1.0)
-            for focal, centre, i in axes:
-                across = (start[:, i] + offset * slope[:, i]) * (focal * inverse) + (centre * self.factor - 0.5)
-                pixels[:, i] = np.where(front, across, -10.0)
+        for k, offset in enumerate(np.asarray(offsets, np.float32)):
+            depth = z + offset * dz
+            behind = depth <= 1e-12
+            if behind.any():
+                depth[behind] = np.nan
+            np.divide(x + offset * dx, depth, out=pixels[:, 0])
+            np.divide(y + offset * dy, depth, out=pixels[:, 1])
+            pixels += middle
+            if behind.any():
+                pixels[behind] = -10.0
             out[k] = look_up(self.values, pixels)
         return out
 

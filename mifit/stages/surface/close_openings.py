@@ -10,9 +10,9 @@ expressions of the other timesteps undo the movement there, so that what is open
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,6 +133,20 @@ def close_openings(
         if found.lines and np.mean([found.heights_mm[k] for k in found.lines]) >= SMALLEST_PIXELS * found.pixel:
             geometry = _closed(model, geometry, margins, found.lines, opening)
     return geometry, details
+
+
+def close_again(
+    model: MorphableModel, geometry: GeometryEstimate, details: Mapping[str, Any], openings: Sequence[Opening]
+) -> GeometryEstimate:
+    """Margins that `close_openings` has closed, and that have moved a little since, on the middle between them."""
+    for opening in openings:
+        steps = [geometry.index(t) for t in details.get(opening.name, {}).get("closed", ())]
+        margins = Margins.of(model, opening.marks) if steps else None
+        if margins is not None:
+            shapes = object_shapes(model, geometry)
+            lines = {k: Gap.of(shapes[k], margins).middle for k in steps}
+            geometry = _closed(model, geometry, margins, lines, opening)
+    return geometry
 
 
 @dataclass

@@ -56,7 +56,8 @@ def epipolar_residual(
         shift = np.zeros((len(cameras), *step.position.shape))
         shift[b] = normalize(across)
         moved.append(replace(step, shift=shift))
-    found = sweep(texels, moved, pixel * np.arange(-FARTHEST, FARTHEST + 1), window, [pair])
+    pairs = [((k, pair[0]), (k, pair[1])) for k in range(len(moved))]
+    found = sweep(texels, moved, pixel * np.arange(-FARTHEST, FARTHEST + 1), window, pairs)
     used = found.precision > 0
     if used.sum() < FEWEST:
         return None

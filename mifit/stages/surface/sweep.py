@@ -8,12 +8,16 @@ surface is, and one score per texel and offset sums all pairs of views of all ti
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.mesh import normalize
+from mifit.core.threads import threads
 from mifit.core.uv import TexelMap
 from mifit.stages.surface.band import FeatureImage
 
@@ -30,9 +34,15 @@ POWER, INDEPENDENT = 1.5, 0.11
 GLARE = 0.1
 """Least difference in log brightness between two views at which a match counts a quarter."""
 GLARE_DEVIATIONS = 3.5
-"""The same in units of the differences' deviation over the face, where that is more."""
+"""The same in units of the differences' deviation over the face, where that is more; for views of one timestep."""
+LEAST_APART, BEST_APART, FARTHEST_APART = 5.0, 25.0, 50.0
+"""Angle between views of different timesteps that are compared, degrees."""
+MOST_PAIRS = 12
+"""Of views of different timesteps."""
 LEAST_SCORE = 0.4
 """Correlation below which a texel counts as not matched."""
+
+View = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -76,7 +86,9 @@ class Found:
     score: NDArray[np.float32]
 
 
-def sweep(texels: TexelMap, steps: Sequence[Posed], offsets: NDArray, window: int, pairs: Sequence) -> Found:
+def sweep(
+    texels: TexelMap, steps: Sequence[Posed], offsets: NDArray, window: int, pairs: Sequence[tuple[View, View]]
+) -> Found:
     """Find each texel's offset.
 
     Parameters
@@ -87,47 +99,108 @@ def sweep(texels: TexelMap, steps: Sequence[Posed], offsets: NDArray, window: in
         Evenly spaced, ascending, world units.
     window : int
         Texels along a side, odd.
-    pairs : sequence of (int, int)
-        Views to compare.
+    pairs : sequence of pairs of (int, int)
+        Views to compare, each named by its step and its place in it.
     """
     count, layers = len(texels.index), len(offsets)
     total = np.zeros((layers, count), np.float32)
     weight = np.zeros(count, np.float32)
-    for step in steps:
-        at = {}
-        for i in {i for pair in pairs for i in pair}:
-            way = step.normal if step.shift is None else step.shift[i]
-            at[i] = step.images[i].sample(step.position, way, offsets)  # (K, N, 3)
-        for a, b in pairs:
-            trust = np.sqrt(step.seen[a] * step.seen[b])
-            if not (trust > 0).any():
-                continue
-            valid = (at[a][..., 1] > 0.99).all(0) & (at[b][..., 1] > 0.99).all(0) & (trust > 0)
-            trust = trust * _without_glare(at[a][layers // 2, :, 2] - at[b][layers // 2, :, 2], valid)
-            mask = texels.to_map(valid.astype(np.float32))
-            inside = cv2.blur(mask, (window, window))
-            enough = texels.from_map(inside) > 0.5
-            use = np.where(valid & enough, trust, np.float32(0))
-            for k in range(layers):
-                total[k] += use * texels.from_map(
-                    _correlate(texels, mask, inside, at[a][k, :, 0], at[b][k, :, 0], window)
-                )
-            weight += use
+    named = list(dict.fromkeys(view for pair in pairs for view in pair))
+    with ThreadPoolExecutor(threads()) as pool:
+        shown = dict(zip(named, pool.map(lambda view: _shown(steps[view[0]], view[1], offsets), named), strict=True))
+
+        def compared(pair: tuple[View, View]) -> tuple[NDArray, NDArray] | None:
+            seen = [steps[k].seen[i] for k, i in pair]
+            deviations = GLARE_DEVIATIONS if pair[0][0] == pair[1][0] else 0.0
+            return _compared(texels, [shown[view] for view in pair], np.sqrt(seen[0] * seen[1]), window, deviations)
+
+        for scores in pool.map(compared, pairs):
+            if scores is not None:
+                total += scores[0]
+                weight += scores[1]
     score = total / np.maximum(weight, 1e-6)
     return _peak(score, weight, offsets)
 
 
-def _without_glare(difference: NDArray, valid: NDArray) -> NDArray[np.float32]:
+@dataclass(frozen=True)
+class _Shown:
+    """One view of the texels: feature (K, N) at each offset, whether all are in the image, and log brightness."""
+
+    feature: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    bright: NDArray[np.float32]
+
+
+def _shown(step: Posed, view: int, offsets: NDArray) -> _Shown:
+    """What a view shows of texels moved by offsets, of those that it sees."""
+    way = step.normal if step.shift is None else step.shift[view]
+    rows = np.flatnonzero(step.seen[view] > 0)
+    at = step.images[view].sample(step.position[rows], way[rows], offsets)  # (K, n, 3)
+    feature = np.zeros((len(offsets), len(step.position)), np.float32)
+    valid, bright = np.zeros(feature.shape[1], bool), np.zeros(feature.shape[1], np.float32)
+    feature[:, rows], bright[rows] = at[..., 0], at[len(offsets) // 2, :, 2]
+    valid[rows] = (at[..., 1] > 0.99).all(axis=0)
+    return _Shown(feature, valid, bright)
+
+
+def _compared(
+    texels: TexelMap, views: Sequence[_Shown], trust: NDArray, window: int, deviations: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    """(K, N) correlation of two views times its weight, and that (N,); None where nothing is seen in both."""
+    one, other = views
+    valid = one.valid & other.valid & (trust > 0)
+    if not valid.any():
+        return None
+    trust = trust * _without_glare(one.bright - other.bright, valid, deviations)
+    mask = texels.to_map(valid.astype(np.float32))
+    inside = cv2.blur(mask, (window, window))
+    enough = texels.from_map(inside) > 0.5
+    use = np.where(valid & enough, trust, np.float32(0))
+    scores = np.empty_like(one.feature)
+    for k, (x, y) in enumerate(zip(one.feature, other.feature, strict=True)):
+        scores[k] = use * texels.from_map(_correlate(texels, mask, inside, x, y, window))
+    return scores, use
+
+
+def across_time(steps: Sequence[Posed], rotation: NDArray) -> list[tuple[View, View]]:
+    """Pairs of views of different timesteps that see a rigid head (T, 3, 3) from directions fairly apart.
+
+    A head that turns shows each camera what two cameras show at once, and more: the flank of a nose that one of them
+    never sees.
+    """
+    towards = {
+        (k, i): normalize(image.camera.position - step.position.mean(axis=0)) @ rotation[k]
+        for k, step in enumerate(steps)
+        for i, image in enumerate(step.images)
+    }
+    angles = {
+        (a, b): float(np.degrees(np.arccos(np.clip(towards[a] @ towards[b], -1.0, 1.0))))
+        for a, b in combinations(towards, 2)
+        if a[0] != b[0]
+    }
+    left = {pair: abs(angle - BEST_APART) for pair, angle in angles.items() if LEAST_APART <= angle <= FARTHEST_APART}
+    chosen: list[tuple[View, View]] = []
+    uses = dict.fromkeys(towards, 0)
+    while left and len(chosen) < MOST_PAIRS:
+        a, b = min(left, key=lambda pair: (uses[pair[0]] + uses[pair[1]], left[pair]))
+        del left[a, b]
+        chosen.append((a, b))
+        uses[a] += 1
+        uses[b] += 1
+    return chosen
+
+
+def _without_glare(difference: NDArray, valid: NDArray, deviations: float) -> NDArray[np.float32]:
     """How far texels look as bright in one view as in the other, 0..1, from differences of log brightness.
 
     What is painted on skin does; a highlight lies elsewhere on it in every view, and matches itself at the depth of
-    what it mirrors.
+    what it mirrors. Light on a head that turns moves over its skin as a highlight does.
     """
     if not valid.any():
         return np.ones(len(difference), np.float32)
     difference = difference - np.median(difference[valid])
-    spread = 1.4826 * float(np.median(np.abs(difference[valid])))
-    return (1.0 / (1.0 + (difference / max(GLARE, GLARE_DEVIATIONS * spread)) ** 2) ** 2).astype(np.float32)
+    spread = 1.4826 * float(np.median(np.abs(difference[valid]))) if deviations else 0.0
+    return (1.0 / (1.0 + (difference / max(GLARE, deviations * spread)) ** 2) ** 2).astype(np.float32)
 
 
 def _correlate(

@@ -1,0 +1,212 @@
+"""Pose and expression of each timestep, by what its views show of one surface.
+
+Landmarks that share a bias leave a head's expressions apart by tenths of a millimetre and its poses by a degree, which
+shifts all that is painted on the skin from one timestep to the next by pixels. Every view's texture is compared with
+the mean of all views of all timesteps, and each timestep follows its gradient:
+
+    sum_ki w_ki (f_i(x_k(r_k, t_k, e_k)) - mean)^2 / s^2 + |e_k|^2 / EXPRESSION^2 + |r_k, t_k / size|^2 / POSE^2
+
+over turns r, shifts t and changes e of the expression at each timestep k, with the band-passed views f_i. What all
+timesteps would do alike is left out: that is the surface's to tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.estimate import GeometryEstimate
+from mifit.core.mesh import interpolate
+from mifit.core.threads import threads
+from mifit.core.uv import TexelMap
+from mifit.morphable import MorphableModel
+from mifit.stages.geometry.parameters import exponential
+from mifit.stages.surface.band import FeatureImage
+from mifit.stages.surface.sweep import Posed
+
+POINTS = 8000
+"""Texels that are compared at the most."""
+ITERATIONS = 10
+STILL_PIXELS = 0.02
+"""Largest root mean square shift of an iteration's step that ends the iterations, pixels of the level."""
+FEWEST = 500
+"""Views of texels below which nothing is compared."""
+INDEPENDENT = 0.1
+"""Part of the texels that count as measured on their own."""
+LEAST_SPREAD = 1e-3
+"""Of the features."""
+POSE = 0.03
+"""Deviation of turns beforehand, radians, and of shifts in terms of the head's size."""
+EXPRESSION = 0.3
+"""Deviation of the expressions' coefficients from those found before: a part of that of the coefficients themselves."""
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What one view shows at points.
+
+    Attributes
+    ----------
+    value, weight : (n,)
+        Feature, and how far it counts; weight 0 where the view doesn't see the point.
+    slope : (n, 3)
+        Change of the feature per world length that the point moves.
+    pixel : float
+        World length of a pixel of the level.
+    """
+
+    value: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    pixel: float
+
+
+@dataclass(frozen=True)
+class _View:
+    """One view: its timestep's position among those aligned, its image, and how well it sees each point."""
+
+    step: int
+    image: FeatureImage
+    seen: NDArray[np.float32]
+
+
+def align_timesteps(
+    model: MorphableModel, geometry: GeometryEstimate, texels: TexelMap, posed: Sequence[Posed]
+) -> GeometryEstimate:
+    """Move timesteps to where their views agree with those of the others.
+
+    Parameters
+    ----------
+    model : MorphableModel
+    geometry : GeometryEstimate
+        Fit at the timesteps of ``posed``.
+    texels : TexelMap
+    posed : sequence of Posed
+        The texels of the surface, which may be displaced from ``geometry``'s.
+
+    Returns
+    -------
+    GeometryEstimate
+        With other ``rotation``, ``translation``, ``expression`` and the ``vertices`` that follow.
+    """
+    rows = np.arange(len(texels.index))
+    if len(rows) > POINTS:
+        rows = np.sort(np.random.default_rng(0).choice(rows, POINTS, replace=False))
+    flat = model.expression.reshape(model.n_vertices, -1)
+    basis = interpolate(flat, model.faces, texels.face[rows], texels.weights[rows]).reshape(len(rows), 3, -1)
+    scale, rotation = float(geometry.scale), geometry.rotation.astype(np.float64)
+    low, high = model.expression_bounds.T.astype(np.float64)[:, None] - geometry.expression
+    # Object space about the middle, in world lengths: what moves alike at all timesteps is alike here.
+    middles = np.stack([p.position.mean(axis=0) for p in posed])
+    start = np.stack([(p.position[rows] - c) @ r for p, c, r in zip(posed, middles, rotation, strict=True)])
+    size = float(np.sqrt((start**2).sum(axis=2).mean()))
+    wide = np.concatenate([np.full(3, POSE), np.full(3, POSE * size), np.full(model.n_expression, EXPRESSION)])
+    turns = np.tile(np.eye(3), (len(posed), 1, 1))
+    shifts, changes = np.zeros((len(posed), 3)), np.zeros((len(posed), model.n_expression))
+    spent = np.zeros((len(posed), len(wide)))
+    views = [
+        _View(k, image, seen[rows]) for k, p in enumerate(posed) for image, seen in zip(p.images, p.seen, strict=True)
+    ]
+    owner = np.array([view.step for view in views])
+    for _ in range(ITERATIONS):
+        at = start + scale * np.einsum("nck,tk->tnc", basis, changes)
+        at = at @ turns.transpose(0, 2, 1) + shifts[:, None]
+        looks = _looks(views, [c + x @ r.T for x, c, r in zip(at, middles, rotation, strict=True)])
+        steps = _steps(looks, owner, at, rotation, turns, scale * basis, wide, spent)
+        if steps is None:
+            return geometry
+        steps -= steps.mean(axis=0)
+        steps[:, 6:] = np.clip(changes + steps[:, 6:], np.minimum(low, 0.0), np.maximum(high, 0.0)) - changes
+        spent += steps
+        for k, step in enumerate(steps):
+            turn = exponential(step[:3])
+            turns[k], shifts[k] = turn @ turns[k], turn @ shifts[k] + step[3:6]
+        changes += steps[:, 6:]
+        moved = np.sqrt((steps[:, :3] ** 2).sum(1) * size**2 + (steps[:, 3:6] ** 2).sum(1)).max()
+        if moved < STILL_PIXELS * min(look.pixel for look in looks):
+            break
+    return _moved(model, geometry, middles, turns, shifts, changes)
+
+
+def _looks(views: Sequence[_View], world: Sequence[NDArray]) -> list[_Look]:
+    """What each view shows of its timestep's points (n, 3)."""
+    with ThreadPoolExecutor(threads()) as pool:
+        return list(pool.map(lambda view: _look(view.image, world[view.step], view.seen), views))
+
+
+def _look(image: FeatureImage, points: NDArray, seen: NDArray) -> _Look:
+    """One view of world points (n, 3); central differences over a pixel."""
+    camera = image.camera
+    fx, fy = camera.fx * image.factor, camera.fy * image.factor
+    u, v, depth = camera.to_camera(points).T
+    depth = np.maximum(depth, 1e-12)
+    right, down, ahead = camera.rotation
+    across = image.sample(points, right * (depth / fx)[:, None], np.array([-0.5, 0.0, 0.5]))
+    along = image.sample(points, down * (depth / fy)[:, None], np.array([-0.5, 0.5]))
+    known = (across[..., 1] > 0.99).all(axis=0) & (along[..., 1] > 0.99).all(axis=0)
+    x, y = (across[2] - across[0])[:, 0] * fx / depth, (along[1] - along[0])[:, 0] * fy / depth
+    slope = x[:, None] * right + y[:, None] * down - ((x * u + y * v) / depth)[:, None] * ahead
+    weight = np.where(known, seen, 0.0).astype(np.float64)
+    return _Look(across[1, :, 0].astype(np.float64), weight, slope, float(np.median(depth)) / fx)
+
+
+def _steps(
+    looks: list[_Look],
+    owner: NDArray,
+    at: NDArray,
+    rotation: NDArray,
+    turns: NDArray,
+    basis: NDArray,
+    wide: NDArray,
+    spent: NDArray,
+) -> NDArray[np.float64] | None:
+    """(T, 6 + Ke) steps of turns, shifts and expressions, object space; None where too little is seen."""
+    value = np.stack([look.value for look in looks])
+    weight = np.stack([look.weight for look in looks])
+    used = (weight > 0) & ((weight > 0).sum(axis=0) > 1)
+    if used.sum() < FEWEST:
+        return None
+    mean = (weight * value).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-6)
+    residual = np.where(used, value - mean, 0.0)
+    spread = max(1.4826 * float(np.median(np.abs(residual[used]))), LEAST_SPREAD)
+    weight = np.where(used, weight / (1.0 + (residual / (2.0 * spread)) ** 2) ** 2, 0.0) * INDEPENDENT / spread**2
+    prior = np.diag(wide**-2.0)
+    system, gradient = np.tile(prior, (len(spent), 1, 1)), spent @ prior
+    for look, k, counts, off in zip(looks, owner, weight, residual, strict=True):
+        some = np.flatnonzero(counts > 0)
+        slope = look.slope[some] @ rotation[k]  # by object-space movement
+        bent = np.einsum("nc,nck->nk", slope @ turns[k], basis[some])
+        jacobian = np.concatenate([np.cross(at[k, some], slope), slope, bent], axis=1)
+        system[k] += (jacobian * counts[some, None]).T @ jacobian
+        gradient[k] += jacobian.T @ (counts[some] * off[some])
+    found: NDArray[np.float64] = -np.linalg.solve(system, gradient[..., None])[..., 0].astype(np.float64)
+    return found
+
+
+def _moved(
+    model: MorphableModel,
+    geometry: GeometryEstimate,
+    middles: NDArray,
+    turns: NDArray,
+    shifts: NDArray,
+    changes: NDArray,
+) -> GeometryEstimate:
+    """The fit whose timesteps have moved about their middles."""
+    rotation = geometry.rotation @ turns
+    old = geometry.rotation.astype(np.float64)
+    about = (geometry.translation - middles)[:, None] @ old  # of the object's origin from the middle, object axes
+    origin = (about @ turns.transpose(0, 2, 1) + shifts[:, None]) @ old.transpose(0, 2, 1) + middles[:, None]
+    shapes = (geometry.vertices - geometry.translation[:, None]) @ old
+    shapes = shapes + float(geometry.scale) * np.einsum("vck,tk->tvc", model.expression, changes)
+    vertices = shapes @ rotation.transpose(0, 2, 1) + origin
+    return replace(
+        geometry,
+        rotation=rotation,
+        translation=origin[:, 0],
+        expression=geometry.expression + changes,
+        vertices=vertices.astype(geometry.vertices.dtype),
+    )
