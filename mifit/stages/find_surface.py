@@ -99,7 +99,7 @@ def find_surface(
         fitted = fit_model(
             capture,
             model,
-            geometry,
+            last.geometry,
             cameras,
             lambda world, sweep: search.planes(geometry.timesteps, world, *sweep),
             spanned,
