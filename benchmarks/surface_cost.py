@@ -29,8 +29,7 @@ from mifit.config import GeometryConfig
 from mifit.core.files import write_text
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages import find_surface
-from mifit.stages.surface import outline
-from mifit.stages.surface.sweep import Posed
+from mifit.stages.surface import coarse_to_fine, outline
 
 MODELS = {"scan_city": "builtin", "scan_studio": "builtin"}
 """Models of the captures; the others have the ICT model."""
@@ -40,6 +39,7 @@ PARTS = {
     "- its colours": ("rendering.py", "linearize"),
     "- its texture": ("consistency.py", "linearize"),
     "guard of the refit": ("prediction_between_views.py", "errors_between_views"),
+    "alignment of the timesteps": ("align_timesteps.py", "align_timesteps"),
     "sweeps": ("sweep.py", "sweep"),
     "texels as the views see them": ("views.py", "pose_texels"),
     "borders of the head": ("outline.py", "find_borders"),
@@ -66,10 +66,10 @@ def count_work(amounts: dict[str, float], stack: ExitStack) -> None:
 
         stack.enter_context(mock.patch.object(place, name, counted))
 
-    def swept(texels: Any, steps: list[Posed], offsets: Any, window: int, pairs: Any) -> None:
-        looks = len(texels.index) * len(offsets) * len(steps)
+    def swept(texels: Any, steps: Any, offsets: Any, window: int, pairs: Any) -> None:
+        looks = len(texels.index) * len(offsets)
         amounts["sweeps"] += 1
-        amounts["sweeps: texels x offsets x views"] += looks * len(steps[0].images)
+        amounts["sweeps: texels x offsets x views"] += looks * len({view for pair in pairs for view in pair})
         amounts["sweeps: texels x offsets x pairs"] += looks * len(pairs)
 
     def bordered(capture: Any, scene: SurfaceScene, name: str, timestep: int, factor: float) -> None:
@@ -80,10 +80,10 @@ def count_work(amounts: dict[str, float], stack: ExitStack) -> None:
         box = scene._box(camera)
         amounts["rays: pixels"] += camera.pixel_centres()[box].size / 2
 
-    wrap(find_surface, "sweep", swept)
-    wrap(find_surface, "find_borders", bordered)
+    wrap(coarse_to_fine, "sweep", swept)
+    wrap(coarse_to_fine, "find_borders", bordered)
     wrap(SurfaceScene, "gbuffer", looked)
-    assert outline.find_borders is not find_surface.find_borders
+    assert outline.find_borders is not coarse_to_fine.find_borders
 
 
 def measure(name: str, peak: dict[str, Any]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from mifit.progress import Progress, silent
 from mifit.solve import Outcome
 from mifit.stages.eyes import behind_lids
 from mifit.stages.surface.close_openings import LIDS, LIPS, close_again, close_openings
-from mifit.stages.surface.descent import Descent, Search, sweeps
+from mifit.stages.surface.coarse_to_fine import Reached, Search, sweeps
 from mifit.stages.surface.model_fit import SHADING_ROUNDS, fit_model, landmarks_are_biased
 from mifit.stages.surface.prediction_between_views import errors_between_views
 from mifit.stages.surface.thin_walls import keep_walls
@@ -73,7 +73,8 @@ def find_surface(
     Notes
     -----
     Coarse to fine: at every level the texels of the current surface are moved along their normals to where the views
-    agree best (`surface.sweep`), and the mesh follows by sparse least squares (`surface.displace`).
+    agree best (`surface.sweep`), and the mesh follows by sparse least squares (`surface.displace`). Where landmarks
+    are biased, pose and expression of the timesteps follow the images too (`surface.align_timesteps`).
     """
     began = time.perf_counter()
     config = config or SurfaceConfig()
@@ -93,7 +94,7 @@ def find_surface(
     coarse, finest = levels[:-1], levels[-1:]
     total = len(levels) + SETTLING + (len(coarse) + len(spanned) + SHADING_ROUNDS) * refit
     search = Search(capture, model, cameras, resolution, pairs, config, progress, total, beyond)
-    last = search.descend(Descent.at(geometry), coarse)
+    last = search.descend(Reached.at(geometry), coarse)
     between: list[float] = []  # without and with it
     if refit:
         fitted = fit_model(
@@ -107,7 +108,7 @@ def find_surface(
             progress=search.advance,
             scenes=search.scenes,
         )
-        other = search.descend(Descent.at(fitted), coarse)
+        other = search.descend(Reached.at(fitted), coarse)
         # Colours mislead where the albedo model doesn't explain them; through the truer surface views predict others.
         # What the finest sweep adds is small beside what parts the two, and dear.
         between = errors_between_views(
@@ -124,7 +125,7 @@ def find_surface(
     lids = [set(closed[opening.name]["closed"]) for opening in LIDS if opening.name in closed]
     if beyond and any(seen == set(geometry.timesteps) for seen in lids):
         # Lids that have just met over the eyes lie where they fade into the skin around them: now they are measured.
-        covered = Descent.at(behind_lids(model, found), last.stiffness)
+        covered = Reached.at(behind_lids(model, found), last.stiffness)
         last = search.descend(covered, [(config.finest, CLOSED_LAYERS), *finest])
         found = close_again(model, last.estimate, closed, openings)
     search.finish()

@@ -26,7 +26,7 @@ from mifit.stages.surface.displace import SIDED, USUAL, Displaced, Plate, solve_
 from mifit.stages.surface.local_planes import touching_planes
 from mifit.stages.surface.model_fit import PlaneTerm, landmarks_are_biased
 from mifit.stages.surface.outline import joined
-from mifit.stages.surface.sweep import Found, Posed, _without_glare
+from mifit.stages.surface.sweep import GLARE_DEVIATIONS, Found, Posed, _without_glare
 from tests.morphable.intersections import intersections
 
 QUICK = GeometryConfig(rounds=1, surface_points=800, pixels=400, max_iterations=15)
@@ -121,7 +121,7 @@ def test_outlines_follow_the_images(model, bumpy, start, monkeypatch):
     vertices = start.vertices + inwards @ start.rotation.transpose(0, 2, 1)
     fitted = replace(start, vertices=vertices.astype(np.float32))
     outlined = covered_wrongly(model, bumpy, find_surface(bumpy, narrow, fitted, BOTH))
-    monkeypatch.setattr("mifit.stages.find_surface.find_borders", lambda *_: joined([]))
+    monkeypatch.setattr("mifit.stages.surface.coarse_to_fine.find_borders", lambda *_: joined([]))
     matched = covered_wrongly(model, bumpy, find_surface(bumpy, narrow, fitted, BOTH))
     assert outlined < 0.85 * matched and matched < covered_wrongly(model, bumpy, fitted)
 
@@ -276,7 +276,7 @@ def test_a_highlight_that_one_view_shows_counts_little_and_exposure_nothing():
     valid = np.ones(1000, bool)
     difference = 0.4 + 0.01 * rng.normal(size=1000)
     difference[:50] += 0.6
-    weight = _without_glare(difference, valid)
+    weight = _without_glare(difference, valid, GLARE_DEVIATIONS)
     assert weight[:50].max() < 0.05 and weight[50:].min() > 0.5 and np.median(weight) > 0.9
 
 

@@ -54,7 +54,7 @@ STIFFEST = 5000.0
 
 
 @dataclass(frozen=True)
-class Descent:
+class Reached:
     """Where a run of sweeps ended; ``geometry`` is the model's surface under the displacement."""
 
     geometry: GeometryEstimate
@@ -67,7 +67,7 @@ class Descent:
     outcome: Outcome
 
     @classmethod
-    def at(cls, estimate: GeometryEstimate, stiffness: float = USUAL) -> Descent:
+    def at(cls, estimate: GeometryEstimate, stiffness: float = USUAL) -> Reached:
         """On a surface that is displaced or not, nothing swept yet."""
         displacement = np.zeros((estimate.vertices.shape[1], 3))
         if estimate.displacement is not None:
@@ -160,7 +160,7 @@ class Search:
         shared = replace(swept.found, precision=swept.found.precision / len(posed))
         return [touching_planes(texels, one, shared) for one in posed], swept.step
 
-    def descend(self, last: Descent, levels: Sequence[tuple[int, int]]) -> Descent:
+    def descend(self, last: Reached, levels: Sequence[tuple[int, int]]) -> Reached:
         """Displace a fitted model's surface; levels as of `sweeps`."""
         model, geometry, scale = self._model, last.geometry, float(last.geometry.scale)
         neutral = model.shape(geometry.identity).astype(np.float64)
@@ -212,7 +212,7 @@ class Search:
             self.advance()
         # A sweep tells offsets to a part of its step: where the last one moved the surface by less, it has settled.
         outcome = Outcome.CONVERGED if moved < SETTLED * step else Outcome.MAX_ITERATIONS
-        return Descent(geometry, displacement, world, stiffness, matched, moved, outcome)
+        return Reached(geometry, displacement, world, stiffness, matched, moved, outcome)
 
     def epipolar_residuals(self, geometry: GeometryEstimate, world: NDArray, level: int) -> dict[str, float | None]:
         """Median distance from one another's epipolar lines for each pair of views, pixels of the images."""
