@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
-SHADING_ROUNDS, SHADING_ITERATIONS = 5, 10
+SHADING_ROUNDS, SHADING_ITERATIONS = 3, 10
 """Rounds by colours and texture, before anything is swept: they reach farthest; and iterations of each."""
 PASSES, ITERATIONS = 2, 6
 """Times that the planes' counterparts are found anew after a sweep, and iterations of each."""
