@@ -166,4 +166,17 @@ TERMS = [
       "return power * c", "tests/test_paper.py tests/appearance/test_models.py"),
 ]  # fmt: skip
 
-MUTATIONS = [*CONVENTIONS, *MEASURES, *LIGHT, *GEOMETRY, *MESH, *TERMS]
+SURFACE = [
+    M("timesteps turn the other way", STAGES, r"np\.cross\(at\[k, some\], slope\)", "np.cross(slope, at[k, some])",
+      "tests/stages/test_align_timesteps.py"),
+    M("timesteps aligned without what expressions move", STAGES, r"^    bent = np\.einsum|^        bent = np\.einsum",
+      "        bent = 0.0 * np.einsum", "tests/stages/test_align_timesteps.py"),
+    M("what all timesteps do alike is theirs", STAGES, r"^        steps -= steps\.mean\(axis=0\)$", "",
+      "tests/stages/test_align_timesteps.py"),
+    M("views of one timestep counted as of two", STAGES, r"if a\[0\] != b\[0\]$", "",
+      "tests/stages/test_align_timesteps.py"),
+    M("lids stay apart after they were measured", STAGES, r"^        found = close_again\(.*\)$", "        found = last.estimate",
+      "tests/stages/test_close_openings.py"),
+]  # fmt: skip
+
+MUTATIONS = [*CONVENTIONS, *MEASURES, *LIGHT, *GEOMETRY, *MESH, *TERMS, *SURFACE]

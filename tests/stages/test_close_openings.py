@@ -17,9 +17,9 @@ from mifit.core.estimate import GeometryEstimate, Report
 from mifit.core.mesh import face_cross
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs, with_eyes
-from mifit.stages.geometry.displaced import displaced
+from mifit.stages.geometry.displaced import displaced, moved_by
 from mifit.stages.geometry.parameters import exponential
-from mifit.stages.surface.close_openings import LIDS, LIPS, close_openings
+from mifit.stages.surface.close_openings import LIDS, LIPS, close_again, close_openings
 from mifit.stages.surface.closed_line import heights, read_strip
 from mifit.stages.surface.margins import COLUMNS, Gap, Margins
 from tests.morphable.intersections import intersections
@@ -265,6 +265,51 @@ def test_a_blink_leaves_the_eyes_of_other_timesteps_open(model, squinting):
     for opening in LIDS:
         gaps = [gap_of(model, g, k, opening.marks).height(model.unit_mm) for g in (squinting, found) for k in (0, 1)]
         assert abs(gaps[2]) < 1.2 and gaps[3] > 0.7 * gaps[1]
+
+
+def raised(model, found, opening, height_mm):
+    """A fit whose upper lid has been moved up."""
+    margins = Margins.of(model, opening.marks)
+    movement = np.zeros_like(model.mean)
+    movement[np.setdiff1d(margins.upper, margins.lower)] = (0.0, height_mm / model.unit_mm, 0.0)
+    return moved_by(model, found, movement)
+
+
+def test_margins_that_have_moved_are_put_together_again(model, shut):
+    found, details = shut
+    apart = found
+    for opening in LIDS:
+        apart = raised(model, apart, opening, 1.0)
+    again = close_again(model, apart, details, LIDS)
+    for opening in LIDS:
+        closed, moved, after = (gap_of(model, g, 0, opening.marks) for g in (found, apart, again))
+        assert moved.height(model.unit_mm) > 0.9 and abs(after.height(model.unit_mm)) < 0.1
+        rise = np.median((after.middle - closed.middle)[:, 1]) * model.unit_mm
+        assert rise == pytest.approx(0.5, abs=0.1)
+    assert close_again(model, apart, {name: {"closed": []} for name in details}, LIDS) is apart
+
+
+def test_closed_lids_that_are_measured_again_stay_closed(model, squinting, monkeypatch):
+    """Nothing in these images tells their depth; one that has them a millimetre apart leaves no such slit."""
+    capture = eyed(model, squinting, ("shut", "shut"))
+    monkeypatch.setattr(stage, "landmarks_are_biased", lambda _: True)
+    descend, sweeps = stage.Search.descend, []
+
+    def moving(self, last, levels):
+        sweeps.append(list(levels))
+        reached = descend(self, last, levels)
+        if len(levels) == 1 or levels[0][1] != stage.CLOSED_LAYERS:
+            return reached
+        moved = reached.estimate
+        for opening in LIDS:
+            moved = raised(model, moved, opening, 1.0)
+        return stage.Reached.at(moved, reached.stiffness)
+
+    monkeypatch.setattr(stage.Search, "descend", moving)
+    found = stage.find_surface(capture, model, squinting, BOTH, SurfaceConfig(finest=2, refit=False, close_lips=False))
+    assert sweeps[-1][0] == (2, stage.CLOSED_LAYERS)
+    for opening in LIDS:
+        assert abs(gap_of(model, found, 0, opening.marks).height(model.unit_mm)) < 0.5
 
 
 def test_added_eyes_follow_the_lids(model, squinting):
