@@ -33,6 +33,8 @@ FINEST_AGAIN = 2
 """Further sweeps at the finest level while the model alone moves."""
 CLOSED_LAYERS = 8
 """Offsets to either side in the first sweep of lids that have been closed."""
+TRIES = 2
+"""Refits with other points and pixels, at the most, of a single timestep, where a refit may end in a wrong place."""
 OFF_PIXELS = 1.0
 """Median distance from epipolar lines that deserves a warning."""
 NARROWEST = 0.03
@@ -92,11 +94,13 @@ def find_surface(
     refit = config.refit and beyond
     spanned = [*levels, *[levels[-1]] * FINEST_AGAIN] if refit else []
     coarse, finest = levels[:-1], levels[-1:]
-    total = len(levels) + SETTLING + (len(coarse) + len(spanned) + SHADING_ROUNDS) * refit
+    tries = (TRIES if len(geometry.timesteps) == 1 else 1) * refit
+    total = len(levels) + SETTLING + (len(coarse) + len(spanned) + SHADING_ROUNDS) * tries
     search = Search(capture, model, cameras, resolution, pairs, config, progress, total, beyond)
     last = search.descend(Reached.at(geometry), coarse)
     between: list[float] = []  # without and with it
-    if refit:
+    refit = False
+    for seed in range(tries):
         fitted = fit_model(
             capture,
             model,
@@ -105,6 +109,7 @@ def find_surface(
             lambda world, sweep: search.planes(geometry.timesteps, world, *sweep),
             spanned,
             geometry_config or GeometryConfig(),
+            seed,
             progress=search.advance,
             scenes=search.scenes,
         )
@@ -115,7 +120,9 @@ def find_surface(
             capture, model, cameras, geometry.timesteps, [last.world, other.world], geometry.gains
         )
         refit = between[1] < between[0]
-        last = other if refit else last
+        if refit:
+            last = other
+            break
     last = search.descend(last, finest)
     again = 0
     while again < SETTLING and last.outcome is not Outcome.CONVERGED:

@@ -364,6 +364,27 @@ def test_a_refit_on_which_the_views_agree_less_is_dropped(model, bumpy, start, m
     assert np.array_equal(kept.vertices, alone.vertices)
 
 
+def test_a_single_timestep_gets_another_try(model, bumpy, start, monkeypatch):
+    """With other points and pixels, as a refit may end in a wrong place; several timesteps hold each other."""
+    seeds = []
+
+    def misled(capture, model, geometry, cameras, planes, sweeps, config, seed, **_):
+        seeds.append(seed)
+        off = np.float32(0.6 if seed == 0 else 0.0)
+        return replace(geometry, vertices=geometry.vertices + off, translation=geometry.translation + off)
+
+    monkeypatch.setattr("mifit.stages.find_surface.fit_model", misled)
+    monkeypatch.setattr("mifit.stages.find_surface.landmarks_are_biased", lambda _: True)
+    errors = iter([[1.0, 2.0], [1.0, 0.9]])
+    monkeypatch.setattr("mifit.stages.find_surface.errors_between_views", lambda *_: next(errors))
+    config = SurfaceConfig(finest=2)
+    kept = find_surface(bumpy, model, start.at([0]), BOTH, config).report.details["phases"][-1]
+    assert seeds == [0, 1] and kept["refitted"] is True and kept["between_views"] == [1.0, 0.9]
+    errors = iter([[1.0, 2.0]])
+    kept = find_surface(bumpy, model, start, BOTH, config).report.details["phases"][-1]
+    assert seeds == [0, 1, 0] and kept["refitted"] is False
+
+
 def test_halves_are_compared_where_landmarks_are_biased_alone(model, bumpy, start, monkeypatch):
     """A head within the model's span is as symmetric as its modes make it."""
     given = []
