@@ -91,11 +91,10 @@ def find_surface(
     levels = sweeps(resolution, config, capture.unit_mm)
     # Landmarks that agree with the fit say more of a face within the model's span than shading and sweeps do.
     beyond = landmarks_are_biased(geometry)
-    refit = config.refit and beyond
-    spanned = [*levels, *[levels[-1]] * FINEST_AGAIN] if refit else []
+    tries = (TRIES if len(geometry.timesteps) == 1 else 1) * (config.refit and beyond)
     coarse, finest = levels[:-1], levels[-1:]
-    tries = (TRIES if len(geometry.timesteps) == 1 else 1) * refit
-    total = len(levels) + SETTLING + (len(coarse) + len(spanned) + SHADING_ROUNDS) * tries
+    spanned, over_lids = [*levels, *finest * FINEST_AGAIN], [(config.finest, CLOSED_LAYERS), *finest]
+    total = len(levels) + SETTLING + (len(coarse) + len(spanned) + SHADING_ROUNDS) * tries + len(over_lids) * beyond
     search = Search(capture, model, cameras, resolution, pairs, config, progress, total, beyond)
     last = search.descend(Reached.at(geometry), coarse)
     between: list[float] = []  # without and with it
@@ -130,10 +129,11 @@ def find_surface(
     openings = LIPS * config.close_lips + LIDS * config.close_lids
     found, closed = close_openings(capture, model, last.estimate, cameras, openings)
     lids = [set(closed[opening.name]["closed"]) for opening in LIDS if opening.name in closed]
-    if beyond and any(seen == set(geometry.timesteps) for seen in lids):
+    covering = beyond and any(seen == set(geometry.timesteps) for seen in lids)
+    if covering:
         # Lids that have just met over the eyes lie where they fade into the skin around them: now they are measured.
         covered = Reached.at(behind_lids(model, found), last.stiffness)
-        last = search.descend(covered, [(config.finest, CLOSED_LAYERS), *finest])
+        last = search.descend(covered, over_lids)
         found = close_again(model, last.estimate, closed, openings)
     search.finish()
     found, crossed = keep_walls(model, found)
@@ -144,7 +144,7 @@ def find_surface(
         "name": "surface",
         "outcome": last.outcome.value,
         "moved_last_mm": last.moved * capture.unit_mm,
-        "levels": [level for level, _ in (*levels, *finest * again)],
+        "levels": [level for level, _ in (*levels, *finest * again, *over_lids * covering)],
         "matched": last.matched,
         "refitted": refit,
         "between_views": between,

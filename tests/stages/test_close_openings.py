@@ -306,8 +306,14 @@ def test_closed_lids_that_are_measured_again_stay_closed(model, squinting, monke
         return stage.Reached.at(moved, reached.stiffness)
 
     monkeypatch.setattr(stage.Search, "descend", moving)
-    found = stage.find_surface(capture, model, squinting, BOTH, SurfaceConfig(finest=2, refit=False, close_lips=False))
+    told = []
+    config = SurfaceConfig(finest=2, refit=False, close_lips=False)
+    found = stage.find_surface(
+        capture, model, squinting, BOTH, config, lambda _, done, total: told.append((done, total))
+    )
     assert sweeps[-1][0] == (2, stage.CLOSED_LAYERS)
+    assert len(found.report.details["phases"][-1]["levels"]) == sum(map(len, sweeps))
+    assert all(done <= total for done, total in told) and told[-1][0] == told[-1][1]
     for opening in LIDS:
         assert abs(gap_of(model, found, 0, opening.marks).height(model.unit_mm)) < 0.5
 
