@@ -29,6 +29,7 @@ from mifit.config import SHADINGS, FitConfig, GeometryConfig, NormalsConfig, Ref
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
 from mifit.core.files import write_text
 from mifit.errors import ConvergenceError, InputError
+from mifit.morphable.openings import with_eyes
 
 MODEL = SHARED / "models" / "ict_facekit" / "ict_facekit_head.npz"
 CAMERAS = ("left", "right")
@@ -241,7 +242,7 @@ def main() -> int:
         print(f"ablation: left out, it needs the data folder {SHARED}", file=sys.stderr)
         return 0
     mifit.set_variant("auto")
-    model = MorphableModel.load(MODEL)
+    model = with_eyes(MorphableModel.load(MODEL))  # as a fit has it
     captures: dict[str, dict[str, Any]] = {}
     stored = RESULTS / f"{a.name}.json"
     if stored.exists():  # captures that aren't named keep their figures

@@ -117,9 +117,10 @@ def main() -> None:
     mifit.set_variant("auto")
     capture, model = Capture.load(SHARED / "captures" / arguments.capture), MorphableModel.load(arguments.model)
     if arguments.result is None:
-        geometry = mifit.fit(capture, model, CAMERAS, TIMESTEPS, until="geometry").geometry
+        fitted = mifit.fit(capture, model, CAMERAS, TIMESTEPS, until="geometry")
     else:
-        geometry = Reconstruction.load(arguments.result, model=model).geometry
+        fitted = Reconstruction.load(arguments.result, model=model)
+    model, geometry = fitted.model, fitted.geometry  # with eyes, if it had none
     config = mifit.ReflectanceConfig(texture_size=arguments.size)
     clean = mifit.infer_reflectance(capture, model, geometry, CAMERAS, config)
     surface = Surface(capture, model, geometry, CAMERAS, arguments.size)

@@ -23,7 +23,7 @@ class GeometryConfig:
 
     objective: Literal["consistency", "paper"] = one_of("consistency", "what is minimised")
     eyes: bool = flag(
-        False,
+        True,
         "give a model whose eyes are holes simple eyes and the inside of a mouth; its maps' layout moves up by 9 %",
     )
     rounds: int = number(2, "outer steps: visibility is found anew in each", least=0, most=100)
@@ -249,7 +249,7 @@ class FitConfig:
         that with values of 0..1 it is 0.001 / 255.
         """
         return cls(
-            geometry=GeometryConfig(objective="paper", as_written=True, camera_gains="never"),
+            geometry=GeometryConfig(objective="paper", as_written=True, camera_gains="never", eyes=False),
             surface=SurfaceConfig(enabled=False),
             reflectance=ReflectanceConfig(
                 solver="adam",

@@ -13,7 +13,7 @@ import mifit
 from mifit.capture.choose_frames import FrameChoice
 from mifit.config import FitConfig
 from mifit.errors import InputError
-from mifit.pipeline import choose, choose_timesteps, fit
+from mifit.pipeline import choose, choose_timesteps, fit, fitted_model
 from mifit.progress import Progress, silent
 from mifit.reconstruction import Reconstruction
 from mifit.result.ownership import CHECKPOINTS, check_ours, claim, locked
@@ -106,7 +106,7 @@ def _identity(
     return {
         "version": mifit.__version__,
         "capture": capture.digest(cameras, steps),
-        "model": model.digest,
+        "model": fitted_model(model, config).digest,
         "cameras": list(cameras),
         "timesteps": list(steps),
         "config": json.loads(json.dumps({**dataclasses.asdict(config), "seed": seed})),

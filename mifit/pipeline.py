@@ -57,8 +57,8 @@ def fit(
     capture : Capture
         Images with cameras and landmarks.
     model : MorphableModel
-        The face model to fit. With ``[geometry] eyes`` one whose eyes are holes gets simple ones: the result's
-        ``model``, whose vertices begin with this one's.
+        The face model to fit. One whose eyes are holes gets simple ones, unless ``[geometry] eyes`` is false: the
+        result's ``model``, whose vertices begin with this one's.
     cameras : sequence of str, optional
         Cameras to use; no other camera's images are read. Default: the capture's first two.
     timesteps : sequence of int or FrameChoice, optional
@@ -95,7 +95,6 @@ def fit(
     The three stages of Song, Zheng, Cai, Cham, "Recovering Facial Reflectance and Geometry from Multi-view
     Images", sections 4 to 6. A Mitsuba variant must be active (``mifit.set_variant``).
     """
-    from mifit.morphable.openings import lacks_eyes, with_eyes
     from mifit.reconstruction import Reconstruction
     from mifit.render.variant import check_active_variant
 
@@ -108,8 +107,7 @@ def fit(
         raise InputError(f"until: found {until!r}, expected one of {', '.join(STAGES)}")
     check_images(capture, cameras, timesteps)
     digest = capture.digest(cameras, timesteps)
-    if config.geometry.eyes and lacks_eyes(model):
-        model = with_eyes(model)
+    given, model = model, fitted_model(model, config)
     estimated: tuple[str, ...] = ()
     if not capture.calibrated:
         dense = calibrated(capture, model, cameras, timesteps, progress)
@@ -129,7 +127,7 @@ def fit(
             warnings=(
                 *estimated,
                 *one_place(capture, cameras, estimates["geometry"]),
-                *empty_eyes(model),
+                *eyes_note(given, model),
             ),
             seconds=seconds,
             peak_memory=peak_memory(),
@@ -180,13 +178,26 @@ def check_images(capture: Capture, cameras: Sequence[str], timesteps: Sequence[i
                 )
 
 
-def empty_eyes(model: MorphableModel) -> tuple[str, ...]:
-    """A warning where renders will look through the eyes into the head."""
-    from mifit.morphable.openings import lacks_eyes
+def fitted_model(model: MorphableModel, config: FitConfig) -> MorphableModel:
+    """The model that a fit uses: the given one, with simple eyes where its own are holes and the settings want them."""
+    from mifit.morphable.openings import lacks_eyes, with_eyes
 
-    if not lacks_eyes(model):
+    return with_eyes(model) if config.geometry.eyes and lacks_eyes(model) else model
+
+
+def eyes_note(given: MorphableModel, fitted: MorphableModel) -> tuple[str, ...]:
+    """What to say of the eyes: that the fit put some into a model, or that renders will look through holes."""
+    from mifit.morphable.openings import STRIP, lacks_eyes
+
+    if fitted is not given:
+        return (
+            f"the eyes of model {given.name} are holes: the fit put simple eyes and the inside of a mouth there, and "
+            f"the layout of its maps lies {100 * STRIP:.0f} % higher than the model's own; [geometry] eyes = false "
+            "leaves the model as it is",
+        )
+    if not lacks_eyes(fitted):
         return ()
-    return (f"the eyes of model {model.name} are holes; [geometry] eyes = true puts simple ones there",)
+    return (f"the eyes of model {fitted.name} are holes; [geometry] eyes = true puts simple ones there",)
 
 
 def one_place(capture: Capture, cameras: Sequence[str], geometry: GeometryEstimate) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """`mifit fit` into a folder: what is refused before work starts, what goes on, and what is never lost."""
 
 import dataclasses
+import shutil
 from types import SimpleNamespace
 
 import cv2
@@ -12,12 +13,15 @@ from mifit import commands
 from mifit.config import FitConfig, MeshConfig, ReflectanceConfig
 from mifit.errors import InputError
 from mifit.fitting import fit_into
+from mifit.morphable import MorphableModel
+from mifit.morphable.openings import eyeballs, with_eyes
 from mifit.pipeline import fitted_to
 from mifit.reconstruction import Reconstruction
 from mifit.result import ownership
+from mifit.result.ownership import CHECKPOINTS
 from tests.output.conftest import ball_result
 from tests.output.test_result_safety import tree
-from tests.test_pipeline import Stages, made_up_capture
+from tests.test_pipeline import Stages, made_up_capture, mean_geometry, without_eyes
 from tests.variant import VARIANT
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -82,6 +86,25 @@ def test_a_shorter_fit_keeps_what_a_longer_one_made(fit, tmp_path):
         fit(tmp_path / "out", resume=True, until="geometry", config=other)
     assert tree(tmp_path / "out") == before
     assert fit(tmp_path / "out", resume=True, config=other) == ALL[2:]
+
+
+def test_a_fit_that_gave_its_model_eyes_goes_on_with_the_model_as_it_was(monkeypatch, tmp_path):
+    model = MorphableModel.load("builtin:coarse").subset(identity=2, expression=2, albedo=2)
+    without_eyes(model).save(tmp_path / "skin.npz")
+    skin = MorphableModel.load(tmp_path / "skin.npz")
+    stages, geometry = Stages(monkeypatch), mean_geometry(with_eyes(skin), (0, 3))
+    for name in ("fit_geometry", "find_surface"):
+        monkeypatch.setattr(f"mifit.stages.{name}.{name}", stages.stand_in(name, geometry))
+    out, options = tmp_path / "out", {"until": "geometry", "resume": True}
+    first = fit_into(out, made_up_capture(), skin, **options)
+    assert stages.ran == ALL[:2] and len(eyeballs(first.model)) == 2
+    before = tree(out)
+    again = fit_into(out, made_up_capture(), skin, **options)
+    assert stages.ran == ALL[:2] and tree(out) == before and again.model.digest == first.model.digest
+    assert any("[geometry] eyes = false" in text for text in again.warnings)
+    shutil.rmtree(out / CHECKPOINTS)  # the result alone says that all is there
+    fit_into(out, made_up_capture(), skin, **options)
+    assert stages.ran == ALL[:2]
 
 
 def test_tracked_frames_stay(fit, tracked):

@@ -12,7 +12,7 @@ from mifit.core.estimate import GeometryEstimate, Report, ResidualEstimate
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs, with_eyes
-from mifit.pipeline import check_images, choose_timesteps, empty_eyes, one_place
+from mifit.pipeline import check_images, choose_timesteps, eyes_note, one_place
 from mifit.steps import PARTS, Source, keys, steps
 from tests.output.conftest import ball_camera, ball_result
 
@@ -42,10 +42,14 @@ def test_the_order_in_which_timesteps_are_named_does_not_matter():
         choose_timesteps(capture, [3, 0])
 
 
-def test_a_model_whose_eyes_are_holes_brings_a_warning():
+def test_a_model_whose_eyes_are_holes_brings_a_note():
+    """Of eyes that it got and of the maps' layout, or of the holes that it kept."""
     model = MorphableModel.load("builtin:coarse").subset(identity=2, expression=2, albedo=2)
-    assert empty_eyes(model) == ()
-    assert "[geometry] eyes = true puts simple ones there" in empty_eyes(without_eyes(model))[0]
+    skin = without_eyes(model)
+    assert eyes_note(model, model) == ()
+    assert "[geometry] eyes = true puts simple ones there" in eyes_note(skin, skin)[0]
+    (given,) = eyes_note(skin, with_eyes(skin))
+    assert "maps lies 9 % higher" in given and "[geometry] eyes = false leaves" in given
 
 
 def without_eyes(model):
@@ -56,17 +60,27 @@ def without_eyes(model):
 
 
 def test_a_fit_gives_a_model_eyes_that_has_none(monkeypatch):
-    """What runs sees the model with eyes, if the settings say so; one that has eyes is left alone."""
+    """What runs sees the model with eyes, unless the settings say no; one that has eyes is left alone."""
     seen = []
     monkeypatch.setattr("mifit.pipeline.run_steps", lambda steps, source, *_: seen.append(source.model) or 1 / 0)
     model = MorphableModel.load("builtin:coarse").subset(identity=2, expression=2, albedo=2)
     skin = without_eyes(model)
-    eyed = FitConfig(geometry=mifit.GeometryConfig(eyes=True))
-    for given, config in ((skin, eyed), (skin, None), (model, eyed)):
+    holes = FitConfig(geometry=mifit.GeometryConfig(eyes=False))
+    for given, config in ((skin, None), (skin, holes), (skin, FitConfig.paper()), (model, None)):
         with pytest.raises(ZeroDivisionError):
             mifit.fit(made_up_capture(), given, config=config)
     assert len(eyeballs(seen[0])) == 2 and seen[0].n_vertices > skin.n_vertices
-    assert seen[1] is skin and seen[2] is model
+    assert seen[1] is skin and seen[2] is skin and seen[3] is model
+
+
+def mean_geometry(model, timesteps=(0,)):
+    """The model's mean as if it had been fitted, at the origin."""
+    n, t = len(model.mean), len(timesteps)
+    return GeometryEstimate(
+        timesteps, np.zeros(model.n_identity), np.zeros(model.n_albedo), np.zeros((t, model.n_expression)),
+        np.tile(np.eye(3), (t, 1, 1)), np.zeros((t, 3)), 1.0, np.tile(model.mean, (t, 1, 1)),
+        np.full((n, 3), 0.3, np.float32), np.zeros((9, 3)), 0.0, Report("converged"),
+    )  # fmt: skip
 
 
 def test_a_result_with_added_eyes_is_read_with_the_model_that_was_given(tmp_path):
@@ -75,14 +89,9 @@ def test_a_result_with_added_eyes_is_read_with_the_model_that_was_given(tmp_path
     skin.save(tmp_path / "skin.npz")
     whole = with_eyes(MorphableModel.load(tmp_path / "skin.npz"))
     assert whole.source == f"{tmp_path / 'skin.npz'}+eyes"
-    n, k = len(whole.mean), (whole.n_identity, whole.n_albedo, whole.n_expression)
-    geometry = GeometryEstimate(
-        (0,), np.zeros(k[0]), np.zeros(k[1]), np.zeros((1, k[2])), np.eye(3)[None], np.zeros((1, 3)), 1.0,
-        whole.mean[None], np.full((n, 3), 0.3, np.float32), np.zeros((9, 3)), 0.0, Report("converged"),
-    )  # fmt: skip
     result = dataclasses.replace(
-        ball_result(), model=whole, model_source=whole.source, geometry=geometry, reflectance=None, normals=None,
-        mesh=None, residual=None,
+        ball_result(), model=whole, model_source=whole.source, geometry=mean_geometry(whole), reflectance=None,
+        normals=None, mesh=None, residual=None,
     )  # fmt: skip
     result.save(tmp_path / "result")
     for model in (None, skin, whole):

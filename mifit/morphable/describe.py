@@ -56,7 +56,7 @@ def notices(model: MorphableModel) -> list[str]:
     """Things about a valid model that a person should know."""
     out = []
     if lacks_eyes(model):
-        out.append("its eyes are holes; [geometry] eyes = true, or mifit model convert --eyes, puts simple ones there")
+        out.append("its eyes are holes; a fit, and mifit model convert --eyes, put simple ones there")
     if len(model.degenerate_faces):
         out.append(
             f"{len(model.degenerate_faces)} faces of the mean have no area, the first is {model.degenerate_faces[0]}"

@@ -183,6 +183,19 @@ def with_eyes(model: MorphableModel) -> MorphableModel:
     return found
 
 
+def leading_faces(model: MorphableModel, count: int) -> NDArray[np.bool_] | None:
+    """(F,) faces of the first ``count`` vertices, where those are the model or what it was before it got eyes.
+
+    None where some face joins them to later vertices, where the face area goes on beyond them, or where there are
+    fewer vertices.
+    """
+    later = model.faces >= count
+    whole, cut = later.all(axis=1), later.any(axis=1)
+    if count > model.n_vertices or (whole != cut).any() or (whole & model.face_mask).any():
+        return None
+    return ~whole
+
+
 def _openings(model: MorphableModel) -> tuple[list[NDArray[np.int64]], NDArray[np.int64] | None]:
     """Borders around the eyes, at x < 0 and x > 0, and around the mouth."""
     marks = model.mean[model.landmarks].astype(np.float64)

@@ -18,6 +18,7 @@ from mifit.core.image import to_8_bit
 from mifit.core.metrics import mean_squared_error, psnr_from_rmse, ssim
 from mifit.core.npz import read_npz
 from mifit.errors import InputError
+from mifit.morphable.openings import leading_faces
 from mifit.output.deferred import shade_methods, trace_mesh, visible_surface
 from mifit.output.resect import needs_resection, resect
 from mifit.progress import Progress, silent
@@ -241,7 +242,7 @@ def _truth(capture: Capture, reconstruction: Result, timestep: int) -> tuple[NDA
     """Vertices, faces and face area of the capture's ground-truth mesh.
 
     The mesh's faces are those that the truth folder carries (``faces`` and ``face_mask`` in ``mesh.npz``), else
-    the fitted model's when the vertex counts agree.
+    the fitted model's. Of a model that got eyes the truth may have the first vertices, those of the model's file.
     """
     folder = Path(capture.path) / "truth"
     path = folder / f"{timestep:04d}.npz"
@@ -264,9 +265,10 @@ def _truth(capture: Capture, reconstruction: Result, timestep: int) -> tuple[NDA
         mask = data["face_mask"].astype(bool) if "face_mask" in data else np.ones(len(faces), dtype=bool)
         return vertices, faces, mask
     model = reconstruction.model
-    if len(vertices) != len(model.mean):
+    own = leading_faces(model, len(vertices))
+    if own is None:
         raise InputError(
             f"{path}: found {len(vertices)} vertices, but the fitted model {model.name!r} has {len(model.mean)}, "
             f"so its faces don't fit; expected {mesh} with the truth's faces, or use --region model"
         )
-    return vertices, model.faces, model.face_mask
+    return vertices, model.faces[own], model.face_mask[own]

@@ -12,7 +12,7 @@ from mifit.core.mesh import vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
-from mifit.morphable.openings import RADIUS_MM, eyeballs, holes, lacks_eyes, with_eyes
+from mifit.morphable.openings import RADIUS_MM, eyeballs, holes, lacks_eyes, leading_faces, with_eyes
 from mifit.render.gbuffer import SurfaceScene
 from tests.stages.memory_capture import look_at_head
 
@@ -37,6 +37,17 @@ def test_what_was_there_stays(skin: MorphableModel, whole: MorphableModel) -> No
     symmetry = whole.symmetry
     np.testing.assert_array_equal(symmetry[symmetry], np.arange(whole.n_vertices))
     np.testing.assert_allclose(whole.mean[symmetry][n:] * [-1, 1, 1], whole.mean[n:], atol=0.05)
+
+
+def test_the_first_vertices_are_the_model_without_eyes(skin: MorphableModel, whole: MorphableModel) -> None:
+    own = leading_faces(whole, skin.n_vertices)
+    assert own is not None
+    np.testing.assert_array_equal(whole.faces[own], skin.faces)
+    np.testing.assert_array_equal(whole.face_mask[own], skin.face_mask)
+    everything = leading_faces(whole, whole.n_vertices)
+    assert everything is not None and everything.all()
+    for count in (0, 3, skin.n_vertices - 1, skin.n_vertices + 1, whole.n_vertices + 1):
+        assert leading_faces(whole, count) is None
 
 
 def test_eyeballs_are_round_and_lie_behind_the_lids(whole: MorphableModel) -> None:

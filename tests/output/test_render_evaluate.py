@@ -11,9 +11,12 @@ from mifit.core import sh
 from mifit.core.image import srgb_to_linear
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
+from mifit.morphable import MorphableModel
+from mifit.morphable.openings import with_eyes
 from mifit.output.deferred import surface_material, trace_mesh, visible_surface
 from mifit.output.evaluate import compare, evaluate, face_area
 from tests.output.conftest import ball_camera, ball_result
+from tests.test_pipeline import mean_geometry, without_eyes
 
 
 @dataclass(frozen=True)
@@ -164,6 +167,22 @@ def test_truth_region_counts_uncovered_pixels_as_black(ball, variant, tmp_path):
     found = compare(ball, capture, "third", 0, region="truth")
     uncovered = found.region & (found.renders["full"][..., 3] == 0)
     assert uncovered.any() and (found.renders["full"][uncovered] == 0).all()
+
+
+def test_truth_of_a_model_that_got_eyes_is_its_first_vertices(variant, tmp_path):
+    model = MorphableModel.load("builtin:coarse").subset(identity=2, expression=2, albedo=2)
+    skin = without_eyes(model)
+    camera = ball_camera("third", 5.0, 128)
+    (tmp_path / "truth").mkdir()
+    np.savez(tmp_path / "truth" / "0000.npz", vertices=skin.mean)
+    capture, regions = FakeCapture((camera,), lambda c, t: np.full((128, 128, 3), 0.3), tmp_path), []
+    for fitted in (skin, with_eyes(skin)):
+        result = replace(
+            ball_result(), model=fitted, geometry=mean_geometry(fitted), reflectance=None, normals=None, mesh=None
+        )
+        regions.append(compare(result, capture, "third", 0, region="truth").region)
+    assert regions[0].sum() > 1000
+    np.testing.assert_array_equal(*regions)
 
 
 def test_truth_of_another_mesh_needs_its_faces(ball, variant, tmp_path):
