@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from mifit.capture import Capture
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
 from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.core.uv import TexelMap, rasterize_uv, sample_map
 from mifit.morphable import MorphableModel
+from mifit.morphable.openings import STRIP, leading_faces
 from mifit.reconstruction import Reconstruction
 
 
@@ -47,6 +48,14 @@ def _averaged(image: NDArray, size: int) -> NDArray:
     return image.reshape(size, k, size, k, *image.shape[2:]).mean((1, 3))
 
 
+def truth_layout(model: MorphableModel, count: int) -> NDArray:
+    """(U, 2) texture coordinates in the maps of a truth of ``count`` vertices.
+
+    Eyes that a fit gave the model come after those vertices and moved its layout up.
+    """
+    return model.uv if count == model.n_vertices else (model.uv - (0.0, STRIP)) / (1.0, 1.0 - STRIP)
+
+
 def bumped_normals(
     model: MorphableModel, capture: Path, timestep: int, texels: TexelMap, bump_unit: float = 1.0
 ) -> NDArray:
@@ -57,11 +66,15 @@ def bumped_normals(
     with np.load(capture / "truth" / f"{timestep:04d}.npz") as truth, np.load(capture / "truth" / "maps.npz") as maps:
         vertices, bump = truth["vertices"].astype(np.float64), bump_unit * maps["bump"].astype(np.float64)
     slope = np.stack([np.gradient(bump, axis=1), -np.gradient(bump, axis=0)], axis=-1) * len(bump)
-    slope = texels.from_map(_averaged(slope, texels.size))
-    p, t = vertices[model.faces], model.uv[model.faces_uv].astype(np.float64)
+    uv = truth_layout(model, len(vertices)).astype(np.float64)
+    slope = sample_map(_averaged(slope, texels.size), interpolate(uv, model.faces_uv, texels.face, texels.weights))
+    own = leading_faces(model, len(vertices))
+    p, t = vertices[model.faces[own]], uv[model.faces_uv[own]]
     e, d = p[:, 1:] - p[:, :1], t[:, 1:] - t[:, :1]
-    by_uv = np.einsum("fij,fjc->fic", np.linalg.pinv(d), e)[texels.face]  # dp/du, dp/dv
-    n = _smooth_normals(model, vertices, texels)
+    by_uv = np.einsum("fij,fjc->fic", np.linalg.pinv(d), e)[
+        texels.face
+    ]  # dp/du, dp/dv; the first faces are the truth's
+    n = normalize(interpolate(vertex_normals(vertices, model.faces[own]), model.faces, texels.face, texels.weights))
     by_uv -= np.einsum("nic,nc->ni", by_uv, n)[..., None] * n[:, None]
     bent = np.cross(by_uv[:, 0] + slope[:, :1] * n, by_uv[:, 1] + slope[:, 1:] * n)
     return normalize(bent * np.sign(np.sum(bent * n, axis=1, keepdims=True)))
@@ -114,15 +127,17 @@ def map_errors(capture: Capture, model: MorphableModel, found: ReflectanceEstima
     Over texels of the face area that were seen well.
     """
     size = len(found.diffuse)
-    truth = true_maps(capture, size)
-    seen = (found.confidence > 0.5) & rasterize_uv(model.uv, model.faces_uv, size, model.face_mask).mask
-    estimate, true = found.diffuse[seen], truth["albedo"][seen]
+    truth, texels = true_maps(capture, size), rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+    with np.load(Path(capture.path) / "truth" / f"{capture.timesteps[0]:04d}.npz") as frame:
+        uv = truth_layout(model, len(frame["vertices"]))
+    uv = interpolate(uv, model.faces_uv, texels.face, texels.weights)
+    seen = texels.from_map(found.confidence) > 0.5
+    estimate, true = texels.from_map(found.diffuse)[seen], sample_map(truth["albedo"], uv)[seen]
+    specular, lobe = texels.from_map(found.specular)[seen], sample_map(truth["specular"], uv)[seen]
     scale = (estimate * true).sum(0) / np.maximum((estimate**2).sum(0), 1e-12)
     return {
         "diffuse_rmse": round(float(np.sqrt(np.mean((scale * estimate - true) ** 2))), 4),
-        "specular_correlation": round(float(np.corrcoef(found.specular[seen], truth["specular"][seen])[0, 1]), 3)
-        if np.ptp(found.specular[seen]) > 0
-        else 0.0,
+        "specular_correlation": round(float(np.corrcoef(specular, lobe)[0, 1]), 3) if np.ptp(specular) > 0 else 0.0,
     }
 
 

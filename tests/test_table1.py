@@ -1,6 +1,7 @@
 """Table 1: errors against a truth that is known exactly, and what the table says of subjects that failed."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,10 @@ from benchmarks import table1
 from benchmarks.truth import truth_errors
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import rasterize_uv
+from mifit.morphable import MorphableModel
+from mifit.morphable.openings import with_eyes
 from tests.output.conftest import ball_result
+from tests.test_pipeline import mean_geometry, without_eyes
 
 
 @pytest.fixture
@@ -62,6 +66,42 @@ def test_errors_grow_with_the_distance_from_the_truth(perfect):
     found = truth_errors(result, folder, 0.1)
     assert found["mesh_mm"] == pytest.approx(0.5 * 0.3 * result.unit_mm, abs=0.002)  # one of two timesteps moved
     assert found["normal_degrees_stage1"] > 5 and found["diffuse_rmse"] > 0.01
+
+
+def test_a_model_that_got_eyes_is_judged_by_the_truth_of_the_model_as_it_was(tmp_path):
+    """Eyes come behind the truth's vertices and move the maps' layout: neither is an error."""
+    skin, size = without_eyes(MorphableModel.load("builtin:coarse").subset(identity=2, expression=2, albedo=2)), 128
+
+    def painted(uv):
+        return np.float32(0.4) + 0.2 * np.sin(uv @ np.array([[20.0, 3, 9], [5, 25, 14]])).astype(np.float32)
+
+    centres = (np.arange(2 * size) + 0.5) / (2 * size)
+    image = painted(np.stack(np.meshgrid(centres, 1 - centres), axis=-1))
+    (tmp_path / "truth").mkdir()
+    np.savez(tmp_path / "truth" / "0000.npz", vertices=skin.mean, R=np.eye(3), t=np.zeros(3))
+    maps = {"albedo": image, "specular": image[..., 1], "roughness": image[..., 0], "bump": image[..., 2]}
+    np.savez(tmp_path / "truth" / "maps.npz", **maps)
+    frame = {"file_path": "x.png", "timestep_index": 0, "w": 64, "h": 64}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    found = []
+    for model in (skin, with_eyes(skin)):
+        texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+        at = painted(interpolate(skin.uv, skin.faces_uv, texels.face, texels.weights))
+        normals = interpolate(vertex_normals(model.mean, model.faces), model.faces, texels.face, texels.weights)
+        ball, geometry = ball_result(), mean_geometry(model)
+        found.append(truth_errors(replace(
+            ball, model=model, geometry=geometry,
+            reflectance=replace(
+                ball.reflectance, diffuse=texels.to_map(at), specular=texels.to_map(at[:, 1]),
+                confidence=texels.to_map(np.ones(len(at), np.float32)),
+            ),
+            normals=replace(
+                ball.normals, timesteps=(0,), normal_object=texels.to_map(normalize(normals).astype(np.float32))[None]
+            ),
+        ), tmp_path, 1.0))  # fmt: skip
+    assert found[0]["diffuse_rmse"] < 0.005 and found[0]["specular_correlation"] > 0.99
+    assert found[0]["normal_degrees"] > 2
+    assert found[1] == pytest.approx(found[0], rel=0.03, abs=0.002)
 
 
 def test_failed_subjects_stay_in_the_table():
