@@ -32,20 +32,20 @@ POUCH_MM, POUCH_LINES, POUCH_TIP = 30.0, 8, 0.35
 """Depth of the pouch, rings from front to back, and how much narrower it is at the back."""
 CORNER_ALBEDO = (0.4, 0.17, 0.14)
 """Of the tissue that closes what is open between lids and ball, in the corners of the eye."""
-BEHIND_MM = 0.05
-"""Distance of the pouch's rim behind the lips'."""
+BEHIND_MM = 0.01
+"""Distance of the rims of pouch and corners behind those of lips and lids."""
 STRIP = 0.09
 """Height of the strip at the bottom of the maps that holds eyes and pouch; what was there moves up."""
 MARGIN = 0.004
 SMALLEST_RIM = 8
 """Vertices around an eye or the mouth at the least."""
-SMALLEST = 20
-"""Vertices of an eyeball at the least."""
+SMALLEST = 50
+"""Vertices of an eyeball at the least: more than those of a rim, each of which the tissue in the corners meets."""
 EYES, CORNERS, INNER_LIPS = (slice(36, 42), slice(42, 48)), ((36, 39), (45, 42)), slice(60, 68)
 """iBUG points; corners from the outer to the inner one."""
 SUFFIX = "+eyes"
 """After a model's file: with these pieces."""
-VERSION = 1
+VERSION = 2
 """Of the pieces; a result that was made with others has another model."""
 
 
@@ -249,7 +249,7 @@ def _corner(model: MorphableModel, loop: NDArray, corner: NDArray, width: float)
     rim = np.roll(loop, -outer)
     if model.mean[rim[len(rim) // 4], 1] < model.mean[rim[0], 1]:  # over the upper lid first, on both sides
         rim = np.roll(rim[::-1], 1)
-    rim = rim[np.round(np.linspace(0, len(rim), SMALLEST - 2, endpoint=False)).astype(int)]
+    rim = rim[np.round(np.linspace(0, len(rim), min(len(rim), SMALLEST - 2), endpoint=False)).astype(int)]
     n, unit = len(rim), 1.0 / model.unit_mm
     points = model.mean[rim].astype(np.float64) - (0.0, 0.0, BEHIND_MM * unit)
     tip = points.mean(axis=0) - (0.0, 0.0, RADIUS_MM * unit)

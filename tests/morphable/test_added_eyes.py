@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import RADIUS_MM, eyeballs, holes, lacks_eyes, leading_faces, with_eyes
+from mifit.output.deferred import trace_mesh
 from mifit.render.gbuffer import SurfaceScene
 from tests.stages.memory_capture import look_at_head
 
@@ -88,6 +90,22 @@ def test_nothing_is_seen_through_the_eyes_and_the_mouth(skin, whole, variant) ->
         faces = [int(buffer.face[int(y), int(x)]) for x, y in points]
         seen.append([face >= len(skin.faces) and bool(front[face]) for face in faces])
     assert seen == [[False] * 3, [True] * 3]
+
+
+def test_no_gap_is_left_between_lids_and_corners(skin, whole, variant) -> None:
+    """From aside, where the ball ends before the lids do."""
+    vertices = whole.mean.astype(np.float64)
+    for degrees in (-35.0, 0.0, 35.0):
+        camera = look_at_head("a", degrees, 700, 700, distance=60.0)
+        surface = trace_mesh(vertices, whole.faces, camera, 1)
+        seen = np.zeros(camera.height * camera.width, bool)
+        seen[surface.index] = True
+        marks = camera.project(vertices[whole.landmarks]).astype(np.int32)
+        for eye in (slice(36, 42), slice(42, 48)):
+            inside = np.zeros((camera.height, camera.width), np.uint8)
+            cv2.fillConvexPoly(inside, cv2.convexHull(marks[eye]), 1)
+            through = (cv2.dilate(inside, np.ones((9, 9))) > 0) & ~seen.reshape(inside.shape)
+            assert through.sum() <= 2, degrees  # rays that pass between two faces
 
 
 def test_the_new_parts_have_a_place_of_their_own_in_the_maps(skin, whole) -> None:
