@@ -179,4 +179,17 @@ SURFACE = [
       "tests/stages/test_close_openings.py"),
 ]  # fmt: skip
 
-MUTATIONS = [*CONVENTIONS, *MEASURES, *LIGHT, *GEOMETRY, *MESH, *TERMS, *SURFACE]
+EYES = [
+    M("models keep the holes of their eyes", "mifit/config.py", r"(eyes: bool = flag\(\s+)True", r"\g<1>False",
+      "tests/test_pipeline.py"),
+    M("the paper's preset adds eyes", "mifit/config.py", r'camera_gains="never", eyes=False', 'camera_gains="never"',
+      "tests/test_pipeline.py"),
+    M("a model that got eyes taken for another one", "mifit/fitting.py", r"fitted_model\(model, config\)\.digest", "model.digest",
+      "tests/test_fitting.py"),
+    M("a truth without eyes given the faces of eyes", OUTPUT, r"model\.faces\[own\], model\.face_mask\[own\]",
+      "model.faces, model.face_mask", "tests/output/test_render_evaluate.py"),
+    M("a truth's maps read in the layout with eyes", "benchmarks/truth.py", r"return model\.uv if count == model\.n_vertices else .*",
+      "return model.uv", "tests/test_table1.py"),
+]  # fmt: skip
+
+MUTATIONS = [*CONVENTIONS, *MEASURES, *LIGHT, *GEOMETRY, *MESH, *TERMS, *SURFACE, *EYES]
