@@ -7,6 +7,7 @@ pouch behind the lips. Both have a place in the maps, so that photographs show i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,6 +44,8 @@ SMALLEST = 50
 """Vertices of an eyeball at the least: more than those of a rim, each of which the tissue in the corners meets."""
 EYES, CORNERS, INNER_LIPS = (slice(36, 42), slice(42, 48)), ((36, 39), (45, 42)), slice(60, 68)
 """iBUG points; corners from the outer to the inner one."""
+SAME_MM = 0.01
+"""Distance between vertices that were added and those that would be."""
 SUFFIX = "+eyes"
 """After a model's file: with these pieces."""
 VERSION = 2
@@ -134,12 +137,7 @@ def with_eyes(model: MorphableModel) -> MorphableModel:
     eyes, mouth = _openings(model) if not eyeballs(model) else ([], None)
     if len(eyes) < 2:
         raise InputError(f"{model.name}: found {len(eyes)} eyes that are holes, expected 2; it has eyes, or is no skin")
-    width = STRIP - 2 * MARGIN
-    corners = [_corner(model, loop, np.array([0.7 + k * STRIP, MARGIN]), width) for k, loop in enumerate(eyes)]
-    pieces = [_eyeball(model, loop, k, np.array([MARGIN + k * STRIP, MARGIN]), width) for k, loop in enumerate(eyes)]
-    pieces += corners
-    if mouth is not None:
-        pieces.append(_pouch(model, mouth, np.array([2 * STRIP + MARGIN, MARGIN]), np.array([0.5, width])))
+    pieces = _pieces(model, eyes, mouth)
     uv = model.uv.astype(np.float64) * (1.0, 1.0 - STRIP) + (0.0, STRIP)
     faces: list[NDArray] = [model.faces]
     faces_uv: list[NDArray] = [model.faces_uv]
@@ -183,6 +181,39 @@ def with_eyes(model: MorphableModel) -> MorphableModel:
     return found
 
 
+def carried(model: MorphableModel) -> sp.csr_matrix | None:
+    """(V, V') weighted means of the first V' vertices that all vertices move with; None for a model that got no eyes.
+
+    The first rows are the identity: pieces that were added go along with the skin and hold none of it back.
+    """
+    balls = eyeballs(model)
+    count = min((int(ball.min()) for ball in balls), default=0)
+    own = leading_faces(model, count)
+    if len(balls) != 2 or own is None:
+        return None
+    kept = {name: getattr(model, name)[:count] for name in ("mean", "identity", "expression", "mean_albedo")}
+    kept |= {name: getattr(model, name)[own] for name in ("faces", "faces_uv", "face_mask")}
+    symmetry = None if model.symmetry is None else model.symmetry[:count]
+    skin = replace(model, **kept, albedo_modes=model.albedo_modes[:count], symmetry=symmetry, fingerprint="")
+    eyes, mouth = _openings(skin)
+    pieces = _pieces(skin, eyes, mouth) if len(eyes) == 2 else []
+    added = np.concatenate([np.zeros((0, 3)), *(piece.points for piece in pieces)])
+    rest = model.mean[count:]
+    if len(added) != len(rest) or np.abs(added - rest).max(initial=0.0) * model.unit_mm > SAME_MM:
+        return None  # eyes of the model's own
+    return sp.vstack([sp.identity(count), *(piece.identity for piece in pieces)]).tocsr()
+
+
+def _pieces(model: MorphableModel, eyes: Sequence[NDArray], mouth: NDArray | None) -> list[_Piece]:
+    """Eyeballs, corners and pouch for the borders of openings, with their places in the strip."""
+    width = STRIP - 2 * MARGIN
+    pieces = [_eyeball(model, loop, k, np.array([MARGIN + k * STRIP, MARGIN]), width) for k, loop in enumerate(eyes)]
+    pieces += [_corner(model, loop, np.array([0.7 + k * STRIP, MARGIN]), width) for k, loop in enumerate(eyes)]
+    if mouth is not None:
+        pieces.append(_pouch(model, mouth, np.array([2 * STRIP + MARGIN, MARGIN]), np.array([0.5, width])))
+    return pieces
+
+
 def leading_faces(model: MorphableModel, count: int) -> NDArray[np.bool_] | None:
     """(F,) faces of the first ``count`` vertices, where those are the model or what it was before it got eyes.
 
@@ -193,7 +224,7 @@ def leading_faces(model: MorphableModel, count: int) -> NDArray[np.bool_] | None
     whole, cut = later.all(axis=1), later.any(axis=1)
     if count > model.n_vertices or (whole != cut).any() or (whole & model.face_mask).any():
         return None
-    return ~whole
+    return np.logical_not(whole)
 
 
 def _openings(model: MorphableModel) -> tuple[list[NDArray[np.int64]], NDArray[np.int64] | None]:

@@ -13,6 +13,7 @@ from mifit.config import GeometryConfig, SurfaceConfig
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
+from mifit.morphable.openings import carried, with_eyes
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.eyes import eyeballs
 from mifit.stages.find_surface import find_surface
@@ -28,6 +29,7 @@ from mifit.stages.surface.model_fit import PlaneTerm, landmarks_are_biased
 from mifit.stages.surface.outline import joined
 from mifit.stages.surface.sweep import GLARE_DEVIATIONS, Found, Posed, _without_glare
 from tests.morphable.intersections import intersections
+from tests.test_pipeline import without_eyes
 
 QUICK = GeometryConfig(rounds=1, surface_points=800, pixels=400, max_iterations=15)
 BOTH = ("left", "right")
@@ -98,6 +100,19 @@ def test_a_surface_beyond_the_span_is_found(model, bumpy, start, found):
     before, after = off_mm(model, bumpy, start), off_mm(model, bumpy, found)
     assert after.mean() < 0.6 * before.mean()
     assert np.median(after) < 0.3
+
+
+def test_added_eyes_go_along_with_the_skin_and_leave_it_alone(model, bumpy, found):
+    """Slivers of other pieces once made the skin less stiff: their bending counted as the skin's."""
+    whole = with_eyes(without_eyes(model))
+    eyed = find_surface(bumpy, whole, fitted_to(whole, bumpy), BOTH)
+    moved, n = eyed.displacement, model.n_vertices
+    for ball in eyeballs(whole):
+        np.testing.assert_allclose(moved[ball] - moved[ball[0]], 0.0, atol=1e-6)
+    assert np.abs(moved[n:]).max() > 0.005
+    np.testing.assert_allclose(moved[n:], (carried(whole) @ moved[:n])[n:], atol=1e-6)
+    stiffness = [g.report.details["phases"][-1]["stiffness"] for g in (found, eyed)]
+    assert 0.7 < stiffness[1] / stiffness[0] < 1.4
 
 
 def covered_wrongly(model, capture, estimate):

@@ -13,6 +13,7 @@ from mifit.config import SurfaceConfig
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.morphable.openings import carried, leading_faces
 from mifit.progress import Progress
 from mifit.solve import Outcome
 from mifit.stages.geometry.points import corner_matrix
@@ -111,6 +112,7 @@ class Search:
         self._capture, self._model, self._cameras, self._pairs = capture, model, cameras, pairs
         self._resolution, self._config, self._progress = resolution, config, progress
         self._done, self._total = 0, total
+        self._carried = carried(model)
         self.scenes = Scenes(model.faces, np.unique(model.faces[model.face_mask]), SLACK * resolution.pixel)
         progress("find surface", 0, total)
 
@@ -166,7 +168,10 @@ class Search:
         neutral = model.shape(geometry.identity).astype(np.float64)
         # A head that the model spans is as symmetric as its modes make it.
         halves = model.symmetry if self._beyond else None
-        plate = Plate.of(neutral, model.faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm, symmetry=halves)
+        # Eyes that were added have no bending of their own: as slivers beside the skin they would steer its stiffness.
+        own = len(neutral) if self._carried is None else self._carried.shape[1]
+        faces, halves = model.faces[leading_faces(model, own)], None if halves is None else halves[:own]
+        plate = Plate.of(neutral[:own], faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm, symmetry=halves)
         world, displacement, stiffness = last.world, last.displacement, last.stiffness
         matched, moved, step = 0.0, 0.0, 0.0
         for level, half in levels:
@@ -189,18 +194,19 @@ class Search:
             turned = [b.normal @ rotation for b, rotation in zip(borders, geometry.rotation, strict=True)]
             face = np.concatenate([texels.face[some], outline.face])
             weights = np.concatenate([texels.weights[some], outline.weights])
+            points = corner_matrix(model.faces, face, weights, len(neutral))
             solved = solve_displacement(
                 plate,
-                corner_matrix(model.faces, face, weights, len(neutral)),
+                points if self._carried is None else points @ self._carried,
                 np.concatenate([normalize(np.mean(objects, axis=0))[some], *turned]),
                 np.concatenate([found.offset[some], outline.offset]) / scale,
                 np.concatenate([found.precision[some] * THIN**2, outline.precision]) * scale**2,
-                displacement,
+                displacement[:own],
                 stiffness,
                 ROBUST_STEPS * step / scale,
             )
-            change = scale * solved.displacement - scale * displacement
-            displacement = solved.displacement
+            reached = solved.displacement if self._carried is None else self._carried @ solved.displacement
+            change, displacement = scale * reached - scale * displacement, reached
             stiffness = solved.likely_stiffness(self._config.stiffness, STIFFEST)
             world = displaced_world(geometry, displacement)
             measured = np.flatnonzero(found.precision > 0)
