@@ -180,6 +180,8 @@ SURFACE = [
 ]  # fmt: skip
 
 EYES = [
+    M("added eyes bend with the skin", STAGES, r"self\._carried = carried\(model\)$", "self._carried = None",
+      "tests/stages/test_find_surface.py -k eyes"),
     M("models keep the holes of their eyes", "mifit/config.py", r"(eyes: bool = flag\(\s+)True", r"\g<1>False",
       "tests/test_pipeline.py"),
     M("the paper's preset adds eyes", "mifit/config.py", r'camera_gains="never", eyes=False', 'camera_gains="never"',
