@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import vertex_normals
 from mifit.morphable import MorphableModel
-from mifit.morphable.openings import eyeballs
+from mifit.morphable.openings import eyeballs, leading_faces
 
 SEARCH_MM = 12.0
 """Depth of an eyeball outside the skin up to which it is found."""
@@ -35,6 +35,8 @@ def behind_lids(model: MorphableModel, geometry: GeometryEstimate) -> GeometryEs
     eyes = eyeballs(model)
     if not eyes:
         return geometry
+    # The tissue behind the lids that comes with added eyes is meant to lie behind the balls.
+    lids = leading_faces(model, min(int(eye.min()) for eye in eyes))
     unit = float(geometry.scale) / model.unit_mm  # of world length in a millimetre
     vertices = geometry.vertices.copy()
     for world in (world for world in vertices for _ in range(PASSES)):
@@ -43,7 +45,8 @@ def behind_lids(model: MorphableModel, geometry: GeometryEstimate) -> GeometryEs
             points = world[eye].astype(np.float64)
             own = np.isin(model.faces[:, 0], eye)
             near = np.linalg.norm(world - points.mean(axis=0), axis=1) < np.ptp(points, axis=0).max()
-            skin = model.faces[~own & near[model.faces].any(axis=1)]
+            covering = ~own & near[model.faces].any(axis=1)
+            skin = model.faces[covering if lids is None else covering & lids]
             depth = _depth_outside(points, normals[eye], world.astype(np.float64), skin, SEARCH_MM * unit)
             # Its neighbours go with a vertex: an edge from one behind the skin to one at it may cut the skin.
             inner = np.searchsorted(eye, model.faces[own])
