@@ -180,6 +180,8 @@ SURFACE = [
 ]  # fmt: skip
 
 EYES = [
+    M("tissue behind the lids taken for skin", STAGES, r"covering if lids is None else covering & lids", "covering",
+      "tests/stages/test_eyes.py"),
     M("added eyes bend with the skin", STAGES, r"self\._carried = carried\(model\)$", "self._carried = None",
       "tests/stages/test_find_surface.py -k eyes"),
     M("models keep the holes of their eyes", "mifit/config.py", r"(eyes: bool = flag\(\s+)True", r"\g<1>False",

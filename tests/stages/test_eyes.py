@@ -10,7 +10,9 @@ from stages.normal_scene import dome_model
 
 from mifit.core.estimate import GeometryEstimate, Report
 from mifit.morphable import MorphableModel
+from mifit.morphable.openings import with_eyes
 from mifit.stages.eyes import behind_lids, eyeballs
+from tests.test_pipeline import without_eyes
 
 
 @pytest.fixture(scope="module")
@@ -57,3 +59,18 @@ def test_an_eyeball_that_stands_out_goes_behind_the_lids(head: MorphableModel) -
     assert left.sum() < 0.1 * len(moved), (left.sum(), len(moved))
     still = behind_lids(head, replace(before, vertices=before.vertices[:0]))
     assert still.vertices.shape[0] == 0
+
+
+def test_tissue_behind_the_lids_pushes_no_eyeball(head: MorphableModel) -> None:
+    """It surrounds the balls that a model got: wherever it lies, only skin sends them back."""
+    skin = without_eyes(head)
+    whole = with_eyes(skin)
+    added = np.arange(whole.n_vertices) >= skin.n_vertices
+    tissue = added & ~np.isin(np.arange(whole.n_vertices), np.concatenate(eyeballs(whole)))
+    moved = []
+    for forwards in (0.0, 0.6):
+        vertices = whole.mean.astype(np.float64)
+        vertices[tissue, 2] += forwards
+        before = posed(whole, vertices)
+        moved.append(np.abs(behind_lids(whole, before).vertices[0] - before.vertices[0]).max(axis=1))
+    np.testing.assert_array_equal(*moved)
