@@ -180,6 +180,8 @@ SURFACE = [
 ]  # fmt: skip
 
 EYES = [
+    M("eyeballs matched at the lids", STAGES, r"self\.scenes = Scenes\(self\._faces,", "self.scenes = Scenes(model.faces,",
+      "tests/stages/test_find_surface.py -k eyes"),
     M("tissue behind the lids taken for skin", STAGES, r"covering if lids is None else covering & lids", "covering",
       "tests/stages/test_eyes.py"),
     M("added eyes bend with the skin", STAGES, r"self\._carried = carried\(model\)$", "self._carried = None",

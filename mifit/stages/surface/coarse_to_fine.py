@@ -113,7 +113,10 @@ class Search:
         self._resolution, self._config, self._progress = resolution, config, progress
         self._done, self._total = 0, total
         self._carried = carried(model)
-        self.scenes = Scenes(model.faces, np.unique(model.faces[model.face_mask]), SLACK * resolution.pixel)
+        self._own = model.n_vertices if self._carried is None else self._carried.shape[1]
+        # Rays meet the skin alone: through eyes that were added, windows at the lids would match what the balls mirror.
+        self._faces = model.faces[leading_faces(model, self._own)]
+        self.scenes = Scenes(self._faces, np.unique(model.faces[model.face_mask]), SLACK * resolution.pixel)
         progress("find surface", 0, total)
 
     def finish(self) -> None:
@@ -169,9 +172,10 @@ class Search:
         # A head that the model spans is as symmetric as its modes make it.
         halves = model.symmetry if self._beyond else None
         # Eyes that were added have no bending of their own: as slivers beside the skin they would steer its stiffness.
-        own = len(neutral) if self._carried is None else self._carried.shape[1]
-        faces, halves = model.faces[leading_faces(model, own)], None if halves is None else halves[:own]
-        plate = Plate.of(neutral[:own], faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm, symmetry=halves)
+        own, halves = self._own, None if halves is None else halves[: self._own]
+        plate = Plate.of(
+            neutral[:own], self._faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm, symmetry=halves
+        )
         world, displacement, stiffness = last.world, last.displacement, last.stiffness
         matched, moved, step = 0.0, 0.0, 0.0
         for level, half in levels:
