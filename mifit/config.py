@@ -77,7 +77,7 @@ class ShapeConfig:
     )
 
 
-SHADINGS = ["auto", "paper", "printed", "prefiltered", "shadowed", "keyed", "matt"]
+SHADINGS = ["auto", "paper", "printed", "prefiltered", "shadowed", "keyed", "near", "matt"]
 """What ``shading`` may be; registering a shading model (``appearance.models``) adds its name."""
 
 
@@ -121,9 +121,9 @@ class ReflectanceConfig:
     )
     shading: Annotated[str, pydantic.AfterValidator(_known_shading)] = one_of(
         "auto",
-        "image-formation model: paper, prefiltered, shadowed, keyed (shadowed with a compact light), matt (shadowed "
-        "without specular reflection), or another that is registered; auto takes the one of the last three that best "
-        "predicts images that are left out",
+        "image-formation model: paper, prefiltered, shadowed, keyed (shadowed with a distant compact light), near (with "
+        "one at a place), matt (shadowed without specular reflection), or another that is registered; auto takes the "
+        "one of the last four that best predicts images that are left out",
     )
     bands: int = number(10, "bands of the lighting of prefiltered and shadowed; paper has 3", least=3, most=10)
     exponent: float | None = number(
@@ -162,9 +162,9 @@ class ReflectanceConfig:
     )
 
     def __post_init__(self) -> None:
-        if self.solver == "adam" and self.shading == "keyed":
+        if self.solver == "adam" and self.shading in ("keyed", "near"):
             raise ValueError(
-                "shading: found 'keyed' with solver 'adam', which has no search for the light's direction; "
+                f"shading: found {self.shading!r} with solver 'adam', which has no search for a light's place; "
                 "use solver 'als', or shading 'shadowed'"
             )
 

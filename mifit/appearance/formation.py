@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mifit.appearance import models
 from mifit.appearance.arrays import aligned, expect, on_device, stored
-from mifit.appearance.illumination import DistantLight, Illumination, Light
+from mifit.appearance.illumination import DistantLight, Illumination, Light, NearLight
 from mifit.appearance.kernels import PreparedLobe, diffuse_transfer, prepare
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
@@ -24,7 +24,7 @@ from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, Ver
 from mifit.errors import InputError
 
 OPEN = Occlusion()
-LightTransfer = Callable[[Sequence[DistantLight], NDArray[np.uint32]], tuple[NDArray[np.float32], NDArray[np.float32]]]
+LightTransfer = Callable[..., tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 
 def form_image(ambient: Any, albedo: Any, diffuse: Any, specular_albedo: Any, specular: Any) -> Any:
@@ -148,23 +148,23 @@ class Appearance:
         both = stored([*diffuse, *specular], scene.count)
         return both[:, : len(diffuse)], both[:, len(diffuse) :]
 
-    def light_transfer(self, normals: ArrayLike, view: ArrayLike) -> LightTransfer:
-        """What distant compact lights, several at a time, send off points: parameters as in `shade`.
+    def light_transfer(self, normals: ArrayLike, view: ArrayLike, points: ArrayLike | None = None) -> LightTransfer:
+        """What compact lights, several of one kind at a time, send off points: parameters as in `shade`.
 
         Returns
         -------
         callable
             ``(lights, visible)`` -> diffuse and specular radiance (M, N) at unit albedo and light;
-            ``visible`` (M, N) uint32 tells which of a light's samples each point sees (``DistantLight.visible``).
+            ``visible`` (M, N) uint32 tells which of a light's samples each point sees (``Light.visible``).
         """
         import drjit as dr
         import mitsuba as mi
 
         dark = Appearance(self.model, Illumination.dark(1), self.lobe)
-        scene = _Scene(dark, normals, view, Occlusion(), None, shadows=False)
+        scene = _Scene(dark, normals, view, Occlusion(), points, shadows=False)
 
         def transfer(
-            lights: Sequence[DistantLight], visible: NDArray
+            lights: Sequence[DistantLight] | Sequence[NearLight], visible: NDArray
         ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
             shape = len(lights), scene.count
             if not shape[0] * shape[1]:
@@ -179,8 +179,16 @@ class Appearance:
                 return mi.Vector3f(*(dr.gather(mi.Float, towards, light * (3 * rays) + 3 * ray + i) for i in range(3)))
 
             n, v = (dr.gather(mi.Vector3f, x, point) for x in (scene.n, scene.v))
+            directions, strength = [direction(ray) for ray in range(rays)], mi.Float(1.0)
+            if isinstance(lights[0], NearLight):
+                p = dr.gather(mi.Point3f, scene.points, point)
+                places = mi.Float(aligned(np.stack([each.position for each in lights])).ravel())
+                reach = mi.Float(aligned([each.distance**2 for each in lights]))
+                place = mi.Point3f(*(dr.gather(mi.Float, places, 3 * light + i) for i in range(3)))
+                strength = dr.gather(mi.Float, reach, light) / dr.squared_norm(place - p)
+                directions = [dr.normalize(mi.Point3f(d) - p) for d in directions]
             seen = mi.UInt(aligned(visible, np.uint32).ravel())
-            found = self.model.light(n, v, scene.lobe, [direction(ray) for ray in range(rays)], 1.0, seen)
+            found = self.model.light(n, v, scene.lobe, directions, strength, seen)
             both = stored(list(found), shape[0] * shape[1])
             return both[:, 0].reshape(shape), both[:, 1].reshape(shape)
 

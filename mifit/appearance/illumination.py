@@ -13,14 +13,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mifit.appearance.near_light import RAYS, NearLight
 from mifit.core.sh import SHLighting, basis, order_of
 from mifit.errors import InputError
 
 if TYPE_CHECKING:
     from mifit.render.gbuffer import SurfaceScene
-
-RAYS = 16
-"""Directions or points that stand for the extent of a compact light."""
 
 
 class Light(Protocol):
@@ -32,7 +30,8 @@ class Light(Protocol):
     Attributes
     ----------
     colour : (3,)
-        Linear Rec. 709. Of a distant light the irradiance of a surface that faces it.
+        Linear Rec. 709. Of a distant light the irradiance of a surface that faces it, of a near one that irradiance
+        at its centre.
     """
 
     @property
@@ -49,7 +48,7 @@ class Light(Protocol):
         ...
 
     def coefficients(self, order: int) -> NDArray[np.float64]:
-        """(B*B, 3) SH coefficients of its radiance: what B bands can show of it."""
+        """(B*B, 3) SH coefficients of its radiance: what B bands can show of it; of a near one, at its centre."""
         ...
 
     def document(self) -> dict[str, Any]:
@@ -60,8 +59,8 @@ class Light(Protocol):
         """The stock Mitsuba emitter that is nearest to it."""
         ...
 
-    def describe(self) -> str:
-        """A few words for a report."""
+    def describe(self, unit_mm: float | None = None) -> str:
+        """A few words for a report; ``unit_mm`` are the millimetres per unit of the world, where they are known."""
         ...
 
     def visible(self, scene: SurfaceScene, points: NDArray, normals: NDArray) -> NDArray[np.uint32]:
@@ -122,8 +121,8 @@ class DistantLight:
             "irradiance": {"type": "rgb", "value": [float(x) for x in self.colour]},
         }
 
-    def describe(self) -> str:
-        """Where it is and how large it looks."""
+    def describe(self, unit_mm: float | None = None) -> str:
+        """Where it is and how large it looks, which no unit matters to."""
         x, y, z = self.direction
         return f"towards ({x:.2f}, {y:.2f}, {z:.2f}), with an angular radius of {math.degrees(self.radius):.1f} degrees"
 
@@ -149,6 +148,8 @@ def light_from(document: dict[str, Any]) -> Light:
     KeyError, TypeError, ValueError
         A value is missing, of the wrong kind or shape, or not finite.
     """
+    if "position" in document:
+        return NearLight.of(document)
     direction, colour = (np.array(document[name], dtype=np.float64) for name in ("direction", "irradiance"))
     radius = float(document["radius"])
     if direction.shape != (3,) or colour.shape != (3,) or not np.isfinite([*direction, *colour, radius]).all():

@@ -70,14 +70,23 @@ class PathTracer:
         Lat-long radiance in Mitsuba's ``envmap`` layout: row 0 up, u = 0 along -z, u = 1/4 along +x.
     max_depth : int
         Longest path in segments; 4 is two bounces of light between skin and skin.
+    lamps : sequence of dict
+        Emitters beside the environment, as Mitsuba's dictionaries.
     """
 
-    def __init__(self, materials: dict[str, Material], environment: NDArray, max_depth: int = 4) -> None:
+    def __init__(
+        self,
+        materials: dict[str, Material],
+        environment: NDArray,
+        max_depth: int = 4,
+        lamps: Sequence[dict[str, Any]] = (),
+    ) -> None:
         import mitsuba as mi
 
         self._bsdfs = {name: mi.load_dict(_bsdf(material)) for name, material in materials.items()}
         bitmap = mi.Bitmap(np.ascontiguousarray(environment, dtype=np.float32))
         self._emitter = mi.load_dict({"type": "envmap", "bitmap": bitmap})
+        self._lamps = {f"lamp{i}": mi.load_dict(lamp) for i, lamp in enumerate(lamps)}
         self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
 
     def render(
@@ -102,7 +111,7 @@ class PathTracer:
         import mitsuba as mi
 
         spp = _stratified_count(spp)
-        content: dict[str, Any] = {"type": "scene", "environment": self._emitter}
+        content: dict[str, Any] = {"type": "scene", "environment": self._emitter, **self._lamps}
         for i, surface in enumerate(surfaces):
             content[f"surface{i}"] = make_mesh(
                 surface.vertices,

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.near_light import NearLight
 from mifit.capture.landmark_files import write_landmarks
 from mifit.capture.transforms import MIN_SIDE, Shot, View, write_transforms
 from mifit.core.camera import Camera
@@ -41,6 +42,8 @@ DISTANCE = 72.0
 """Centimetres from the cameras to the head."""
 MOST_MM = 20.0
 """Of what moves a head or a landmark away from the model."""
+LAMP, LEAST_LAMP = 6.0, 20.0
+"""Irradiance of a lamp at the origin, where the procedural studio's is about 1, and its least distance in centimetres."""
 FULL_WELL = 12000.0
 """Electrons of a pixel at linear value 1: shot noise."""
 READ_NOISE = 0.0012
@@ -61,6 +64,7 @@ def synthesize(
     motion: head.Motion = "poses",
     outside: float = head.OUTSIDE,
     landmark_bias: float = 0.0,
+    lamp: Sequence[float] | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Render a capture of an unseen subject, with ground truth beside it.
@@ -94,6 +98,8 @@ def synthesize(
     landmark_bias : float
         Millimetres, standard deviation of each coordinate of a landmark's bias, see `detector.draw_bias`; by default
         landmarks are true but for noise.
+    lamp : (3,), optional
+        Place of a bare bulb beside the environment, centimetres from the origin, where heads are.
     progress : Progress
 
     Returns
@@ -122,6 +128,8 @@ def synthesize(
             raise InputError(f"{name}: found {length}, expected 0 to {MOST_MM:g} mm")
     if tone is not None and not 0 <= tone <= 1:
         raise InputError(f"tone: found {tone}, expected 0 (fair) to 1 (deep)")
+    if lamp is not None and not (np.shape(lamp) == (3,) and LEAST_LAMP <= np.linalg.norm(lamp) < math.inf):
+        raise InputError(f"lamp: found {lamp}, expected x, y, z at {LEAST_LAMP:g} cm or more from the origin")
     shape = MorphableModel.load(model)
     radiance = None if env is None else read_environment(env)
     out.mkdir(parents=True, exist_ok=True)  # a place that can't be written is refused now, not after the first render
@@ -135,7 +143,13 @@ def synthesize(
         light = studio_environment(seed + i) if radiance is None else radiance
         start = i * (timesteps + 1)
         _write_capture(
-            folder, subject, cameras, light, spp, lambda done, start=start: progress("Rendering", start + done, total)
+            folder,
+            subject,
+            cameras,
+            light,
+            lamp,
+            spp,
+            lambda done, start=start: progress("Rendering", start + done, total),
         )
     return out
 
@@ -229,12 +243,14 @@ def _write_capture(
     subject: _Subject,
     cameras: list[Camera],
     environment: NDArray[np.float32],
+    lamp: Sequence[float] | None,
     spp: int,
     advance: Callable[[int], None],
 ) -> None:
     """Render and write one capture; ``transforms.json`` comes last, so a broken-off folder isn't taken for whole."""
     advance(0)
-    tracer = PathTracer(_materials(subject), environment)
+    lamps = [] if lamp is None else [NearLight(np.array(lamp, float), 0.0, np.full(3, LAMP), np.zeros(3)).emitter()]
+    tracer = PathTracer(_materials(subject), environment, lamps=lamps)
     exposure = _exposure(tracer, subject, cameras[0])
     _write_maps(folder / "truth" / "maps.npz", subject.skin["face"])
     visibility = SurfaceScene(subject.neutral, subject.model.faces)
@@ -270,7 +286,9 @@ def _write_capture(
                 expression=pose.expression,
             )
         advance(t + 2)
-    note = {"seed": subject.seed, "exposure": exposure, "spp": spp, "model": subject.model.name}
+    note: dict[str, object] = {"seed": subject.seed, "exposure": exposure, "spp": spp, "model": subject.model.name}
+    if lamp is not None:
+        note["lamp"] = [float(x) for x in lamp]
     write_text(folder / "truth" / "scene.json", json.dumps(note, indent=1) + "\n")
     write_image(folder / "truth" / "environment.exr", environment)
     write_transforms(folder / "transforms.json", [View.of(camera) for camera in cameras], shots, "cm")

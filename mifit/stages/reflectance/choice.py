@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance import models
+from mifit.appearance.illumination import DistantLight
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
 from mifit.config import ReflectanceConfig
@@ -19,6 +20,8 @@ from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.key import RADII, STEPS, TEXELS, Candidates, find_lights, search
 from mifit.stages.reflectance.lighting import LightingSolution, solve_lighting
 from mifit.stages.reflectance.lighting_equations import PRIORS, LightingPriors, LightingProblem
+from mifit.stages.reflectance.near import TEXELS as PLACE_TEXELS
+from mifit.stages.reflectance.near import UNKNOWN_SKIN, Judge, approach, find_near, without_edges
 from mifit.stages.reflectance.prediction import Prediction, predict
 from mifit.stages.reflectance.priors import EXPONENT, NORMAL_REFLECTANCE
 
@@ -34,6 +37,12 @@ EXPONENTS = (10.0, 160.0)
 """Exponents between which a lobe is looked for, an octave at a time: Beckmann roughness 0.4 to 0.1."""
 JUDGES = 1200
 """Texels by which ways to explain the images are compared."""
+PLACE_ITERATIONS = 20
+"""Gauss-Newton iterations of a fit about which places of a light are judged: they differ by little."""
+PLACE_SEARCHES, APPROACH = 3, 0.3
+"""Searches for a place, and the first step of all but the first one, of log distance."""
+CLEARLY = 0.1
+"""Instead, where no image can be left out: part by which a light at a place has to lower the error of the fit."""
 FAINT = 0.2
 """Irradiance of a compact light, relative to that of all other light: below, it is taken for a flaw of the model."""
 START_ITERATIONS = 5
@@ -47,16 +56,21 @@ TRIAL_ITERATIONS = 8
 
 @dataclass(frozen=True)
 class Candidate:
-    """A way to explain the images: a shading model by name, with or without compact lights and specular reflection."""
+    """A way to explain the images: a shading model by name, with or without compact lights and specular reflection.
+
+    A compact light is distant, or ``near``.
+    """
 
     model: str
     lights: bool = False
     glossy: bool = True
+    near: bool = False
 
 
 CANDIDATES = {
     "shadowed": Candidate("shadowed"),
     "keyed": Candidate("shadowed", lights=True),
+    "near": Candidate("shadowed", lights=True, near=True),
     "matt": Candidate("shadowed", glossy=False),
 }
 """What ``shading = auto`` chooses from. Every face shadows itself: a model without shadows, free to bend the light to
@@ -118,8 +132,9 @@ def choose_lighting(
             if lit is None:
                 continue
             keyed, why = trials.add("keyed", lit), "as configured"
-            if not auto or keyed.error < (1.0 - MARGIN) * chosen.error:
-                chosen = trials.best_exponent(keyed) if free else keyed
+            best = _nearer(trials, keyed, way.near) if auto or way.near else keyed
+            if not auto or best.error < (1.0 - MARGIN) * chosen.error:
+                chosen = trials.best_exponent(best) if free else best
                 break
     if auto:
         why = f"predicts images left out better than others by more than {MARGIN:.0%}, or is the likeliest beforehand"
@@ -242,6 +257,30 @@ def _with_light(trials: _Trials, chosen: Trial, priors: LightingPriors) -> Forwa
         if light.radius < RADII[1]:
             return forward.with_lights((light,))
     return None
+
+
+def _nearer(trials: _Trials, keyed: Trial, wanted: bool) -> Trial:
+    """The same with its compact light at a place, where that predicts better or is wanted; itself otherwise.
+
+    The place is searched again from a fit with the light at the last one.
+    """
+    seen, config = trials.seen, trials.config
+    step = max(1, len(seen.texel) // PLACE_TEXELS)
+    part, expected = seen.take(slice(0, None, step)), trials.albedo[::step]
+    light = keyed.forward.lights[0]
+    for _ in range(PLACE_SEARCHES):
+        forward = keyed.forward.with_lights((light,))
+        certain = without_edges(part, forward)
+        found = fit_lighting(certain, forward, expected, config, PLACE_ITERATIONS, priors=UNKNOWN_SKIN)
+        problem = lighting_problem(certain, forward, found.light, expected, config.robust)
+        judge = Judge.about(certain, forward, problem, found, UNKNOWN_SKIN)
+        place = find_near(judge, light, part.point) if isinstance(light, DistantLight) else approach(judge, light, APPROACH)
+        if place is None:
+            return keyed
+        light = place
+    near = trials.add("near", keyed.forward.with_lights((light,)))
+    margin = MARGIN if near.prediction is not None else CLEARLY
+    return near if wanted or near.error < (1.0 - margin) * keyed.error else keyed
 
 
 def noise_weight(colour: NDArray, robust: bool) -> NDArray[np.float32]:

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.formation import Appearance
-from mifit.appearance.illumination import DistantLight, Illumination, Light
+from mifit.appearance.illumination import DistantLight, Illumination, Light, NearLight
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
 from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, VertexTransfer
 from mifit.stages.observations import Observations
 
+Lights = Sequence[DistantLight] | Sequence[NearLight]
 LightColumns = Callable[..., tuple[NDArray[np.float32], NDArray[np.float32]]]
 CHUNK = 1 << 19
 """Points shaded at a time: bounds the memory of the basis functions."""
@@ -130,22 +131,27 @@ class Forward:
 
         Shadows are traced unless (M, N, T) bits tell which of each light's samples the texels see.
         """
-        transfer = self.appearance.light_transfer(*_flat(seen))
+        transfer = self.appearance.light_transfer(*_flat(seen), _points(seen))
 
         def columns(
-            lights: Sequence[DistantLight], visible: NDArray[np.uint32] | None = None
+            lights: Lights, visible: NDArray[np.uint32] | None = None
         ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
             if visible is None:
-                visible = self._visible(seen, lights)
+                visible = self.visible(seen, lights)
             shape = len(lights), *seen.weight.shape
             matt, glossy = transfer(lights, visible[..., seen.step].reshape(len(lights), -1))
             return matt.reshape(shape), self._gloss(glossy.reshape(shape))
 
         return columns
 
-    def _visible(self, seen: Observations, lights: Sequence[DistantLight]) -> NDArray[np.uint32]:
+    def visible(self, seen: Observations, lights: Lights) -> NDArray[np.uint32]:
         """(M, N, T) which of each light's samples the texels see; a word of bits holds those of two lights."""
         out = np.empty((len(lights), *seen.point.shape[:2]), np.uint32)
+        if len(lights) and isinstance(lights[0], NearLight):
+            for number, light in enumerate(lights):
+                for t, mesh in enumerate(self.meshes):
+                    out[number, :, t] = light.visible(mesh.scene, seen.point[:, t], seen.normal[:, t])
+            return out
         for first in range(0, len(lights), 2):
             pair = [light.samples() for light in lights[first : first + 2]]
             both = self.open_towards(seen, np.concatenate(pair))

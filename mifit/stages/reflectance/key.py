@@ -214,7 +214,7 @@ def search(
     (gain,) = candidates.explained([DistantLight(direction, radius, np.zeros(3))])
     widen = 1.5
     while step > STEPS[1]:
-        around = [(d, radius) for d in _ring(direction, step)]
+        around = [(d, radius) for d in ring(direction, step)]
         around += [(direction, float(np.clip(radius * f, *RADII))) for f in (widen, 1.0 / widen)]
         gains = candidates.explained([DistantLight(*c, np.zeros(3)) for c in around])
         best = int(np.argmax(gains))
@@ -225,7 +225,7 @@ def search(
     return float(gain), DistantLight(direction, float(radius), np.zeros(3))
 
 
-def _ring(direction: NDArray, angle: float, count: int = 6) -> NDArray[np.float64]:
+def ring(direction: NDArray, angle: float, count: int = 6) -> NDArray[np.float64]:
     """(count, 3) directions at an angle from one."""
     across = np.linalg.svd(direction[None])[2][1:]
     turn = 2.0 * np.pi * np.arange(count) / count
