@@ -21,6 +21,7 @@ KINDS = {
     "normalmap": "bsdf",
     "roughconductor": "bsdf",
     "directional": "emitter",
+    "point": "emitter",
     "envmap": "emitter",
     "shenv": "emitter",
     "hdrfilm": "film",
