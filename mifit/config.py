@@ -121,9 +121,9 @@ class ReflectanceConfig:
     )
     shading: Annotated[str, pydantic.AfterValidator(_known_shading)] = one_of(
         "auto",
-        "image-formation model: paper, prefiltered, shadowed, keyed (shadowed with a distant compact light), near (with "
-        "one at a place), matt (shadowed without specular reflection), or another that is registered; auto takes the "
-        "one of the last four that best predicts images that are left out",
+        "image-formation model: paper, prefiltered, shadowed, keyed (shadowed with a distant compact light), near "
+        "(with one at a place), matt (shadowed without specular reflection), or another that is registered; auto takes "
+        "the one of the last four that best predicts images that are left out",
     )
     bands: int = number(10, "bands of the lighting of prefiltered and shadowed; paper has 3", least=3, most=10)
     exponent: float | None = number(

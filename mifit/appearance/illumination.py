@@ -43,8 +43,8 @@ class Light(Protocol):
         """The same light in another colour."""
         ...
 
-    def rotated(self, rotation: ArrayLike) -> Light:
-        """The light turned by a rotation (3, 3) about the origin of world space."""
+    def rotated(self, rotation: ArrayLike, about: ArrayLike = (0.0, 0.0, 0.0)) -> Light:
+        """The light turned by a rotation (3, 3) about a point of world space, its origin by default."""
         ...
 
     def coefficients(self, order: int) -> NDArray[np.float64]:
@@ -101,8 +101,8 @@ class DistantLight:
         """The same light in another colour."""
         return replace(self, colour=np.asarray(colour, dtype=np.float64))
 
-    def rotated(self, rotation: ArrayLike) -> DistantLight:
-        """The light turned by a rotation R (3, 3): what came from d comes from R d."""
+    def rotated(self, rotation: ArrayLike, about: ArrayLike = (0.0, 0.0, 0.0)) -> DistantLight:
+        """The light turned by a rotation R (3, 3), whatever the point: what came from d comes from R d."""
         return replace(self, direction=np.asarray(rotation, dtype=np.float64) @ self.direction)
 
     def coefficients(self, order: int) -> NDArray[np.float64]:
@@ -223,10 +223,13 @@ class Illumination:
         lights = tuple(light.with_colour(colour) for light, colour in zip(self.lights, values[count:], strict=True))
         return Illumination(values[:count], lights, self.ambient if ambient is None else ambient)
 
-    def rotated(self, rotation: ArrayLike) -> Illumination:
-        """Turned by a rotation R (3, 3): what came from d comes from R d."""
+    def rotated(self, rotation: ArrayLike, about: ArrayLike = (0.0, 0.0, 0.0)) -> Illumination:
+        """Turned by a rotation R (3, 3): what came from d comes from R d.
+
+        Near lights are carried around a point of world space, its origin by default.
+        """
         turned = SHLighting(self.radiance).rotate(rotation).coefficients
-        return replace(self, radiance=turned, lights=tuple(light.rotated(rotation) for light in self.lights))
+        return replace(self, radiance=turned, lights=tuple(light.rotated(rotation, about) for light in self.lights))
 
     def scaled(self, factor: float) -> Illumination:
         """Everything brighter by a factor."""

@@ -80,10 +80,10 @@ class NearLight:
         """The same light in another colour."""
         return replace(self, colour=np.asarray(colour, dtype=np.float64))
 
-    def rotated(self, rotation: ArrayLike) -> NearLight:
-        """The light carried around the origin of world space by a rotation R (3, 3), and the centre with it."""
-        turn = np.asarray(rotation, dtype=np.float64)
-        return replace(self, position=turn @ self.position, centre=turn @ self.centre)
+    def rotated(self, rotation: ArrayLike, about: ArrayLike = (0.0, 0.0, 0.0)) -> NearLight:
+        """The light carried around a point of world space by a rotation R (3, 3), and its centre with it."""
+        turn, pivot = np.asarray(rotation, dtype=np.float64), np.asarray(about, dtype=np.float64)
+        return replace(self, **{n: pivot + turn @ (getattr(self, n) - pivot) for n in ("position", "centre")})
 
     def coefficients(self, order: int) -> NDArray[np.float64]:
         """(B*B, 3) SH coefficients of what the centre receives of it; other points receive something else."""

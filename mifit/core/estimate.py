@@ -86,6 +86,11 @@ class GeometryEstimate:
     gains: Mapping[str, Sequence[float]] = field(default_factory=dict)
     displacement: NDArray | None = None
 
+    @property
+    def middle(self) -> NDArray:
+        """(3,) mean of the first timestep's vertices: what near lights are turned about."""
+        return np.asarray(self.vertices[0], dtype=np.float64).mean(axis=0)
+
     def gain(self, camera: str) -> NDArray:
         """(3,) float32 gain of a camera; 1 where none is known."""
         return np.array(self.gains.get(camera, (1.0, 1.0, 1.0)), dtype=np.float32)

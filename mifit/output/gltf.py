@@ -141,6 +141,7 @@ def write_glb(
                 "extras": {
                     "sh_radiance": reconstruction.lighting.coefficients.tolist(),
                     "sh_convention": "real, Condon-Shortley phase, index l*l+l+m, world axes",
+                    "lights": [light.document() for light in reconstruction.illumination.lights],
                     "timestep": timestep,
                 },
             }

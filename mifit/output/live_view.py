@@ -87,7 +87,7 @@ def under(result: Result, turn: float, environment: Path | None) -> Result:
     if turn == 0.0 or result.reflectance is None:
         return result
     rotation = Rotation.from_rotvec(np.radians(turn) * vertical(result)).as_matrix()
-    illumination = result.reflectance.illumination.rotated(rotation)
+    illumination = result.reflectance.illumination.rotated(rotation, result.geometry.middle)
     return result.with_illumination(illumination)
 
 

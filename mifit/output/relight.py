@@ -57,7 +57,8 @@ def relit_many(
     turns = [_rotation(rotation) for rotation in rotations]
     if isinstance(lighting, Illumination):
         lit = lighting if exposure is None else lighting.scaled(exposure)
-        return [reconstruction.with_illumination(lit.rotated(turn)) for turn in turns]
+        middle = reconstruction.geometry.middle
+        return [reconstruction.with_illumination(lit.rotated(turn, middle)) for turn in turns]
     before = float(reconstruction.lighting.coefficients[0] @ LUMINANCE)
     image = None if isinstance(lighting, SHLighting) else _environment(lighting)
     smooth = SHLighting.from_envmap(image, reconstruction.lighting.order) if image is not None else lighting

@@ -347,8 +347,8 @@ def _lighting(result: Result) -> str:
     matt, mirror = lighting_balls(lighting)
     panorama = np.maximum(lighting.to_latlong(), 0)
     codes = to_8_bit(panorama / max(float(panorama.max()), 1e-12))
-    lights = result.illumination.lights
-    compact = "".join(f"; the sharp light {light.describe(result.unit_mm)}, was found apart from them" for light in lights)
+    lights = [light.describe(result.unit_mm) for light in result.illumination.lights]
+    compact = "".join(f"; the sharp light {light}, was found apart from them" for light in lights)
     return f"""<div class="balls">{_figure(png_uri(matt), "White matt ball", "lighting on a matt ball")}
 {_figure(png_uri(mirror), "Mirror ball", "lighting in a mirror ball")}
 {_figure(jpeg_uri(codes), "All directions, latitude by longitude", "lighting panorama")}</div>

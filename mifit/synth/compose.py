@@ -43,7 +43,7 @@ DISTANCE = 72.0
 MOST_MM = 20.0
 """Of what moves a head or a landmark away from the model."""
 LAMP, LEAST_LAMP = 6.0, 20.0
-"""Irradiance of a lamp at the origin, where the procedural studio's is about 1, and its least distance in centimetres."""
+"""Irradiance of a lamp at the origin, where the procedural studio's is about 1, and its least distance in cm."""
 FULL_WELL = 12000.0
 """Electrons of a pixel at linear value 1: shot noise."""
 READ_NOISE = 0.0012

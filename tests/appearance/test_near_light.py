@@ -25,7 +25,7 @@ ALL = np.uint32(0xFFFF)
 def surface(count: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points about the origin, their normals, and directions towards the eye."""
     rng = np.random.default_rng(0)
-    p, n = rng.normal(size=(count, 3)), normalize(rng.normal(size=(count, 3)) + [0.0, 0.0, 1.0])
+    p, n = rng.normal(size=(count, 3)), normalize(rng.normal((0.0, 0.0, 1.0), size=(count, 3)))
     v = normalize(n + 0.6 * rng.normal(size=(count, 3)))
     return p, n, np.where((n * v).sum(1, keepdims=True) > 0, v, -v)
 
@@ -111,12 +111,13 @@ def test_harmonics_are_those_that_its_centre_receives(variant):
     np.testing.assert_allclose(light.coefficients(3), np.outer(basis(towards, 3), light.colour))
 
 
-def test_it_is_carried_around_the_origin():
+def test_it_is_carried_around_the_origin_or_a_point():
     turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     turned = FLASH.rotated(turn)
     np.testing.assert_allclose(turned.position, turn @ FLASH.position)
     np.testing.assert_allclose(turned.direction, turn @ FLASH.direction)
     np.testing.assert_allclose(turned.intensity, FLASH.intensity)
+    np.testing.assert_allclose(FLASH.rotated(turn, FLASH.position).position, FLASH.position)
 
 
 def test_json_brings_it_back():

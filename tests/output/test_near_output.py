@@ -55,9 +55,8 @@ def test_a_scene_for_shdirect_has_it_too(lit):
     import mitsuba as mi
 
     dark = replace(lit, reflectance=replace(lit.reflectance, illumination=lit.illumination.without_lights()))
-    images = [
-        np.array(mi.render(r.scene(timestep=0, integrator="shdirect", method="diffuse"), sensor=0, spp=16)) for r in (lit, dark)
-    ]
+    scenes = [r.scene("shdirect", 0, method="diffuse") for r in (lit, dark)]
+    images = [np.array(mi.render(scene, sensor=0, spp=16)) for scene in scenes]
     local = lit.render(lit.cameras[0], 0, "diffuse")[..., :3] - dark.render(lit.cameras[0], 0, "diffuse")[..., :3]
     bright = local[..., 0] > 0.15
     got = (images[0] - images[1])[..., :3]
@@ -77,7 +76,24 @@ def test_the_report_says_where_it_is(lit):
     assert f"({np.linalg.norm(PLACE) * lit.unit_mm:.0f} mm) from the head's middle" in _lighting(lit)
 
 
-def test_relighting_takes_it_away_or_turns_it(lit):
+def test_relighting_takes_it_away_or_carries_it_around_the_head(lit):
     assert lit.relight(np.ones((16, 32, 3), np.float32)).illumination.lights == ()
-    (turned,) = lit.relight(lit.illumination, rotate=90.0).illumination.lights
-    np.testing.assert_allclose(turned.position, [PLACE[2], PLACE[1], -PLACE[0]], atol=1e-9)
+    aside = np.array([3.0, 2.0, 100.0])  # a head that isn't at the origin of its world
+    geometry = replace(lit.geometry, vertices=lit.geometry.vertices + aside.astype(np.float32))
+    middle = geometry.vertices[0].mean(0)
+    light = replace(lit.illumination.lights[0], position=PLACE + middle, centre=middle)
+    moved = replace(lit, geometry=geometry)
+    (turned,) = moved.relight(replace(lit.illumination, lights=(light,)), rotate=90.0).illumination.lights
+    np.testing.assert_allclose(turned.position - middle, [PLACE[2], PLACE[1], -PLACE[0]], atol=1e-4)
+
+
+def test_glb_files_name_it(lit, tmp_path):
+    from mifit.output.export import export
+
+    export(lit, "glb", tmp_path / "ball.glb")
+    assert b'"intensity"' in (tmp_path / "ball.glb").read_bytes()
+
+
+def test_an_edited_face_keeps_it(lit):
+    dark = lit.with_albedo(0.5 * lit.reflectance.diffuse)
+    np.testing.assert_allclose(added(dark, "diffuse", "local", 2), 0.5 * added(lit, "diffuse", "local", 2), atol=2e-3)

@@ -41,8 +41,9 @@ PLACE_ITERATIONS = 20
 """Gauss-Newton iterations of a fit about which places of a light are judged: they differ by little."""
 PLACE_SEARCHES, APPROACH = 3, 0.3
 """Searches for a place, and the first step of all but the first one, of log distance."""
-CLEARLY = 0.1
-"""Instead, where no image can be left out: part by which a light at a place has to lower the error of the fit."""
+NEARER, CLEARLY = 0.02, 0.1
+"""Part by which a compact light at a place has to lower the error of predicted images below that of the same light far
+away, which has one unknown less; and, where no image can be left out, that of the fit."""
 FAINT = 0.2
 """Irradiance of a compact light, relative to that of all other light: below, it is taken for a flaw of the model."""
 START_ITERATIONS = 5
@@ -133,6 +134,8 @@ def choose_lighting(
                 continue
             keyed, why = trials.add("keyed", lit), "as configured"
             best = _nearer(trials, keyed, way.near) if auto or way.near else keyed
+            if way.near and best is keyed:
+                why = "the compact light is too far away to have a place"
             if not auto or best.error < (1.0 - MARGIN) * chosen.error:
                 chosen = trials.best_exponent(best) if free else best
                 break
@@ -274,12 +277,12 @@ def _nearer(trials: _Trials, keyed: Trial, wanted: bool) -> Trial:
         found = fit_lighting(certain, forward, expected, config, PLACE_ITERATIONS, priors=UNKNOWN_SKIN)
         problem = lighting_problem(certain, forward, found.light, expected, config.robust)
         judge = Judge.about(certain, forward, problem, found, UNKNOWN_SKIN)
-        place = find_near(judge, light, part.point) if isinstance(light, DistantLight) else approach(judge, light, APPROACH)
-        if place is None:
+        far = isinstance(light, DistantLight)
+        light = find_near(judge, light, part.point) if far else approach(judge, light, APPROACH)
+        if light is None:
             return keyed
-        light = place
     near = trials.add("near", keyed.forward.with_lights((light,)))
-    margin = MARGIN if near.prediction is not None else CLEARLY
+    margin = NEARER if near.prediction is not None else CLEARLY
     return near if wanted or near.error < (1.0 - margin) * keyed.error else keyed
 
 

@@ -122,9 +122,7 @@ class Judge:
         matt, glossy = rows.diffuse @ light, rows.specular @ light
         maps = found.diffuse[rows.texel], found.specular[rows.texel, None]
         residual = rows.colour - form_image(0.0, maps[0], matt, maps[1], glossy)
-        normal = LightingEquations.accumulate(
-            rows, found.diffuse, found.specular, matt, glossy, residual, self.weight
-        )
+        normal = LightingEquations.accumulate(rows, found.diffuse, found.specular, matt, glossy, residual, self.weight)
         for name in normal.__dataclass_fields__:
             setattr(normal, name, getattr(normal, name) + getattr(self.priors, name))
         remaining = normal.eliminate(False, DAMPING)
