@@ -198,4 +198,21 @@ EYES = [
       "return model.uv", "tests/test_table1.py"),
 ]  # fmt: skip
 
-MUTATIONS = [*CONVENTIONS, *MEASURES, *LIGHT, *GEOMETRY, *MESH, *TERMS, *SURFACE, *EYES]
+NEAR = [
+    M("a near light as strong everywhere", ANY, r"reach / dr\.squared_norm\(position - points\)", "reach / reach",
+      "tests/appearance/test_near_light.py"),
+    M("shadows of what lies behind a near light", RENDER, r"ray\.maxt = reach", "pass", "tests/appearance/test_near_light.py"),
+    M("candidates for a place as strong everywhere", ANY,
+      r"dr\.gather\(mi\.Float, reach, light\) / dr\.squared_norm\(place - p\)", "mi.Float(1.0)",
+      "tests/appearance/test_near_light.py"),
+    M("intensity is what the centre receives", ANY, r"return self\.colour \* self\.distance\*\*2", "return self.colour",
+      "tests/appearance/test_near_light.py"),
+    M("places judged without what follows them", STAGES, r"^        gain \+= remaining\.right @ .*$", "",
+      "tests/stages/test_near_light_search.py"),
+    M("every compact light is near", STAGES, r"if best >= PLACES - 1:", "if False:",
+      "tests/stages/test_near_light_search.py"),
+    M("near lights carried around the world's origin", OUTPUT, r"lit\.rotated\(turn, middle\)", "lit.rotated(turn)",
+      "tests/output/test_near_output.py"),
+]  # fmt: skip
+
+MUTATIONS = [*CONVENTIONS, *MEASURES, *LIGHT, *NEAR, *GEOMETRY, *MESH, *TERMS, *SURFACE, *EYES]

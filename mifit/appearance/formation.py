@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mifit.appearance import models
 from mifit.appearance.arrays import aligned, expect, on_device, stored
-from mifit.appearance.illumination import DistantLight, Illumination, Light, NearLight
+from mifit.appearance.illumination import Illumination, Light, NearLight
 from mifit.appearance.kernels import PreparedLobe, diffuse_transfer, prepare
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
@@ -163,9 +163,7 @@ class Appearance:
         dark = Appearance(self.model, Illumination.dark(1), self.lobe)
         scene = _Scene(dark, normals, view, Occlusion(), points, shadows=False)
 
-        def transfer(
-            lights: Sequence[DistantLight] | Sequence[NearLight], visible: NDArray
-        ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        def transfer(lights: Sequence[Light], visible: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
             shape = len(lights), scene.count
             if not shape[0] * shape[1]:
                 return np.zeros(shape, np.float32), np.zeros(shape, np.float32)
@@ -180,10 +178,11 @@ class Appearance:
 
             n, v = (dr.gather(mi.Vector3f, x, point) for x in (scene.n, scene.v))
             directions, strength = [direction(ray) for ray in range(rays)], mi.Float(1.0)
-            if isinstance(lights[0], NearLight):
+            near = [each for each in lights if isinstance(each, NearLight)]
+            if near:
                 p = dr.gather(mi.Point3f, scene.points, point)
-                places = mi.Float(aligned(np.stack([each.position for each in lights])).ravel())
-                reach = mi.Float(aligned([each.distance**2 for each in lights]))
+                places = mi.Float(aligned(np.stack([each.position for each in near])).ravel())
+                reach = mi.Float(aligned([each.distance**2 for each in near]))
                 place = mi.Point3f(*(dr.gather(mi.Float, places, 3 * light + i) for i in range(3)))
                 strength = dr.gather(mi.Float, reach, light) / dr.squared_norm(place - p)
                 directions = [dr.normalize(mi.Point3f(d) - p) for d in directions]

@@ -39,6 +39,10 @@ class Light(Protocol):
         """(3,) linear Rec. 709."""
         ...
 
+    def samples(self, count: int = RAYS) -> NDArray[np.float64]:
+        """(count, 3) unit directions, or places of a near light, that cover its extent evenly."""
+        ...
+
     def with_colour(self, colour: ArrayLike) -> Light:
         """The same light in another colour."""
         ...

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.formation import Appearance
-from mifit.appearance.illumination import DistantLight, Illumination, Light, NearLight
+from mifit.appearance.illumination import Illumination, Light, NearLight
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
 from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, VertexTransfer
 from mifit.stages.observations import Observations
 
-Lights = Sequence[DistantLight] | Sequence[NearLight]
 LightColumns = Callable[..., tuple[NDArray[np.float32], NDArray[np.float32]]]
 CHUNK = 1 << 19
 """Points shaded at a time: bounds the memory of the basis functions."""
@@ -134,7 +133,7 @@ class Forward:
         transfer = self.appearance.light_transfer(*_flat(seen), _points(seen))
 
         def columns(
-            lights: Lights, visible: NDArray[np.uint32] | None = None
+            lights: Sequence[Light], visible: NDArray[np.uint32] | None = None
         ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
             if visible is None:
                 visible = self.visible(seen, lights)
@@ -144,7 +143,7 @@ class Forward:
 
         return columns
 
-    def visible(self, seen: Observations, lights: Lights) -> NDArray[np.uint32]:
+    def visible(self, seen: Observations, lights: Sequence[Light]) -> NDArray[np.uint32]:
         """(M, N, T) which of each light's samples the texels see; a word of bits holds those of two lights."""
         out = np.empty((len(lights), *seen.point.shape[:2]), np.uint32)
         if len(lights) and isinstance(lights[0], NearLight):

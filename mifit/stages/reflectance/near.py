@@ -96,7 +96,7 @@ class Judge:
         )
         smooth = replace(problem, diffuse=problem.diffuse[..., :bands], specular=problem.specular[..., :bands])
         columns = forward.with_lights(()).light_columns(seen)
-        return cls(columns, smooth, found, weight, added, forward.visible(seen, forward.lights)[0])
+        return cls(columns, smooth, found, weight, added, forward.visible(seen, [forward.lights[0]])[0])
 
     def unexplained(self, lights: Sequence[Light]) -> NDArray[np.float64]:
         """(M,) energy that each of some compact lights leaves once all else has followed it by a step."""
@@ -134,8 +134,9 @@ class Judge:
 def without_edges(seen: Observations, forward: Forward) -> Observations:
     """Observations where the compact light of a model, were it `EDGE` in radius, would be seen whole or not at all."""
     light = forward.lights[0]
+    assert isinstance(light, (DistantLight, NearLight))
     distance = light.distance if isinstance(light, NearLight) else 1.0
-    bits = forward.visible(seen, [replace(light, radius=EDGE * distance)])[0]  # type: ignore[type-var]
+    bits = forward.visible(seen, [replace(light, radius=EDGE * distance)])[0]
     certain = (bits == 0) | (bits == (1 << RAYS) - 1)
     return replace(seen, weight=np.where(certain[:, seen.step], seen.weight, np.float32(0.0)))
 
