@@ -41,7 +41,7 @@ PLACE_ITERATIONS = 20
 """Gauss-Newton iterations of a fit about which places of a light are judged: they differ by little."""
 PLACE_SEARCHES, APPROACH = 3, 0.3
 """Searches for a place, and the first step of all but the first one, of log distance."""
-NEARER, CLEARLY = 0.02, 0.1
+NEARER, CLEARLY = 0.015, 0.1
 """Part by which a compact light at a place has to lower the error of predicted images below that of the same light far
 away, which has one unknown less; and, where no image can be left out, that of the fit."""
 FAINT = 0.2
