@@ -115,11 +115,13 @@ def fit(
     source = Source(capture, digest, model, cameras, timesteps, seed)
 
     def result(estimates: Mapping[Part, Any], seconds: float = 0.0) -> Reconstruction:
+        views, refined = tuple(capture.camera(name) for name in cameras), estimates.get("cameras")
         return Reconstruction(
             model=model,
-            **cast(dict, estimates),
+            **{part: estimate for part, estimate in cast(dict, estimates).items() if part != "cameras"},
             config={**dataclasses.asdict(config), "seed": seed},
-            cameras=tuple(capture.camera(name) for name in cameras),
+            cameras=views if refined is None else tuple(map(refined.refined, views)),
+            calibration=views if refined is not None and refined.names else (),
             capture_digest=digest,
             model_source=model.source,
             units=capture.units,

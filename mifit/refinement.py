@@ -151,7 +151,7 @@ class Refinement(Generic[R]):
             raise InputError("refine: found a result without reflectance, expected one of 'mifit fit' with all stages")
         self._began = time.perf_counter()
         self._result, self._seed = result, seed
-        self._capture = capture.with_fitted(result.cameras)
+        self._capture = capture.with_fitted(result.cameras, result.calibration)
         names = [camera.name for camera in result.cameras]
         size, model = len(result.reflectance.diffuse), result.model
         surface = Surface(self._capture, model, result.geometry.at(result.timesteps[:1]), names, size, whole=True)

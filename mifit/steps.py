@@ -1,8 +1,9 @@
 """The steps of a fit: a list of what runs, with which inputs and settings, and the cache that skips what is done.
 
 A step sees nothing but what it is given: the source (capture, model, cameras, timesteps, seed), the estimates that it
-names as inputs, and its settings. The key of its checkpoint is made of exactly these, so that any change of one runs
-it anew, with all that depends on it, and a change of anything else doesn't.
+names as inputs, and its settings. One that names refined cameras sees the capture with them. The key of its checkpoint
+is made of exactly these, so that any change of one runs it anew, with all that depends on it, and a change of anything
+else doesn't.
 
 To add a step, write ``_name(source, inputs, progress, *settings)`` and put a `Step` into `steps`. A step whose
 ``part`` an earlier one has made already replaces that estimate for all that come after it.
@@ -32,6 +33,7 @@ from mifit.config import (
     SurfaceConfig,
 )
 from mifit.core.estimate import (
+    CamerasEstimate,
     GeometryEstimate,
     MeshEstimate,
     NormalsEstimate,
@@ -46,9 +48,10 @@ if TYPE_CHECKING:
 
 Stage = Literal["geometry", "reflectance", "normals"]
 STAGES: tuple[Stage, ...] = ("geometry", "reflectance", "normals")
-Part = Literal["geometry", "reflectance", "normals", "mesh", "residual"]
+Part = Literal["geometry", "cameras", "reflectance", "normals", "mesh", "residual"]
 PARTS: dict[Part, type] = {
     "geometry": GeometryEstimate,
+    "cameras": CamerasEstimate,
     "reflectance": ReflectanceEstimate,
     "normals": NormalsEstimate,
     "mesh": MeshEstimate,
@@ -123,29 +126,37 @@ class Step:
 
 def steps(config: FitConfig, until: Stage = "normals") -> list[Step]:
     """The steps of a fit with these settings, in order."""
-    found = [Step("geometry", "geometry", (), (config.geometry,), _fit_geometry)]
+    measured = replace(config.geometry, refine_cameras=False)
+    found = [Step("geometry", "geometry", (), (measured,), _fit_geometry)]
     if config.surface.enabled:
-        found.append(Step("surface", "geometry", ("geometry",), (config.surface, config.geometry), _find_surface))
+        found.append(Step("surface", "geometry", ("geometry",), (config.surface, measured), _find_surface))
+    seen: tuple[Part, ...] = ()
+    if config.geometry.refine_cameras:
+        seen = ("cameras",)
+        found += [
+            Step("cameras", "cameras", ("geometry",), (), _refine_cameras),
+            Step("geometry_refined", "geometry", ("geometry", *seen), (config.surface, measured), _fit_refined),
+        ]
     if until == "geometry":
         return found
-    found.append(Step("reflectance", "reflectance", ("geometry",), (config.reflectance,), _infer_reflectance))
+    infer = Step("reflectance", "reflectance", ("geometry", *seen), (config.reflectance,), _infer_reflectance)
+    found.append(infer)
     # How many rounds there are is no matter of a round: those that are done serve when more are asked for.
     shape = replace(config.shape, rounds=1)
     for number in range(1, config.shape.rounds + 1):
+        given = ("geometry", "reflectance", *seen)
         found += [
-            Step(
-                f"geometry_{number}", "geometry", ("geometry", "reflectance"), (shape, config.geometry), _refine_shape
-            ),
-            Step(f"reflectance_{number}", "reflectance", ("geometry",), (config.reflectance,), _infer_reflectance),
+            Step(f"geometry_{number}", "geometry", given, (shape, measured), _refine_shape),
+            replace(infer, name=f"reflectance_{number}"),
         ]
     if until == "reflectance":
         return found
     found += [
-        Step("normals", "normals", ("geometry", "reflectance"), (config.normals,), _refine_normals),
+        Step("normals", "normals", ("geometry", "reflectance", *seen), (config.normals,), _refine_normals),
         Step("mesh", "mesh", ("geometry", "normals"), (config.mesh,), _refine_mesh),
     ]
     if config.residual.enabled:
-        given: tuple[Part, ...] = ("geometry", "reflectance", "normals")
+        given = ("geometry", "reflectance", "normals", *seen)
         found.append(Step("residual", "residual", given, (config.residual,), _find_residual))
     return found
 
@@ -205,7 +216,7 @@ def run_steps(
             done = checkpoint.load(folder, name, PARTS[step.part], key) if folder else None
             if done is None:
                 inputs = {part: estimates[part] for part in step.inputs}
-                done = step.run(source, inputs, progress, *step.settings)
+                done = step.run(_seen(source, inputs), inputs, progress, *step.settings)
                 if folder:
                     checkpoint.save(folder, name, done, key)
         if step.part in estimates and step.part not in step.inputs:
@@ -214,6 +225,14 @@ def run_steps(
         if watch:
             watch(estimates)
     return estimates, before + sum(estimate.report.seconds for estimate in estimates.values())
+
+
+def _seen(source: Source, inputs: Inputs) -> Source:
+    """The source with refined cameras where a step is given any."""
+    if "cameras" not in inputs or not inputs["cameras"].names:
+        return source
+    capture, cameras = source.capture, inputs["cameras"]
+    return replace(source, capture=capture.with_estimate([cameras.refined(capture.camera(n)) for n in cameras.names]))
 
 
 def _alone(path: Path) -> contextlib.AbstractContextManager:
@@ -240,6 +259,26 @@ def _find_surface(
 
     found = find_surface(source.capture, source.model, inputs["geometry"], source.cameras, config, progress, geometry)
     return behind_lids(source.model, found)
+
+
+def _refine_cameras(source: Source, inputs: Inputs, progress: Progress) -> Any:
+    from mifit.stages.refine_cameras import refine_cameras
+
+    return refine_cameras(source.capture, source.model, inputs["geometry"], source.cameras, progress)
+
+
+def _fit_refined(
+    source: Source, inputs: Inputs, progress: Progress, surface: SurfaceConfig, geometry: GeometryConfig
+) -> Any:
+    from mifit.stages.refine_cameras import reported
+
+    first, cameras = inputs["geometry"], inputs["cameras"]
+    if not cameras.names:
+        return reported(first, cameras)
+    found = _fit_geometry(source, {}, progress, geometry)
+    if surface.enabled:
+        found = _find_surface(source, {"geometry": found}, progress, surface, geometry)
+    return reported(found, cameras, first.report.seconds)
 
 
 def _infer_reflectance(source: Source, inputs: Inputs, progress: Progress, config: ReflectanceConfig) -> Any:

@@ -83,7 +83,7 @@ def track_into(
     with locked(folder):
         result, room = _with_room(result, len(timesteps))
         for frame in track(
-            capture.with_fitted(result.cameras),
+            capture.with_fitted(result.cameras, result.calibration),
             result.model,
             result.geometry,
             result.reflectance,

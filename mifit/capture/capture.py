@@ -116,7 +116,7 @@ class Capture:
     units : str
         Unit of length of the poses: ``mm``, ``cm``, ``dm`` or ``m``.
     estimated : dict of str to Camera
-        Cameras that were estimated, not calibrated; empty for a calibrated capture.
+        Cameras that were estimated, or refined from their calibration; empty where all are as calibrated.
     """
 
     path: Path
@@ -244,12 +244,21 @@ class Capture:
         return result.hexdigest()
 
     def with_estimate(self, cameras: Sequence[Camera]) -> Capture:
-        """The same capture with estimated cameras for views that aren't calibrated; `calibrated` stays False."""
+        """The same capture with estimated cameras, refined ones included; whether it is `calibrated` stays as it is."""
         return dataclasses.replace(self, estimated={camera.name: camera for camera in cameras}, _cache=self._cache)
 
-    def with_fitted(self, cameras: Sequence[Camera]) -> Capture:
-        """The capture as a fit with these cameras saw it: its own calibration, or else the estimated cameras."""
-        return self if self.calibrated or not cameras else self.with_estimate(cameras)
+    def with_fitted(self, cameras: Sequence[Camera], calibration: Sequence[Camera] = ()) -> Capture:
+        """The capture as a fit with these cameras saw it: its own calibration, or else the estimated cameras.
+
+        Cameras that were refined from a ``calibration`` take the place of the capture's own where these are the same
+        still: one that was calibrated anew, or another capture's, stands.
+        """
+        if not self.calibrated:
+            return self.with_estimate(cameras) if cameras else self
+        named = set(self.views) >= {camera.name for camera in calibration}
+        if calibration and named and all(self.camera(camera.name) == camera for camera in calibration):
+            return self.with_estimate(cameras)
+        return self
 
     def save(self) -> None:
         """Write ``transforms.json`` anew (whole or not at all); images and landmarks stay as they are."""

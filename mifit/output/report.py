@@ -80,7 +80,7 @@ def write_report(
     Path
         The file.
     """
-    capture = capture.with_fitted(reconstruction.cameras)
+    capture = capture.with_fitted(reconstruction.cameras, reconstruction.calibration)
     shown = reconstruction.timesteps[:SHOWN_TIMESTEPS]
     sections = [
         ("Result", _summary(reconstruction, evaluation)),

@@ -8,7 +8,7 @@ Bundle adjustment, 2000).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,13 +54,15 @@ class Bundle:
     focal : (C,)
         Pixels.
     cameras : (C, 4, 4)
-        From the first camera's frame to each camera's.
+        From a common frame, such as the first camera's, to each camera's.
     heads : (T, 4, 4)
-        From the head's frame to the first camera's.
+        From the head's frame to the common one.
     points : (N, 3)
         Head's frame, at timestep 0.
     expression : (T, K)
         Coefficients relative to timestep 0.
+    moved : (R,)
+        How far calibrated cameras have moved in the ways that are open to them, deviations.
     """
 
     focal: NDArray[np.float64]
@@ -68,6 +70,7 @@ class Bundle:
     heads: NDArray[np.float64]
     points: NDArray[np.float64]
     expression: NDArray[np.float64]
+    moved: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ class AdjustedBundle:
     bundle : Bundle
     deviation : float
         Largest standard deviation of the logarithm of an unknown focal length, from the normal equations with all else
-        eliminated, scaled by the residuals. Errors that matches share aren't in it.
+        eliminated, scaled by the residuals. Errors that matches share aren't in it. 0 where a calibration holds them.
     residual : float
         Median distance of a point from its match, pixels.
     settled : bool
@@ -99,7 +102,9 @@ class _Projected:
     residual: NDArray[np.float64]  # (M, 2) pixels
 
 
-def adjust_bundle(start: Bundle, seen: Sightings, intrinsics: Intrinsics, modes: NDArray) -> AdjustedBundle:
+def adjust_bundle(
+    start: Bundle, seen: Sightings, intrinsics: Intrinsics, modes: NDArray, ways: NDArray | None = None
+) -> AdjustedBundle:
     """Bring projections onto matches.
 
     Parameters
@@ -109,20 +114,25 @@ def adjust_bundle(start: Bundle, seen: Sightings, intrinsics: Intrinsics, modes:
     intrinsics : Intrinsics
     modes : (N, 3, K)
         How expressions move the points; K may be 0.
+    ways : (P, R), optional
+        Columns that the movements of calibrated cameras are made of, each by one deviation of a Gaussian prior about
+        the start; P are the logarithms of the unknown focal lengths, whose own prior doesn't count then, and turn and
+        shift of each camera but the first.
 
     Returns
     -------
     AdjustedBundle
     """
-    bundle, damping, settled = start, 1e-4, False
+    damping, settled = 1e-4, False
+    bundle = replace(start, moved=np.zeros(0 if ways is None else ways.shape[1]))
     projected = _project(bundle, seen, modes)
-    energy = _energy(bundle, projected, seen, intrinsics)
+    energy = _energy(bundle, projected, seen, intrinsics, ways)
     for _ in range(STEPS):
-        system = _System.of(bundle, projected, seen, intrinsics, modes)
+        system = _System.of(bundle, projected, seen, intrinsics, modes, ways)
         while damping < 1e6:
-            trial = _moved(bundle, *system.step(damping), intrinsics)
+            trial = _moved(bundle, *system.step(damping), intrinsics, ways)
             shown = _project(trial, seen, modes)
-            value = _energy(trial, shown, seen, intrinsics)
+            value = _energy(trial, shown, seen, intrinsics, ways)
             if value < energy:
                 break
             damping *= 4.0
@@ -133,9 +143,24 @@ def adjust_bundle(start: Bundle, seen: Sightings, intrinsics: Intrinsics, modes:
         bundle, projected, energy, damping = trial, shown, value, max(damping / 5.0, 1e-9)
         if settled:
             break
-    system = _System.of(bundle, projected, seen, intrinsics, modes)
+    system = _System.of(bundle, projected, seen, intrinsics, modes, ways)
     lengths = np.linalg.norm(projected.residual, axis=1)
     return AdjustedBundle(bundle, system.deviation(projected.residual), float(np.median(lengths)), settled)
+
+
+def information(bundle: Bundle, seen: Sightings, intrinsics: Intrinsics) -> NDArray[np.float64]:
+    """(P, P) mean square by which movements of the cameras change what a still head's matches show, pixels.
+
+    Points have followed the movement where they can. P as for the ways of `adjust_bundle`.
+    """
+    modes = np.zeros((len(bundle.points), 3, 0))
+    projected = _project(bundle, seen, modes)
+    shown = replace(
+        projected, residual=np.zeros_like(projected.residual)
+    )  # before a large movement all look like outliers
+    system = _System.of(bundle, shown, seen, intrinsics, modes, None)
+    reduced, _ = system._reduced(system._inverse(0.0), 0.0)
+    return np.asarray(reduced * seen.deviation**2 / len(seen.point))
 
 
 def _project(bundle: Bundle, seen: Sightings, modes: NDArray) -> _Projected:
@@ -162,10 +187,12 @@ def _off(bundle: Bundle, intrinsics: Intrinsics) -> NDArray[np.float64]:
     return np.array([np.log(bundle.focal[intrinsics.group == g][0]) - mean[g] for g in range(len(mean))])
 
 
-def _energy(bundle: Bundle, projected: _Projected, seen: Sightings, intrinsics: Intrinsics) -> float:
+def _energy(
+    bundle: Bundle, projected: _Projected, seen: Sightings, intrinsics: Intrinsics, ways: NDArray | None
+) -> float:
     """Infinite where a point comes to lie behind a camera."""
     loss = float(_weights(projected.residual, seen)[0].sum())
-    prior = np.sum((_off(bundle, intrinsics) / intrinsics.prior[1]) ** 2)
+    prior = np.sum(bundle.moved**2 if ways is not None else (_off(bundle, intrinsics) / intrinsics.prior[1]) ** 2)
     prior += np.sum((bundle.expression / EXPRESSION_DEVIATION) ** 2)
     return loss + 0.5 * float(prior) if np.isfinite(loss) else np.inf
 
@@ -192,7 +219,13 @@ class _System:
 
     @classmethod
     def of(
-        cls, bundle: Bundle, projected: _Projected, seen: Sightings, intrinsics: Intrinsics, modes: NDArray
+        cls,
+        bundle: Bundle,
+        projected: _Projected,
+        seen: Sightings,
+        intrinsics: Intrinsics,
+        modes: NDArray,
+        ways: NDArray | None,
     ) -> _System:
         cameras, steps, k = len(bundle.cameras), len(bundle.heads), modes.shape[2]
         focals = len(intrinsics.prior[0])
@@ -219,16 +252,20 @@ class _System:
             jacobian[of, :, first + 3 : first + 6] = turned[of]
             first = face_at + k * (t - 1)
             jacobian[of, :, first : first + k] = by_point[of] @ modes[seen.point[of]]
+        before = np.zeros(face_at)  # movement from the prior's mean, and its inverse variance
+        stiff = np.zeros(face_at)
+        before[:focals], stiff[:focals] = _off(bundle, intrinsics), intrinsics.prior[1] ** -2.0
+        if ways is not None:
+            jacobian = np.concatenate([jacobian[..., :head_at] @ ways, jacobian[..., head_at:]], axis=2)
+            before = np.concatenate([bundle.moved, np.zeros(face_at - head_at)])
+            stiff = np.concatenate([np.ones(ways.shape[1]), np.zeros(face_at - head_at)])
         weight = _weights(residual, seen)[1]
         weighted = jacobian * weight[:, None, None]
         columns = jacobian.shape[2]
-        block = weighted.reshape(-1, columns).T @ jacobian.reshape(-1, columns)
-        right = weighted.reshape(-1, columns).T @ residual.ravel()
-        diagonal = np.zeros(columns)
-        diagonal[:focals], diagonal[face_at:] = intrinsics.prior[1] ** -2.0, EXPRESSION_DEVIATION**-2.0
-        right += diagonal * np.concatenate(
-            [_off(bundle, intrinsics), np.zeros(face_at - focals), bundle.expression[1:].ravel()]
-        )
+        block = weighted.reshape(2 * len(at), columns).T @ jacobian.reshape(2 * len(at), columns)
+        right = weighted.reshape(2 * len(at), columns).T @ residual.ravel()
+        diagonal = np.concatenate([stiff, np.full(columns - len(stiff), EXPRESSION_DEVIATION**-2.0)])
+        right += diagonal * np.concatenate([before, bundle.expression[1:].ravel()])
         starts = np.flatnonzero(np.diff(seen.point, prepend=-1))
         by_weight = by_point * weight[:, None, None]
         return cls(
@@ -238,7 +275,7 @@ class _System:
             np.add.reduceat(by_weight.transpose(0, 2, 1) @ by_point, starts),
             np.add.reduceat(np.einsum("mkp,mk->mp", by_weight, residual), starts),
             weight,
-            focals,
+            focals if ways is None else 0,
         )
 
     def _inverse(self, damping: float) -> NDArray[np.float64]:
@@ -248,7 +285,7 @@ class _System:
     def _reduced(self, inverse: NDArray, damping: float) -> tuple[NDArray, NDArray]:
         """The Schur complement of the points (P, P), and the mixed block times their inverse (N, P, 3)."""
         product, size = self.mixed @ inverse, len(self.block)
-        flat = [np.ascontiguousarray(m.transpose(1, 0, 2)).reshape(size, -1) for m in (product, self.mixed)]
+        flat = [np.ascontiguousarray(m.transpose(1, 0, 2)).reshape(size, 3 * len(m)) for m in (product, self.mixed)]
         return self.block + damping * np.diag(np.diag(self.block)) - flat[0] @ flat[1].T, product
 
     def step(self, damping: float) -> tuple[NDArray, NDArray]:
@@ -261,6 +298,8 @@ class _System:
 
     def deviation(self, residual: NDArray) -> float:
         """As in `AdjustedBundle`; infinite where nothing determines a focal length."""
+        if not self.focals:
+            return 0.0
         reduced, _ = self._reduced(self._inverse(0.0), 0.0)
         variance = np.diag(np.linalg.pinv(reduced, hermitian=True))[: self.focals]
         freedom = 2 * len(residual) - 3 * len(self.points) - len(self.block)
@@ -268,8 +307,12 @@ class _System:
         return float(np.sqrt(variance.max() * scale)) if freedom > 0 and variance.min() > 0 else np.inf
 
 
-def _moved(bundle: Bundle, change: NDArray, points: NDArray, intrinsics: Intrinsics) -> Bundle:
+def _moved(bundle: Bundle, change: NDArray, points: NDArray, intrinsics: Intrinsics, ways: NDArray | None) -> Bundle:
     cameras, steps, focals = len(bundle.cameras), len(bundle.heads), len(intrinsics.prior[0])
+    moved = bundle.moved
+    if ways is not None:
+        moved, rest = moved + change[: len(moved)], change[len(moved) :]
+        change = np.concatenate([ways @ change[: len(moved)], rest])
     free = intrinsics.group >= 0
     focal = bundle.focal.copy()
     focal[free] *= np.exp(np.clip(change[intrinsics.group[free]], -0.5, 0.5))
@@ -284,6 +327,7 @@ def _moved(bundle: Bundle, change: NDArray, points: NDArray, intrinsics: Intrins
         heads=_turned(bundle.heads, change[head_at:face_at]),
         points=bundle.points + points,
         expression=expression,
+        moved=moved,
     )
 
 

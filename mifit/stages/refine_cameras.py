@@ -1,0 +1,284 @@
+"""Poses and focal lengths of calibrated cameras by dense matches between them, the calibration as a prior.
+
+Views of one timestep are matched through the fitted mesh, whose errors don't matter: what is adjusted are the images'
+own correspondences, every timestep's points free in space. So two views tell what their epipolar lines tell: how one
+is rolled, looks up and magnifies beside the other. What shifts matches along the lines alone, such as a turn that makes
+the views converge nearer, can't be told from depth: there the calibration stays.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.camera import Camera
+from mifit.core.estimate import CamerasEstimate, GeometryEstimate, Report
+from mifit.core.mesh import interpolate
+from mifit.core.threads import one_blas_thread
+from mifit.core.uv import rasterize_uv
+from mifit.progress import Progress, silent
+from mifit.stages.calibrate_densely import MATCH_DEVIATION, MATCH_SIDE, MOST_TIMESTEPS
+from mifit.stages.calibration.adjustment import (
+    AdjustedBundle,
+    Bundle,
+    Intrinsics,
+    Sightings,
+    adjust_bundle,
+    information,
+)
+from mifit.stages.calibration.rig import (
+    pose_precisions,
+    rig_precision,
+    settled_rig,
+    told_ways,
+)
+from mifit.stages.calibration.tracks import follow_points, unwrap_image
+from mifit.stages.surface.views import texture_size
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+
+LARGEST_MAP = 1024
+"""Side of the unwrapped images, texels, at most."""
+MOST_MATCHES = 10000
+"""Texels of a timestep that are looked for in other views."""
+BLOCK = 32
+"""Side of the squares of texels, like a chessboard's, whose matches are adjusted or left out in turn."""
+FEWEST_MATCHES = 200
+"""Of each kind, below which nothing is adjusted."""
+TOLD_PIXELS = 0.2
+"""Root mean square change of matches by one deviation of the prior below which they don't tell a movement."""
+BETTER = 0.95
+"""Part of the residual of matches left out that an adjustment must leave at most to be kept."""
+SHARED_PIXELS = 0.05
+"""Smooth errors that neighbouring matches share, left out or not: residuals must fall by more, in quadrature."""
+LEFT_PIXELS = 0.5
+"""Residual of matches left out beyond which it isn't the cameras' poses and focal lengths that are off, or not alone.
+
+These three lengths are for images whose longer side has `MATCH_SIDE` pixels or fewer."""
+PLAIN = 10.0
+"""Factor on the deviation of matches where none of them is to count as an outlier."""
+FARTHEST = 3.0
+"""Deviations of the prior beyond which a calibration isn't adjusted: it is another one."""
+
+
+@dataclass(frozen=True)
+class _Matches:
+    """Points seen by two cameras or more at one timestep."""
+
+    seen: Sightings
+    points: NDArray[np.float64]  # (N, 3) on the fitted mesh, world
+    block: NDArray[np.int64]  # (N,) row plus column of the square of texels that each lies in
+
+    def some(self, chosen: NDArray[np.bool_]) -> _Matches:
+        """Those of chosen points (N,)."""
+        kept = chosen[self.seen.point]
+        number = np.cumsum(chosen) - 1
+        seen = replace(
+            self.seen,
+            pixels=self.seen.pixels[kept],
+            point=number[self.seen.point[kept]],
+            camera=self.seen.camera[kept],
+            timestep=self.seen.timestep[kept],
+        )
+        return _Matches(seen, self.points[chosen], self.block[chosen])
+
+
+@one_blas_thread()
+def refine_cameras(
+    capture: Capture,
+    model: MorphableModel,
+    geometry: GeometryEstimate,
+    cameras: Sequence[str],
+    progress: Progress = silent,
+) -> CamerasEstimate:
+    """Adjust the calibration of two or more cameras to dense matches.
+
+    Parameters
+    ----------
+    capture : Capture
+        Calibrated.
+    model : MorphableModel
+    geometry : GeometryEstimate
+        A fit with the calibration as it is; views are matched through its meshes.
+    cameras : sequence of str
+        No other camera's images are read.
+    progress : Progress
+
+    Returns
+    -------
+    CamerasEstimate
+        No cameras where the calibration stays: it can't be adjusted, the adjustment disagrees with it by more than
+        `FARTHEST` deviations or didn't settle, or matches that were left out don't agree better. ``report.details``
+        says why under ``"kept"`` (None where cameras were refined), and has residuals and movements. A warning says it
+        too, but where matches that were left out simply agree with the calibration.
+
+    Notes
+    -----
+    The prior is Gaussian, with `rig.FOCAL_DEVIATION`, `rig.TURN_DEGREES` and `rig.SHIFT_DEVIATION` of each camera. Of
+    its directions those are opened that change matches by `TOLD_PIXELS` at one deviation or more; in all others
+    cameras stay. All cameras move: of rigs that explain matches alike the one that differs least from the calibration
+    is taken, so that the world frame, and with it cameras that weren't fitted, stay valid.
+    """
+    began = time.perf_counter()
+    if not capture.calibrated:
+        return _kept("the capture is uncalibrated: its cameras are estimates already", {}, began)
+    if len(cameras) < 2:
+        return _kept("one camera has nothing to be matched with", {}, began)
+    views = [capture.camera(name) for name in cameras]
+    scale = max(max(max(view.width, view.height) for view in views) / MATCH_SIDE, 1.0)
+    matches = _match(capture, model, geometry, views, MATCH_DEVIATION * scale, progress)
+    used = matches.block % 2 == 0
+    counts = {"matches": int(used.sum()), "matches_left_out": int((~used).sum())}
+    if min(counts.values()) < FEWEST_MATCHES:
+        found = f"{len(used)} points of the face are matched between them"
+        return _kept(f"{found}, expected at least {2 * FEWEST_MATCHES}; more timesteps help", counts, began)
+    taken, left = matches.some(used), matches.some(~used)
+    centre = geometry.vertices[:, np.unique(model.faces[model.face_mask])].reshape(-1, 3).mean(axis=0)
+    poses = np.array([view.world_to_camera for view in views])
+    focal = np.array([_focal(view) for view in views])
+    precisions = pose_precisions(poses, np.array([np.linalg.norm(view.position - centre) for view in views]))
+    calibrated = Bundle(focal, poses, np.eye(4)[None], taken.points, np.zeros((1, 0)))
+    before = _triangulated(taken, calibrated)
+    told = information(before.bundle, taken.seen, _free(focal))
+    ways = told_ways(told, rig_precision(poses, precisions), TOLD_PIXELS * scale)
+    adjusted = adjust_bundle(before.bundle, taken.seen, _free(focal), _rigid(taken), ways)
+    rig = replace(adjusted.bundle, cameras=settled_rig(poses, adjusted.bundle.cameras, precisions))
+    moved = [_moved(view, float(f), pose) for view, f, pose in zip(views, rig.focal, rig.cameras, strict=True)]
+    judged = [_triangulated(left, one).residual for one in (calibrated, rig)]
+    details = {
+        **counts,
+        "residual_pixels": [before.residual, _triangulated(taken, rig).residual],
+        "residual_left_out_pixels": judged,
+        "deviations": np.abs(rig.moved).tolist(),
+        "moved": {a.name: _movement(a, b, centre, capture.unit_mm) for a, b in zip(views, moved, strict=True)},
+    }
+    farthest = float(np.abs(rig.moved).max(initial=0.0))
+    before_after = f"{judged[0]:.2f} pixels off with it, {judged[1]:.2f} with adjusted cameras"
+    if not adjusted.settled:
+        return _kept("the adjustment to dense matches hasn't settled", details, began)
+    if farthest > FARTHEST:
+        found = f"dense matches are off by {farthest:.1f} of the deviations that a calibration is taken to have"
+        return _kept(f"{found}, expected at most {FARTHEST:g}; calibrate the cameras anew", details, began)
+    if judged[1] > LEFT_PIXELS * scale:
+        found = f"dense matches are {before_after}, expected at most {LEFT_PIXELS * scale:.2g}"
+        return _kept(f"{found}; the cameras may be out of step, or their lenses distort otherwise", details, began)
+    if judged[1] > BETTER * judged[0] or judged[0] ** 2 - judged[1] ** 2 < (SHARED_PIXELS * scale) ** 2:
+        return _kept(f"matches that were left out are {before_after}", details, began, warn=False)
+    return CamerasEstimate(
+        tuple(view.name for view in views),
+        np.array([(view.fx, view.fy) for view in moved]),
+        rig.cameras,
+        Report("converged", seconds=time.perf_counter() - began, details={**details, "kept": None}),
+    )
+
+
+def reported(geometry: GeometryEstimate, cameras: CamerasEstimate, seconds: float = 0.0) -> GeometryEstimate:
+    """A fit whose report says what became of the cameras, and counts further ``seconds`` of work before it."""
+    before, found = geometry.report, cameras.report
+    phase = {"name": "cameras", "outcome": found.outcome, **found.details, "seconds": found.seconds}
+    report = replace(
+        before,
+        seconds=before.seconds + seconds,
+        warnings=(*before.warnings, *found.warnings),
+        details={**before.details, "phases": [*before.details.get("phases", []), phase]},
+    )
+    return replace(geometry, report=report)
+
+
+def _free(focal: NDArray) -> Intrinsics:
+    """Every camera has its own focal length, about which ways of moving say all."""
+    return Intrinsics(np.arange(len(focal)), (np.log(focal), math.inf))
+
+
+def _rigid(matches: _Matches) -> NDArray[np.float64]:
+    """No expressions: points of different timesteps are different points."""
+    return np.zeros((len(matches.points), 3, 0))
+
+
+def _triangulated(matches: _Matches, rig: Bundle) -> AdjustedBundle:
+    """Points where cameras that stay see them best; least squares, so that two views share a residual."""
+    seen = replace(matches.seen, deviation=PLAIN * matches.seen.deviation)
+    still = np.zeros((7 * len(rig.cameras) - 6, 0))
+    return adjust_bundle(replace(rig, points=matches.points), seen, _free(rig.focal), _rigid(matches), still)
+
+
+def _kept(why: str, details: dict, began: float, warn: bool = True) -> CamerasEstimate:
+    """The calibration as it is, and why."""
+    warnings = (f"the cameras stay as they were calibrated: {why}",) if warn else ()
+    report = Report("converged", {}, time.perf_counter() - began, warnings, {**details, "kept": why})
+    return CamerasEstimate((), np.zeros((0, 2)), np.zeros((0, 4, 4)), report)
+
+
+def _match(
+    capture: Capture,
+    model: MorphableModel,
+    geometry: GeometryEstimate,
+    views: Sequence[Camera],
+    deviation: float,
+    progress: Progress,
+) -> _Matches:
+    """Points of the face that several views show at a timestep, pixels with this deviation."""
+    steps = np.unique(np.linspace(0, len(geometry.timesteps) - 1, MOST_TIMESTEPS).round().astype(int))
+    centre = geometry.vertices[0].mean(axis=0)
+    length = min(float(np.linalg.norm(centre - view.position)) / _focal(view) for view in views)
+    size = texture_size(model, geometry.vertices[0].astype(np.float64), length, LARGEST_MAP)
+    texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+    middle = np.array([(view.cx, view.cy) for view in views])
+    square = np.array([(_focal(view) / view.fx, _focal(view) / view.fy) for view in views])
+    block, pixels, number, camera, points = [], [], [], [], []
+    count = 0
+    for done, k in enumerate(steps):
+        progress("match views", done, len(steps))
+        vertices = geometry.vertices[k].astype(np.float64)
+        unwrapped = []
+        for i, view in enumerate(views):
+            frame = capture.frame(view.name, geometry.timesteps[k])
+            usable = frame.valid & ~frame.clipped
+            unwrapped.append(unwrap_image(frame.image, usable, view, vertices, model.faces, texels, (i, 0)))
+        tracks = follow_points(unwrapped, 2, MOST_MATCHES)
+        at = np.searchsorted(texels.index, tracks.texel)
+        row, column = np.divmod(tracks.texel, size)
+        block.append(row // BLOCK + column // BLOCK)
+        points.append(interpolate(vertices, model.faces, texels.face[at], texels.weights[at]))
+        pixels.append((tracks.pixels - middle[tracks.image]) * square[tracks.image])
+        number.append(tracks.point + count)
+        camera.append(tracks.image)
+        count += len(tracks.texel)
+    progress("match views", len(steps), len(steps))
+    where, seen_by = np.concatenate(number), np.concatenate(camera)
+    seen = Sightings(np.concatenate(pixels), where, seen_by, np.zeros_like(seen_by), deviation)
+    return _Matches(seen, np.concatenate(points).astype(np.float64), np.concatenate(block))
+
+
+def _focal(view: Camera) -> float:
+    return math.sqrt(view.fx * view.fy)
+
+
+def _moved(view: Camera, focal: float, pose: NDArray) -> Camera:
+    """A camera at another pose, with another focal length and pixels as they were."""
+    factor = focal / _focal(view)
+    return replace(view, fx=view.fx * factor, fy=view.fy * factor, world_to_camera=pose)
+
+
+def _movement(before: Camera, after: Camera, centre: NDArray, unit_mm: float) -> dict[str, float]:
+    """How far a camera has moved, and what it shows of the head."""
+    turn = after.rotation @ before.rotation.T
+    degrees = math.degrees(math.acos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0)))
+    distance = float(np.linalg.norm(before.position - centre))
+    return {
+        "degrees": degrees,
+        "focal_percent": 100.0 * (after.fx / before.fx - 1.0),
+        "position_mm": float(np.linalg.norm(after.position - before.position)) * unit_mm,
+        "at_head_mm": float(np.linalg.norm(after.project(centre) - before.project(centre)))
+        * distance
+        / _focal(before)
+        * unit_mm,
+    }

@@ -1,0 +1,223 @@
+"""Calibrated cameras that matches adjust: what images tell is undone, what they don't tell stays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from memory_capture import MemoryCapture, make_capture
+from scipy.spatial.transform import Rotation
+
+from mifit.core.camera import Camera
+from mifit.core.estimate import CamerasEstimate, GeometryEstimate, Report
+from mifit.morphable import MorphableModel
+from mifit.stages.calibration import adjustment
+from mifit.stages.calibration.rig import movements, pose_precisions, rig_precision, settled_rig, told_ways
+from mifit.stages.refine_cameras import refine_cameras, reported
+
+BOTH = ("left", "right")
+TURNS = [(0, 0, 0), (-8, 14, 3), (9, -12, -4)]
+
+
+@dataclass
+class Calibrated(MemoryCapture):
+    """A capture in memory whose calibration may be off; ``frames`` are those of the true cameras."""
+
+    calibrated: bool = True
+
+    def with_camera(self, camera: Camera) -> Calibrated:
+        return replace(self, cameras_by_name={**self.cameras_by_name, camera.name: camera})
+
+
+@pytest.fixture(scope="module")
+def model(variant) -> MorphableModel:
+    return MorphableModel.load("builtin:coarse").subset(identity=30, expression=20, albedo=10)
+
+
+def captured(model: MorphableModel, **options) -> Calibrated:
+    return Calibrated(**vars(make_capture(model, seed=3, **options)))
+
+
+@pytest.fixture(scope="module")
+def true(model) -> Calibrated:
+    """A head that turns, painted, seen by exact cameras."""
+    return captured(model, angles=TURNS)
+
+
+def fit_of(capture: Calibrated, model: MorphableModel, steps: int) -> GeometryEstimate:
+    """The true head, as a fit would give it but for a millimetre."""
+    vertices = capture.vertices[:steps] + 0.1 * np.sin(capture.vertices[:steps])
+    return GeometryEstimate(
+        tuple(range(steps)), np.zeros(30), np.zeros(10), np.zeros((steps, 20)), capture.rotation[:steps],
+        np.zeros((steps, 3)), 1.0, vertices, model.mean_albedo, np.zeros((9, 3)), 0.0, Report("converged"),
+    )  # fmt: skip
+
+
+def off(camera: Camera, degrees=(0.0, 0.0, 0.0), focal: float = 1.0) -> Camera:
+    """A camera that has turned about its own axes, its place as it was."""
+    pose = camera.world_to_camera.copy()
+    pose[:3, :3] = Rotation.from_rotvec(degrees, degrees=True).as_matrix() @ pose[:3, :3]
+    pose[:3, 3] = -pose[:3, :3] @ camera.position
+    return replace(camera, world_to_camera=pose, fx=focal * camera.fx, fy=focal * camera.fy)
+
+
+def miss(capture: Calibrated, cameras) -> float:
+    """Pixels by which what the true cameras show of the head lies off these cameras' epipolar lines, root mean square.
+
+    Half a distance to each view, as a point between the lines shares it.
+    """
+    a, b = cameras
+    truth = [capture.camera(name) for name in BOTH]
+    points = capture.vertices.reshape(-1, 3)
+    rays = [c.pixel_rays(t.project(points)) for c, t in zip(cameras, truth, strict=True)]
+    normal = np.cross(b.position - a.position, rays[0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return float(np.sqrt(np.mean((0.5 * b.fx * np.sum(normal * rays[1], axis=1)) ** 2)))
+
+
+def refined(found: CamerasEstimate, capture: Calibrated) -> list[Camera]:
+    return [found.refined(capture.camera(name)) for name in BOTH]
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_what_matches_see_of_a_wrong_camera_is_undone(model, true, steps: int) -> None:
+    """Roll, pitch and focal length of one camera, from three timesteps or one."""
+    wrong = true.with_camera(off(true.camera("right"), (0.3, 0.0, 0.3), 1.005))
+    found = refine_cameras(wrong, model, fit_of(true, model, steps), BOTH)
+    assert found.names == BOTH and found.report.warnings == () and found.report.details["kept"] is None
+    before, after = miss(true, [wrong.camera(name) for name in BOTH]), miss(true, refined(found, wrong))
+    assert before > 1.5 and after < 0.1 * before
+    told = found.report.details
+    for key in ("residual_pixels", "residual_left_out_pixels"):
+        assert told[key][0] > 1.0 and told[key][1] < 0.2
+    assert 0.5 < max(told["moved"][name]["at_head_mm"] for name in BOTH) < 6.0
+
+
+def test_a_right_calibration_stays(model, true) -> None:
+    found = refine_cameras(true, model, fit_of(true, model, 3), BOTH)
+    assert found.names == () and found.report.warnings == ()
+    assert "matches that were left out are 0.0" in found.report.details["kept"]
+    assert max(found.report.details["deviations"]) < 0.1
+    assert refined(found, true) == [true.camera(name) for name in BOTH]
+
+
+def test_matches_do_not_tell_how_far_views_converge(model, true) -> None:
+    """A turn along the baseline moves matches along their epipolar lines: depth explains it as well."""
+    wrong = true.with_camera(off(true.camera("right"), (0.0, 0.3, 0.0)))
+    found = refine_cameras(wrong, model, fit_of(true, model, 3), BOTH)
+    assert found.names == ()
+    for moved in found.report.details["moved"].values():
+        assert moved["degrees"] < 0.05 and moved["position_mm"] < 0.5
+
+
+def test_another_calibration_is_not_adjusted(model, true) -> None:
+    wrong = true.with_camera(off(true.camera("right"), focal=1.06))
+    found = refine_cameras(wrong, model, fit_of(true, model, 1), BOTH)
+    assert found.names == ()
+    assert "of the deviations that a calibration is taken to have, expected at most 3" in found.report.warnings[0]
+
+
+def test_what_cameras_do_not_explain_is_said(model, true) -> None:
+    """A roll that images this small don't tell for certain: the other ways can't make up for it."""
+    wrong = true.with_camera(off(true.camera("right"), (0.0, 0.0, 4.0)))
+    found = refine_cameras(wrong, model, fit_of(true, model, 1), BOTH)
+    assert found.names == ()
+    assert found.report.warnings[0].endswith("the cameras may be out of step, or their lenses distort otherwise")
+
+
+def test_an_adjustment_that_does_not_settle_is_dropped(model, true, monkeypatch) -> None:
+    wrong = true.with_camera(off(true.camera("right"), (0.3, 0.0, 0.3), 1.005))
+    monkeypatch.setattr(adjustment, "STEPS", 1)
+    found = refine_cameras(wrong, model, fit_of(true, model, 1), BOTH)
+    assert found.names == () and found.report.warnings[0].endswith("hasn't settled")
+
+
+def test_captures_that_cannot_be_matched_are_left_alone(model, true) -> None:
+    fit = fit_of(true, model, 1)
+    flat = true.changed(lambda name, t, frame: replace(frame, image=np.full_like(frame.image, 0.5)))
+    for capture, cameras, why in (
+        (replace(true, calibrated=False), BOTH, "the capture is uncalibrated"),
+        (true, BOTH[:1], "one camera has nothing to be matched with"),
+        (flat, BOTH, "0 points of the face are matched between them, expected at least 400"),
+    ):
+        found = refine_cameras(capture, model, fit, cameras)
+        assert found.names == () and why in found.report.warnings[0]
+
+
+def test_a_fit_reports_what_became_of_the_cameras(model, true) -> None:
+    fit = fit_of(true, model, 1)
+    fit = replace(fit, report=Report("converged", {}, 3.0, ("a",), {"phases": [{"name": "surface"}]}))
+    cameras = CamerasEstimate(
+        (), np.zeros((0, 2)), np.zeros((0, 4, 4)), Report("converged", {}, 2.0, ("b",), {"kept": "c"})
+    )
+    found = reported(fit, cameras, 10.0).report
+    assert found.seconds == 13.0 and found.warnings == ("a", "b")
+    assert [phase["name"] for phase in found.details["phases"]] == ["surface", "cameras"]
+    assert found.details["phases"][1]["kept"] == "c"
+
+
+def rig(count: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of cameras around a head 70 cm away, and the inverse covariances of their movements."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for k, pose in enumerate(poses):
+        pose[:3, :3] = Rotation.from_euler("yx", (25 * k - 20, 5 * k), degrees=True).as_matrix()
+        pose[:3, 3] = (1.0, -2.0, 70.0)
+    return poses, pose_precisions(poses, np.full(count, 70.0))
+
+
+def moved(pose: np.ndarray, turn=(0.0, 0.0, 0.0), centre=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """A pose turned by degrees about the camera's centre, which moves by a way along the camera's axes."""
+    at = -pose[:3, :3].T @ pose[:3, 3] + pose[:3, :3].T @ np.array(centre)
+    out = np.eye(4)
+    out[:3, :3] = Rotation.from_rotvec(turn, degrees=True).as_matrix() @ pose[:3, :3]
+    out[:3, 3] = -out[:3, :3] @ at
+    return out
+
+
+@pytest.mark.parametrize(
+    ("turn", "centre"), [((0.5, 0, 0), (0, 0, 0)), ((0, 0, 0.5), (0, 0, 0)), ((0, 0, 0), (0, 0.35, 0))]
+)
+def test_a_deviation_of_the_prior_is_what_is_documented(turn, centre) -> None:
+    """0.5 degrees about the centre, or 0.5 % of the distance."""
+    poses, precisions = rig()
+    way = movements(poses[1:2], moved(poses[1], turn, centre)[None])[0]
+    assert way @ precisions[1] @ way == pytest.approx(1.0, rel=0.02)
+
+
+def test_what_all_cameras_do_together_costs_nothing_and_is_taken_back() -> None:
+    poses, precisions = rig()
+    together = np.eye(4)
+    together[:3, :3], together[:3, 3] = (
+        Rotation.from_rotvec([0.4, -0.3, 0.5], degrees=True).as_matrix(),
+        (0.2, 0.1, -0.3),
+    )
+    assert settled_rig(poses, poses @ together, precisions) == pytest.approx(poses, abs=1e-5)
+    back = poses @ together @ np.linalg.inv(together)
+    relative = movements(poses, back)[1:].ravel()
+    cost = rig_precision(poses, precisions)[3:, 3:]
+    assert relative @ cost @ relative < 1e-12
+    # The first camera alone turns: what the others do beside it, seen from it, costs less than its own turn would.
+    one = poses.copy()
+    one[0] = moved(poses[0], (0.5, 0, 0))
+    seen = one @ np.linalg.inv(one[0]) @ poses[0]
+    way = movements(poses, seen)[1:].ravel()
+    settled = movements(poses, settled_rig(poses, one, precisions)).ravel()
+    alone = sum(m @ p @ m for m, p in zip(settled.reshape(-1, 6), precisions, strict=True))
+    assert 0.2 < alone < 0.95 and way @ cost @ way == pytest.approx(alone, rel=0.03)
+
+
+def test_a_rig_of_two_shares_what_one_is_off_by() -> None:
+    poses, precisions = rig(2)
+    one = poses.copy()
+    one[1] = moved(poses[1], (0, 0, 0.4))
+    found = settled_rig(poses, one, precisions)
+    assert found[1] @ np.linalg.inv(found[0]) == pytest.approx(one[1] @ np.linalg.inv(one[0]))
+    turns = np.degrees(np.linalg.norm(movements(poses, found)[:, :3], axis=1))
+    assert turns == pytest.approx([0.2, 0.2], abs=0.03)
+
+
+def test_ways_are_deviations_of_the_prior_that_matches_tell() -> None:
+    precision = np.diag([4.0, 1.0, 0.25])  # deviations 0.5, 1 and 2
+    ways = told_ways(np.diag([0.36, 0.01, 0.04]), precision, least=0.25)  # 0.3, 0.1 and 0.4 pixels
+    assert np.abs(ways) == pytest.approx(np.array([[0.5, 0.0], [0.0, 0.0], [0.0, 2.0]]))
