@@ -183,10 +183,8 @@ def track(arguments: Namespace) -> None:
     from mifit.result.ownership import remember
     from mifit.tracking import sequence_left, track_into
 
-    for name in arguments.overlay or ():
-        capture.with_fitted(result.cameras, result.calibration).camera(
-            name
-        )  # an unknown one is refused now, not after the work
+    for name in arguments.overlay or ():  # an unknown one is refused now, not after the work
+        capture.with_fitted(result.cameras, result.calibration).camera(name)
     timesteps = sequence_left(result, capture, arguments.resume)
     if arguments.timesteps:
         timesteps = choose("timestep", capture.timesteps, arguments.timesteps, 0)

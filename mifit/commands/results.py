@@ -83,11 +83,8 @@ def render(arguments: Namespace) -> None:
     if not arguments.camera:
         camera = result.orbit(**turned, timestep=timestep)
     elif arguments.capture:
-        camera = (
-            mifit.Capture.load(arguments.capture)
-            .with_fitted(result.cameras, result.calibration)
-            .camera(arguments.camera)
-        )
+        capture = mifit.Capture.load(arguments.capture).with_fitted(result.cameras, result.calibration)
+        camera = capture.camera(arguments.camera)
     else:
         camera = result.camera(arguments.camera)
     use_variant(arguments)

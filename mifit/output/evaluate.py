@@ -213,11 +213,9 @@ def located(capture: Capture, reconstruction: Result, camera: str) -> Capture:
     """The capture with the fitted cameras, and with the named one placed where it is neither calibrated nor fitted."""
     if needs_resection(reconstruction, capture, camera):
         return capture.with_estimate([*reconstruction.cameras, resect(reconstruction, capture, camera).camera])
-    return (
-        capture
-        if camera in capture.estimated
-        else capture.with_fitted(reconstruction.cameras, reconstruction.calibration)
-    )
+    if camera in capture.estimated:
+        return capture
+    return capture.with_fitted(reconstruction.cameras, reconstruction.calibration)
 
 
 def as_photographed(reconstruction: Result, image: NDArray, camera: str) -> NDArray:

@@ -117,8 +117,8 @@ def refine_cameras(
     CamerasEstimate
         No cameras where the calibration stays: it can't be adjusted, the adjustment disagrees with it by more than
         `FARTHEST` deviations or didn't settle, or matches that were left out don't agree better. ``report.details``
-        says why under ``"kept"`` (None where cameras were refined), and has residuals and movements. A warning says it
-        too, but where matches that were left out simply agree with the calibration.
+        says why under ``"kept"`` (None where cameras were refined), and has residuals and movements. A warning says
+        what was done and why, but where matches that were left out simply agree with the calibration.
 
     Notes
     -----
@@ -172,11 +172,13 @@ def refine_cameras(
         return _kept(f"{found}; the cameras may be out of step, or their lenses distort otherwise", details, began)
     if judged[1] > BETTER * judged[0] or judged[0] ** 2 - judged[1] ** 2 < (SHARED_PIXELS * scale) ** 2:
         return _kept(f"matches that were left out are {before_after}", details, began, warn=False)
+    away = ", in ".join(f"{name} by {way['at_head_mm']:.1f}" for name, way in details["moved"].items())
+    note = f"the calibration is off: dense matches are {before_after}, which shift the head in {away} mm"
     return CamerasEstimate(
         tuple(view.name for view in views),
         np.array([(view.fx, view.fy) for view in moved]),
         rig.cameras,
-        Report("converged", seconds=time.perf_counter() - began, details={**details, "kept": None}),
+        Report("converged", {}, time.perf_counter() - began, (note,), {**details, "kept": None}),
     )
 
 
