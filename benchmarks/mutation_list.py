@@ -214,5 +214,23 @@ NEAR = [
     M("near lights carried around the world's origin", OUTPUT, r"lit\.rotated\(turn, middle\)", "lit.rotated(turn)",
       "tests/output/test_near_output.py"),
 ]  # fmt: skip
+CAMERAS = [
+    M("cameras move where matches don't tell", STAGES, r"ways\[:, squared > least\*\*2\]", "ways",
+      "tests/stages/test_refine_cameras.py"),
+    M("a refined rig stays where the first camera was", STAGES, r"poses = poses @ step", "poses = poses + 0.0 * step",
+      "tests/stages/test_refine_cameras.py"),
+    M("a camera's turn is taken for one about the origin", STAGES, r"moved\[3:, :3\] = cross_matrix\(shift\)", "pass",
+      "tests/stages/test_refine_cameras.py"),
+    M("cameras without their prior", STAGES, r"np\.ones\(ways\.shape\[1\]\)", "np.zeros(ways.shape[1])",
+      "tests/stages/test_refine_cameras.py"),
+    M("refined cameras kept though nothing is better", STAGES, r"if judged\[1\] > BETTER \* judged\[0\] or", "if False and",
+      "tests/stages/test_refine_cameras.py"),
+    M("later steps don't see refined cameras", "mifit/steps.py", r'if "cameras" not in inputs or', "if True or",
+      "tests/test_pipeline.py"),
+    M("refined cameras forced on another calibration", CAPTURE, r"all\(self\.camera\(camera\.name\) == camera for",
+      "all(True for", "tests/capture/test_capture.py"),
+    M("results forget the calibration they refined", "mifit/result/*.py", r'capture\.get\("calibration", \[\]\)', "[]",
+      "tests/test_pipeline.py"),
+]  # fmt: skip
 
-MUTATIONS = [*CONVENTIONS, *MEASURES, *LIGHT, *NEAR, *GEOMETRY, *MESH, *TERMS, *SURFACE, *EYES]
+MUTATIONS = [*CONVENTIONS, *MEASURES, *LIGHT, *GEOMETRY, *MESH, *TERMS, *SURFACE, *EYES, *NEAR, *CAMERAS]

@@ -30,7 +30,7 @@ from mifit.stages.calibration.adjustment import (
     Intrinsics,
     Sightings,
     adjust_bundle,
-    information,
+    camera_information,
 )
 from mifit.stages.calibration.rig import (
     pose_precisions,
@@ -147,7 +147,7 @@ def refine_cameras(
     precisions = pose_precisions(poses, np.array([np.linalg.norm(view.position - centre) for view in views]))
     calibrated = Bundle(focal, poses, np.eye(4)[None], taken.points, np.zeros((1, 0)))
     before = _triangulated(taken, calibrated)
-    told = information(before.bundle, taken.seen, _free(focal))
+    told = camera_information(before.bundle, taken.seen, _free(focal))
     ways = told_ways(told, rig_precision(poses, precisions), TOLD_PIXELS * scale)
     adjusted = adjust_bundle(before.bundle, taken.seen, _free(focal), _rigid(taken), ways)
     rig = replace(adjusted.bundle, cameras=settled_rig(poses, adjusted.bundle.cameras, precisions))

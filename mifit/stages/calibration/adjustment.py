@@ -148,7 +148,7 @@ def adjust_bundle(
     return AdjustedBundle(bundle, system.deviation(projected.residual), float(np.median(lengths)), settled)
 
 
-def information(bundle: Bundle, seen: Sightings, intrinsics: Intrinsics) -> NDArray[np.float64]:
+def camera_information(bundle: Bundle, seen: Sightings, intrinsics: Intrinsics) -> NDArray[np.float64]:
     """(P, P) mean square by which movements of the cameras change what a still head's matches show, pixels.
 
     Points have followed the movement where they can. P as for the ways of `adjust_bundle`.
