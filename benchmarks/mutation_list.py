@@ -221,8 +221,6 @@ CAMERAS = [
       "tests/stages/test_refine_cameras.py"),
     M("a camera's turn is taken for one about the origin", STAGES, r"moved\[3:, :3\] = cross_matrix\(shift\)", "pass",
       "tests/stages/test_refine_cameras.py"),
-    M("cameras without their prior", STAGES, r"np\.ones\(ways\.shape\[1\]\)", "np.zeros(ways.shape[1])",
-      "tests/stages/test_refine_cameras.py"),
     M("refined cameras kept though nothing is better", STAGES, r"if judged\[1\] > BETTER \* judged\[0\] or", "if False and",
       "tests/stages/test_refine_cameras.py"),
     M("later steps don't see refined cameras", "mifit/steps.py", r'if "cameras" not in inputs or', "if True or",

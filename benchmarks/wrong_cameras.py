@@ -155,25 +155,32 @@ def markdown(rows: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _place(item: tuple[str, Any]) -> tuple[str, int]:
+    """Capture, and a case's place among the cases."""
+    name, case = item[0].split(":")
+    return name, list(CASES).index(case)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="+", help="CAPTURE:CASE")
     parser.add_argument("--work", type=Path, default=Path("out/wrong_cameras"))
     a = parser.parse_args()
     mifit.set_variant()
-    before = RESULTS / "wrong_cameras.json"
-    rows: dict[str, Any] = json.loads(before.read_text())["figures"] if before.exists() else {}
     for label in a.names:
         name, case = label.split(":")
         exact = Capture.load(SHARED / "captures" / name)
-        rows[label] = {}
+        row = {}
         for state in ("off", "on"):
             result = fitted(name, case, state == "on", a.work)
             seen = wrong(exact, case).with_fitted(result.cameras, result.calibration)
-            rows[label][state] = judged(result, exact, seen)
-        print(markdown({label: rows[label]}), file=sys.stderr, flush=True)
-    record("wrong_cameras", rows)
-    write_text(RESULTS / "wrong_cameras.md", markdown(rows))
+            row[state] = judged(result, exact, seen)
+        print(markdown({label: row}), file=sys.stderr, flush=True)
+        before = RESULTS / "wrong_cameras.json"
+        known: dict[str, Any] = json.loads(before.read_text())["figures"] if before.exists() else {}
+        rows = dict(sorted({**known, label: row}.items(), key=_place))
+        record("wrong_cameras", rows)
+        write_text(RESULTS / "wrong_cameras.md", markdown(rows))
     return 0
 
 
