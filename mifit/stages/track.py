@@ -1,7 +1,8 @@
 """Further timesteps with reflectance and lighting fixed: pose and expression, then normals (paper, section 6).
 
 Each new timestep starts where the last one ended. Its surface texture is compared with that of the fitted timesteps,
-so that nothing drifts. Its normals are drawn to the mean correction of the last frames, carried along in the tangent
+so that nothing drifts: at spread points by stage 1's terms, then finely where landmarks are biased
+(`surface.kept_texture`). Its normals are drawn to the mean correction of the last frames, carried along in the tangent
 planes of the moving face: where the images say little the detail stays, where they say much it follows at once.
 """
 
@@ -26,6 +27,8 @@ from mifit.stages.fit_geometry import fit_pose_expression
 from mifit.stages.geometry.refine import texture_reference
 from mifit.stages.normals.carried import CarriedTangents
 from mifit.stages.normals.normal_refinement import check_maps, refine_frame
+from mifit.stages.surface.kept_texture import KeptTexture
+from mifit.stages.surface.model_fit import landmarks_are_biased
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -165,6 +168,9 @@ class Follower:
         self._config, self._seed = geometry_config, seed
         self._home = geometry.at(geometry.timesteps if fitted is None else fitted)
         self._reference = texture_reference(capture, model, self._home, cameras, geometry_config, seed)
+        # Landmarks without a bias place a face better than skin does, whose shading turns with the light.
+        biased = landmarks_are_biased(self._home)
+        self._texture = KeptTexture(capture, model, self._home, cameras) if biased else None
         self._last = geometry.at(geometry.timesteps[-1:]) if last is None else last
 
     @one_blas_thread()
@@ -193,6 +199,7 @@ class Follower:
             return landmark_error(self._capture, self._model, found, self._cameras)
 
         found, refound = _follow(fit, error, self._last, self._home)
+        found = found if self._texture is None else self._texture.aligned(found)
         warnings = list(found.report.warnings)
         if refound:
             warnings.append(f"timestep {timestep}: lost the face and found it again by its landmarks")

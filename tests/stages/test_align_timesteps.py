@@ -15,6 +15,7 @@ from mifit.stages.fit_geometry import fit_geometry
 from mifit.stages.geometry.displaced import moved_by
 from mifit.stages.geometry.parameters import exponential
 from mifit.stages.surface.align_timesteps import align_timesteps
+from mifit.stages.surface.kept_texture import KeptTexture
 from mifit.stages.surface.sweep import BEST_APART, MOST_PAIRS, Posed, across_time
 from mifit.stages.surface.views import pose_texels
 from tests.stages.test_find_surface import QUICK
@@ -69,6 +70,31 @@ def off_mm(model, one, other):
     seen = np.unique(model.faces[model.face_mask])
     way = (one.vertices - other.vertices)[:, seen] @ other.rotation
     return 10.0 * float(np.sqrt(((way - way.mean(axis=0)) ** 2).sum(axis=2).mean()))
+
+
+def test_a_further_timestep_goes_to_where_the_kept_ones_agree(model, capture, right):
+    start = moved_by(model, replace(right, displacement=None), np.zeros_like(model.mean))
+    off = disturbed(model, start).at((2,))
+    kept = KeptTexture(capture, model, right.at((0, 1)), BOTH)
+    found = kept.aligned(off)
+    seen, true = np.unique(model.faces[model.face_mask]), capture.vertices[2]
+    before, after = (10.0 * np.linalg.norm(g.vertices[0] - true, axis=1)[seen].mean() for g in (off, found))
+    assert before > 0.4
+    assert after < 0.3 * before
+    assert found.timesteps == (2,)
+    assert kept.aligned(found).vertices == pytest.approx(found.vertices, abs=0.02)  # and stays there
+
+
+def test_a_timestep_whose_face_is_hidden_stays(model, capture, right):
+    rng, frames = np.random.default_rng(5), dict(capture.frames)
+    for name in BOTH:
+        frame = frames[name, 2]
+        frames[name, 2] = replace(frame, image=rng.uniform(0.1, 0.5, frame.image.shape).astype(np.float32))
+    hidden = replace(capture, frames=frames)
+    off = disturbed(model, right).at((2,))
+    found = KeptTexture(hidden, model, right.at((0, 1)), BOTH).aligned(off)
+    shift = np.linalg.norm(found.translation - off.translation)
+    assert shift < 0.05  # cm: noise agrees with nothing
 
 
 def test_disturbed_timesteps_are_put_back(model, capture, right):

@@ -7,7 +7,8 @@ the mean of all views of all timesteps, and each timestep follows its gradient:
     sum_ki w_ki (f_i(x_k(r_k, t_k, e_k)) - mean)^2 / s^2 + |e_k|^2 / EXPRESSION^2 + |r_k, t_k / size|^2 / POSE^2
 
 over turns r, shifts t and changes e of the expression at each timestep k, with the band-passed views f_i. What all
-timesteps would do alike is left out: that is the surface's to tell.
+timesteps would do alike is left out: that is for the surface to tell. A timestep that is followed goes to where those
+that stay agree with it.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ EXPRESSION = 0.3
 
 
 @dataclass(frozen=True)
-class _Look:
+class Look:
     """What one view shows at points.
 
     Attributes
@@ -75,7 +76,11 @@ class _View:
 
 
 def align_timesteps(
-    model: MorphableModel, geometry: GeometryEstimate, texels: TexelMap, posed: Sequence[Posed]
+    model: MorphableModel,
+    geometry: GeometryEstimate,
+    texels: TexelMap,
+    posed: Sequence[Posed],
+    still: Sequence[Look] = (),
 ) -> GeometryEstimate:
     """Move timesteps to where their views agree with those of the others.
 
@@ -87,15 +92,16 @@ def align_timesteps(
     texels : TexelMap
     posed : sequence of Posed
         The texels of the surface, which may be displaced from ``geometry``'s.
+    still : sequence of Look, optional
+        What views of other timesteps, which stay, show of the same texels (`looks_at`); without them what all
+        timesteps do alike is left out.
 
     Returns
     -------
     GeometryEstimate
         With other ``rotation``, ``translation``, ``expression`` and the ``vertices`` that follow.
     """
-    rows = np.arange(len(texels.index))
-    if len(rows) > POINTS:
-        rows = np.sort(np.random.default_rng(0).choice(rows, POINTS, replace=False))
+    rows = _points(texels)
     flat = model.expression.reshape(model.n_vertices, -1)
     basis = interpolate(flat, model.faces, texels.face[rows], texels.weights[rows]).reshape(len(rows), 3, -1)
     scale, rotation = float(geometry.scale), geometry.rotation.astype(np.float64)
@@ -108,18 +114,17 @@ def align_timesteps(
     turns = np.tile(np.eye(3), (len(posed), 1, 1))
     shifts, changes = np.zeros((len(posed), 3)), np.zeros((len(posed), model.n_expression))
     spent = np.zeros((len(posed), len(wide)))
-    views = [
-        _View(k, image, seen[rows]) for k, p in enumerate(posed) for image, seen in zip(p.images, p.seen, strict=True)
-    ]
+    views = _views(posed, rows)
     owner = np.array([view.step for view in views])
     for _ in range(ITERATIONS):
         at = start + scale * np.einsum("nck,tk->tnc", basis, changes)
         at = at @ turns.transpose(0, 2, 1) + shifts[:, None]
         looks = _looks(views, [c + x @ r.T for x, c, r in zip(at, middles, rotation, strict=True)])
-        steps = _steps(looks, owner, at, rotation, turns, scale * basis, wide, spent)
+        steps = _steps(looks, still, owner, at, rotation, turns, scale * basis, wide, spent)
         if steps is None:
             return geometry
-        steps -= steps.mean(axis=0)
+        if not still:
+            steps -= steps.mean(axis=0)
         steps[:, 6:] = np.clip(changes + steps[:, 6:], np.minimum(low, 0.0), np.maximum(high, 0.0)) - changes
         spent += steps
         for k, step in enumerate(steps):
@@ -132,13 +137,33 @@ def align_timesteps(
     return _moved(model, geometry, middles, turns, shifts, changes)
 
 
-def _looks(views: Sequence[_View], world: Sequence[NDArray]) -> list[_Look]:
+def looks_at(texels: TexelMap, posed: Sequence[Posed]) -> list[Look]:
+    """What all views show of the points that `align_timesteps` compares."""
+    rows = _points(texels)
+    return _looks(_views(posed, rows), [p.position[rows] for p in posed])
+
+
+def _points(texels: TexelMap) -> NDArray[np.intp]:
+    """Rows of the texels that are compared, the same for the same texels."""
+    rows = np.arange(len(texels.index))
+    if len(rows) > POINTS:
+        rows = np.sort(np.random.default_rng(0).choice(rows, POINTS, replace=False))
+    return rows
+
+
+def _views(posed: Sequence[Posed], rows: NDArray) -> list[_View]:
+    return [
+        _View(k, image, seen[rows]) for k, p in enumerate(posed) for image, seen in zip(p.images, p.seen, strict=True)
+    ]
+
+
+def _looks(views: Sequence[_View], world: Sequence[NDArray]) -> list[Look]:
     """What each view shows of its timestep's points (n, 3)."""
     with ThreadPoolExecutor(threads()) as pool:
         return list(pool.map(lambda view: _look(view.image, world[view.step], view.seen), views))
 
 
-def _look(image: FeatureImage, points: NDArray, seen: NDArray) -> _Look:
+def _look(image: FeatureImage, points: NDArray, seen: NDArray) -> Look:
     """One view of world points (n, 3); central differences over a pixel."""
     camera = image.camera
     fx, fy = camera.fx * image.factor, camera.fy * image.factor
@@ -151,11 +176,12 @@ def _look(image: FeatureImage, points: NDArray, seen: NDArray) -> _Look:
     x, y = (across[2] - across[0])[:, 0] * fx / depth, (along[1] - along[0])[:, 0] * fy / depth
     slope = x[:, None] * right + y[:, None] * down - ((x * u + y * v) / depth)[:, None] * ahead
     weight = np.where(known, seen, 0.0).astype(np.float64)
-    return _Look(across[1, :, 0].astype(np.float64), weight, slope, float(np.median(depth)) / fx)
+    return Look(across[1, :, 0].astype(np.float64), weight, slope, float(np.median(depth)) / fx)
 
 
 def _steps(
-    looks: list[_Look],
+    looks: list[Look],
+    still: Sequence[Look],
     owner: NDArray,
     at: NDArray,
     rotation: NDArray,
@@ -165,8 +191,8 @@ def _steps(
     spent: NDArray,
 ) -> NDArray[np.float64] | None:
     """(T, 6 + Ke) steps of turns, shifts and expressions, object space; None where too little is seen."""
-    value = np.stack([look.value for look in looks])
-    weight = np.stack([look.weight for look in looks])
+    value = np.stack([look.value for look in (*looks, *still)])
+    weight = np.stack([look.weight for look in (*looks, *still)])
     used = (weight > 0) & ((weight > 0).sum(axis=0) > 1)
     if used.sum() < FEWEST:
         return None
@@ -176,7 +202,7 @@ def _steps(
     weight = np.where(used, weight / (1.0 + (residual / (2.0 * spread)) ** 2) ** 2, 0.0) * INDEPENDENT / spread**2
     prior = np.diag(wide**-2.0)
     system, gradient = np.tile(prior, (len(spent), 1, 1)), spent @ prior
-    for look, k, counts, off in zip(looks, owner, weight, residual, strict=True):
+    for look, k, counts, off in zip(looks, owner, weight, residual, strict=False):  # of those that move
         some = np.flatnonzero(counts > 0)
         slope = look.slope[some] @ rotation[k]  # by object-space movement
         bent = np.einsum("nc,nck->nk", slope @ turns[k], basis[some])

@@ -1,0 +1,90 @@
+"""The surface's texture at the fitted timesteps, to which a further timestep is aligned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.estimate import GeometryEstimate
+from mifit.core.mesh import interpolate
+from mifit.core.uv import rasterize_uv
+from mifit.render.gbuffer import SurfaceScene
+from mifit.stages.surface.align_timesteps import align_timesteps, looks_at
+from mifit.stages.surface.sweep import Posed
+from mifit.stages.surface.views import pose_texels, texture_size
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+
+LONGEST_SIDE = 1000.0
+"""Pixels of the images that are compared: larger ones are reduced."""
+LARGEST_MAP = 512
+
+
+class KeptTexture:
+    """What the views of fitted timesteps show of the surface.
+
+    Parameters
+    ----------
+    capture, model
+        Images, and the model that was fitted.
+    geometry : GeometryEstimate
+        The fitted timesteps.
+    cameras : sequence of str
+        Cameras to read; no other camera of the capture is touched.
+    """
+
+    def __init__(
+        self, capture: Capture, model: MorphableModel, geometry: GeometryEstimate, cameras: Sequence[str]
+    ) -> None:
+        self._capture, self._model, self._cameras = capture, model, tuple(cameras)
+        views = [capture.camera(name) for name in cameras]
+        self._factor = min(1.0, LONGEST_SIDE / max(max(view.width, view.height) for view in views))
+        vertices = geometry.vertices.astype(np.float64)
+        centre = vertices[0].mean(axis=0)
+        lengths = [float(np.linalg.norm(centre - view.position)) / np.sqrt(view.fx * view.fy) for view in views]
+        size = texture_size(model, vertices[0], float(np.mean(lengths)) / self._factor, LARGEST_MAP)
+        self._texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+        posed = [self._posed(*one) for one in zip(geometry.timesteps, vertices, strict=True)]
+        self._looks = looks_at(self._texels, posed)
+        weight = np.stack([look.weight for look in self._looks])
+        self._known = weight.sum(axis=0) > 0
+        value = np.stack([look.value for look in self._looks])
+        self._mean = (weight * value).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-6)
+
+    def aligned(self, geometry: GeometryEstimate) -> GeometryEstimate:
+        """Pose and expression of one timestep where its views agree best with those that are kept.
+
+        ``geometry`` itself where they agree no better elsewhere, as when something hides most of the face.
+        """
+        model, texels = self._model, self._texels
+        posed = self._posed(geometry.timesteps[0], geometry.vertices[0].astype(np.float64))
+        moved = align_timesteps(model, geometry, texels, [posed], self._looks)
+        by = interpolate(moved.vertices[0] - geometry.vertices[0], model.faces, texels.face, texels.weights)
+        if not self._apart(replace(posed, position=posed.position + by)) < self._apart(posed):
+            return geometry
+        return replace(
+            moved,
+            **{
+                name: getattr(moved, name).astype(getattr(geometry, name).dtype)
+                for name in ("rotation", "translation", "expression")
+            },
+        )
+
+    def _apart(self, posed: Posed) -> float:
+        """Median difference of what a timestep's views show from what is kept; infinite where they show nothing."""
+        apart = [
+            np.abs(look.value - self._mean)[(look.weight > 0) & self._known] for look in looks_at(self._texels, [posed])
+        ]
+        every = np.concatenate(apart)
+        return float(np.median(every)) if len(every) else np.inf
+
+    def _posed(self, timestep: int, vertices: NDArray) -> Posed:
+        scene = SurfaceScene(vertices, self._model.faces)
+        given = scene, vertices, self._model.faces, self._texels, self._cameras, timestep, self._factor
+        return pose_texels(self._capture, *given)
