@@ -1,9 +1,10 @@
 """What further frames of a video buy: normals, maps and a held-out view over the number of frames.
 
-    python -m benchmarks.video [--subjects 5] [--frames 40] [--texels 128] [--work out/video]
+    python -m benchmarks.video [--subjects 5] [--scan] [--frames 40] [--texels 256] [--work out/video]
 
 The first heads of `benchmarks.table1` with more timesteps, at half its image size. Four timesteps are fitted, the
 others are followed and absorbed (`mifit.refine`), and the result is judged on the fitted timesteps every so often.
+With ``--scan`` also a scanned head, rendered as they are, whose normals are compared with the scan's.
 Videos, fits and figures stay in the work folder, so that a stopped benchmark goes on. ``--plot`` draws
 ``docs/images/video.png`` from the committed figures.
 """
@@ -14,6 +15,7 @@ import argparse
 import json
 import statistics
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ import numpy as np
 
 import mifit as mi
 from benchmarks.figure import figure
+from benchmarks.judge import judge_surface, judge_views
 from benchmarks.record import RESULTS, SHARED, record
 from benchmarks.scan import nearest
 from benchmarks.table1 import ENVIRONMENTS, LANDMARK_BIAS, SEED, TONES, mifit, outside
@@ -41,6 +44,13 @@ JUDGED = (1, 2, 4, 8, 16, 40)
 """Numbers of frames at which the result is judged."""
 SIZE = {"width": 340, "height": 240, "spp": 64}
 """With 16 samples a pixel the noise of the path tracer alone holds every held-out view at 29 dB."""
+SCAN_UNIT_MM = 37.0
+"""Of the scan's file."""
+SCAN_MAPS = {
+    "albedo": "Map-COL.jpg",
+    "specular": "Map-SPEC.jpg",
+    "displacement": "Infinite-Level_02_Disp_NoSmoothUV-4096.jpg",
+}
 PLOT = Path("docs/images/video.png")
 POINTS = 3000
 """Points at which the bound of the normals is measured."""
@@ -56,6 +66,19 @@ def video(subject: int, frames: int, work: Path) -> Path:
         mifit("synth", "--out", folder, "--seed", SEED + subject, "--force", "--tone", TONES[subject % len(TONES)],
               "--outside", outside(subject), "--landmark-bias", LANDMARK_BIAS, "--timesteps", frames, *options,
               *light)  # fmt: skip
+    return folder
+
+
+def scan_video(frames: int, work: Path) -> Path:
+    """Folder of the shared scan's video, rendered once, with detected landmarks."""
+    folder, source = work / "scan" / "capture", SHARED / "models" / "lee_perry_smith"
+    if not (folder / "landmarks").exists():
+        options = [part for key, value in SIZE.items() for part in (f"--{key}", value)]
+        maps = [f"{name}={source / file}" for name, file in SCAN_MAPS.items()]
+        mifit("synth", "--out", folder, "--head", source / "LeePerrySmith.glb", "--unit-mm", SCAN_UNIT_MM, "--flip-v",
+              "--maps", *maps, "--env", SHARED / "hdri" / "city.hdr", "--timesteps", frames, "--force",
+              *options)  # fmt: skip
+        mifit("landmarks", folder)
     return folder
 
 
@@ -83,6 +106,18 @@ def judge(result: Reconstruction, capture: Capture) -> dict[str, float]:
     }
 
 
+def judge_scan(result: Reconstruction, capture: Capture) -> dict[str, float]:
+    """Errors against the scan at the points that all fitted views see, and of the held-out view's skin."""
+    assert result.reflectance is not None
+    view = judge_views({"full": (result, "full")}, capture, ("third",), range(FITTED), CAMERAS)["full"]["skin"]
+    confidence = result.reflectance.confidence[result.reflectance.diffuse.any(-1)]
+    return {
+        **judge_surface(result, capture, CAMERAS),
+        "third_full_db": round(view["psnr"], 3),
+        "confidence": round(float(confidence.mean()), 4),
+    }
+
+
 def normals_of_what_is_seen(result: Reconstruction, capture: Capture) -> float:
     """Degrees by which perfect normals of the surface that each texel lies on would differ from the truth at its place.
 
@@ -103,33 +138,43 @@ def normals_of_what_is_seen(result: Reconstruction, capture: Capture) -> float:
     return round(angle(normals, true[rows]), 3)
 
 
-def run_subject(subject: int, frames: int, work: Path, texels: int) -> dict[str, Any]:
-    """Figures of one head; those of a finished one are read."""
-    folder = work / f"subject_{subject:02d}"
+def run_video(
+    name: str,
+    capture: Capture,
+    judged: Callable[[Reconstruction, Capture], dict[str, float]],
+    frames: int,
+    work: Path,
+    texels: int,
+) -> dict[str, Any]:
+    """Figures of one video; those of a finished one are read."""
+    folder = work / name
     figures = folder / f"figures_{texels}_{frames}.json"
     if figures.exists():
         return dict(json.loads(figures.read_text()))
-    capture = Capture.load(video(subject, frames, work))
     result = fitted(capture, folder, texels)
-    found: dict[str, Any] = {
-        "subject": subject,
-        "fit": judge(result, capture),
-        "normal_degrees_of_what_is_seen": normals_of_what_is_seen(result, capture),
-        "frames": {},
-    }
+    found: dict[str, Any] = {"video": name, "fit": judged(result, capture), "frames": {}}
     refinement, seconds = Refinement(result, capture), []
     for timestep in range(frames):
         began, cpu = time.perf_counter(), time.process_time()
         refinement.add(timestep)
         seconds.append((time.perf_counter() - began, time.process_time() - cpu))
         if timestep + 1 in JUDGED or timestep + 1 == frames:
-            found["frames"][str(timestep + 1)] = judge(refinement.refined(), capture)
-            print(subject, timestep + 1, found["frames"][str(timestep + 1)], flush=True)
+            found["frames"][str(timestep + 1)] = judged(refinement.refined(), capture)
+            print(name, timestep + 1, found["frames"][str(timestep + 1)], flush=True)
     followed = np.array(seconds[FITTED:])
     found["seconds_per_pair"], found["processor_seconds_per_pair"] = np.median(followed, axis=0).round(3).tolist()
     found["left_out"] = {str(t): why for t, why in refinement.left_out.items()}
     write_text(figures, json.dumps(found, indent=1) + "\n")
     return found
+
+
+def run_subject(subject: int, frames: int, work: Path, texels: int) -> dict[str, Any]:
+    """Figures of one of Table 1's heads."""
+    capture = Capture.load(video(subject, frames, work))
+    name = f"subject_{subject:02d}"
+    found = run_video(name, capture, judge, frames, work, texels)
+    bound = normals_of_what_is_seen(fitted(capture, work / name, texels), capture)
+    return {"subject": subject, **found, "normal_degrees_of_what_is_seen": bound}
 
 
 def means(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
@@ -172,8 +217,9 @@ def main() -> None:
     """Run the benchmark, or draw its figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--subjects", type=int, default=5)
+    parser.add_argument("--scan", action="store_true", help="the shared scan too")
     parser.add_argument("--frames", type=int, default=40)
-    parser.add_argument("--texels", type=int, default=128)
+    parser.add_argument("--texels", type=int, default=256)
     parser.add_argument("--work", type=Path, default=Path("out/video"))
     parser.add_argument("--plot", action="store_true", help="only draw the committed figures")
     arguments = parser.parse_args()
@@ -181,6 +227,9 @@ def main() -> None:
         mi.set_variant("auto")
         rows = [run_subject(i, arguments.frames, arguments.work, arguments.texels) for i in range(arguments.subjects)]
         figures = {"size": SIZE, "texels": arguments.texels, "rows": rows, "means": means(rows)}
+        if arguments.scan:
+            capture = Capture.load(scan_video(arguments.frames, arguments.work))
+            figures["scan"] = run_video("scan", capture, judge_scan, arguments.frames, arguments.work, arguments.texels)
         record("video", figures, [SEED + row["subject"] for row in rows])
     draw(json.loads((RESULTS / "video.json").read_text())["figures"])
 
