@@ -184,7 +184,7 @@ EYES = [
       "tests/stages/test_find_surface.py -k eyes"),
     M("tissue behind the lids taken for skin", STAGES, r"covering if lids is None else covering & lids", "covering",
       "tests/stages/test_eyes.py"),
-    M("added eyes bend with the skin", STAGES, r"self\._carried = carried\(model\)$", "self._carried = None",
+    M("added eyes bend with the skin", STAGES, r"self\._by_skin = skin_weights\(model\)$", "self._by_skin = None",
       "tests/stages/test_find_surface.py -k eyes"),
     M("models keep the holes of their eyes", "mifit/config.py", r"(eyes: bool = flag\(\s+)True", r"\g<1>False",
       "tests/test_pipeline.py"),

@@ -181,7 +181,7 @@ def with_eyes(model: MorphableModel) -> MorphableModel:
     return found
 
 
-def carried(model: MorphableModel) -> sp.csr_matrix | None:
+def skin_weights(model: MorphableModel) -> sp.csr_matrix | None:
     """(V, V') weighted means of the first V' vertices that all vertices move with; None for a model that got no eyes.
 
     The first rows are the identity: pieces that were added go along with the skin and hold none of it back.

@@ -13,7 +13,7 @@ from mifit.core.mesh import vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
-from mifit.morphable.openings import RADIUS_MM, carried, eyeballs, holes, lacks_eyes, leading_faces, with_eyes
+from mifit.morphable.openings import RADIUS_MM, eyeballs, holes, lacks_eyes, leading_faces, skin_weights, with_eyes
 from mifit.output.deferred import trace_mesh
 from mifit.render.gbuffer import SurfaceScene
 from tests.stages.memory_capture import look_at_head
@@ -54,12 +54,12 @@ def test_the_first_vertices_are_the_model_without_eyes(skin: MorphableModel, who
 
 def test_all_vertices_are_carried_by_those_of_the_skin(skin: MorphableModel, whole: MorphableModel) -> None:
     """As their identity modes are; a model without added pieces carries itself."""
-    found, n = carried(whole), skin.n_vertices
+    found, n = skin_weights(whole), skin.n_vertices
     assert found is not None and found.shape == (whole.n_vertices, n)
     np.testing.assert_array_equal(found[:n].toarray(), np.eye(n))
     np.testing.assert_allclose(np.asarray(found.sum(axis=1)), 1.0)
     np.testing.assert_allclose(found @ skin.identity[..., 3].astype(np.float64), whole.identity[..., 3], atol=1e-6)
-    assert carried(skin) is None and carried(MorphableModel.load("builtin:coarse")) is None
+    assert skin_weights(skin) is None and skin_weights(MorphableModel.load("builtin:coarse")) is None
 
 
 def test_eyeballs_are_round_and_lie_behind_the_lids(whole: MorphableModel) -> None:

@@ -13,7 +13,7 @@ from mifit.config import GeometryConfig, SurfaceConfig
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
-from mifit.morphable.openings import carried, with_eyes
+from mifit.morphable.openings import skin_weights, with_eyes
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.eyes import eyeballs
 from mifit.stages.find_surface import find_surface
@@ -116,7 +116,7 @@ def test_added_eyes_go_along_with_the_skin_and_leave_it_alone(model, bumpy, foun
     for ball in eyeballs(whole):
         np.testing.assert_allclose(moved[ball] - moved[ball[0]], 0.0, atol=1e-6)
     assert np.abs(moved[n:]).max() > 0.005
-    np.testing.assert_allclose(moved[n:], (carried(whole) @ moved[:n])[n:], atol=1e-6)
+    np.testing.assert_allclose(moved[n:], (skin_weights(whole) @ moved[:n])[n:], atol=1e-6)
     stiffness = [g.report.details["phases"][-1]["stiffness"] for g in (found, eyed)]
     assert 0.7 < stiffness[1] / stiffness[0] < 1.4
 

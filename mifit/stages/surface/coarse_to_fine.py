@@ -13,7 +13,7 @@ from mifit.config import SurfaceConfig
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, rasterize_uv
-from mifit.morphable.openings import carried, leading_faces
+from mifit.morphable.openings import leading_faces, skin_weights
 from mifit.progress import Progress
 from mifit.solve import Outcome
 from mifit.stages.geometry.points import corner_matrix
@@ -112,8 +112,8 @@ class Search:
         self._capture, self._model, self._cameras, self._pairs = capture, model, cameras, pairs
         self._resolution, self._config, self._progress = resolution, config, progress
         self._done, self._total = 0, total
-        self._carried = carried(model)
-        self._own = model.n_vertices if self._carried is None else self._carried.shape[1]
+        self._by_skin = skin_weights(model)
+        self._own = model.n_vertices if self._by_skin is None else self._by_skin.shape[1]
         # Rays meet the skin alone: through eyes that were added, windows at the lids would match what the balls mirror.
         self._faces = model.faces[leading_faces(model, self._own)]
         self.scenes = Scenes(self._faces, np.unique(model.faces[model.face_mask]), SLACK * resolution.pixel)
@@ -172,7 +172,9 @@ class Search:
         # A head that the model spans is as symmetric as its modes make it.
         halves = model.symmetry if self._beyond else None
         # Eyes that were added have no bending of their own: as slivers beside the skin they would steer its stiffness.
-        own, halves = self._own, None if halves is None else halves[: self._own]
+        own = self._own
+        if halves is not None and self._by_skin is not None:
+            halves = halves[:own]
         plate = Plate.of(
             neutral[:own], self._faces, FORGET_MM / model.unit_mm, CONTACT_MM / model.unit_mm, symmetry=halves
         )
@@ -201,7 +203,7 @@ class Search:
             points = corner_matrix(model.faces, face, weights, len(neutral))
             solved = solve_displacement(
                 plate,
-                points if self._carried is None else points @ self._carried,
+                points if self._by_skin is None else points @ self._by_skin,
                 np.concatenate([normalize(np.mean(objects, axis=0))[some], *turned]),
                 np.concatenate([found.offset[some], outline.offset]) / scale,
                 np.concatenate([found.precision[some] * THIN**2, outline.precision]) * scale**2,
@@ -209,7 +211,7 @@ class Search:
                 stiffness,
                 ROBUST_STEPS * step / scale,
             )
-            reached = solved.displacement if self._carried is None else self._carried @ solved.displacement
+            reached = solved.displacement if self._by_skin is None else self._by_skin @ solved.displacement
             change, displacement = scale * reached - scale * displacement, reached
             stiffness = solved.likely_stiffness(self._config.stiffness, STIFFEST)
             world = displaced_world(geometry, displacement)
