@@ -231,4 +231,13 @@ CAMERAS = [
       "tests/test_pipeline.py"),
 ]  # fmt: skip
 
-MUTATIONS = [*CONVENTIONS, *MEASURES, *LIGHT, *GEOMETRY, *MESH, *TERMS, *SURFACE, *EYES, *NEAR, *CAMERAS]
+TIME = [
+    M("a calibration that is off taken for time", STAGES, r"count \* product - movement \* shift", "count * product",
+      "tests/stages/test_frame_offsets.py"),
+    M("a camera that is later called earlier", STAGES, r"0\.5 \* \(after - before\)", "0.5 * (before - after)",
+      "tests/stages/test_frame_offsets.py"),
+    M("cameras out of step named again and again", ANY, r" if OUT_OF_STEP not in line\)", ")", "tests/stages/test_track.py -k step"),
+    M("tracked frames aligned to themselves", STAGES, r"\(\*looks, \*still\)", "looks", "tests/stages/test_align_timesteps.py"),
+]  # fmt: skip
+
+MUTATIONS = [*CONVENTIONS, *MEASURES, *LIGHT, *GEOMETRY, *MESH, *TERMS, *SURFACE, *EYES, *NEAR, *CAMERAS, *TIME]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,8 +17,9 @@ from mifit.errors import InputError
 from mifit.progress import Progress, silent
 from mifit.result.ownership import claim, locked
 from mifit.result.record import R
-from mifit.result.writing import add_timestep
+from mifit.result.writing import add_timestep, write_remarks
 from mifit.stages.normals.mesh_refinement import MeshRefiner
+from mifit.stages.surface.frame_offsets import OUT_OF_STEP, frame_offset_warnings, frame_offsets
 from mifit.stages.track import TrackedFrame, track
 
 if TYPE_CHECKING:
@@ -98,7 +99,24 @@ def track_into(
         ):
             result = extend(result, frame, refiner, digests[frame.timestep], room)
             add_timestep(result, folder, frame.timestep)
+        if timesteps:
+            result = with_frame_offsets(result, capture)
+            write_remarks(result, folder)
     return result
+
+
+def with_frame_offsets(result: R, capture: Capture) -> R:
+    """A tracked result whose normals' report says by how much cameras are out of step (``frame_offsets``)."""
+    if result.normals is None:
+        return result
+    names = [camera.name for camera in result.cameras]
+    seen = capture.with_fitted(result.cameras, result.calibration)
+    found = frame_offsets(seen, result.model, result.geometry, names)
+    report = result.normals.report
+    details = {**report.details, "frame_offsets": {name: asdict(offset) for name, offset in found.items()}}
+    before = tuple(line for line in report.warnings if OUT_OF_STEP not in line)
+    warnings = (*before, *frame_offset_warnings(found, names[0]))
+    return replace(result, normals=replace(result.normals, report=replace(report, details=details, warnings=warnings)))
 
 
 def sequence_left(result: Result, capture: Capture, resume: bool) -> tuple[int, ...]:

@@ -70,6 +70,8 @@ def make_capture(
     seed=0,
     identity=0.6,
     painted=True,
+    frown=0.4,
+    shift=0.3,
 ):
     """Paint, pose and photograph a random face of the model.
 
@@ -77,6 +79,8 @@ def make_capture(
     ----------
     angles : sequence of (3,)
         Rotation vector of each timestep, degrees.
+    frown, shift : float
+        Deviations of the expression's coefficients and of the position, cm, at each timestep.
     """
     rng = np.random.default_rng(seed)
     x_id = identity * rng.normal(size=model.n_identity)
@@ -85,10 +89,10 @@ def make_capture(
     frames, world, rotations = {}, [], []
     for t, angle in enumerate(angles):
         low, high = model.expression_bounds.T
-        x_ex = np.clip(0.4 * rng.normal(size=model.n_expression) * (t > 0), low, high)
+        x_ex = np.clip(frown * rng.normal(size=model.n_expression) * (t > 0), low, high)
         rotation = exponential(np.radians(np.asarray(angle)))
         objects = model.shape(x_id, x_ex).astype(np.float64)
-        vertices = objects @ rotation.T + rng.normal(size=3) * 0.3
+        vertices = objects @ rotation.T + rng.normal(size=3) * shift
         scene = SurfaceScene(vertices, model.faces)
         normals = vertex_normals(vertices, model.faces)
         spots = model.mean.astype(np.float64)
