@@ -214,6 +214,7 @@ NEAR = [
     M("near lights carried around the world's origin", OUTPUT, r"lit\.rotated\(turn, middle\)", "lit.rotated(turn)",
       "tests/output/test_near_output.py"),
 ]  # fmt: skip
+
 CAMERAS = [
     M("cameras move where matches don't tell", STAGES, r"ways\[:, squared > least\*\*2\]", "ways",
       "tests/stages/test_refine_cameras.py"),

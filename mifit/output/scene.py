@@ -53,10 +53,10 @@ def write_scene(
     lobe's rise and the refined normals as slopes, and the light is ``shenv``. In ``NAME_stock.xml`` the skin blends
     ``diffuse`` with a ``roughconductor`` of Beckmann roughness sqrt(2 / (m + 2)), which doesn't rise, under a
     ``normalmap``, and the light is a lat-long ``envmap``. A relit reconstruction has its environment as ``envmap`` in
-    both. A compact light is a stock ``directional`` or,
-    where it is near, ``point`` emitter in both. The ambient term stands for light that local
-    shading leaves out, such as interreflection, so a path-traced scene doesn't have it. A camera whose pixels aren't
-    square is mifit's ``pinhole`` in ``NAME.xml``; in ``NAME_stock.xml`` it has square ones
+    both. A compact light is a stock ``directional`` or, where it is near, ``point`` emitter in both. The ambient
+    term stands for light that local shading leaves out, such as interreflection, so a path-traced scene doesn't
+    have it. A camera whose pixels aren't square is mifit's ``pinhole`` in ``NAME.xml``; in ``NAME_stock.xml`` it
+    has square ones
     (`Camera.with_square_pixels`).
 
     Parameters

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, normalize
 from mifit.core.threads import one_blas_thread
-from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.core.uv import TexelMap
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.surface.sweep import sweep
-from mifit.stages.surface.views import pose_texels, texture_size
+from mifit.stages.surface.views import pose_texels, texels_of_pixels
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -38,9 +38,6 @@ FARTHEST = 4
 """Pixels that are searched to either side."""
 WINDOW = 11
 """Side of the windows that are compared, texels."""
-LONGEST_SIDE = 1000.0
-"""Pixels of the images that are compared: larger ones are reduced."""
-LARGEST_MAP = 512
 FEWEST_TEXELS = 200
 LEAST_PIXELS = 0.3
 """Movement across the planes in a frame, root mean square over the frames, below which nothing is told."""
@@ -113,11 +110,7 @@ def frame_offsets(
     views = [capture.camera(name) for name in cameras]
     if len(inner) < FEWEST_FRAMES or len(views) < 2:
         return {}
-    factor = min(1.0, LONGEST_SIDE / max(max(view.width, view.height) for view in views))
-    centre = geometry.vertices[0].mean(axis=0)
-    pixel = float(np.mean([np.linalg.norm(centre - v.position) / np.sqrt(v.fx * v.fy) for v in views])) / factor
-    size = texture_size(model, geometry.vertices[0].astype(np.float64), pixel, LARGEST_MAP)
-    texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+    texels, factor, pixel = texels_of_pixels(model, geometry.vertices[0].astype(np.float64), views)
     found = {}
     for name, view in zip(cameras[1:], views[1:], strict=True):
         pair = [cameras[0], name]

@@ -11,19 +11,14 @@ from numpy.typing import NDArray
 
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate
-from mifit.core.uv import rasterize_uv
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.surface.align_timesteps import align_timesteps, looks_at
 from mifit.stages.surface.sweep import Posed
-from mifit.stages.surface.views import pose_texels, texture_size
+from mifit.stages.surface.views import pose_texels, texels_of_pixels
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
-
-LONGEST_SIDE = 1000.0
-"""Pixels of the images that are compared: larger ones are reduced."""
-LARGEST_MAP = 512
 
 
 class KeptTexture:
@@ -44,12 +39,8 @@ class KeptTexture:
     ) -> None:
         self._capture, self._model, self._cameras = capture, model, tuple(cameras)
         views = [capture.camera(name) for name in cameras]
-        self._factor = min(1.0, LONGEST_SIDE / max(max(view.width, view.height) for view in views))
         vertices = geometry.vertices.astype(np.float64)
-        centre = vertices[0].mean(axis=0)
-        lengths = [float(np.linalg.norm(centre - view.position)) / np.sqrt(view.fx * view.fy) for view in views]
-        size = texture_size(model, vertices[0], float(np.mean(lengths)) / self._factor, LARGEST_MAP)
-        self._texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+        self._texels, self._factor, _ = texels_of_pixels(model, vertices[0], views)
         posed = [self._posed(*one) for one in zip(geometry.timesteps, vertices, strict=True)]
         self._looks = looks_at(self._texels, posed)
         weight = np.stack([look.weight for look in self._looks])

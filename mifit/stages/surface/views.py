@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
-from mifit.core.uv import TexelMap
+from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.surface.band import feature_image
 from mifit.stages.surface.sweep import Posed
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 GRAZING_COSINE = 0.2  # beyond about 78 degrees a pixel covers too much surface to compare it
 OUTLINE_SCALE = 0.25  # outlines are found in images of this scale
+LONGEST_SIDE = 1000.0  # pixels of images whose texture is compared over time: larger ones are reduced
+LARGEST_TEXTURE = 512  # texels along a side, of that
 OUTLINE_SLOPE = 12.0  # depth step between neighbouring pixels, in pixel lengths, that is an outline
 
 
@@ -98,3 +100,20 @@ def texture_size(model: MorphableModel, vertices: NDArray, length: float, larges
     u, v = b - a, c - a
     covered = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum()
     return int(np.clip(np.sqrt(area / max(covered, 1e-12)) / length, 64, largest))
+
+
+def texels_of_pixels(
+    model: MorphableModel, vertices: NDArray, cameras: Sequence[Camera]
+) -> tuple[TexelMap, float, float]:
+    """Texels of the face at these vertices (V, 3) that are about as large as what pixels show of it.
+
+    Returns
+    -------
+    texels, pixels per pixel of the images (1 but for large ones), world length of such a pixel at the face
+    """
+    factor = min(1.0, LONGEST_SIDE / max(max(view.width, view.height) for view in cameras))
+    centre = vertices.mean(axis=0)
+    lengths = [float(np.linalg.norm(centre - view.position)) / np.sqrt(view.fx * view.fy) for view in cameras]
+    pixel = float(np.mean(lengths)) / factor
+    size = texture_size(model, vertices, pixel, LARGEST_TEXTURE)
+    return rasterize_uv(model.uv, model.faces_uv, size, model.face_mask), factor, pixel
