@@ -177,6 +177,8 @@ SURFACE = [
       "tests/stages/test_align_timesteps.py"),
     M("lids stay apart after they were measured", STAGES, r"^        found = close_again\(.*\)$", "        found = last.estimate",
       "tests/stages/test_close_openings.py"),
+    M("outlines left out of the refit", STAGES, r"borders\.normal, borders\.precision, outside", "borders.normal, 0.0 * borders.precision, outside",
+      "tests/stages/test_find_surface.py -k outlines_lead"),
 ]  # fmt: skip
 
 EYES = [

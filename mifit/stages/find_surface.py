@@ -105,7 +105,8 @@ def find_surface(
             model,
             last.geometry,
             cameras,
-            lambda world, sweep: search.planes(geometry.timesteps, world, *sweep),
+            # A head beyond the model's span has other outlines: they lead there, and what is matched has the last word.
+            lambda world, sweep: search.planes(geometry.timesteps, world, *sweep, outlines=sweep in coarse),
             spanned,
             geometry_config or GeometryConfig(),
             seed,

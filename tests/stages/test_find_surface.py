@@ -346,7 +346,7 @@ def test_planes_through_sloping_offsets_touch_the_measured_surface(model):
     wrong = rng.random(len(flat)) < 0.03
     measured = np.where(own[:, 2] > 0.8, 1e4, 0.0)
     found = Found(offset + np.where(wrong, 3.0, 0.0), measured, np.ones(len(flat), np.float32))
-    planes = touching_planes(texels, posed, found)
+    planes = touching_planes(texels, posed, found, 0.3)
     assert len(planes.precision) == (measured > 0).sum()
     turned = np.degrees(np.arccos(np.clip(planes.normal @ way, -1.0, 1.0)))
     assert np.median(turned) < 0.3 and np.percentile(turned, 90) < 1.0
@@ -370,6 +370,30 @@ def test_biased_landmarks_bend_the_shape_less(model, bumpy):
     moved = found.scale * found.displacement @ found.rotation.transpose(0, 2, 1)
     alone = replace(found, vertices=found.vertices - moved)
     assert off_mm(model, bumpy, alone).mean() < 0.5 * before
+
+
+def test_outlines_lead_a_refit_and_what_is_matched_has_the_last_word(model, bumpy, start, monkeypatch):
+    """In the coarse sweeps lines of sight that pass the head at its outlines hold the model, in the finest none do."""
+    planes = {}
+
+    def asked(capture, model, geometry, cameras, measure, sweeps, *_, **__):
+        planes.update({sweep: measure(bumpy.vertices.astype(np.float64), sweep) for sweep in set(sweeps)})
+        return geometry
+
+    monkeypatch.setattr("mifit.stages.find_surface.fit_model", asked)
+    monkeypatch.setattr("mifit.stages.find_surface.landmarks_are_biased", lambda _: True)
+    monkeypatch.setattr("mifit.stages.find_surface.sweeps", lambda *_: [(1, 6), (1, 4), (0, 4)])
+    find_surface(bumpy, model, start, BOTH)
+    assert {sweep: [len(parts) for parts in found] for sweep, found in planes.items()} == {
+        (1, 6): [2, 2],
+        (1, 4): [2, 2],
+        (0, 4): [1, 1],
+    }
+    outline = planes[1, 4][0][1]
+    way = bumpy.vertices[0] - outline.position[:, None]
+    beyond = np.where(np.linalg.norm(way, axis=-1) < 1.0, (way * outline.normal[:, None]).sum(-1), -np.inf)
+    assert len(outline.precision) > 30 and (outline.precision > 0).all()
+    assert 10.0 * np.median(np.abs(beyond.max(axis=1))) < 1.0  # the true head touches them, mm
 
 
 def test_a_refit_on_which_the_views_agree_less_is_dropped(model, bumpy, start, monkeypatch):

@@ -21,7 +21,7 @@ from mifit.stages.geometry.scenes import Scenes
 from mifit.stages.surface.align_timesteps import align_timesteps
 from mifit.stages.surface.displace import USUAL, Plate, solve_displacement
 from mifit.stages.surface.epipolar import epipolar_residual
-from mifit.stages.surface.local_planes import MeasuredPlanes, touching_planes
+from mifit.stages.surface.local_planes import MeasuredPlanes, passing_planes, touching_planes
 from mifit.stages.surface.outline import Borders, find_borders, joined
 from mifit.stages.surface.sweep import Found, Posed, across_time, sweep
 from mifit.stages.surface.views import Resolution, pose_texels, texture_size
@@ -47,6 +47,8 @@ FORGET_MM = 150.0
 """Wavelength above which displacements fall back to the model where nothing is measured."""
 CONTACT_MM = 1.5
 """Gap below which opposed parts of the surface, such as closed lips, move together."""
+OUTSIDE_STEPS, OUTSIDE_BORDER = 1.0, 3.0
+"""Distance from the model at which a measurement counts as outside its span: steps of a sweep, pixels of an outline."""
 SETTLED = 0.25
 """Part of the last sweep's step below which the surface counts as settled."""
 THIN = 2
@@ -156,14 +158,22 @@ class Search:
         return Swept(sweep(texels, posed, step * np.arange(-half, half + 1), WINDOW, [*pairs, *further]), step)
 
     def planes(
-        self, timesteps: Sequence[int], world: NDArray, level: int, half: int
-    ) -> tuple[list[MeasuredPlanes], float]:
-        """Planes that touch what a sweep finds, per timestep, which share its precision, and the sweep's step."""
+        self, timesteps: Sequence[int], world: NDArray, level: int, half: int, outlines: bool
+    ) -> list[tuple[MeasuredPlanes, ...]]:
+        """Planes that touch what a sweep finds, of each timestep, and those along the outlines where wanted.
+
+        The timesteps share the precision of what the sweep finds.
+        """
         texels = self._texels(world, level)
         posed = [self._posed(t, vertices, texels, level) for t, vertices in zip(timesteps, world, strict=True)]
         swept = self._sweep(texels, posed, level, half, ())
         shared = replace(swept.found, precision=swept.found.precision / len(posed))
-        return [touching_planes(texels, one, shared) for one in posed], swept.step
+        inside = [touching_planes(texels, one, shared, OUTSIDE_STEPS * swept.step) for one in posed]
+        if not outlines:
+            return [(planes,) for planes in inside]
+        borders = [self._borders(t, vertices, level) for t, vertices in zip(timesteps, world, strict=True)]
+        farthest = OUTSIDE_BORDER * self._resolution.pixel
+        return [(planes, passing_planes(border, farthest)) for planes, border in zip(inside, borders, strict=True)]
 
     def descend(self, last: Reached, levels: Sequence[tuple[int, int]]) -> Reached:
         """Displace a fitted model's surface; levels as of `sweeps`."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mifit.core.mesh import normalize
 from mifit.core.uv import TexelMap
+from mifit.stages.surface.outline import Borders
 from mifit.stages.surface.sweep import Found, Posed
 
 WINDOW = 15
@@ -32,11 +33,14 @@ class MeasuredPlanes:
         World space.
     precision : (N,)
         Inverse variance of the distance from a plane; neighbours' errors are alike, which it allows for.
+    outside : float
+        Distance at which a plane counts as outside the model's span.
     """
 
     position: NDArray
     normal: NDArray
     precision: NDArray
+    outside: float
 
     def thinned(self, most: int, rng: np.random.Generator) -> MeasuredPlanes:
         """At most so many of them, which count for all."""
@@ -44,10 +48,11 @@ class MeasuredPlanes:
         if count <= most:
             return self
         some = np.sort(rng.choice(count, most, replace=False))
-        return MeasuredPlanes(self.position[some], self.normal[some], self.precision[some] * (count / most))
+        precision = self.precision[some] * (count / most)
+        return MeasuredPlanes(self.position[some], self.normal[some], precision, self.outside)
 
 
-def touching_planes(texels: TexelMap, posed: Posed, found: Found) -> MeasuredPlanes:
+def touching_planes(texels: TexelMap, posed: Posed, found: Found, outside: float) -> MeasuredPlanes:
     """Planes through what a sweep found.
 
     Offsets are regressed on the surface around each texel, weighted by their precision and robustly, with a prior of
@@ -59,6 +64,8 @@ def touching_planes(texels: TexelMap, posed: Posed, found: Found) -> MeasuredPla
     posed : Posed
         Texels as they were swept, at one timestep.
     found : Found
+    outside : float
+        Distance at which a plane counts as outside the model's span.
     """
     row, column = (axis.astype(np.float64) for axis in np.divmod(texels.index, texels.size))
     along = posed.position.astype(np.float64).T
@@ -82,7 +89,13 @@ def touching_planes(texels: TexelMap, posed: Posed, found: Found) -> MeasuredPla
     second = (aa * slope_row - ab * slope_column) / determinant
     normal = normalize(posed.normal - first[:, None] * by_column - second[:, None] * by_row)
     position = posed.position + height[:, None] * posed.normal
-    return MeasuredPlanes(position[used], normal[used], weight[used])
+    return MeasuredPlanes(position[used], normal[used], weight[used], outside)
+
+
+def passing_planes(borders: Borders, outside: float) -> MeasuredPlanes:
+    """Planes of the lines of sight that pass the head where the image has its outline; ``outside`` as of the others."""
+    position = borders.position + borders.offset[:, None] * borders.normal
+    return MeasuredPlanes(position, borders.normal, borders.precision, outside)
 
 
 def _regress(

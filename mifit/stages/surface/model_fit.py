@@ -54,8 +54,6 @@ COUNTERPART_MAP = 256
 """Side of the map whose texels may be counterparts of planes."""
 FARTHEST_MM = 6.0
 """Distance at which a plane has no counterpart on the model."""
-OUTSIDE_STEPS = 1.0
-"""Distance from a plane, in steps of the sweep, at which the measured surface counts as outside the model's span."""
 SCATTER_PIXELS = 1.5
 """Deviation of a landmark between images of one head; what exceeds it is bias."""
 SMALLEST_COSINE = 0.7
@@ -66,8 +64,8 @@ or a hundred to 10."""
 UNEXPLAINED = 100.0
 """Mean square of a pixel's residual, of 255 and over all channels, above which colours count in inverse proportion."""
 
-Measure = Callable[[NDArray, tuple[int, int]], tuple[list[MeasuredPlanes], float]]
-"""Planes of each timestep and the step of the sweep, from the model's world vertices (T, V, 3) and a sweep."""
+Measure = Callable[[NDArray, tuple[int, int]], Sequence[Sequence[MeasuredPlanes]]]
+"""Planes of each timestep, matched and at outlines, from the model's world vertices (T, V, 3) and a sweep."""
 
 
 @dataclass(frozen=True)
@@ -234,8 +232,8 @@ def fit_model(
     start = gather(model, visibility.world(state), seen, config.robust_colour, config.albedo_prior)
     appearance = fit_appearance(start, config.max_iterations).value
     for number, sweep in enumerate((*[None] * SHADING_ROUNDS, *sweeps)):
-        planes, scale = ([], 1.0) if sweep is None else measure(visibility.world(state), sweep)
-        planes = [part.thinned(POINTS, rng) for part in planes]
+        measured = [] if sweep is None else measure(visibility.world(state), sweep)
+        planes = [(step, part.thinned(POINTS, rng)) for step, parts in enumerate(measured) for part in parts]
         state = state.recentred()
         colours, x = paper_problem(model, state, appearance, (), visibility, config, seed + number)
         colours = replace(colours, priors={"albedo": COLOUR, "ambient": colours.priors["ambient"]}).holding_slopes(x)
@@ -245,7 +243,7 @@ def fit_model(
         problem = JointProblem(colours, texture, min(1.0, UNEXPLAINED / max(left, 1e-30)))
         low, high = bounds(colours.layout, model.expression_bounds)
         for _ in range(PASSES if planes else 1):
-            terms = _counterparts(model, texels, visibility.world(state), planes, farthest, OUTSIDE_STEPS * scale)
+            terms = _counterparts(model, texels, visibility.world(state), planes, farthest)
             solution = minimize(
                 replace(problem, planes=terms),
                 x,
@@ -277,13 +275,12 @@ def _counterparts(
     model: MorphableModel,
     texels: TexelMap,
     world: NDArray,
-    planes: Sequence[MeasuredPlanes],
+    planes: Sequence[tuple[int, MeasuredPlanes]],
     farthest: float,
-    scale: float,
 ) -> list[PlaneTerm]:
-    """The texels of the model nearest to measured planes, per timestep; planes far from all of them are left out."""
+    """The texels of the model nearest to planes of timesteps; planes far from all of them are left out."""
     terms = []
-    for step, plane in enumerate(planes):
+    for step, plane in planes:
         if not len(plane.precision):
             continue
         vertices = world[step]
@@ -293,7 +290,8 @@ def _counterparts(
         normal = normalize(interpolate(vertex_normals(vertices, model.faces), model.faces, *corners))
         used = (distance < farthest) & ((normal * plane.normal).sum(1) > SMALLEST_COSINE)
         basis = PointBasis.on_faces(model, corners[0][used], corners[1][used])
-        terms.append(PlaneTerm(step, basis, plane.position[used], plane.normal[used], plane.precision[used], scale))
+        parts = plane.position[used], plane.normal[used], plane.precision[used]
+        terms.append(PlaneTerm(step, basis, *parts, plane.outside))
     return terms
 
 
