@@ -35,8 +35,8 @@ class GeometryConfig:
     )
     camera_gains: Literal["auto", "always", "never"] = one_of(
         "auto",
-        "find each camera's exposure and white balance relative to the first one's; auto: where they differ and more "
-        "than one timestep tells",
+        "find each camera's exposure and white balance relative to the first one's; auto: where they surely differ and "
+        "more than one timestep tells",
     )
     refine_cameras: bool = flag(
         False,

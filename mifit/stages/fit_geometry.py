@@ -16,7 +16,7 @@ from mifit.errors import ConvergenceError, InputError
 from mifit.morphable import MorphableModel
 from mifit.progress import Progress, silent
 from mifit.solve import Solution
-from mifit.stages.gains import differ, estimate_gains
+from mifit.stages.gains import estimate_gains
 from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.displaced import displaced
 from mifit.stages.geometry.faults import calibration_warnings, unseen_warnings
@@ -100,8 +100,8 @@ def fit_geometry(
     too_few = len(cameras) == 1 or len(timesteps) == 1
     if config.camera_gains == "never" or (config.camera_gains == "auto" and too_few):
         return found
-    gains = estimate_gains(capture, model, found, cameras, seed, progress)
-    if config.camera_gains == "auto" and not differ(gains):
+    gains = estimate_gains(capture, model, found, cameras, seed, progress, certain=config.camera_gains == "auto")
+    if not gains:
         return found
     for name in cameras:
         if name not in gains:

@@ -121,9 +121,36 @@ def test_gains_are_one_unless_known(dome):
     assert (dome.geometry.gain("left") == 1).all() and dome.geometry.gains == {}
 
 
-def test_cameras_differ_from_a_tenth_on() -> None:
+def test_cameras_differ_from_a_tenth_on_whatever_part_of_the_ratios_is_sheen() -> None:
     from mifit.stages.gains import differ
 
-    assert not differ({"left": (1.0, 1.0, 1.0), "right": (1.04, 0.97, 1.08)})
-    assert differ({"left": (1.0, 1.0, 1.0), "right": (1.25, 0.9, 1.1)})
-    assert differ({"left": (1.0, 1.0, 1.0), "right": (1.0, 0.88, 1.0)})
+    def log(*right):
+        return np.log([(1.0, 1.0, 1.0), right])
+
+    assert not differ(log(1.04, 0.97, 1.08))
+    assert differ(log(1.25, 0.9, 1.1)) and differ(log(1.0, 0.88, 1.0))
+    assert differ(log(1.25, 0.9, 1.1), log(1.2, 0.85, 1.0))
+    assert not differ(log(1.02, 1.03, 1.04), log(0.94, 0.9, 0.87))  # the lighting alone says so
+    assert not differ(log(1.2, 1.2, 1.2), log(1.05, 1.04, 1.03))
+    assert not differ(log(1.2, 1.0, 1.0), log(0.8, 1.0, 1.0))
+
+
+def test_sheen_that_the_lighting_takes_for_granted_makes_no_gain(dome, monkeypatch):
+    """As on meshes that are millimetres off: the cameras' ratios agree, and the lighting says that they shouldn't."""
+    opinion = np.log([(1.0, 1.0, 1.0), (0.94, 0.9, 0.87)])
+    monkeypatch.setattr("mifit.stages.gains._from_lighting", lambda seen, albedo, ratios, *_: ratios + opinion)
+    assert estimate_gains(dome, dome.model, dome.geometry, ("left", "right"), certain=True) == {}
+    always = estimate_gains(dome, dome.model, dome.geometry, ("left", "right"))
+    assert abs(np.log(always["right"])).max() > 0.1  # or else the test shows nothing
+
+
+def test_a_difference_that_the_lighting_takes_for_sheen_is_not_certain(dome, monkeypatch):
+    images = scaled(dome, scale=(1.1, 1.15, 1.2))
+    opinion = np.log([(1.0, 1.0, 1.0), (0.92, 0.9, 0.87)])
+    assert set(estimate_gains(images, dome.model, dome.geometry, ("left", "right"), certain=True)) == {"left", "right"}
+    monkeypatch.setattr("mifit.stages.gains._from_lighting", lambda seen, albedo, ratios, *_: ratios + opinion)
+    assert estimate_gains(images, dome.model, dome.geometry, ("left", "right"), certain=True) == {}
+
+
+def test_a_true_gain_is_certain(dome, gains):
+    assert estimate_gains(scaled(dome), dome.model, dome.geometry, ("left", "right"), certain=True) == gains
