@@ -260,6 +260,27 @@ def test_the_correction_tilts_the_normal() -> None:
     assert np.abs(np.array(value)[0] - expected).max() < 1e-4
 
 
+@pytest.mark.parametrize("fresnel", [{}, {"fresnel": 8.0}])
+def test_an_interpolated_normal_that_faces_away_reflects_diffusely(fresnel: dict) -> None:
+    """The surface itself faces the view, so what is seen there is not the black of a back."""
+    import mitsuba as mi
+
+    plugin = bsdf(diffuse_reflectance=0.3, specular_reflectance=0.5, exponent=20.0, **fresnel)
+    wo = hemisphere(300)
+    si = interaction(direction(95), 300)
+    light = mi.Vector3f(wo.T.astype(np.float32))
+    assert (np.array(plugin.eval(mi.BSDFContext(), si, light)) == 0).all()
+    si.n = mi.Normal3f(*direction(20))
+    value, pdf = plugin.eval_pdf(mi.BSDFContext(), si, light)
+    assert np.allclose(np.array(value)[0], 0.3 / np.pi * wo[:, 2], rtol=1e-5)
+    assert np.allclose(np.array(pdf), wo[:, 2] / np.pi, rtol=1e-5)
+    rng = np.random.default_rng(0)
+    drawn, weight = plugin.sample(
+        mi.BSDFContext(), si, mi.Float(rng.random(300)), mi.Point2f(rng.random((2, 300)).astype(np.float32))
+    )
+    assert (np.array(drawn.wo)[2] > 0).all() and np.allclose(np.array(weight), 0.3, rtol=1e-4)
+
+
 def test_diffuse_reflectance_and_the_back() -> None:
     import mitsuba as mi
 

@@ -54,9 +54,10 @@ def make() -> type:
         pole is the uncorrected normal itself. Slopes are zero there, linear around it, and can't turn the normal over.
         The shading frame's $s$ follows the UV parametrisation.
 
-        Reflects on the side of the normal; wrap it in Mitsuba's `twosided` for both. Where a corrected normal faces
-        away from the view, near silhouettes, the diffuse base still reflects and the lobe doesn't. `sample` draws half
-        vectors in proportion to $(n' \cdot h)^m$, or with `fresnel` directions about $r$, and cosine-weighted
+        Reflects on the side of the normal; wrap it in Mitsuba's `twosided` for both. Where an interpolated or corrected
+        normal faces away from the view and the surface doesn't, near silhouettes, the diffuse base still reflects and
+        the lobe doesn't: a coarse mesh has no black outline. `sample` draws half vectors in proportion to
+        $(n' \cdot h)^m$, or with `fresnel` directions about $r$, and cosine-weighted
         directions, in proportion to the albedos. All parameters are differentiable.
         """
 
@@ -141,17 +142,20 @@ def make() -> type:
             diffuse, specular, _, fresnel, n = dr.detach(parameters)
             cosine = dr.dot(wi, n)
             s, d = dr.mean(self.at_angle(diffuse, specular, fresnel, cosine)), dr.mean(diffuse)
-            return dr.select(cosine > 0.0, dr.select(s + d > 0.0, s / dr.maximum(s + d, 1e-12), 0.5), 0.0)
+            facing = (cosine > 0.0) & (mi.Frame3f.cos_theta(wi) > 0.0)
+            return dr.select(facing, dr.select(s + d > 0.0, s / dr.maximum(s + d, 1e-12), 0.5), 0.0)
 
-        def _reflects(self, wi: Any, wo: Any, n: Any) -> tuple[Any, Any, Any]:
+        def _reflects(self, si: Any, wo: Any, n: Any) -> tuple[Any, Any, Any]:
             """Where the base reflects, where the lobe does as well, and the corrected cosine of wo."""
-            cosine = dr.dot(wo, n)
-            above = (mi.Frame3f.cos_theta(wi) > 0.0) & (mi.Frame3f.cos_theta(wo) > 0.0) & (cosine > 0.0)
-            return above, above & (dr.dot(wi, n) > 0.0), cosine
+            cosine, facing = dr.dot(wo, n), mi.Frame3f.cos_theta(si.wi) > 0.0
+            front = facing | (dr.dot(si.n, si.to_world(si.wi)) > 0.0)
+            above = front & (mi.Frame3f.cos_theta(wo) > 0.0) & (cosine > 0.0)
+            return above, above & facing & (dr.dot(si.wi, n) > 0.0), cosine
 
-        def _value(self, ctx: Any, wi: Any, wo: Any, parameters: Any, active: Any) -> Any:
+        def _value(self, ctx: Any, si: Any, wo: Any, parameters: Any, active: Any) -> Any:
             diffuse, specular, exponent, fresnel, n = parameters
-            reflects, shines, cosine = self._reflects(wi, wo, n)
+            wi = si.wi
+            reflects, shines, cosine = self._reflects(si, wo, n)
             value = mi.Spectrum(0.0)
             if ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
                 factor = normalization(exponent) if self.normalized else dr.inv_pi
@@ -162,24 +166,24 @@ def make() -> type:
                 value += diffuse * dr.inv_pi
             return dr.select(active & reflects, value * cosine, 0.0)
 
-        def _density(self, ctx: Any, wi: Any, wo: Any, parameters: Any, active: Any) -> Any:
+        def _density(self, ctx: Any, si: Any, wo: Any, parameters: Any, active: Any) -> Any:
             _, _, exponent, fresnel, n = parameters
-            reflects, shines, cosine = self._reflects(wi, wo, n)
-            p = self._specular_probability(ctx, wi, parameters)
-            lobe = dr.select(shines, self._lobe(wi, wo, n, exponent, fresnel)[1], 0.0)
+            reflects, shines, cosine = self._reflects(si, wo, n)
+            p = self._specular_probability(ctx, si.wi, parameters)
+            lobe = dr.select(shines, self._lobe(si.wi, wo, n, exponent, fresnel)[1], 0.0)
             return dr.select(active & reflects, dr.lerp(cosine * dr.inv_pi, lobe, p), 0.0)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self._value(ctx, si.wi, wo, self.parameters(si, active), active)
+            return self._value(ctx, si, wo, self.parameters(si, active), active)
 
         def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self._density(ctx, si.wi, wo, self.parameters(si, active), active)
+            return self._density(ctx, si, wo, self.parameters(si, active), active)
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
             parameters = self.parameters(si, active)
             return (
-                self._value(ctx, si.wi, wo, parameters, active),
-                self._density(ctx, si.wi, wo, parameters, active),
+                self._value(ctx, si, wo, parameters, active),
+                self._density(ctx, si, wo, parameters, active),
             )
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
@@ -212,8 +216,8 @@ def make() -> type:
                 mi.UInt32(+mi.BSDFFlags.GlossyReflection),
                 mi.UInt32(+mi.BSDFFlags.DiffuseReflection),
             )
-            bs.pdf = dr.detach(self._density(ctx, si.wi, bs.wo, parameters, active))
-            value = self._value(ctx, si.wi, bs.wo, parameters, active)
+            bs.pdf = dr.detach(self._density(ctx, si, bs.wo, parameters, active))
+            value = self._value(ctx, si, bs.wo, parameters, active)
             valid = active & (bs.pdf > 0.0)
             return bs, dr.select(valid, value / dr.select(valid, bs.pdf, 1.0), 0.0)
 
