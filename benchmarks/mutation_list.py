@@ -248,4 +248,16 @@ TIME = [
     M("tracked frames aligned to themselves", STAGES, r"\[posed\], self\._looks\)", "[posed])", "tests/stages/test_align_timesteps.py"),
 ]  # fmt: skip
 
-MUTATIONS = [*CONVENTIONS, *MEASURES, *LIGHT, *GEOMETRY, *MESH, *TERMS, *SURFACE, *EYES, *NEAR, *CAMERAS, *TIME]
+VIDEO = [
+    M("a surface swept again is always kept", STAGES, r"kept = between\[1\] < between\[0\]", "kept = True",
+      "tests/stages/test_sweep_again.py"),
+    M("what judges is swept too", STAGES, r"swept = \[t for t in geometry\.timesteps if t not in judged\]",
+      "swept = list(geometry.timesteps)", "tests/stages/test_sweep_again.py"),
+    M("more timesteps are more certain", STAGES, r"found\.precision \* min\(1\.0, self\._count_as / len\(posed\)\)",
+      "found.precision", "tests/stages/test_sweep_again.py"),
+    M("frames that disagree are swept", ANY, r"if apart\(one\) < DISAGREES \* usual:", "if True:", "tests/test_resurfacing.py"),
+    M("timesteps that aren't swept stay on the old surface", ANY, r"on_surface\(model, posed\.at\(\(timestep,\)\), found\.displacement\)",
+      "on_surface(model, posed.at((timestep,)), geometry.displacement)", "tests/test_resurfacing.py"),
+]  # fmt: skip
+
+MUTATIONS = [*CONVENTIONS, *MEASURES, *LIGHT, *GEOMETRY, *MESH, *TERMS, *SURFACE, *EYES, *NEAR, *CAMERAS, *TIME, *VIDEO]

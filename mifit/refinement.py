@@ -1,7 +1,8 @@
-"""``mifit.refine``: all frames of a video make the maps, the light and the normals of a result sharper.
+"""``mifit.refine``: all frames of a video make the surface, the maps and the normals of a result sharper.
 
-Every frame is added to sums of a fixed size per texel (`stages.absorb`) and then forgotten: memory doesn't grow with
-the number of frames, and their order doesn't matter.
+The surface comes first (`resurfacing`), since what is kept of a frame is tied to it. Then every frame is added to
+sums of a fixed size per texel (`stages.absorb`) and forgotten: memory doesn't grow with the number of frames, and their
+order doesn't matter.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from mifit.core.uv import TexelMap
 from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
 from mifit.result.record import R, Result
+from mifit.resurfacing import resurfaced
 from mifit.stages.absorb.frame import Absorber, FrameFit, carried_offsets
 from mifit.stages.absorb.information import Information
 from mifit.stages.absorb.solve_sums import Solved, solve_sums
@@ -58,7 +60,7 @@ def refine(
     progress: Progress = silent,
     checkpoints: str | Path | None = None,
 ) -> R:
-    """Add what further frames show to the maps and normals of a result.
+    """Add what further frames show to the surface, the maps and the normals of a result.
 
     Parameters
     ----------
@@ -74,13 +76,17 @@ def refine(
     progress : Progress
         ``done`` counts frames.
     checkpoints : path, optional
-        Folder in which the sums are kept while frames are added: a run that was stopped goes on from there.
+        Folder in which the surface and the sums are kept while frames are added: a run that was stopped goes on from
+        there.
 
     Returns
     -------
     Reconstruction
         With the timesteps of ``result``. ``reflectance.frames`` tells how many frames showed each texel,
-        ``normals.report.details["refined"]`` which frames were added and which were left out, and why.
+        ``normals.report.details["refined"]`` which frames were added and which were left out, and why. Where six
+        frames or more come to those that were fitted, on a surface beyond the model's span, the surface has been swept
+        with up to sixteen of them and is kept where views of others predict one another better; the last of
+        ``geometry.report.details["phases"]`` says so.
 
     Raises
     ------
@@ -97,13 +103,17 @@ def refine(
         if timestep not in capture.timesteps:
             known = ", ".join(map(str, capture.timesteps))
             raise InputError(f"timestep {timestep}: not in the capture; it has {known}")
-    refinement = Refinement(result, capture, seed)
-    order = [*refinement.fitted, *(t for t in wanted if t not in refinement.fitted)]
+    check_reflectance(result)
     folder, key = None if checkpoints is None else Path(checkpoints), ""
     if folder is not None:
         names = [camera.name for camera in result.cameras]
         key = checkpoint.digest([_digest(result), capture.digest(names, wanted), wanted, seed])
+    seen = capture.with_fitted(result.cameras, result.calibration)
+    result = resurfaced(result, seen, fitted_jointly(result), wanted, seed, progress, folder, key)
+    refinement = Refinement(result, capture, seed)
+    if folder is not None:
         refinement.restore(folder, key)
+    order = [*refinement.fitted, *(t for t in wanted if t not in refinement.fitted)]
     for done, timestep in enumerate(order):
         progress("refine", done, len(order))
         if timestep not in refinement.fits:
@@ -147,8 +157,8 @@ class Refinement(Generic[R]):
     """
 
     def __init__(self, result: R, capture: Capture, seed: int = 0) -> None:
-        if result.reflectance is None:
-            raise InputError("refine: found a result without reflectance, expected one of 'mifit fit' with all stages")
+        check_reflectance(result)
+        assert result.reflectance is not None
         self._began = time.perf_counter()
         self._result, self._seed = result, seed
         self._capture = capture.with_fitted(result.cameras, result.calibration)
@@ -162,7 +172,7 @@ class Refinement(Generic[R]):
         self._information = Information.nothing(len(surface))
         self._last = result.geometry.at(result.timesteps[-1:])
         self._follower: Follower | None = None
-        self.fitted = _fitted(result)
+        self.fitted = fitted_jointly(result)
         self.fits: dict[int, FrameFit] = {}
         self.left_out: dict[int, str] = {}
 
@@ -302,7 +312,13 @@ def _disagreement(fit: FrameFit, fitted: Sequence[FrameFit]) -> str:
     return ""
 
 
-def _fitted(result: Result) -> list[int]:
+def check_reflectance(result: Result) -> None:
+    """Refuse a result that has no maps to refine."""
+    if result.reflectance is None:
+        raise InputError("refine: found a result without reflectance, expected one of 'mifit fit' with all stages")
+
+
+def fitted_jointly(result: Result) -> list[int]:
     """Timesteps that were fitted jointly, not tracked."""
     tracked = [] if result.normals is None else result.normals.report.details.get("tracked", [])
     return [t for t in result.timesteps if t not in tracked]

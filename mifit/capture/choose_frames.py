@@ -64,7 +64,13 @@ class FrameChoice:
         }
 
 
-def choose_frames(capture: Capture, cameras: Sequence[str], count: int) -> FrameChoice:
+def choose_frames(
+    capture: Capture,
+    cameras: Sequence[str],
+    count: int,
+    timesteps: Sequence[int] | None = None,
+    beside: Sequence[int] = (),
+) -> FrameChoice:
     """Choose the timesteps of a capture that tell most about a face.
 
     Frames that are blurred, show closed eyes, lack landmarks or whose views disagree are left out. Of the others the
@@ -78,6 +84,10 @@ def choose_frames(capture: Capture, cameras: Sequence[str], count: int) -> Frame
         No other camera is read.
     count : int
         How many; fewer come back where there aren't as many.
+    timesteps : sequence of int, optional
+        Those to choose from; default: all.
+    beside : sequence of int
+        Timesteps that are taken already: those that are chosen lie far from them too, and are others.
 
     Raises
     ------
@@ -86,7 +96,7 @@ def choose_frames(capture: Capture, cameras: Sequence[str], count: int) -> Frame
     """
     if not cameras:
         raise InputError("choose_frames: found no camera, expected at least one")
-    steps = np.array(capture.timesteps)
+    steps = np.array(sorted({*(capture.timesteps if timesteps is None else timesteps), *beside}))
     points = np.stack([_landmarks(capture, name, steps) for name in cameras])  # (C, T, 68, 2)
     known = np.isfinite(points).all((2, 3))
     if not known.any():
@@ -96,7 +106,7 @@ def choose_frames(capture: Capture, cameras: Sequence[str], count: int) -> Frame
     opening = _eye_opening(points)
     apart = _disagreement(capture, cameras, points)
     for i, t in enumerate(int(t) for t in steps):
-        if t in left_out:
+        if t in left_out or t in beside:
             continue
         if sharp[i] < BLURRED * np.nanmedian(sharp):
             left_out[t] = f"blurred: {sharp[i] / np.nanmedian(sharp):.0%} of the usual sharpness"
@@ -108,11 +118,12 @@ def choose_frames(capture: Capture, cameras: Sequence[str], count: int) -> Frame
     if not len(good):  # better the worst frames than none
         good = np.flatnonzero(known.any(0))
     poses = _poses(points[:, good])
-    chosen, why = _spread(poses, sharp[good] / np.nanmedian(sharp), count)
+    taken = [k for k, i in enumerate(good) if steps[i] in beside]
+    chosen, why = _spread(poses, sharp[good] / np.nanmedian(sharp), count, taken)
     found = {int(steps[good[k]]): text for k, text in zip(chosen, why, strict=True)}
-    return FrameChoice(
-        tuple(sorted(found)), dict(sorted(found.items())), left_out, camera_offsets(capture, cameras, points)
-    )
+    every = bool((np.diff(steps) == 1).all())
+    offsets = camera_offsets(capture, cameras, points) if every else {}
+    return FrameChoice(tuple(sorted(found)), dict(sorted(found.items())), left_out, offsets)
 
 
 def camera_offsets(capture: Capture, cameras: Sequence[str], points: NDArray) -> dict[str, float]:
@@ -221,16 +232,19 @@ def _poses(points: NDArray) -> NDArray[np.float64]:
     return np.where(np.isfinite(flat), flat, np.nanmedian(flat, axis=0))
 
 
-def _spread(poses: NDArray, sharpness: NDArray, count: int) -> tuple[list[int], list[str]]:
-    """Rows that lie far from one another, sharper ones preferred, and the reason for each."""
+def _spread(poses: NDArray, sharpness: NDArray, count: int, taken: Sequence[int] = ()) -> tuple[list[int], list[str]]:
+    """Rows that lie far from one another and from those taken, sharper ones preferred, and the reason for each."""
     middle = np.median(poses, axis=0)
     away = np.linalg.norm(poses - middle, axis=1)
     good = np.clip(np.nan_to_num(sharpness, nan=1.0), 0.5, 1.0)
-    first = int(np.argmin(away / good))
-    chosen, why = [first], ["nearest to the middle of all poses"]
-    nearest = np.linalg.norm(poses - poses[first], axis=1)
-    while len(chosen) < min(count, len(poses)):
-        pick = int(np.argmax(np.where(np.isin(np.arange(len(poses)), chosen), -1.0, nearest * good)))
+    chosen: list[int] = []
+    why: list[str] = []
+    if not taken and count > 0:
+        chosen, why = [int(np.argmin(away / good))], ["nearest to the middle of all poses"]
+    known = [*taken, *chosen]
+    nearest = np.linalg.norm(poses[:, None] - poses[known], axis=2).min(axis=1)
+    while len(chosen) < min(count, len(poses) - len(taken)):
+        pick = int(np.argmax(np.where(np.isin(np.arange(len(poses)), [*taken, *chosen]), -1.0, nearest * good)))
         why.append(f"farthest in pose from those before, {nearest[pick]:.2f} widths between the eyes")
         chosen.append(pick)
         nearest = np.minimum(nearest, np.linalg.norm(poses - poses[pick], axis=1))

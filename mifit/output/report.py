@@ -51,6 +51,8 @@ STAGES = {
     "mesh": "3 Mesh",
     "residual": "3 Residual",
 }
+FURTHER_FRAMES = "surface of further frames"
+"""Phase of a geometry's report that tells of a surface that was swept again (`stages.sweep_again`)."""
 SHOWN_TIMESTEPS = 4
 """Timesteps whose pictures a report holds, so that it stays small enough for a phone."""
 
@@ -283,6 +285,13 @@ def _frames(result: Result) -> str:
     lines += [f"Timestep {t} was not to be chosen: {why}." for t, why in chosen.get("left_out", {}).items()]
     for camera, offset in chosen.get("camera_offsets_frames", {}).items():
         lines.append(f"Camera {camera} is {offset:+.2f} frames later than the first one, by its epipolar lines.")
+    for swept in (p for p in result.geometry.report.details.get("phases", []) if p["name"] == FURTHER_FRAMES):
+        old, new = swept["between_views"]
+        end = "kept" if swept["kept"] else "dropped"
+        lines.append(
+            f"The surface was swept with {len(swept['timesteps'])} timesteps and {end}: "
+            f"in {len(swept['judged'])} others the views predict one another to {new:.4f} instead of {old:.4f}."
+        )
     if refined:
         lines.append(f"{len(refined['timesteps'])} frames were added to maps and normals.")
         lines += [f"Timestep {t} was left out of them: {why}." for t, why in refined["left_out"].items()]

@@ -126,3 +126,12 @@ def test_nothing_to_choose_by_is_refused():
         choose_frames(head, head.cameras, 2)
     with pytest.raises(InputError, match="no camera"):
         choose_frames(head, (), 2)
+
+
+def test_further_frames_lie_far_from_those_taken_and_come_from_those_named():
+    head = Head(np.linspace(-30.0, 30.0, STEPS))
+    found = choose_frames(head, head.cameras, 2, timesteps=range(1, STEPS - 2), beside=(0, 1))
+    assert set(found.timesteps) == {5, STEPS - 3} and found.why.keys() == set(found.timesteps)
+    every = choose_frames(head, head.cameras, STEPS, beside=(0, 1))
+    assert set(every.timesteps) == set(range(2, STEPS))
+    assert not choose_frames(head, head.cameras, 2, timesteps=(0, 2, 5, 9, 11)).offsets  # a speed needs the next frame

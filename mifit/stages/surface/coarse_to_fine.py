@@ -96,7 +96,22 @@ class Swept:
 
 
 class Search:
-    """Sweeps, coarse to fine, from a fit of the model."""
+    """Sweeps, coarse to fine, from a fit of the model.
+
+    Parameters
+    ----------
+    capture, model, cameras, config, progress
+        As in `find_surface`.
+    resolution : Resolution
+    pairs : sequence of (int, int)
+        Views of a timestep that are compared.
+    total : int
+        Sweeps that there will be, for ``progress``.
+    beyond : bool
+        Whether the head is taken to lie beyond the model's span: its halves are then alike, and its timesteps aligned.
+    count_as : float, optional
+        Number of timesteps that all together count as; default: as many as there are.
+    """
 
     def __init__(
         self,
@@ -109,8 +124,9 @@ class Search:
         progress: Progress,
         total: int,
         beyond: bool,
+        count_as: float | None = None,
     ) -> None:
-        self._beyond = beyond
+        self._beyond, self._count_as = beyond, count_as
         self._capture, self._model, self._cameras, self._pairs = capture, model, cameras, pairs
         self._resolution, self._config, self._progress = resolution, config, progress
         self._done, self._total = 0, total
@@ -155,7 +171,10 @@ class Search:
         """One sweep of a surface, with ``further`` pairs of views beside those of each timestep."""
         step = STEP_PIXELS * self._resolution.pixel * 2.0**level / self._resolution.parallax
         pairs = [((k, a), (k, b)) for k in range(len(posed)) for a, b in self._pairs]
-        return Swept(sweep(texels, posed, step * np.arange(-half, half + 1), WINDOW, [*pairs, *further]), step)
+        found = sweep(texels, posed, step * np.arange(-half, half + 1), WINDOW, [*pairs, *further])
+        if self._count_as is not None:
+            found = replace(found, precision=found.precision * min(1.0, self._count_as / len(posed)))
+        return Swept(found, step)
 
     def planes(
         self, timesteps: Sequence[int], world: NDArray, level: int, half: int, outlines: bool
