@@ -249,6 +249,7 @@ TIME = [
 ]  # fmt: skip
 
 VIDEO = [
+    M("a bias told in pixels alone", STAGES, r"SCATTER_OF_FACE \* float\(", "0.0 * float(", "tests/stages/test_find_surface.py -k bias"),
     M("a surface swept again is always kept", STAGES, r"kept = between\[1\] < between\[0\]", "kept = True",
       "tests/stages/test_sweep_again.py"),
     M("what judges is swept too", STAGES, r"swept = \[t for t in geometry\.timesteps if t not in judged\]",

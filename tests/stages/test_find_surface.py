@@ -394,6 +394,27 @@ def test_outlines_lead_a_refit_and_what_is_matched_has_the_last_word(model, bump
     beyond = np.where(np.linalg.norm(way, axis=-1) < 1.0, (way * outline.normal[:, None]).sum(-1), -np.inf)
     assert len(outline.precision) > 30 and (outline.precision > 0).all()
     assert 10.0 * np.median(np.abs(beyond.max(axis=1))) < 1.0  # the true head touches them, mm
+@pytest.mark.parametrize(
+    ("noise", "width", "biased"),
+    [
+        (1.0, 300.0, False),  # noise of 0.8 pixels, which a fit takes for one
+        (1.0, 75.0, False),
+        (1.25, 145.0, True),  # a detector that is off by 0.9 per cent, in an image of 340 x 240
+        (1.4, 300.0, False),
+        (1.9, 300.0, True),
+        (3.0, 650.0, False),
+        (25.0, 650.0, True),
+    ],
+)
+def test_a_bias_is_told_in_terms_of_the_face(start, noise, width, biased):
+    details = {"landmark_noise_pixels": noise, "face_width_pixels": width}
+    assert landmarks_are_biased(replace(start, report=replace(start.report, details=details))) is biased
+
+
+def test_the_width_of_the_face_is_that_in_the_images(model, bumpy, start):
+    ends = bumpy.vertices[0][model.landmarks[[0, 16]]]
+    width = np.mean([np.ptp(bumpy.camera(name).project(ends)[:, 0]) for name in BOTH])  # turned by 20 degrees
+    assert 1.0 < start.report.details["face_width_pixels"] / width < 1.2
 
 
 def test_a_refit_on_which_the_views_agree_less_is_dropped(model, bumpy, start, monkeypatch):

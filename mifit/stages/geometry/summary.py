@@ -96,6 +96,7 @@ def pack(
         "phases": journal.phases,
         "landmark_rms_pixels": _landmark_rms(state, views),
         "landmark_noise_pixels": noise,
+        "face_width_pixels": _face_width(model, world, views),
     }
     if journal.last is not None and journal.last.system is not None:
         details["standard_deviations"] = _deviations(state, journal.last)
@@ -132,6 +133,16 @@ def pack(
         ),
         gains=dict(gains),
     )
+
+
+def _face_width(model: MorphableModel, world: NDArray, views: tuple[LandmarkView, ...]) -> float:
+    """Mean width of the face in the images, pixels, as a view from the front would have it; 0 without views."""
+    found = []
+    for view in views:
+        ends = world[view.step][model.landmarks[[0, 16]]].astype(np.float64)
+        depth = float(np.linalg.norm(ends.mean(axis=0) - view.camera.position))
+        found.append(float(np.linalg.norm(ends[1] - ends[0])) * np.sqrt(view.camera.fx * view.camera.fy) / depth)
+    return float(np.mean(found)) if found else 0.0
 
 
 def _landmark_rms(state: State, views: tuple[LandmarkView, ...]) -> dict[str, float]:

@@ -56,6 +56,11 @@ FARTHEST_MM = 6.0
 """Distance at which a plane has no counterpart on the model."""
 SCATTER_PIXELS = 1.5
 """Deviation of a landmark between images of one head; what exceeds it is bias."""
+OUTSIDE_STEPS = 1.0
+"""Distance from a plane, in steps of the sweep, at which the measured surface counts as outside the model's span."""
+SCATTER_OF_FACE, LEAST_SCATTER = 0.005, 1.1
+"""Deviation of a landmark between images of one head, as a part of the face's width and at least in pixels; what
+exceeds it is bias. Good detectors scatter by 0.3 per cent and about a pixel, and are off by one to four per cent."""
 SMALLEST_COSINE = 0.7
 """Between normals of the model and of the found surface where they are compared."""
 COLOUR = 1.0
@@ -220,7 +225,9 @@ def fit_model(
     images = len(cameras) * len(steps)
     pixels = min(config.pixels, max(PIXELS // images, FEWEST_PIXELS))
     config = replace(config, as_written=False, scale_deviation=0.0, landmark_noise=noise, pixels=pixels)
-    views = landmark_views(capture, model, cameras, steps, biased_noise(noise, images), fewest=0)
+    views = landmark_views(
+        capture, model, cameras, steps, biased_noise(noise, images, scatter_pixels(geometry)), fewest=0
+    )
     views = slid(model, geometry, views)
     visibility = Visibility(capture, model, tuple(cameras), steps, geometry.gains, scenes)
     points = spread_points(model, min(config.surface_points, TEXTURE_POINTS), seed)
@@ -295,17 +302,22 @@ def _counterparts(
     return terms
 
 
+def scatter_pixels(geometry: GeometryEstimate) -> float:
+    """Deviation of a landmark coordinate that a good detector has between images of this face, pixels."""
+    return max(LEAST_SCATTER, SCATTER_OF_FACE * float(geometry.report.details.get("face_width_pixels", 0.0)))
+
+
 def landmarks_are_biased(geometry: GeometryEstimate) -> bool:
     """Whether the landmarks lie farther from the fit than a good detector scatters."""
-    return float(geometry.report.details.get("landmark_noise_pixels", 0.0)) > SCATTER_PIXELS
+    return float(geometry.report.details.get("landmark_noise_pixels", 0.0)) > scatter_pixels(geometry)
 
 
-def biased_noise(deviation: float, images: int) -> float:
+def biased_noise(deviation: float, images: int, scatter: float) -> float:
     """Deviation of a landmark coordinate under which all images count as one where they share a bias, pixels.
 
     What exceeds the scatter of a good detector is the same in every image of a head.
     """
-    scatter = min(deviation, SCATTER_PIXELS)
+    scatter = min(deviation, scatter)
     return float(np.sqrt(scatter**2 + images * (deviation**2 - scatter**2)))
 
 
