@@ -394,6 +394,8 @@ def test_outlines_lead_a_refit_and_what_is_matched_has_the_last_word(model, bump
     beyond = np.where(np.linalg.norm(way, axis=-1) < 1.0, (way * outline.normal[:, None]).sum(-1), -np.inf)
     assert len(outline.precision) > 30 and (outline.precision > 0).all()
     assert 10.0 * np.median(np.abs(beyond.max(axis=1))) < 1.0  # the true head touches them, mm
+
+
 @pytest.mark.parametrize(
     ("noise", "width", "biased"),
     [

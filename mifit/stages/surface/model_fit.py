@@ -54,10 +54,6 @@ COUNTERPART_MAP = 256
 """Side of the map whose texels may be counterparts of planes."""
 FARTHEST_MM = 6.0
 """Distance at which a plane has no counterpart on the model."""
-SCATTER_PIXELS = 1.5
-"""Deviation of a landmark between images of one head; what exceeds it is bias."""
-OUTSIDE_STEPS = 1.0
-"""Distance from a plane, in steps of the sweep, at which the measured surface counts as outside the model's span."""
 SCATTER_OF_FACE, LEAST_SCATTER = 0.005, 1.1
 """Deviation of a landmark between images of one head, as a part of the face's width and at least in pixels; what
 exceeds it is bias. Good detectors scatter by 0.3 per cent and about a pixel, and are off by one to four per cent."""
