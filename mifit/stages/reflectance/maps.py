@@ -9,8 +9,9 @@ map is inverted at once by cosine transforms.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
@@ -22,8 +23,8 @@ SPLIT = 0.5
 """Weight of ADMM's splits relative to the median curvature of the blocks."""
 RELAX = 1.7
 """Over-relaxation of both splits (Boyd et al. 2011, section 3.4.3): 40 iterations end nearer to it than 60 did."""
-CHUNK = 32768
-"""Texels whose blocks are solved at once: what they need stays in a core's cache."""
+CHUNK = 16384
+"""Texels that are looked at at once: what they need stays in a core's cache."""
 
 
 @dataclass(frozen=True)
@@ -82,52 +83,106 @@ class TexelSystems:
             return parts[0]
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
-    def take(self, rows: slice) -> TexelSystems:
-        """Blocks of some of the texels."""
-        return TexelSystems(*(getattr(self, f.name)[rows] for f in fields(self)))
-
     def solve(self, x0: NDArray, y0: NDArray, px: NDArray | float, py: NDArray | float) -> tuple[NDArray, NDArray]:
         """Minimise each block plus ``px |x - x0|^2 + py (y - y0)^2`` within 0..1: x (N, 3) and y (N,)."""
-        blocks = _Blocks(self, np.broadcast_to(px, 3).astype(self.dd.dtype)[:, None], py)
-        x, y = blocks.solve(np.broadcast_to(x0, self.dd.shape).T, np.broadcast_to(y0, self.sr.shape))
-        return x.T, y
+        weight = np.append(np.broadcast_to(px, 3), py).astype(self.dd.dtype)[:, None]
+        target = np.concatenate([np.broadcast_to(x0, self.dd.shape).T, np.broadcast_to(y0, (1, len(self.sr)))])
+        found = np.empty_like(target, self.dd.dtype)
+        _Blocks.of(self, np.arange(len(self.sr)), weight, np.zeros_like(found), weight).solve(target, found)
+        return found[:3].T, found[3]
 
 
+@dataclass(frozen=True)
 class _Blocks:
-    """`TexelSystems` with the pulls of ADMM's splits, which are the same in all iterations, worked in.
+    """Blocks of N texels plus quadratic terms of ADMM's, worked out as far as they are the same in all iterations.
 
-    Channels come first here, (3, N): sums over three neighbours in memory are slow.
+    Channels come first: sums over three neighbours in memory are slow. With x eliminated, and a target t (4, N),
+    ``o = at + gain t`` are the x that would be found if y were 0, ``eliminated y = right + pull t - sum_c both_c o_c``,
+    and ``x = o - slope y``.
+
+    Attributes
+    ----------
+    at, gain, slope, both : (3, N)
+    right, curvature, eliminated : (N,)
+        Of y; its curvature with x held, and with x eliminated.
+    pull : float
+        Weight of the target of y.
     """
 
-    def __init__(self, systems: TexelSystems, px: NDArray, py: NDArray | float) -> None:
-        self.px, self.py = px, py
-        self.ds, self.dr = (np.ascontiguousarray(a.T) for a in (systems.ds, systems.dr))
-        self.sr = systems.sr
-        self.inverse = 1.0 / (systems.dd.T + px)
-        self.slope = self.ds * self.inverse
-        self.removed = self.ds * self.slope  # what eliminating each x takes from the curvature of y
-        self.curvature = systems.ss + py
-        self.eliminated = np.maximum(self.curvature - _over_channels(self.removed), 1e-12)
+    at: NDArray[np.float32]
+    gain: NDArray[np.float32]
+    slope: NDArray[np.float32]
+    both: NDArray[np.float32]
+    right: NDArray[np.float32]
+    curvature: NDArray[np.float32]
+    eliminated: NDArray[np.float32]
+    pull: float
 
-    def solve(self, x0: NDArray, y0: NDArray) -> tuple[NDArray, NDArray]:
-        """x (3, N) and y (N,) in closed form.
+    @classmethod
+    def of(
+        cls, systems: TexelSystems, index: NDArray, weight: NDArray, drawn: NDArray, pull: NDArray[np.float32]
+    ) -> _Blocks:
+        """Blocks at some of N texels plus, at all, ``weight z^2 - 2 (drawn + pull t) z`` of all four albedos z.
+
+        Parameters
+        ----------
+        systems : TexelSystems
+        index : (M,) int
+            Texels of the blocks.
+        weight, pull : (4, 1)
+        drawn : (4, N)
+        """
+
+        def spread(values: NDArray, added: NDArray) -> NDArray[np.float32]:
+            out = np.zeros(drawn.shape[1], drawn.dtype) + added
+            out[index] += values
+            return out
+
+        held, zero = np.broadcast_to(weight, (4, 1)), np.zeros((3, 1), drawn.dtype)
+        dd, both, dr = (
+            np.stack([spread(values[:, c], added[c]) for c in range(3)])
+            for values, added in ((systems.dd, held), (systems.ds, zero), (systems.dr, drawn))
+        )
+        slope, curvature = both / dd, spread(systems.ss, held[3])
+        eliminated = np.maximum(curvature - _over_channels(both * slope), np.float32(1e-12))
+        right = spread(systems.sr, drawn[3])
+        return cls(dr / dd, pull[:3] / dd, slope, both, right, curvature, eliminated, float(pull[3, 0]))
+
+    def take(self, rows: slice | NDArray[np.intp]) -> _Blocks:
+        """Those of some of the texels."""
+        names = [f.name for f in fields(self) if f.name != "pull"]
+        return replace(self, **{name: getattr(self, name)[..., rows] for name in names})
+
+    def solve(self, target: NDArray, out: NDArray) -> None:
+        """Minimise within 0..1 for targets (4, N), in closed form.
 
         y is found with x eliminated; where that drives a diffuse value out of the box, the value is held at the bound
         and y found anew with the others.
         """
-        offset = (self.dr + self.px * x0) * self.inverse
-        pull = self.sr + self.py * y0
-        y = np.clip((pull - _over_channels(self.ds * offset)) / self.eliminated, 0.0, 1.0)
-        x = offset - self.slope * y
-        rows = np.flatnonzero(((x < 0.0) | (x > 1.0)).any(axis=0))
-        if len(rows):
-            bound, free = x[:, rows], (x[:, rows] >= 0.0) & (x[:, rows] <= 1.0)
-            shifted = np.where(free, offset[:, rows], np.clip(bound, 0.0, 1.0))
-            curvature = self.curvature[rows] - _over_channels(np.where(free, self.removed[:, rows], 0.0))
-            right = pull[rows] - _over_channels(self.ds[:, rows] * shifted)
-            y[rows] = np.clip(right / np.maximum(curvature, 1e-12), 0.0, 1.0)
-            x[:, rows] = np.clip(offset[:, rows] - self.slope[:, rows] * y[rows], 0.0, 1.0)
-        return x, y
+        x, y = out[:3], out[3]
+        np.multiply(self.gain, target[:3], out=x)
+        x += self.at
+        np.multiply(self.pull, target[3], out=y)
+        y += self.right
+        for both, offset in zip(self.both, x, strict=True):
+            y -= both * offset
+        y /= self.eliminated
+        np.clip(y, 0.0, 1.0, out=y)
+        for slope, offset in zip(self.slope, x, strict=True):
+            offset -= slope * y
+        if x.min(initial=0.0) < 0.0 or x.max(initial=0.0) > 1.0:
+            self._bounded(np.flatnonzero(((x < 0.0) | (x > 1.0)).any(axis=0)), target, out)
+
+    def _bounded(self, rows: NDArray[np.intp], target: NDArray, out: NDArray) -> None:
+        """Find again those whose x left the box."""
+        blocks, x = self.take(rows), out[:3, rows]
+        free = (x >= 0.0) & (x <= 1.0)
+        offset = blocks.at + blocks.gain * target[:3, rows]
+        shifted = np.where(free, offset, np.clip(x, 0.0, 1.0))
+        curvature = blocks.curvature - _over_channels(np.where(free, blocks.both * blocks.slope, 0.0))
+        right = blocks.right + blocks.pull * target[3, rows] - _over_channels(blocks.both * shifted)
+        y = np.clip(right / np.maximum(curvature, 1e-12), 0.0, 1.0)
+        out[:3, rows], out[3, rows] = np.clip(offset - blocks.slope * y, 0.0, 1.0), y
 
 
 def _over_channels(values: NDArray) -> NDArray:
@@ -139,34 +194,30 @@ def _over_channels(values: NDArray) -> NDArray:
 class Splits:
     """ADMM's copies and multipliers, planes (4, S, S): handed on, they make the next solve a short one.
 
+    A multiplier is kept as the sum of itself and the copy that it belongs to.
+
     Attributes
     ----------
-    smooth, bent : smooth copy of the maps without their base, and its Laplacian
-    u, v : multipliers of the two splits
+    smooth : smooth copy of the maps without their base
+    level : the same plus the multiplier of its split from the maps
+    bend : its Laplacian plus the multiplier of that split
     outcome : Outcome
         Of the solve that left them.
     iterations : int
     """
 
     smooth: NDArray[np.float32] | None = None
-    bent: NDArray[np.float32] | None = None
-    u: NDArray[np.float32] | None = None
-    v: NDArray[np.float32] | None = None
+    level: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    bend: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     outcome: Outcome = Outcome.MAX_ITERATIONS
     iterations: int = 0
 
 
 def plane_laplacian(planes: NDArray) -> NDArray:
     """Five-point Laplacian of planes (..., S, S) with mirrored borders."""
-    out = -4.0 * planes
-    for axis in (planes.ndim - 2, planes.ndim - 1):
-        low, high = ((slice(None),) * axis + (part,) for part in (slice(None, -1), slice(1, None)))
-        out[high] += planes[low]
-        out[low] += planes[high]
-        first, last = ((slice(None),) * axis + (part,) for part in (slice(0, 1), slice(-1, None)))
-        out[first] += planes[first]
-        out[last] += planes[last]
-    return out
+    if planes.ndim > 2:
+        return np.stack([plane_laplacian(plane) for plane in planes])
+    return cv2.Laplacian(planes, cv2.CV_32F, borderType=cv2.BORDER_REPLICATE)
 
 
 def laplacian(image: NDArray) -> NDArray:
@@ -245,54 +296,58 @@ def solve_maps(
     pull = prior_weight * scale
     pull[3] = max(pull[3], specular_pull)
     # Splitting weights near the blocks' own curvature let both sides of a split move at the same pace.
-    rho = (SPLIT * scale)[:, None, None]
-    threshold = np.array([smoothness.diffuse] * 3 + [smoothness.specular], dtype=np.float32)[:, None, None] / rho
-    weak = pull[:, None, None]
+    rho = (SPLIT * scale)[:, None]
+    threshold = np.array([smoothness.diffuse] * 3 + [smoothness.specular], dtype=np.float32)[:, None] / rho
     inverse = 1.0 / (1.0 + laplacian_eigenvalues(size) ** 2)
     splits = Splits() if splits is None else splits
-    smooth, bent, u, v = splits.smooth, splits.bent, splits.u, splits.v
-    if smooth is None or bent is None or u is None or v is None:
-        smooth = (prior if start is None else start.transpose(2, 0, 1).astype(np.float32)) - base
-        bent, u, v = plane_laplacian(smooth), np.zeros_like(smooth), np.zeros_like(smooth)
-    total = 0.5 * rho + weak
-    rows = [slice(at, at + CHUNK) for at in range(0, len(index), CHUNK)]
-    parts = [(_Blocks(systems.take(r), total[:3, :, 0], float(total[3, 0, 0])), index[r]) for r in rows]
-    share, drawn = 0.5 * rho / total, weak / total * prior
+    if splits.smooth is None:
+        splits.smooth = (prior if start is None else start.transpose(2, 0, 1).astype(np.float32)) - base
+        splits.level, splits.bend = splits.smooth.copy(), plane_laplacian(splits.smooth)
+    smooth, level, bend = splits.smooth, splits.level, splits.bend
+    # Texels without a block are solved like all others, by what draws them alone.
+    flat = prior.reshape(4, -1), base.reshape(4, -1)
+    drawn = pull[:, None] * flat[0] + 0.5 * rho * flat[1]
+    every = _Blocks.of(systems, index, 0.5 * rho + pull[:, None], drawn, 0.5 * rho)
+    rows = [slice(at, at + CHUNK) for at in range(0, size * size, CHUNK)]
+    lines = [slice(at, at + CHUNK // size) for at in range(0, size, CHUNK // size)]
+    parts = [(every.take(r), r) for r in rows]
     texel, splits.outcome, splits.iterations = prior.copy(), Outcome.MAX_ITERATIONS, 0
 
-    def pull_texels(k: int) -> None:
-        """Where the blocks are drawn to, and what texels without a block take."""
-        texel[k] = share[k] * (base[k] + smooth[k] - u[k]) + drawn[k]
-
-    def solve_blocks(part: tuple[_Blocks, NDArray[np.int64]]) -> None:
-        block, rows = part
-        flat = texel.reshape(4, -1)
-        x, y = block.solve(flat[:3, rows], flat[3, rows])
-        flat[:3, rows], flat[3, rows] = x, y
+    def solve_blocks(part: tuple[_Blocks, slice]) -> None:
+        blocks, rows = part
+        target = 2.0 * smooth.reshape(4, -1)[:, rows]
+        target -= level.reshape(4, -1)[:, rows]
+        blocks.solve(target, texel.reshape(4, -1)[:, rows])
 
     def smooth_plane(k: int) -> float:
         """One plane's smooth copy and multipliers; the largest change of the copy."""
-        np.clip(texel[k], 0.0, 1.0, out=texel[k])
-        shifted = bent[k] - v[k]
-        z = shifted - np.clip(shifted, -threshold[k], threshold[k])  # soft threshold
-        z = RELAX * z + (1.0 - RELAX) * bent[k]
-        offset = RELAX * (texel[k] - base[k]) + (1.0 - RELAX) * smooth[k]
-        right = offset + u[k] + plane_laplacian(z + v[k])
-        found = idctn(dctn(right, type=2) * inverse, type=2)
-        moved = float(np.abs(found - smooth[k]).max())
-        smooth[k], bent[k] = found, plane_laplacian(found)
-        u[k] += offset - found
-        v[k] += z - bent[k]
-        return moved
+        bent, bound = plane_laplacian(smooth[k]), float(threshold[k, 0])
+        for part in lines:
+            shifted = 2.0 * bent[part]
+            shifted -= bend[k, part]
+            change = shifted - np.clip(shifted, -bound, bound)  # soft threshold
+            change -= bent[part]
+            change *= RELAX
+            bend[k, part] += change
+            np.subtract(texel[k, part], base[k, part], out=change)
+            change -= smooth[k, part]
+            change *= RELAX
+            level[k, part] += change
+        waves = plane_laplacian(bend[k])
+        waves += level[k]
+        waves = dctn(waves, type=2, overwrite_x=True)
+        waves *= inverse
+        found = idctn(waves, type=2, overwrite_x=True)
+        moved = np.subtract(found, smooth[k], out=bent)
+        smooth[k] = found
+        return max(float(moved.max()), -float(moved.min()))
 
     # Planes are independent but for the blocks, and those of each other; NumPy and SciPy let go of the interpreter.
     with ThreadPoolExecutor(min(4, threads())) as pool:
         for _ in range(iterations):
             splits.iterations += 1
-            list(pool.map(pull_texels, range(4)))
             list(pool.map(solve_blocks, parts))
             if max(pool.map(smooth_plane, range(4))) < tolerance:
                 splits.outcome = Outcome.CONVERGED
                 break
-    splits.smooth, splits.bent, splits.u, splits.v = smooth, bent, u, v
     return np.ascontiguousarray(texel.transpose(1, 2, 0), dtype=np.float32)
