@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -159,15 +161,21 @@ class Trial:
     name : str
         Of the candidate.
     forward : Forward
-    found : LightingSolution
+    fit : callable
+        Finds the lighting by all images.
     prediction : Prediction or None
         None where there is nothing to leave out.
     """
 
     name: str
     forward: Forward
-    found: LightingSolution
+    fit: Callable[[], LightingSolution] = field(repr=False)
     prediction: Prediction | None
+
+    @cached_property
+    def found(self) -> LightingSolution:
+        """The fit to all images: what is compared are predictions, so that most trials do without."""
+        return self.fit()
 
     @property
     def exponent(self) -> float:
@@ -195,14 +203,16 @@ class _Trials:
     def add(self, name: str, forward: Forward) -> Trial:
         """Fit one, and let it predict."""
         self.progress("Reflectance lighting", len(self.done), len(self.done) + 1)
-        config = self.config
+        config, prediction = self.config, None
         specular = NORMAL_REFLECTANCE if forward.glossy else 0.0
-        found = fit_lighting(self.seen, forward, self.albedo, config, TRIAL_ITERATIONS, specular)
-        prediction = None
-        if config.robust and not forward.model.turns:
-            problem = lighting_problem(self.seen, forward, found.light, self.albedo, config.robust)
-            prediction = predict(self.seen, problem, specular)
-        self.done.append(Trial(name, forward, found, prediction))
+        if forward.model.turns:
+            fit = partial(fit_lighting, self.seen, forward, self.albedo, config, TRIAL_ITERATIONS, specular)
+        else:
+            problem = lighting_problem(self.seen, forward, forward.dark, self.albedo, config.robust)
+            fit = partial(solve_held, problem, forward, config, TRIAL_ITERATIONS, specular)
+            if config.robust:
+                prediction = predict(self.seen, problem, specular)
+        self.done.append(Trial(name, forward, fit, prediction))
         return self.done[-1]
 
     def best_exponent(self, best: Trial) -> Trial:
@@ -222,9 +232,12 @@ class _Trials:
         return best
 
     def figures(self) -> dict[str, Any]:
-        """Errors of fitted and predicted images, by candidate: the lowest of its exponents, and of every exponent."""
-        names = dict.fromkeys(t.name for t in self.done)
-        residuals = {name: min(float(t.found.unexplained) for t in self.done if t.name == name) for name in names}
+        """Errors of images: fitted, by candidate with the exponent that predicts best, and predicted, by exponent."""
+        best: dict[str, Trial] = {}
+        for trial in self.done:
+            if trial.name not in best or trial.score < best[trial.name].score:
+                best[trial.name] = trial
+        residuals = {name: float(trial.found.unexplained) for name, trial in best.items()}
         predicted = [
             {"shading": t.name, "exponent": t.exponent if t.forward.glossy else None, "error": t.prediction.error}
             for t in self.done
@@ -312,20 +325,11 @@ def fit_lighting(
     priors: LightingPriors = PRIORS,
 ) -> LightingSolution:
     """Lighting and the subset's albedos; a model that turns with the lighting is linearised anew."""
-    light = np.zeros((forward.unknowns, 3))
     if not forward.model.turns:
-        specular = specular if forward.glossy else 0.0
-        problem = lighting_problem(seen, forward, light, albedo, config.robust)
-        return solve_lighting(
-            problem,
-            specular=specular,
-            priors=priors,
-            robust=config.robust,
-            with_ambient=forward.model.has_ambient,
-            iterations=iterations,
-        )
+        problem = lighting_problem(seen, forward, forward.dark, albedo, config.robust)
+        return solve_held(problem, forward, config, iterations, specular, priors)
     # Without highlights first, so that there is lighting to linearise about.
-    problem = lighting_problem(seen, forward, light, albedo, config.robust)
+    problem = lighting_problem(seen, forward, forward.dark, albedo, config.robust)
     problem = replace(problem, specular=np.zeros_like(problem.specular))
     ambient = forward.model.has_ambient
     found = solve_lighting(problem, priors=priors, robust=config.robust, with_ambient=ambient, iterations=6)
@@ -342,3 +346,22 @@ def fit_lighting(
         )
         energy += found.energy
     return replace(found, energy=energy)
+
+
+def solve_held(
+    problem: LightingProblem,
+    forward: Forward,
+    config: ReflectanceConfig,
+    iterations: int,
+    specular: float = NORMAL_REFLECTANCE,
+    priors: LightingPriors = PRIORS,
+) -> LightingSolution:
+    """Lighting and albedos under a model that doesn't turn with the lighting."""
+    return solve_lighting(
+        problem,
+        specular=specular if forward.glossy else 0.0,
+        priors=priors,
+        robust=config.robust,
+        with_ambient=forward.model.has_ambient,
+        iterations=iterations,
+    )

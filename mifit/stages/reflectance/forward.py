@@ -68,6 +68,11 @@ class Forward:
         """Number K of lighting unknowns per channel: coefficients, and a colour per compact light."""
         return self.order**2 + len(self.lights)
 
+    @property
+    def dark(self) -> NDArray[np.float64]:
+        """(K, 3) no light."""
+        return np.zeros((self.unknowns, 3))
+
     def under(self, light: NDArray, ambient: float = 0.0) -> Appearance:
         """The appearance under lighting unknowns (K, 3)."""
         illumination = self.appearance.illumination.with_unknowns(light, ambient)
