@@ -59,7 +59,7 @@ def _evaluate(directions: ArrayLike, order: int, gradient: bool) -> tuple[Array,
         raise InputError(f"directions: found shape {d.shape}, expected (..., 3)")
     check_order(order)
     x, y, z = d[..., 0], d[..., 1], d[..., 2]
-    out = np.empty((*d.shape[:-1], order * order))
+    out = np.empty((order * order, *d.shape[:-1]))  # one after the other: written apart from one another they take long
     grad = np.zeros((*d.shape[:-1], order * order, 3)) if gradient else None
     re, im = np.ones_like(z), np.zeros_like(z)
     re_below, im_below = np.zeros_like(z), np.zeros_like(z)  # (x + iy)^(m-1)
@@ -70,9 +70,9 @@ def _evaluate(directions: ArrayLike, order: int, gradient: bool) -> tuple[Array,
         dq, dq_below = np.zeros_like(z), np.zeros_like(z)
         for degree in range(m, order):
             centre = degree * degree + degree
-            out[..., centre + m] = scale * q * re
+            out[centre + m] = scale * q * re
             if m:
-                out[..., centre - m] = scale * q * im
+                out[centre - m] = scale * q * im
             if grad is not None:
                 grad[..., centre + m, 0] = scale * q * m * re_below
                 grad[..., centre + m, 1] = -scale * q * m * im_below
@@ -84,16 +84,13 @@ def _evaluate(directions: ArrayLike, order: int, gradient: bool) -> tuple[Array,
             n = degree + 1
             a = math.sqrt((4.0 * n * n - 1.0) / (n * n - m * m))
             b = math.sqrt((degree * degree - m * m) / (4.0 * degree * degree - 1.0)) if degree > m else 0.0
-            q, q_below, dq, dq_below = (
-                a * (z * q - b * q_below),
-                q,
-                a * (q + z * dq - b * dq_below),
-                dq,
-            )
+            if grad is not None:
+                dq, dq_below = a * (q + z * dq - b * dq_below), dq
+            q, q_below = a * (z * q - b * q_below), q
         re_below, im_below = re, im
         re, im = x * re - y * im, x * im + y * re
         q_mm *= -math.sqrt((2.0 * m + 3.0) / (2.0 * m + 2.0))
-    return out, grad
+    return np.moveaxis(out, 0, -1), grad
 
 
 def check_order(order: int) -> None:

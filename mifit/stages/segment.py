@@ -23,6 +23,7 @@ from mifit.core.image import to_8_bit
 from mifit.core.labels import Label
 from mifit.core.mesh import interpolate, normalize
 from mifit.core.sh import basis
+from mifit.core.threads import on_all_cores
 from mifit.stages.trust import DARKEST
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ def consensus(surface: Surface, seed: int = 0) -> Consensus:
     Per texel the weighted median over the images of its colour without shading, in turns with the shading (second
     order, shared by all images) fitted to what remains, weighted by a Cauchy function.
     """
-    texels, levels, weights, bases = [], [], [], []
+    texels, levels, weights, normals = [], [], [], []
     facial = np.flatnonzero(surface.facial)
     for part in surface.chunks():
         rows = part[surface.facial[part]]
@@ -109,11 +110,11 @@ def consensus(surface: Surface, seed: int = 0) -> Consensus:
         texels.append(rows)
         levels.append(np.log(np.maximum(seen.colour, DARKEST)) @ OPPONENT.T.astype(np.float32))
         weights.append(seen.measured)
-        bases.append(basis(seen.image_normal, 3).astype(np.float32))
+        normals.append(basis(seen.normal, 3).astype(np.float32))
+        step = seen.step
     # Channels first: medians and sums along three neighbours in memory are slow.
-    level, waves = (np.concatenate(parts).reshape(-1, parts[0].shape[-1]).T.copy() for parts in (levels, bases))
+    level, waves = (np.ascontiguousarray(np.concatenate(parts).transpose(2, 0, 1)) for parts in (levels, normals))
     weight = np.concatenate(weights)
-    level, waves = level.reshape(3, *weight.shape), waves.reshape(9, *weight.shape)
     seen_at = weight > 0
     shading = np.zeros((9, 3))
     share, deviation = np.ones_like(weight), FLOOR
@@ -121,16 +122,22 @@ def consensus(surface: Surface, seed: int = 0) -> Consensus:
     rng = np.random.default_rng(seed)
     places = np.argwhere(seen_at)
     for _ in range(ROUNDS if len(places) else 0):
-        flat = level - np.tensordot(shading.T.astype(np.float32), waves, 1)
-        centre = np.stack([_median(channel, weight * share) for channel in flat])
-        departure = flat - centre[..., None]
-        off = [1.4826 * float(np.median(np.abs(channel[seen_at]))) for channel in departure]
+        flat = level - np.tensordot(shading.T.astype(np.float32), waves, 1)[..., step]
+        trust = weight * share
+
+        def agreed(channel: NDArray, trust: NDArray = trust) -> tuple[NDArray, NDArray, float]:
+            """What the images agree on, how far each is from it, and their robust standard deviation."""
+            middle = _median(channel, trust)
+            apart = channel - middle[:, None]
+            return middle, apart, 1.4826 * float(np.median(np.abs(apart[seen_at])))
+
+        centre, departure, off = (np.stack(part) for part in zip(*on_all_cores(agreed, list(flat)), strict=True))
         deviation = np.maximum(off, FLOOR)
         departure /= deviation.astype(np.float32)[:, None, None]
         share = 1.0 / (1.0 + np.einsum("kij,kij->ij", departure, departure) / np.float32(3))
         i, j = places[rng.choice(len(places), min(SAMPLES, len(places)), replace=False)].T
         scale = (share[i, j] * np.sqrt(weight[i, j])).astype(np.float64)
-        rows = (waves[:, i, j] * scale).T
+        rows = (waves[:, i, step[j]] * scale).T
         damping = SMOOTH * float(scale.sum()) * np.eye(9)
         shading = np.linalg.solve(
             rows.T @ rows + damping, rows.T @ ((level[:, i, j] - centre[:, i]) * scale).T.astype(np.float64)
@@ -164,7 +171,11 @@ def segment(surface: Surface, capture: Capture, model: MorphableModel, seed: int
     """
     agreed = consensus(surface, seed)
     gain = surface.geometry.gain
-    return tuple(_segment_image(view, agreed, capture, model, gain(view.camera.name)) for view in surface.views())
+
+    def labelled(view: Seen) -> NDArray[np.uint8]:
+        return _segment_image(view, agreed, capture, model, gain(view.camera.name))
+
+    return tuple(on_all_cores(labelled, list(surface.views())))
 
 
 def _segment_image(

@@ -9,6 +9,8 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from mifit.core.threads import on_all_cores
+
 SPECULAR_SPREAD = 0.15
 """Standard deviation of the specular albedo over a face, relative to its median."""
 SPECULAR_LIMIT = 0.03
@@ -18,6 +20,8 @@ FEW_IMAGES = 4
 """Images of a texel from which its four albedos are told by the images."""
 BLOCK = 1 << 20
 """Derivatives that are held at a time: they stay in the cache."""
+TEXELS = 1536
+"""Texels that are eliminated at a time."""
 
 
 @dataclass(frozen=True)
@@ -239,21 +243,31 @@ class LightingEquations:
         system[-1, -1], right[-1] = weight.sum(dtype=np.float64), (weight * residual).sum(dtype=np.float64)
         diffuse_cross, specular_cross = np.empty((3, n, k), np.float32), np.empty((n, 3 * k), np.float32)
         root = np.sqrt(weight)
-        for each in rows.blocks:
+
+        def add(each: Block) -> tuple[NDArray, NDArray, NDArray]:
+            """A block's part of the light's system, of its column of ambient and of its right-hand side, by channel."""
             texels, part = each.texels, each.rows
             of = rows.texel[part]
             glossy = specular_albedo[of, None] * rows.specular[part]
             slope = np.empty_like(glossy)
+            square, column, side = np.empty((3, k, k), slope.dtype), np.empty((3, k)), np.empty((3, k))
             for c in range(3):
-                block, r = slice(c * k, (c + 1) * k), root[part, c]
+                r = root[part, c]
                 np.multiply(diffuse[of, c, None], rows.diffuse[part], out=slope)
                 slope += glossy
                 slope *= r[:, None]
-                system[block, block] += slope.T @ slope
-                system[block, -1] += r @ slope
-                right[block] += (r * residual[part, c]) @ slope
+                np.matmul(slope.T, slope, out=square[c])
+                column[c], side[c] = r @ slope, (r * residual[part, c]) @ slope
                 diffuse_cross[c, texels] = each.sums(r * diffuse_light[part, c], slope)
-                specular_cross[texels, block] = each.sums(r * specular_light[part, c], slope)
+                specular_cross[texels, c * k : (c + 1) * k] = each.sums(r * specular_light[part, c], slope)
+            return square, column, side
+
+        for square, column, side in on_all_cores(add, rows.blocks):
+            for c in range(3):
+                block = slice(c * k, (c + 1) * k)
+                system[block, block] += square[c]
+                system[block, -1] += column[c]
+                right[block] += side[c]
         system[-1, :-1] = system[:-1, -1]
         own_right = np.concatenate([dr, sr.sum(1, keepdims=True)], axis=1)
         ambient = np.concatenate([da, sa.sum(1, keepdims=True)], axis=1)
@@ -307,22 +321,33 @@ class LightingEquations:
         across = self.ambient_cross[:, 3] - (slope * self.ambient_cross[:, :3]).sum(1)
         taken[-1, -1] = (self.ambient_cross[:, :3] ** 2 / pivot).sum() + (across**2 / last).sum()
         right[-1] -= (own * self.ambient_cross[:, :3]).sum() + left @ across
-        root = np.sqrt(last).astype(np.float32)[:, None]
-        rest = np.empty_like(self.specular_cross)
-        for c in range(3):
-            block, cross = slice(c * k, (c + 1) * k), self.diffuse_cross[c]
-            np.multiply(cross, -slope[:, c, None].astype(np.float32), out=rest[:, block])
-            rest[:, block] += self.specular_cross[:, block]
-            part = cross / np.sqrt(pivot[:, c, None]).astype(np.float32)
-            taken[block, block] = part.T @ part
-            sums = np.stack([own[:, c], self.ambient_cross[:, c] / pivot[:, c]]).astype(np.float32) @ cross
-            right[block] -= sums[0]
-            taken[block, -1] = sums[1]
-        sums = np.stack([left, across / last]).astype(np.float32) @ rest
-        right[:-1] -= sums[0]
-        taken[:-1, -1] += sums[1]
-        rest /= root
-        taken[:-1, :-1] += rest.T @ rest
+
+        def take(texels: slice) -> tuple[NDArray, NDArray]:
+            """What some of the texels take from the light's system, and from right-hand side and column of ambient."""
+            cross, steep = self.specular_cross[texels], slope[texels].astype(np.float32)
+            rest, squares = np.empty_like(cross), np.empty((3, k, k), cross.dtype)
+            sides = np.empty((2, 3 * k))
+            for c in range(3):
+                block, own_cross = slice(c * k, (c + 1) * k), self.diffuse_cross[c, texels]
+                np.multiply(own_cross, -steep[:, c, None], out=rest[:, block])
+                rest[:, block] += cross[:, block]
+                part = own_cross / np.sqrt(pivot[texels, c, None]).astype(np.float32)
+                np.matmul(part.T, part, out=squares[c])
+                both = np.stack([own[texels, c], self.ambient_cross[texels, c] / pivot[texels, c]])
+                sides[:, block] = both.astype(np.float32) @ own_cross
+            sides += np.stack([left[texels], across[texels] / last[texels]]).astype(np.float32) @ rest
+            rest /= np.sqrt(last[texels]).astype(np.float32)[:, None]
+            square = (rest.T @ rest).astype(np.float64)
+            for c in range(3):
+                block = slice(c * k, (c + 1) * k)
+                square[block, block] += squares[c]
+            return square, sides
+
+        n = len(last)
+        for square, sides in on_all_cores(take, [slice(at, at + TEXELS) for at in range(0, n, TEXELS)]):
+            taken[:-1, :-1] += square
+            right[:-1] -= sides[0]
+            taken[:-1, -1] += sides[1]
         taken[-1, :-1] = taken[:-1, -1]
         count = size if with_ambient else size - 1
         own_diagonal = np.diag(self.system)[:count]

@@ -7,14 +7,13 @@ were left out are compared with what should be seen there. Cameras that are not 
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.formation import form_image
-from mifit.core.threads import threads
+from mifit.core.threads import on_all_cores
 from mifit.stages.observations import Observations
 from mifit.stages.reflectance.lighting import bounded_weight, solve_lighting
 from mifit.stages.reflectance.lighting_equations import LightingProblem
@@ -97,6 +96,5 @@ def predict(seen: Observations, problem: LightingProblem, specular: float, robus
         return float(np.sqrt((bounded_weight(judged, residual) * residual**2).sum() / total)) if total > 0 else None
 
     # What is left out in turn is as much work each time and knows nothing of the others.
-    with ThreadPoolExecutor(threads()) as pool:
-        errors = [found for found in pool.map(error, groups) if found is not None]
+    errors = [found for found in on_all_cores(error, groups) if found is not None]
     return Prediction(name, tuple(errors)) if errors else None
