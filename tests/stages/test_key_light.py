@@ -164,9 +164,9 @@ def test_it_is_looked_for_beside_smoother_lighting_too(walled, monkeypatch):
 
     search, tried = choice._with_light, []
 
-    def hidden_at_first(trials, chosen, priors):
+    def hidden_at_first(trials, chosen, priors, wide):
         tried.append(priors.roughness / PRIORS.roughness)
-        return None if priors is PRIORS else search(trials, chosen, priors)
+        return None if priors is PRIORS else search(trials, chosen, priors, wide)
 
     monkeypatch.setattr(choice, "_with_light", hidden_at_first)
     part = replace(CONFIG, texture_size=24, shading="auto")

@@ -19,7 +19,7 @@ from mifit.core.sh import LUMINANCE
 from mifit.progress import Progress
 from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.key import RADII, STEPS, TEXELS, Candidates, find_lights, search
+from mifit.stages.reflectance.key import RADII, STEPS, TEXELS, Candidates, WideLights, find_lights, search
 from mifit.stages.reflectance.lighting import LightingSolution, solve_lighting
 from mifit.stages.reflectance.lighting_equations import PRIORS, LightingPriors, LightingProblem
 from mifit.stages.reflectance.near import TEXELS as PLACE_TEXELS
@@ -130,8 +130,9 @@ def choose_lighting(
     why = "as configured"
     if auto or way.lights:
         why = "no compact light explains enough"
+        wide = WideLights.of(trials.seen.take(trials.few), chosen.forward)
         for priors in (PRIORS, SMOOTH):
-            lit = _with_light(trials, chosen, priors)
+            lit = _with_light(trials, chosen, priors, wide)
             if lit is None:
                 continue
             keyed, why = trials.add("keyed", lit), "as configured"
@@ -200,6 +201,11 @@ class _Trials:
         self.seen, self.albedo, self.config, self.progress = seen, albedo, config, progress
         self.done: list[Trial] = []
 
+    @property
+    def few(self) -> slice:
+        """Those of the texels by which compact lights are looked for."""
+        return slice(0, None, max(1, len(self.seen.texel) // TEXELS))
+
     def add(self, name: str, forward: Forward) -> Trial:
         """Fit one, and let it predict."""
         self.progress("Reflectance lighting", len(self.done), len(self.done) + 1)
@@ -247,7 +253,7 @@ class _Trials:
         return {"residuals": residuals, "predicted": predicted, "left_out": left_out}
 
 
-def _with_light(trials: _Trials, chosen: Trial, priors: LightingPriors) -> Forward | None:
+def _with_light(trials: _Trials, chosen: Trial, priors: LightingPriors, wide: WideLights) -> Forward | None:
     """A model with a compact light where one explains enough, found on some of the texels.
 
     The search starts from the fit without the light, which had to make up for it; a second one starts from the fit
@@ -256,11 +262,11 @@ def _with_light(trials: _Trials, chosen: Trial, priors: LightingPriors) -> Forwa
     seen, config, forward, found = trials.seen, trials.config, chosen.forward, chosen.found
     if priors is not PRIORS:
         found = fit_lighting(seen, forward, trials.albedo, config, TRIAL_ITERATIONS, priors=priors)
-    step = max(1, len(seen.texel) // TEXELS)
-    part, expected = seen.take(slice(0, None, step)), trials.albedo[::step]
-    found = replace(found, diffuse=found.diffuse[::step], specular=found.specular[::step])
+    few = trials.few
+    part, expected = seen.take(few), trials.albedo[few]
+    found = replace(found, diffuse=found.diffuse[few], specular=found.specular[few])
     problem = lighting_problem(part, forward, found.light, expected, config.robust)
-    for light in find_lights(Candidates.about(part, forward, problem, found, priors)):
+    for light in find_lights(Candidates.about(part, forward, problem, found, priors), wide):
         lit = forward.with_lights((light,))
         fitted = fit_lighting(part, lit, expected, config, 8, priors=priors)
         mean = np.sqrt(np.pi) / 2.0 * fitted.light[0]  # irradiance from everywhere, pi times the mean radiance

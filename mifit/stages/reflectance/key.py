@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mifit.appearance.formation import form_image
 from mifit.appearance.illumination import DistantLight
 from mifit.appearance.reception import fibonacci_sphere
+from mifit.core.threads import on_all_cores
 from mifit.stages.observations import Observations
 from mifit.stages.reflectance.forward import Forward, LightColumns
 from mifit.stages.reflectance.lighting import LightingSolution, bounded_weight, linearize
@@ -134,7 +135,10 @@ class Candidates:
 
         Their shadows are traced, unless bits tell which directions of their discs the texels see (M, n, T).
         """
-        by_diffuse, by_specular = self.columns(lights, open_sky)
+        return self.explained_by(*self.columns(lights, open_sky))
+
+    def explained_by(self, by_diffuse: NDArray, by_specular: NDArray) -> NDArray:
+        """(M,) drop of the energy for what compact lights send off the texels (M, n, J), as of `columns`."""
         m, n, k = len(by_diffuse), len(self.diffuse), self.rows[0].shape[1]
         system, right = np.zeros((m, 3, 3)), np.zeros((m, 3))
         across, moved = np.zeros((m, 3, 3 * k)), np.zeros((m, n, 4, 3))
@@ -164,32 +168,56 @@ class Candidates:
         return 2.0 * (right * irradiance).sum(1) - np.einsum("mi,mij,mj->m", irradiance, system, irradiance)
 
 
-def scan(candidates: Candidates) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Directions (M, 3), all over the sphere, of wide lights, and how much each explains (M,).
+@dataclass(frozen=True)
+class WideLights:
+    """Wide lights from all over the sphere and what they send off some texels, whatever else lights them.
 
-    All directions' shadows are traced first, a ray for each direction.
+    Attributes
+    ----------
+    directions : (M, 3)
+    reaching : (R,) int
+        Those that reach enough of the texels.
+    parts : list of two of (P, n, J)
+        Diffuse and specular radiance of some of these at a time.
     """
-    directions = fibonacci_sphere(round(4.0 * np.pi / SPACING**2))
-    gains = np.zeros(len(directions))
-    for start in range(0, len(directions), 32):
-        part = directions[start : start + 32]
-        bits = candidates.forward.open_towards(candidates.seen, part)
-        visible = (bits[None] >> np.arange(len(part), dtype=np.uint32)[:, None, None]) & np.uint32(1)
-        reached = np.flatnonzero(visible.mean((1, 2)) > LEAST)
-        if len(reached):
-            lights = [DistantLight(part[i], WIDE, np.zeros(3)) for i in reached]
-            every = np.where(visible[reached], np.uint32(0xFFFFFFFF), np.uint32(0))
-            gains[start + reached] = candidates.explained(lights, every)
-    return directions, gains
+
+    directions: NDArray[np.float64]
+    reaching: NDArray[np.intp]
+    parts: list[tuple[NDArray[np.float32], NDArray[np.float32]]]
+
+    @classmethod
+    def of(cls, seen: Observations, forward: Forward) -> WideLights:
+        """Trace all directions' shadows on texels, a ray for each direction."""
+        directions = fibonacci_sphere(round(4.0 * np.pi / SPACING**2))
+        alone = forward.with_lights(())
+        columns, reaching, parts = alone.light_columns(seen), [], []
+        for start in range(0, len(directions), 32):
+            part = directions[start : start + 32]
+            bits = alone.open_towards(seen, part)
+            visible = (bits[None] >> np.arange(len(part), dtype=np.uint32)[:, None, None]) & np.uint32(1)
+            reached = np.flatnonzero(visible.mean((1, 2)) > LEAST)
+            if len(reached):
+                lights = [DistantLight(part[i], WIDE, np.zeros(3)) for i in reached]
+                reaching.append(start + reached)
+                parts.append(columns(lights, np.where(visible[reached], np.uint32(0xFFFFFFFF), np.uint32(0))))
+        return cls(directions, np.concatenate(reaching) if reaching else np.zeros(0, np.intp), parts)
+
+    def explained(self, candidates: Candidates) -> NDArray[np.float64]:
+        """(M,) how much each explains."""
+        gains = np.zeros(len(self.directions))
+        if self.parts:
+            found = on_all_cores(lambda part: candidates.explained_by(*part), self.parts)
+            gains[self.reaching] = np.concatenate(found)
+        return gains
 
 
-def starts(candidates: Candidates) -> list[NDArray[np.float64]]:
+def starts(candidates: Candidates, wide: WideLights) -> list[NDArray[np.float64]]:
     """Directions from which a search is worth a trial, the most promising first, `APART` from one another.
 
     A wide light in a wrong place may explain as much as one in the right place: only the narrow ones that the searches
     end with tell them apart.
     """
-    directions, gains = scan(candidates)
+    directions, gains = wide.directions, wide.explained(candidates)
     energy = float((candidates.weight * candidates.residual**2).sum())
     found: list[NDArray[np.float64]] = []
     for number in np.argsort(-gains):
@@ -200,9 +228,9 @@ def starts(candidates: Candidates) -> list[NDArray[np.float64]]:
     return found
 
 
-def find_lights(candidates: Candidates) -> list[DistantLight]:
+def find_lights(candidates: Candidates, wide: WideLights) -> list[DistantLight]:
     """Compact lights, each the best about one of `starts`, the one that explains most first; none where none does."""
-    found = [search(candidates, direction, WIDE, STEPS[0]) for direction in starts(candidates)]
+    found = [search(candidates, direction, WIDE, STEPS[0]) for direction in starts(candidates, wide)]
     compact = [(gain, light) for gain, light in found if light.radius < RADII[1]]
     return [light for _, light in sorted(compact, key=lambda pair: -pair[0])]
 
