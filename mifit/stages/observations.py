@@ -20,10 +20,12 @@ from mifit.appearance.occlusion import OccludingMesh
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.threads import on_all_cores
 from mifit.core.uv import TexelMap, bilinear, rasterize_uv
 from mifit.errors import InputError
 from mifit.stages.shown import face_pixels, footprint, texel_area
-from mifit.stages.trust import agreement, background, elsewhere
+from mifit.stages.surface_image import Placed, SurfaceImage
+from mifit.stages.trust import agreement, background
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -31,8 +33,6 @@ if TYPE_CHECKING:
 
 CHUNK_VALUES = 1 << 22
 """Texels x images that are held at a time."""
-GRAZING = (0.1, 0.3)
-"""Cosines between which the weight of an observation fades in: below, interpolated normals and footprints mislead."""
 
 
 @dataclass(frozen=True)
@@ -110,20 +110,6 @@ class Observations:
 
 
 @dataclass(frozen=True)
-class _Image:
-    """One image with what is needed to read it at surface points."""
-
-    step: int
-    camera_index: int
-    camera: Camera
-    colour: NDArray[np.float32]  # 0 where unusable
-    unusable: NDArray[np.float32]  # 1 where invalid, not the face area, or at an occlusion edge
-    clipped: NDArray[np.float32]
-    footprint: NDArray[np.float32]  # (F,) pixels per texel, 0 for faces that face away
-    outline: NDArray[np.float32]  # (H, W) pixels to the nearest outline times millimetres per unit of length
-
-
-@dataclass(frozen=True)
 class Seen:
     """One image's camera, its timestep's mesh, and what each pixel shows of it (``face`` -1: nothing; ``weights``)."""
 
@@ -189,7 +175,7 @@ class Surface:
         self.scenes = [mesh.scene for mesh in self.meshes]
         area = texel_area(model.uv, model.faces_uv, size)
         self._kept: Observations | None = None
-        self._images: list[_Image] = []
+        self._images: list[SurfaceImage] = []
         for i, timestep in enumerate(geometry.timesteps):
             for k, name in enumerate(cameras):
                 camera, frame = capture.camera(name), capture.frame(name, timestep)
@@ -201,7 +187,7 @@ class Surface:
                 if whole:
                     unusable |= background(frame.image, outline > 0, facial)
                 self._images.append(
-                    _Image(
+                    SurfaceImage(
                         i,
                         k,
                         camera,
@@ -339,12 +325,18 @@ class Surface:
         for i in range(t):
             point[:, i] = interpolate(self.vertices[i], self.faces, face, weights)
             normal[:, i] = normalize(interpolate(self.normals[i], self.faces, face, weights))
-        for k, image in enumerate(self._images):
-            p = point[:, image.step].astype(np.float64)
-            view[:, k] = normalize(image.camera.position - p)
-            colour[:, k], weight[:, k], clipped[:, k], wrong[:, k] = self._read(
-                image, p, normal[:, image.step], view[:, k], face
-            )
+
+        def place(image: SurfaceImage) -> Placed:
+            return Placed.of(image, point[:, image.step].astype(np.float64), normal[:, image.step], face)
+
+        def read(number: int) -> None:
+            view[:, number] = placed[number].view
+            placed[number].read(self.trust, colour[:, number], weight[:, number], clipped[:, number], wrong[:, number])
+
+        placed = on_all_cores(place, self._images)
+        # Rays take all cores by themselves.
+        placed = [each.seen(self.scenes[each.image.step]) for each in placed]
+        on_all_cores(read, range(j))
         step = np.array([m.step for m in self._images])
         right = np.float32(1.0) - wrong
         if self.trust:
@@ -364,30 +356,3 @@ class Surface:
             normal,
             view,
         )
-
-    def _read(
-        self, image: _Image, point: NDArray, normal: NDArray, view: NDArray, face: NDArray
-    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Colour, weight, clipping and probability of showing something else of one image at surface points."""
-        camera = image.camera
-        pixel = np.nan_to_num(camera.project(point), nan=-1e6)
-        inside = (pixel >= 0.5).all(-1) & (pixel[:, 0] <= camera.width - 0.5) & (pixel[:, 1] <= camera.height - 0.5)
-        cosine = np.sum(normal * view, axis=-1)
-        fade = np.clip((cosine - GRAZING[0]) / (GRAZING[1] - GRAZING[0]), 0.0, 1.0)
-        weight = (image.footprint[face] * fade * inside).astype(np.float32)
-        rows = np.flatnonzero(weight > 0)
-        x, y = pixel[rows, 0] - 0.5, pixel[rows, 1] - 0.5
-        share = 1.0 - bilinear(image.unusable, x, y)
-        usable = share > 0.5
-        usable &= self.scenes[image.step].visible_from(point[rows], camera.position)
-        weight[rows[~usable]] = 0.0
-        rows, x, y, share = rows[usable], x[usable], y[usable], share[usable]
-        colour = np.zeros((len(point), 3), dtype=np.float32)
-        clipped = np.zeros(len(point), dtype=bool)
-        colour[rows] = bilinear(image.colour, x, y) / share[:, None]  # of the usable pixels alone
-        clipped[rows] = bilinear(image.clipped, x, y) > 0.0
-        wrong = np.zeros(len(point), dtype=np.float32)
-        if self.trust:
-            depth = np.sum((point[rows] - camera.position) * camera.rotation[2], axis=1)
-            wrong[rows] = elsewhere(cosine[rows], bilinear(image.outline, x, y) * depth / camera.fx)
-        return colour, weight, clipped, wrong

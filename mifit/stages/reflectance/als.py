@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mifit.appearance.formation import Appearance, form_image
 from mifit.config import ReflectanceConfig
 from mifit.core.sh import LUMINANCE
+from mifit.core.threads import on_all_cores
 from mifit.progress import Progress
 from mifit.solve import Outcome
 from mifit.stages.observations import Observations, Surface
@@ -28,6 +29,8 @@ MAP_ITERATIONS = 40
 """ADMM iterations of a pass. Every pass starts from its maps alone: going on from the multipliers of the pass before
 saves half of them, but carries over what the last weights took an outlier for (a hand before one camera left 0.016
 instead of less than 0.01 in the albedo under it)."""
+SUMMED = 1 << 15
+"""Texels whose observations are summed at a time."""
 ROUNDS = 20
 """Rounds of `alternate` at the most."""
 
@@ -101,11 +104,13 @@ def fit_maps(
                 weight, deviation = active_weight(weight, seen.clipped, residual, config.robust)
                 data += float((weight * residual**2).sum())
                 sigmas.append(deviation)
-            systems.append(
-                TexelSystems.accumulate(
-                    target, weight, diffuse_light, specular_light, pairs, config.specular_difference_weight
-                )
-            )
+            observed = target, weight, diffuse_light, specular_light
+
+            def accumulate(rows: slice, observed: tuple[NDArray, ...] = observed) -> TexelSystems:
+                values = (part[rows] for part in observed)
+                return TexelSystems.accumulate(*values, pairs, config.specular_difference_weight)
+
+            systems += on_all_cores(accumulate, [slice(at, at + SUMMED) for at in range(0, len(chunk), SUMMED)])
         if sigmas:
             energy["data"].append(data)
             sigma = float(np.median(sigmas))
