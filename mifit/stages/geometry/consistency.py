@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
+from mifit.core.threads import on_all_cores
 from mifit.solve import geman_mcclure
 from mifit.solve.systems import DenseSystem
 from mifit.stages.geometry.images import SmoothImage
 from mifit.stages.geometry.landmarks import LandmarkTerm
-from mifit.stages.geometry.normal import NormalEquations, prior_energy
+from mifit.stages.geometry.normal import NormalEquations, prior_energy, square
 from mifit.stages.geometry.parameters import Frames, Layout
 from mifit.stages.geometry.points import PointBasis, geometry_columns, project
 
@@ -84,14 +85,15 @@ class ConsistencyProblem:
 
     def _observe(self, x: NDArray, gradient: bool) -> list:
         """Per view: projection, values, gradients and weights (0 where the image has no valid pixel)."""
-        out = []
-        for view in self.views:
+
+        def observe(view: TextureView) -> tuple:
             points = view.basis.evaluate(x[self.layout.at("identity")], x[self.layout.at("expression", view.step)])
             projection = project(view.camera, self.frames.pose(self.layout, x, view.step), points, gradient)
             values, slope, inside = view.image.sample(projection.pixels, gradient)
             weight = np.where(inside & (projection.depth > 0), view.weight, 0.0)
-            out.append((view, projection, values.astype(np.float64), slope, weight))
-        return out
+            return view, projection, values.astype(np.float64), slope, weight
+
+        return on_all_cores(observe, self.views)
 
     def _reweighted(self, observed: list) -> tuple[NDArray, NDArray, list[NDArray], float]:
         """Robust mean of each point over its views by three rounds of reweighting, started at the median view.
@@ -154,15 +156,23 @@ class ConsistencyProblem:
         s = layout.shared_size
         # rows of the eliminated unknowns: sum over views of w J, in all columns
         pooled = np.zeros((self.count, channels, layout.size), dtype=np.float32)
-        for (view, projection, values, slope, _), weight in zip(observed, weights, strict=True):
-            n = len(view.points)
+
+        def columns(number: int) -> tuple[NDArray, NDArray, NDArray]:
+            """Products of a view's rows, and its part of the pooled ones."""
+            view, projection, values, slope, _ = observed[number]
             shared, local = geometry_columns(layout, view.basis, projection, slope)
-            row_weight = np.repeat(weight, channels)
+            row_weight = np.repeat(weights[number], channels)
             residual = (values - mean[view.points]).reshape(-1)
-            equations.add(view.step, shared, local, residual, factor * row_weight)
+            products = square(shared, local, residual, factor * row_weight)
             w = row_weight.astype(np.float32)[:, None]
-            pooled[view.points, :, :s] += (w * shared).reshape(n, channels, s)
-            pooled[view.points, :, layout.local(view.step)] += (w * local).reshape(n, channels, -1)
+            n = len(view.points)
+            return products, (w * shared).reshape(n, channels, s), (w * local).reshape(n, channels, -1)
+
+        for view, found in zip(self.views, on_all_cores(columns, range(len(self.views))), strict=True):
+            products, shared, local = found
+            equations.add_square(view.step, products)
+            pooled[view.points, :, :s] += shared
+            pooled[view.points, :, layout.local(view.step)] += local
         self.landmarks.accumulate(equations, layout, self.frames, x)
         equations.add_priors(x, self.priors)
         system = equations.system()

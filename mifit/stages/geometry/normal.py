@@ -31,14 +31,14 @@ class NormalEquations:
         residual, weight : (m,)
             Residuals and the weights of their squares.
         """
-        root = np.sqrt(weight).astype(shared.dtype)[:, None]
-        self.add_weighted(
-            step, np.concatenate([shared, local, np.asarray(residual, shared.dtype)[:, None]], axis=1) * root
-        )
+        self.add_square(step, square(shared, local, residual, weight))
 
     def add_weighted(self, step: int, rows: NDArray) -> None:
         """Add rows (m, S + P + 1) of one timestep: shared, local and residual, by the root of their weights."""
-        h = rows.T @ rows
+        self.add_square(step, rows.T @ rows)
+
+    def add_square(self, step: int, h: NDArray) -> None:
+        """Add the `square` of rows of one timestep."""
         s = self.layout.shared_size
         self.shared += h[:s, :s]
         self.coupling[step] += h[:s, s:-1]
@@ -66,6 +66,14 @@ class NormalEquations:
         return ArrowSystem(
             self.shared, self.shared_gradient, list(self.local), list(self.local_gradient), list(self.coupling)
         )
+
+
+def square(shared: NDArray, local: NDArray, residual: NDArray, weight: NDArray) -> NDArray:
+    """Products (S + P + 1, S + P + 1) of rows, their residual as the last column; parameters as in `add`."""
+    root = np.sqrt(weight).astype(shared.dtype)[:, None]
+    rows = np.concatenate([shared, local, np.asarray(residual, shared.dtype)[:, None]], axis=1)
+    rows *= root
+    return rows.T @ rows
 
 
 def prior_energy(layout: Layout, x: NDArray, priors: dict[str, float]) -> float:
