@@ -28,8 +28,9 @@ from mifit.stages.surface_image import Placed, SurfaceImage
 from mifit.stages.trust import agreement, background
 
 if TYPE_CHECKING:
-    from mifit.capture import Capture
+    from mifit.capture import Capture, Frame
     from mifit.morphable import MorphableModel
+    from mifit.render.gbuffer import GBuffer
 
 CHUNK_VALUES = 1 << 22
 """Texels x images that are held at a time."""
@@ -176,28 +177,30 @@ class Surface:
         area = texel_area(model.uv, model.faces_uv, size)
         self._kept: Observations | None = None
         self._images: list[SurfaceImage] = []
+
+        def look(i: int, k: int, camera: Camera, frame: Frame, buffer: GBuffer) -> SurfaceImage:
+            covered, edge, outline, facial = face_pixels(
+                buffer, self.vertices[i], model.faces, shown, camera, model.face_mask
+            )
+            colour = frame.image / geometry.gain(camera.name)
+            unusable = edge | ~covered | ~frame.valid | ~np.isfinite(frame.image).all(-1)
+            if whole:
+                unusable |= background(frame.image, outline > 0, facial)
+            return SurfaceImage(
+                i,
+                k,
+                camera,
+                np.where(unusable[..., None], 0, colour).astype(np.float32),
+                unusable.astype(np.float32),
+                frame.clipped.astype(np.float32),
+                footprint(self.vertices[i], model.faces, camera, area),
+                (outline * (model.unit_mm / geometry.scale)).astype(np.float32),
+            )
+
         for i, timestep in enumerate(geometry.timesteps):
-            for k, name in enumerate(cameras):
-                camera, frame = capture.camera(name), capture.frame(name, timestep)
-                covered, edge, outline, facial = face_pixels(
-                    self.scenes[i], self.vertices[i], model.faces, shown, camera, model.face_mask
-                )
-                colour = frame.image / geometry.gain(name)
-                unusable = edge | ~covered | ~frame.valid | ~np.isfinite(frame.image).all(-1)
-                if whole:
-                    unusable |= background(frame.image, outline > 0, facial)
-                self._images.append(
-                    SurfaceImage(
-                        i,
-                        k,
-                        camera,
-                        np.where(unusable[..., None], 0, colour).astype(np.float32),
-                        unusable.astype(np.float32),
-                        frame.clipped.astype(np.float32),
-                        footprint(self.vertices[i], model.faces, camera, area),
-                        (outline * (model.unit_mm / geometry.scale)).astype(np.float32),
-                    )
-                )
+            views = [(k, capture.camera(name), capture.frame(name, timestep)) for k, name in enumerate(cameras)]
+            found = [(i, *view, self.scenes[i].gbuffer(view[1])) for view in views]
+            self._images += on_all_cores(lambda one: look(*one), found)
 
     def __len__(self) -> int:
         return len(self.texels.index)

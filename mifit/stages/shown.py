@@ -12,7 +12,7 @@ from mifit.core.mesh import face_cross
 from mifit.stages.trust import outline_distance
 
 if TYPE_CHECKING:
-    from mifit.render.gbuffer import SurfaceScene
+    from mifit.render.gbuffer import GBuffer
 
 EDGE_STEP = 0.01
 """Second difference of depth, relative to the diagonal of the mesh, that makes a pixel part of an occlusion edge."""
@@ -40,11 +40,10 @@ def footprint(vertices: NDArray, faces: NDArray, camera: Camera, texels: NDArray
 
 
 def face_pixels(
-    scene: SurfaceScene, vertices: NDArray, faces: NDArray, shown: NDArray, camera: Camera, facial: NDArray
+    buffer: GBuffer, vertices: NDArray, faces: NDArray, shown: NDArray, camera: Camera, facial: NDArray
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Pixels that show the front of the faces (F,) ``shown``, pixels at occlusion edges, pixels to the outline, and
     pixels that show the front of the faces ``facial``."""
-    buffer = scene.gbuffer(camera)
     face = buffer.face
     toward = camera.position - vertices[faces[:, 0]]
     front = np.sum(face_cross(vertices, faces) * toward, axis=1) > 0
