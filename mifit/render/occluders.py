@@ -24,6 +24,8 @@ def occluding_mesh(vertices: NDArray, faces: NDArray) -> OccludingMesh:
     """
     import mitsuba as mi
 
+    # A fit holds its vertices in double precision, its result in single: the same mesh, whose shadows are traced once.
+    vertices = np.asarray(vertices, dtype=np.float64)
     digest = hashlib.blake2b((mi.variant() or "").encode())
     for array in (vertices, faces):
         digest.update(f"{array.shape}{array.dtype}".encode())

@@ -20,6 +20,8 @@ def test_equal_arrays_share_a_mesh_and_its_shadows() -> None:
     traced = first.transfer(3)
     again = occluders.occluding_mesh(np.array(ball.vertices), np.array(ball.faces))
     assert again is first and again.transfer(3) is traced
+    single = np.array(ball.vertices, np.float32)
+    assert occluders.occluding_mesh(single, ball.faces) is occluders.occluding_mesh(single.astype(float), ball.faces)
 
 
 def test_a_moved_mesh_is_another_one_and_the_callers_array_may_change() -> None:
