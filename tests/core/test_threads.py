@@ -6,13 +6,14 @@ import inspect
 import os
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import mifit
-from mifit.core.threads import VARIABLES, one_blas_thread, set_threads
+from mifit.core.threads import VARIABLES, on_all_cores, one_blas_thread, set_threads
 from mifit.errors import InputError
 
 ASK = """
@@ -88,3 +89,17 @@ def test_what_takes_long_uses_one(name: str) -> None:
         required = [p for p in inspect.signature(function).parameters.values() if p.default is p.empty]
         function(*[Probe()] * len(required))
     assert seen.value.args[0] == {1}
+
+
+def test_parts_run_side_by_side_and_come_back_in_their_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MIFIT_THREADS", "2")
+    both = threading.Barrier(2, timeout=20.0)  # one after the other they would wait for ever
+
+    def meet(part: int) -> int:
+        both.wait()
+        return 10 * part
+
+    assert on_all_cores(meet, [3, 1]) == [30, 10]
+    assert on_all_cores(lambda _: threading.current_thread(), [0]) == [threading.current_thread()]
+    with pytest.raises(ZeroDivisionError):
+        on_all_cores(lambda part: 1 / part, [1, 0])

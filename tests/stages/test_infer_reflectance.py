@@ -244,6 +244,23 @@ def test_the_report_says_how_the_maps_ended(dome, monkeypatch, iterations, outco
     assert details["maps_outcome"] == outcome
 
 
+def test_maps_are_the_same_in_parts_and_texels_without_a_block_follow_the_others(monkeypatch):
+    size, rng = 16, np.random.default_rng(5)
+    index = np.flatnonzero(rng.random(size * size) < 0.7)
+    ones = np.ones((len(index), 3), np.float32)
+    target = rng.uniform(-0.2, 1.2, (len(index), 4)).astype(np.float32)
+    systems = TexelSystems(ones, 0.3 * ones, target[:, :3].copy(), ones[:, 0], target[:, 3].copy())
+    prior = np.full((size, size, 4), 0.5, np.float32)
+    given = systems, index, prior, Smoothness(0.02, 0.05)
+    whole = solve_maps(*given, iterations=30)
+    monkeypatch.setattr("mifit.stages.reflectance.maps.CHUNK", 3 * size)
+    np.testing.assert_allclose(solve_maps(*given, iterations=30), whole, atol=1e-6)
+    seen = np.zeros(size * size, bool)
+    seen[index] = True
+    smooth = [np.abs(laplacian(whole)).reshape(-1, 4)[rows].mean() for rows in (seen, ~seen)]
+    assert smooth[1] < smooth[0]  # what nothing measures is drawn by its neighbours alone
+
+
 def test_splits_go_on_where_the_last_solve_stopped():
     size, rng = 16, np.random.default_rng(4)
     n = size * size

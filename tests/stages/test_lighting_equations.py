@@ -73,9 +73,10 @@ def plain_step(problem: LightingProblem, state: State, with_ambient: bool) -> tu
 
 
 @pytest.mark.parametrize("with_ambient", [False, True])
-@pytest.mark.parametrize("block", [8 * K, 1 << 20])
-def test_a_step_is_that_of_all_unknowns_at_once(problem, with_ambient, block, monkeypatch):
+@pytest.mark.parametrize(("block", "texels"), [(8 * K, 7), (1 << 20, N)])
+def test_a_step_is_that_of_all_unknowns_at_once(problem, with_ambient, block, texels, monkeypatch):
     monkeypatch.setattr(lighting_equations, "BLOCK", block)
+    monkeypatch.setattr(lighting_equations, "TEXELS", texels)
     state = State(problem)
     equations = state.equations(problem)
     equations.diffuse += 1.0

@@ -11,9 +11,11 @@ from stages.reflectance_scene import EXPONENT, turning_dome
 
 from mifit.appearance import models
 from mifit.appearance.lobe import Lobe
+from mifit.config import ReflectanceConfig
 from mifit.core.mesh import interpolate
+from mifit.progress import silent
 from mifit.stages.observations import Surface
-from mifit.stages.reflectance import prediction
+from mifit.stages.reflectance import choice, prediction
 from mifit.stages.reflectance.choice import lighting_problem
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.prediction import folds, predict
@@ -86,3 +88,18 @@ def test_a_camera_that_sees_nothing_predicts_nothing(scene):
     still = replace(seen, step=np.zeros_like(seen.step))  # cameras are left out in turn
     blind = replace(problem(), weight=np.where((seen.camera == 1)[:, None], np.float32(0.0), problem().weight))
     assert predict(still, blind, 0.05) is None
+
+
+def test_trials_are_fitted_to_all_images_only_where_that_is_asked_for(scene, monkeypatch):
+    seen, problem = scene
+    fitted = []
+    real = choice.solve_held
+    monkeypatch.setattr(choice, "solve_held", lambda *given: fitted.append(given) or real(*given))
+    trials = choice._Trials(seen, problem().albedo, ReflectanceConfig(), silent)
+    plain = Forward.of(models.get("prefiltered"), 4, Lobe(EXPONENT, 8.0))
+    right = trials.add("right", plain)
+    trials.add("right", plain.with_lobe(Lobe(EXPONENT / 8, 8.0)))
+    assert not fitted and right.score < trials.done[1].score
+    figures = trials.figures()
+    assert len(fitted) == 1 and figures["residuals"] == {"right": right.found.unexplained}
+    assert len(fitted) == 1 and len(figures["predicted"]) == 2
