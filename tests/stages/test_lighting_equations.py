@@ -73,10 +73,10 @@ def plain_step(problem: LightingProblem, state: State, with_ambient: bool) -> tu
 
 
 @pytest.mark.parametrize("with_ambient", [False, True])
-@pytest.mark.parametrize(("block", "texels"), [(8 * K, 7), (1 << 20, N)])
-def test_a_step_is_that_of_all_unknowns_at_once(problem, with_ambient, block, texels, monkeypatch):
+@pytest.mark.parametrize(("block", "crossed"), [(8 * K, 7 * K), (1 << 20, 1 << 17)])
+def test_a_step_is_that_of_all_unknowns_at_once(problem, with_ambient, block, crossed, monkeypatch):
     monkeypatch.setattr(lighting_equations, "BLOCK", block)
-    monkeypatch.setattr(lighting_equations, "TEXELS", texels)
+    monkeypatch.setattr(lighting_equations, "CROSSED", crossed)
     state = State(problem)
     equations = state.equations(problem)
     equations.diffuse += 1.0

@@ -20,8 +20,8 @@ FEW_IMAGES = 4
 """Images of a texel from which its four albedos are told by the images."""
 BLOCK = 1 << 20
 """Derivatives that are held at a time: they stay in the cache."""
-TEXELS = 1536
-"""Texels that are eliminated at a time."""
+CROSSED = 1 << 17
+"""Derivatives by albedo and a channel's light that are eliminated at a time."""
 
 
 @dataclass(frozen=True)
@@ -343,8 +343,8 @@ class LightingEquations:
                 square[block, block] += squares[c]
             return square, sides
 
-        n = len(last)
-        for square, sides in on_all_cores(take, [slice(at, at + TEXELS) for at in range(0, n, TEXELS)]):
+        n, step = len(last), max(CROSSED // k, 1)
+        for square, sides in on_all_cores(take, [slice(at, at + step) for at in range(0, n, step)]):
             taken[:-1, :-1] += square
             right[:-1] -= sides[0]
             taken[:-1, -1] += sides[1]
