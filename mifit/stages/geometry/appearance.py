@@ -67,7 +67,10 @@ class AppearanceProblem:
 
     def _residual(self, x: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         a = self.albedo_size
-        albedo = self.mean + self.modes @ x[:a].astype(np.float32)
+        # OpenBLAS raises the flag for finite values now and then (seen in one run of hundreds, as in NumPy's issue
+        # 24067); values that aren't finite the solver sees in the energies.
+        with np.errstate(invalid="ignore"):
+            albedo = self.mean + self.modes @ x[:a].astype(np.float32)
         shade = self.harmonics @ x[a:-1].reshape(9, 3).astype(np.float32)
         return WHITE * (np.float32(x[-1]) + albedo * shade - self.observed), albedo, shade
 
