@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from mifit.appearance.illumination import Illumination
     from mifit.appearance.lobe import Lobe
 
+FURTHER_FRAMES = "surface of further frames"
+"""Phase in a geometry's report: a surface that was swept again with frames of a video."""
+
 
 @dataclass(frozen=True)
 class Report:

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import mifit
+from mifit.core.estimate import FURTHER_FRAMES
 from mifit.core.files import write_text
 from mifit.core.image import to_8_bit
 from mifit.output.evaluate import Comparison, as_photographed, compare, rgba_8_bit
@@ -33,6 +33,7 @@ from mifit.output.figures import (
     png_uri,
     tint,
 )
+from mifit.output.map_figures import figure, picture_maps
 from mifit.output.viewer import viewer_data
 
 if TYPE_CHECKING:
@@ -51,8 +52,6 @@ STAGES = {
     "mesh": "3 Mesh",
     "residual": "3 Residual",
 }
-FURTHER_FRAMES = "surface of further frames"
-"""Phase of a geometry's report that tells of a surface that was swept again (`stages.sweep_again`)."""
 SHOWN_TIMESTEPS = 4
 """Timesteps whose pictures a report holds, so that it stays small enough for a phone."""
 
@@ -89,7 +88,7 @@ def write_report(
         ("3D view", _view3d(reconstruction, shown[0])),
         ("Inputs and fit", _inputs(reconstruction, capture, shown)),
         ("Frames", _frames(reconstruction)),
-        ("Maps", _maps(reconstruction, shown[0])),
+        ("Maps", picture_maps(reconstruction, shown[0])),
         ("Lighting", _lighting(reconstruction)),
         ("Convergence", _convergence(reconstruction)),
         ("Settings", _settings(reconstruction)),
@@ -201,7 +200,7 @@ def _comparison(result: Result, capture: Capture, evaluation: dict[str, Any], co
         timestep = entry["timestep"]
         found = known.get(timestep) or compare(result, capture, camera, timestep, evaluation["region"])
         maps = "".join(
-            _figure(
+            figure(
                 jpeg_uri(heat_map(found.photograph, render, found.region)[bounding_box(found.region)]),
                 f"{NAMES[m]}: {entry['methods'][m]['psnr']:.2f} dB",
                 f"error map of {NAMES[m]}",
@@ -248,16 +247,16 @@ def _inputs(result: Result, capture: Capture, timesteps: tuple[int, ...]) -> str
             box = bounding_box(render[..., 3] > 0)
             marked = draw_landmarks(photograph, view, frame.landmarks, frame.visible, points)
             label = html.escape(camera)
-            figures.append(_figure(jpeg_uri(marked[box]), f"{label}: input with landmarks", f"input from {label}"))
+            figures.append(figure(jpeg_uri(marked[box]), f"{label}: input with landmarks", f"input from {label}"))
             figures.append(
-                _figure(jpeg_uri(overlay(photograph, render)[box]), f"{label}: fit laid over", f"fit over {label}")
+                figure(jpeg_uri(overlay(photograph, render)[box]), f"{label}: fit laid over", f"fit over {label}")
             )
             mask = face_mask(result, capture, camera, timestep, linear)
             caption = f"{label}: {mask.part(mask.clipped):.1%} clipped, {mask.part(mask.unexplained):.1%} unexplained"
             labels = None if result.reflectance is None else result.reflectance.label(camera, timestep)
             kinds = [] if labels is None else [(labels == kind, colour) for kind, colour, _ in LABEL_TINTS]
             tinted = tint(photograph, (mask.clipped, CLIPPED_TINT), (mask.unexplained, UNEXPLAINED_TINT), *kinds)
-            figures.append(_figure(jpeg_uri(tinted[box]), caption, f"face mask of {label}"))
+            figures.append(figure(jpeg_uri(tinted[box]), caption, f"face mask of {label}"))
         parts.append(f'<h3>Timestep {timestep}</h3><div class="grid">{"".join(figures)}</div>')
     rest = len(result.timesteps) - len(timesteps)
     more = f'<p class="soft">{rest} more timesteps are in the result but not on this page.</p>' if rest else ""
@@ -298,59 +297,6 @@ def _frames(result: Result) -> str:
     return f"<ul>{''.join(f'<li>{html.escape(line)}</li>' for line in lines)}</ul>" if lines else ""
 
 
-def _maps(result: Result, timestep: int) -> str:
-    if result.reflectance is None:
-        return ""
-    reflectance = result.reflectance
-    figures = [
-        _figure(jpeg_uri(to_8_bit(reflectance.diffuse)), "Diffuse albedo", "diffuse albedo map"),
-        _grey("Specular albedo", reflectance.specular),
-        _grey("Confidence: how often and how well each texel was seen", reflectance.confidence, 1.0),
-    ]
-    if reflectance.relief is not None:
-        figures.append(
-            _grey(
-                "Light that mesh and lighting don't explain (mid-grey: none), parted from the albedo",
-                0.5 * reflectance.relief,
-                1.0,
-            )
-        )
-    if reflectance.frames is not None:
-        figures.append(
-            _grey("Frames that showed each texel", reflectance.frames, float(reflectance.frames.max()) or 1.0)
-        )
-    refined = result.refined_normal(timestep)
-    if refined is not None:
-        colours = np.where(np.any(refined != 0, axis=-1, keepdims=True), 127.5 * (refined + 1), 0)
-        figures.append(
-            _figure(
-                jpeg_uri(np.round(colours).astype(np.uint8)),
-                f"Refined normals in object space, timestep {timestep}",
-                "normal map",
-            )
-        )
-    residual = None if result.residual is None else result.residual.at(timestep)
-    if residual is not None:
-        white = max(float(np.quantile(np.abs(residual), 0.999)), 1e-6)
-        codes = np.round(127.5 * (1 + np.clip(residual / white, -1, 1))).astype(np.uint8)
-        caption = f"What images show beyond the model, timestep {timestep} (mid-grey: nothing, white = {white:.2g})"
-        figures.append(_figure(jpeg_uri(codes), caption, "residual"))
-    if result.mesh is not None and timestep in result.mesh.timesteps:
-        shift = result.displacement(timestep) * result.unit_mm
-        white = max(float(np.quantile(np.abs(shift), 0.999)), 1e-6)
-        codes = np.round(127.5 * (1 + np.clip(shift / white, -1, 1))).astype(np.uint8)
-        caption = f"Displacement of the refined mesh, timestep {timestep} (white = {white:.2g} mm outwards)"
-        figures.append(_figure(jpeg_uri(codes), caption, "displacement map"))
-    return f'<div class="grid">{"".join(figures)}</div>'
-
-
-def _grey(caption: str, values: NDArray, peak: float | None = None) -> str:
-    """Figure of a scalar map on a linear scale whose white is named."""
-    white = peak or max(float(np.quantile(values, 0.999)), 1e-6)
-    codes = np.round(255 * np.clip(values / white, 0, 1)).astype(np.uint8)
-    return _figure(jpeg_uri(codes), f"{caption} (white = {white:.3g})", caption.lower())
-
-
 def _lighting(result: Result) -> str:
     lighting = result.lighting
     matt, mirror = lighting_balls(lighting)
@@ -358,9 +304,9 @@ def _lighting(result: Result) -> str:
     codes = to_8_bit(panorama / max(float(panorama.max()), 1e-12))
     lights = [light.describe(result.unit_mm) for light in result.illumination.lights]
     compact = "".join(f"; the sharp light {light}, was found apart from them" for light in lights)
-    return f"""<div class="balls">{_figure(png_uri(matt), "White matt ball", "lighting on a matt ball")}
-{_figure(png_uri(mirror), "Mirror ball", "lighting in a mirror ball")}
-{_figure(jpeg_uri(codes), "All directions, latitude by longitude", "lighting panorama")}</div>
+    return f"""<div class="balls">{figure(png_uri(matt), "White matt ball", "lighting on a matt ball")}
+{figure(png_uri(mirror), "Mirror ball", "lighting in a mirror ball")}
+{figure(jpeg_uri(codes), "All directions, latitude by longitude", "lighting panorama")}</div>
 <p class="soft">Recovered as spherical harmonics of {lighting.order} bands, so only broad light shows{compact}.
 Ambient term {result.illumination.ambient:.4f}.</p>{_choice(result)}"""
 
@@ -402,7 +348,3 @@ def _convergence(result: Result) -> str:
 def _settings(result: Result) -> str:
     text = html.escape(json.dumps(result.config, indent=1, default=str))
     return f"<details><summary>Settings of this fit</summary><pre>{text}</pre></details>"
-
-
-def _figure(uri: str, caption: str, alt: str) -> str:
-    return f'<figure><img src="{uri}" alt="{html.escape(alt)}"><figcaption>{html.escape(caption)}</figcaption></figure>'

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.config import SurfaceConfig
-from mifit.core.estimate import GeometryEstimate
+from mifit.core.estimate import FURTHER_FRAMES, GeometryEstimate
 from mifit.core.threads import one_blas_thread
 from mifit.progress import Progress, silent
 from mifit.stages.eyes import behind_lids
@@ -91,7 +91,7 @@ def sweep_again(
     kept = between[1] < between[0]
     change = (found.displacement - geometry.displacement)[np.unique(model.faces[model.face_mask])]
     details = {
-        "name": "surface of further frames",
+        "name": FURTHER_FRAMES,
         "outcome": last.outcome.value,
         "kept": kept,
         "timesteps": list(swept),
