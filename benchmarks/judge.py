@@ -15,7 +15,7 @@ from benchmarks.truth import angle
 from mifit import Capture, Reconstruction
 from mifit.core.camera import Camera
 from mifit.core.flip import flip
-from mifit.core.image import to_8_bit
+from mifit.core.image import srgb_to_linear, to_8_bit
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.metrics import psnr_from_rmse, ssim
 from mifit.core.uv import sample_map
@@ -81,6 +81,7 @@ class Tally:
     """Sums of a measure's errors over the pixels of several images."""
 
     squared: float = 0.0
+    matched: float = 0.0
     likeness: float = 0.0
     flipped: float = 0.0
     pixels: int = 0
@@ -92,17 +93,29 @@ class Tally:
             return
         difference = image[region].astype(np.float64) - photograph[region]
         self.squared += float((difference**2).mean()) * count
+        self.matched += float((_in_its_exposure(image[region], photograph[region]) ** 2).mean()) * count
         if perceptual:
             self.likeness += ssim(image, photograph, region) * count
             self.flipped += flip(image, photograph, region) * count
         self.pixels += count
 
     def figures(self) -> dict[str, float]:
-        """PSNR (dB), SSIM, FLIP and the number of pixels."""
-        found = {"psnr": round(psnr_from_rmse((self.squared / self.pixels) ** 0.5), 2), "pixels": self.pixels}
+        """PSNR (dB), the same in each photograph's own exposure and white balance, SSIM, FLIP, number of pixels."""
+        plain, matched = (round(psnr_from_rmse((x / self.pixels) ** 0.5), 2) for x in (self.squared, self.matched))
+        found = {"psnr": plain, "psnr_matched": matched, "pixels": self.pixels}
         if self.likeness:
             found |= {"ssim": round(self.likeness / self.pixels, 4), "flip": round(self.flipped / self.pixels, 4)}
         return found
+
+
+def _in_its_exposure(codes: Image, photograph: Image) -> NDArray[np.float64]:
+    """(N, 3) what sRGB codes differ by once each channel's light is scaled to fit best.
+
+    Nothing that a fit reads says how a camera that it doesn't read is exposed.
+    """
+    a, b = (srgb_to_linear(x / 255.0) for x in (codes, photograph))
+    gain = (a * b).sum(0) / np.maximum((a * a).sum(0), 1e-9)
+    return 255.0 * _coded(gain * a) - photograph
 
 
 Methods = Mapping[str, tuple[Reconstruction, str]]

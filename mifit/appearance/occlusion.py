@@ -185,8 +185,8 @@ def trace_transfer(
     """Trace the shadowed diffuse transfer vectors of surface points.
 
     ``albedo * (transfer @ coefficients)`` is the radiance that a Lambertian point reflects under SH lighting, with the
-    mesh's own shadows. The unshadowed part is the closed form and rays only estimate what is taken away, so points
-    that see the whole sky carry no noise.
+    mesh's own shadows. Rays estimate what is seen of the sky, and by as much of it as is seen what they make of the
+    whole sky is replaced by its closed form: points that see all of it carry no noise, and those in deep folds little.
 
     Parameters
     ----------
@@ -283,7 +283,7 @@ def _trace(
     shift_u, shift_v = shift.next_float32(), shift.next_float32()
     point = dr.arange(mi.UInt, count)
 
-    def body(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+    def body(i: Any, seen: Any, whole: list[Any], sums: list[Any]) -> tuple[Any, Any, list[Any], list[Any]]:
         # A rank-1 lattice, shifted at random per point: far less noise than independent rays.
         u = dr.fma(mi.Float(i), 0.7548776662466927, shift_u)
         v = dr.fma(mi.Float(i), 0.5698402909980532, shift_v)
@@ -297,12 +297,20 @@ def _trace(
             hit = scene.ray_intersect_preliminary(ray)
             blocked = hit.is_valid()
             hits.keep(point, i, hit, blocked)
-        return i + 1, [s - dr.select(blocked, yk, 0.0) for s, yk in zip(sums, y, strict=True)]
+        sums = [s + dr.select(blocked, 0.0, yk) for s, yk in zip(sums, y, strict=True)]
+        whole = [s + yk for s, yk in zip(whole, y, strict=True)]
+        return i + 1, seen + dr.select(blocked, 0.0, 1.0), whole, sums
 
-    _, sums = dr.while_loop(
-        state=(mi.UInt(0), [dr.zeros(mi.Float, count) for _ in range(size)]),
-        cond=lambda i, sums: i < samples,
+    zeros = [dr.zeros(mi.Float, count) for _ in range(2 * size + 1)]
+    _, seen, whole, sums = dr.while_loop(
+        state=(mi.UInt(0), zeros[0], zeros[1 : size + 1], zeros[size + 1 :]),
+        cond=lambda i, *_: i < samples,
         body=body,
     )
+    # A control variate whose integral is known: the weight with the least variance is the part that is seen, as far as
+    # which directions are blocked has nothing to do with the value there.
+    seen /= samples
     unshadowed = diffuse_transfer(n, order)
-    return stored([t + s / samples for t, s in zip(unshadowed, sums, strict=True)], count)
+    return stored(
+        [dr.fma(seen, t, (s - seen * w) / samples) for t, w, s in zip(unshadowed, whole, sums, strict=True)], count
+    )

@@ -15,6 +15,12 @@ from mifit.capture.boards import BoardPoints
 LENS, POSE = 9, 6
 """Unknowns of a lens (fx, fy, cx, cy, k1, k2, p1, p2, k3) and of a pose (rotation vector, translation)."""
 _STEP = 1e-6
+CENTRE, ASPECT = 0.03, 0.01
+"""Deviations beforehand of the principal point from the image's middle, in longer sides, and of fy / fx from 1."""
+RADIAL, TANGENTIAL = 0.5, 0.003
+"""Of k1, k2, k3 and of p1, p2 from 0: what a board in the middle of the image doesn't tell stays near a plain lens."""
+LEAST_NOISE = 0.05
+"""Deviation of a board's points from where they are found, pixels, at the least."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +52,13 @@ def adjust(
     matrices: Sequence[NDArray[np.float64]],
     distortions: Sequence[tuple[float, ...]],
     poses: Sequence[NDArray[np.float64]],
+    sizes: Sequence[tuple[int, int]],
+    noise: float,
 ) -> Adjusted:
     """Refine lenses, camera poses and board poses together (Triggs et al., "Bundle Adjustment", 2000).
+
+    Lenses have a prior, whose weight is that of one coordinate with the noise: where the board was seen all over the
+    image it says nothing, and where not it keeps distortion from bending what no point has shown.
 
     Parameters
     ----------
@@ -56,6 +67,10 @@ def adjust(
     seen : one dict of frame to BoardPoints per camera
     matrices, distortions, poses
         Start, see `Adjusted`.
+    sizes : sequence of (int, int)
+        Width and height of the images.
+    noise : float
+        Deviation of the points found, pixels.
     """
     count = len(seen)
     frames = sorted({i for used in seen for i in used})
@@ -91,14 +106,15 @@ def adjust(
             matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
             pixels, _ = cv2.projectPoints(points[found.ids], turn, shift, matrix, lens[c, 4:])
             out.append((pixels.reshape(-1, 2) - (found.pixels - 0.5)).ravel())
-        return np.concatenate(out)
+        return np.concatenate([*out, *(noise * _unlikely(one, size) for one, size in zip(lens, sizes, strict=True))])
 
     ends = np.cumsum([2 * len(found) for _, _, found in blocks])
     rows = [slice(end - 2 * len(found), end) for end, (_, _, found) in zip(ends, blocks, strict=True)]
+    lens_rows = [slice(ends[-1] + PRIORS * c, ends[-1] + PRIORS * (c + 1)) for c in range(count)]
 
     def jacobian(x: NDArray) -> NDArray:
         """Differences; one unknown of every camera, or of every board, at a time: a block depends on one of each."""
-        out = np.zeros((ends[-1], len(x)))
+        out = np.zeros((lens_rows[-1].stop, len(x)))
         groups = [([LENS * c + j for c in range(count)], 0) for j in range(LENS)]
         first = LENS * count
         groups += [([-1, *(first + POSE * c + j for c in range(count - 1))], 0) for j in range(POSE)]
@@ -113,6 +129,9 @@ def adjust(
             for row, block in zip(rows, blocks, strict=True):
                 column = columns[block[:2][which]]  # camera or board
                 if column >= 0:
+                    out[row, column] = change[row]
+            if columns[0] < LENS:
+                for row, column in zip(lens_rows, columns, strict=True):
                     out[row, column] = change[row]
         return out
 
@@ -131,6 +150,17 @@ def adjust(
         [float(deviations[LENS * c : LENS * c + 2].max()) for c in range(count)],
         errors,
     )
+
+
+PRIORS = 8
+
+
+def _unlikely(lens: NDArray, size: tuple[int, int]) -> NDArray[np.float64]:
+    """(PRIORS,) how far a lens lies from a plain one, in deviations."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = lens
+    off = np.array([cx - 0.5 * (size[0] - 1), cy - 0.5 * (size[1] - 1)]) / (CENTRE * max(size))
+    bent = np.array([k1, k2, k3]) / RADIAL, np.array([p1, p2]) / TANGENTIAL
+    return np.concatenate([off, [(fy / fx - 1.0) / ASPECT], *bent])
 
 
 def _vector(pose: NDArray) -> NDArray[np.float64]:

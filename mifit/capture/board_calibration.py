@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.capture.board_adjustment import adjust
+from mifit.capture.board_adjustment import LEAST_NOISE, adjust
 from mifit.capture.boards import Board, BoardPoints, edge_width
 from mifit.capture.sources import Source, check_synchronous
 from mifit.capture.stereo import write_stereo
@@ -38,8 +38,12 @@ LEAST_PART = 0.4
 """Part of the board's points below which it is only partly seen."""
 MAX_BLUR, BLUR_FACTOR = 4.0, 1.6
 """Edges wider than this many pixels, or than this many times those of a camera's sharper frames, are blurred."""
-OUTLIER = 3.0
-"""Frames whose error is this many times the median are left out."""
+OUTLIER, LEAST_OUTLIER = 3.0, 0.3
+"""Frames whose error is this many times the median, and at least so many pixels, are left out."""
+OUT_OF_STEP = 0.5
+"""Error in pixels, at the least, of frames that are left out for what other cameras show: a tilted board that is found
+a little off still tells more than it harms."""
+CONTRADICTS = "contradicts the others: error {:.2f} pixels, {:.2f} is the limit"
 GRID = 6
 """Cells across and down of the picture of coverage."""
 WEAK_COVERAGE, WEAK_FOCAL, BAD_FOCAL, BAD_ERROR = 0.4, 0.005, 0.03, 2.0
@@ -143,19 +147,7 @@ def calibrate_boards(
         watched.append(_calibrate_one(source, board, found, left_out))
     progress("Looking for the board", total, total)
     relative, pair_errors = _relative_poses(watched, board)
-    seen_by = [seen.used for seen in watched]
-    adjusted = adjust(board.points, seen_by, [w.matrix for w in watched], [w.distortion for w in watched], relative)
-    relative = adjusted.poses
-    watched = [
-        dataclasses.replace(
-            seen,
-            matrix=adjusted.matrices[c],
-            distortion=adjusted.distortions[c],
-            focal_deviation=adjusted.focal_deviations[c] / float(adjusted.matrices[c][0, 0]),
-            errors=adjusted.errors[c],
-        )
-        for c, seen in enumerate(watched)
-    ]
+    watched, relative = _together(watched, relative, board)
     scale = 1.0 / UNITS_MM[units]
     cameras = []
     for seen, pose in zip(watched, relative, strict=True):
@@ -267,12 +259,12 @@ def _calibrate_one(
         if len(chosen) < LEAST_FRAMES:
             raise InputError(_too_few(source, len(chosen), left_out))
         matrix, distortion, deviation, errors = _solve({i: used[i] for i in chosen}, board, source.size)
-        limit = max(OUTLIER * float(np.median(list(errors.values()))), 0.3)
+        limit = max(OUTLIER * float(np.median(list(errors.values()))), LEAST_OUTLIER)
         bad = [i for i, error in errors.items() if error > limit]
         if not bad:
             break
         for i in bad:
-            left_out[i] = f"contradicts the others: error {errors[i]:.2f} pixels, {limit:.2f} is the limit"
+            left_out[i] = CONTRADICTS.format(errors[i], limit)
         chosen = [i for i in chosen if i not in bad]
     focal = deviation / float(matrix[0, 0])
     seen = Watched(
@@ -370,6 +362,54 @@ def _relative_poses(watched: Sequence[Watched], board: Board) -> tuple[list[NDAr
                 f"expected at most {BAD_ERROR:g}; the videos aren't synchronous, a camera moved, or one is mirrored"
             )
     return [poses[i] for i in range(len(watched))], errors
+
+
+def _together(
+    watched: Sequence[Watched], poses: Sequence[NDArray[np.float64]], board: Board
+) -> tuple[list[Watched], list[NDArray[np.float64]]]:
+    """All lenses and poses at once, without the frames in which cameras contradict one another.
+
+    A board that moves while the cameras aren't quite in step fits each camera by itself.
+    """
+    watched = list(watched)
+    while True:
+        every = np.array([error for seen in watched for error in seen.errors.values()])
+        found = adjust(
+            board.points,
+            [seen.used for seen in watched],
+            [seen.matrix for seen in watched],
+            [seen.distortion for seen in watched],
+            poses,
+            [seen.size for seen in watched],
+            max(float(np.median(every)) / np.sqrt(2.0), LEAST_NOISE),
+        )
+        poses = found.poses
+        watched = [
+            dataclasses.replace(
+                seen,
+                matrix=found.matrices[c],
+                distortion=found.distortions[c],
+                focal_deviation=found.focal_deviations[c] / float(found.matrices[c][0, 0]),
+                errors=found.errors[c],
+            )
+            for c, seen in enumerate(watched)
+        ]
+        kept = [_consistent(seen) for seen in watched]
+        shared = [len(_shared(a, b)) for k, b in enumerate(kept) for a in kept[:k]]
+        few = any(len(seen.used) < LEAST_FRAMES for seen in kept) or min(shared, default=LEAST_SHARED) < LEAST_SHARED
+        if few or all(len(a.used) == len(b.used) for a, b in zip(kept, watched, strict=True)):
+            return watched, poses
+        watched = kept
+
+
+def _consistent(seen: Watched) -> Watched:
+    """One camera's frames without those whose error stands out."""
+    limit = max(OUTLIER * float(np.median(list(seen.errors.values()))), OUT_OF_STEP)
+    bad = {i: error for i, error in seen.errors.items() if error > limit}
+    reasons = {i: CONTRADICTS.format(error, limit) for i, error in bad.items()}
+    used = {i: found for i, found in seen.used.items() if i not in bad}
+    errors = {i: error for i, error in seen.errors.items() if i not in bad}
+    return dataclasses.replace(seen, used=used, errors=errors, left_out={**seen.left_out, **reasons})
 
 
 def _shared(a: Watched, b: Watched) -> dict[int, NDArray[np.int64]]:

@@ -2,7 +2,8 @@
 
 Many head models are skin alone: renders of them look through the eyes. Here each eye gets the front of a ball of an
 eye's size, which lies on the rims of the lids and moves with the corners of the eye, and the mouth gets a dark
-pouch behind the lips. Both have a place in the maps, so that photographs show iris, sclera and teeth.
+sheet from lip to lip where the teeth are. Both have a place in the maps, so that photographs show iris, sclera and
+teeth.
 """
 
 from __future__ import annotations
@@ -28,15 +29,16 @@ FRONT = np.radians(85.0)
 RINGS, SEGMENTS = 18, 36
 IRIS, PUPIL = np.radians(28.5), np.radians(10.5)
 SCLERA_ALBEDO, IRIS_ALBEDO, PUPIL_ALBEDO = (0.62, 0.58, 0.54), (0.09, 0.055, 0.03), (0.01, 0.01, 0.01)
-POUCH_ALBEDO = (0.12, 0.03, 0.025)
-POUCH_MM, POUCH_LINES, POUCH_TIP = 30.0, 8, 0.35
-"""Depth of the pouch, rings from front to back, and how much narrower it is at the back."""
+MOUTH_ALBEDO = (0.12, 0.03, 0.025)
+TEETH_MM, MOUTH_LINES = 2.0, 8
+"""Distance of the sheet between the lips behind their rims, about that of front teeth, and its lines from either lip to
+the middle. Farther back photographs from two sides would paint the teeth at two places, in the shade of the lips."""
 CORNER_ALBEDO = (0.4, 0.17, 0.14)
 """Of the tissue that closes what is open between lids and ball, in the corners of the eye."""
 BEHIND_MM = 0.01
-"""Distance of the rims of pouch and corners behind those of lips and lids."""
+"""Distance of the rims of sheet and corners behind those of lips and lids."""
 STRIP = 0.09
-"""Height of the strip at the bottom of the maps that holds eyes and pouch; what was there moves up."""
+"""Height of the strip at the bottom of the maps that holds eyes and mouth; what was there moves up."""
 MARGIN = 0.004
 SMALLEST_RIM = 8
 """Vertices around an eye or the mouth at the least."""
@@ -48,7 +50,7 @@ SAME_MM = 0.01
 """Distance between vertices that were added and those that would be."""
 SUFFIX = "+eyes"
 """After a model's file: with these pieces."""
-VERSION = 2
+VERSION = 3
 """Of the pieces; a result that was made with others has another model."""
 
 
@@ -124,7 +126,7 @@ def lacks_eyes(model: MorphableModel) -> bool:
 
 
 def with_eyes(model: MorphableModel) -> MorphableModel:
-    """The model with eyeballs in the holes of its eyes and a pouch in that of its mouth.
+    """The model with eyeballs in the holes of its eyes and a sheet in that of its mouth.
 
     New vertices come after the old ones, whose order, shape and modes stay; texture coordinates move up by a strip.
     `MorphableModel.load` makes the same of ``"FILE+eyes"``, which is the ``source`` of the model returned.
@@ -205,12 +207,12 @@ def skin_weights(model: MorphableModel) -> sp.csr_matrix | None:
 
 
 def _pieces(model: MorphableModel, eyes: Sequence[NDArray], mouth: NDArray | None) -> list[_Piece]:
-    """Eyeballs, corners and pouch for the borders of openings, with their places in the strip."""
+    """Eyeballs, corners and the mouth's sheet for the borders of openings, with their places in the strip."""
     width = STRIP - 2 * MARGIN
     pieces = [_eyeball(model, loop, k, np.array([MARGIN + k * STRIP, MARGIN]), width) for k, loop in enumerate(eyes)]
     pieces += [_corner(model, loop, np.array([0.7 + k * STRIP, MARGIN]), width) for k, loop in enumerate(eyes)]
     if mouth is not None:
-        pieces.append(_pouch(model, mouth, np.array([2 * STRIP + MARGIN, MARGIN]), np.array([0.5, width])))
+        pieces.append(_mouth(model, mouth, np.array([2 * STRIP + MARGIN, MARGIN]), np.array([0.5, width])))
     return pieces
 
 
@@ -296,35 +298,47 @@ def _corner(model: MorphableModel, loop: NDArray, corner: NDArray, width: float)
     return _Piece(points, rows, rows, _facing(points, faces, forward), uv, albedo, np.arange(n + 1))
 
 
-def _pouch(model: MorphableModel, loop: NDArray, corner: NDArray, extent: NDArray) -> _Piece:
+def _mouth(model: MorphableModel, loop: NDArray, corner: NDArray, extent: NDArray) -> _Piece:
+    """A sheet between the lips, in lines that run from each of them to the middle between both."""
     symmetry = np.arange(model.n_vertices) if model.symmetry is None else model.symmetry
     loop = np.roll(loop, -int(np.argmax(symmetry[loop] == loop)))
     rim = np.append(loop, loop[0])  # its texture has two ends, which mirror each other
     n, unit = len(rim), 1.0 / model.unit_mm
-    points = model.mean[rim].astype(np.float64)
-    middle, depth = points[1:].mean(axis=0), np.linspace(0.0, 1.0, POUCH_LINES)
-    narrow = 1.0 - (1.0 - POUCH_TIP) * depth
-    back = np.array([0.0, 0.0, -unit]) * (BEHIND_MM + (POUCH_MM - BEHIND_MM) * depth)[:, None]
-    lines = (middle + narrow[:, None, None] * (points - middle) + back[:, None]).reshape(-1, 3)
-    lines = np.concatenate([lines, [middle + back[-1]]])
+    depth = np.linspace(0.0, 1.0, MOUTH_LINES)
     own = sp.csr_matrix((np.ones(n), (np.arange(n), rim)), (n, model.n_vertices))
-    rows = sp.kron(narrow[:, None], own) + sp.kron((1.0 - narrow)[:, None], _means(loop, n, model.n_vertices))
-    rows = sp.vstack([rows, _means(loop, 1, model.n_vertices)]).tocsr()
+    across = _other_lip(model.mean[loop])
+    other = sp.csr_matrix(np.append(across, across[:1], axis=0)) @ own[:-1]
+    rows = sp.kron((1.0 - 0.5 * depth)[:, None], own) + sp.kron((0.5 * depth)[:, None], other)
+    rows = sp.vstack([rows, 0.5 * (own[:1] + other[:1])]).tocsr()
+    back = BEHIND_MM + (TEETH_MM - BEHIND_MM) * np.append(np.repeat(depth, n), 1.0)
+    lines = rows @ model.mean.astype(np.float64) - [0.0, 0.0, unit] * back[:, None]
     place = np.stack(np.broadcast_arrays(np.arange(n)[None] / (n - 1), 0.9 * depth[:, None]), axis=-1).reshape(-1, 2)
     uv = corner + extent * np.concatenate([place, [[0.5, 1.0]]])
     first = np.arange(n - 1)
-    faces = [
-        np.stack([(POUCH_LINES - 1) * n + first, (POUCH_LINES - 1) * n + first + 1, 0 * first + len(lines) - 1], 1)
-    ]
-    for k in range(POUCH_LINES - 1):
+    last = (MOUTH_LINES - 1) * n + first
+    # The sheet goes on from the skin, whose edges run along the loop: so it faces outward however closed the lips are.
+    faces = [np.stack([last + 1, last, 0 * first + len(lines) - 1], axis=1)]
+    for k in range(MOUTH_LINES - 1):
         a, b = first + k * n, first + k * n + 1
         faces += [np.stack([a, a + n, b + n], axis=1), np.stack([a, b + n, b], axis=1)]
     place_of = {int(vertex): i for i, vertex in enumerate(loop)}
     mirror = np.array([place_of.get(int(symmetry[vertex]), i) for i, vertex in enumerate(rim)])
     mirror[[0, -1]] = n - 1, 0
-    mirror = np.append((np.arange(POUCH_LINES)[:, None] * n + mirror).ravel(), len(lines) - 1)
-    albedo = np.tile(POUCH_ALBEDO, (len(lines), 1))
-    return _Piece(lines, rows, rows, _facing(lines, np.concatenate(faces), middle - lines), uv, albedo, mirror)
+    mirror = np.append((np.arange(MOUTH_LINES)[:, None] * n + mirror).ravel(), len(lines) - 1)
+    albedo = np.tile(MOUTH_ALBEDO, (len(lines), 1))
+    return _Piece(lines, rows, rows, np.concatenate(faces), uv, albedo, mirror)
+
+
+def _other_lip(rim: NDArray) -> NDArray[np.float64]:
+    """(n, n) weights of the vertices of a closed rim (n, 3) that lie opposite each of them, on the other lip."""
+    left, right = sorted((int(np.argmin(rim[:, 0])), int(np.argmax(rim[:, 0]))))
+    lips = np.arange(left, right + 1), np.append(np.arange(right, len(rim)), np.arange(left + 1))
+    weights = np.zeros((len(rim), len(rim)))
+    for one, two in (lips, lips[::-1]):
+        two = two[np.argsort(rim[two, 0])]
+        for column, vertex in zip(np.eye(len(two)), two, strict=True):
+            weights[one, vertex] = np.interp(rim[one, 0], rim[two, 0], column)
+    return weights
 
 
 def _carried(rows: sp.csr_matrix, modes: NDArray) -> NDArray:

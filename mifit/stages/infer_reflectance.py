@@ -89,8 +89,9 @@ def infer_reflectance(
     # Albedos of a lobe that isn't normalised, such as the paper's, have no physical level: stage 1's is taken as it is.
     physical = config.robust and config.solver == "als" and all(m.normalized for m in fitted_models(config))
     if physical:
+        mean = interpolate(model.mean_albedo, model.faces, surface.texels.face, surface.texels.weights)
         face = np.unique(model.faces[model.face_mask])
-        albedo = levelled(albedo, geometry.vertex_albedo[face], model.mean_albedo[face])
+        albedo = levelled(albedo, mean, geometry.vertex_albedo[face], model.mean_albedo[face])
     albedo = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float32)
     solve = fit_adam if config.solver == "adam" else fit_als
     fitted, choice, warnings = solve(surface, albedo, config, seed, progress)

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from mifit.core.mesh import vertex_normals
 from mifit.core.uv import rasterize_uv
@@ -100,6 +101,32 @@ def test_nothing_is_seen_through_the_eyes_and_the_mouth(skin, whole, variant) ->
         faces = [int(buffer.face[int(y), int(x)]) for x, y in points]
         seen.append([face >= len(skin.faces) and bool(front[face]) for face in faces])
     assert seen == [[False] * 3, [True] * 3]
+
+
+def test_the_mouth_is_closed_where_teeth_are(skin: MorphableModel, whole: MorphableModel) -> None:
+    """Opened lips show a sheet that faces outward and lies a few millimetres behind the middle between both."""
+    opened = np.zeros(skin.n_expression)
+    opened[[k for k, name in enumerate(skin.expression_names) if name.lower() == "jawopen"]] = 1.0
+    vertices = whole.shape(np.zeros(whole.n_identity), opened).astype(np.float64)
+    upper, lower = (vertices[whole.landmarks[k]] for k in (62, 66))
+    gap = upper[1] - lower[1]
+    assert gap * whole.unit_mm > 8.0
+    rays = trimesh.Trimesh(vertices, whole.faces, process=False)
+    for part in (0.3, 0.5, 0.7):
+        start = lower + part * (upper - lower) + [0.0, 0.0, 10.0]
+        # The nearest face that a look straight backward meets.
+        corners = vertices[whole.faces] - start
+        a, b, c = (corners[:, i, :2] for i in range(3))
+        area = [u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] for u, v in ((b, c), (c, a), (a, b))]
+        inside = np.flatnonzero((np.minimum.reduce(area) > 0) | (np.maximum.reduce(area) < 0))
+        weights = np.stack(area, axis=1)[inside]
+        depth = (weights / weights.sum(1, keepdims=True) * corners[inside, :, 2]).sum(1)
+        first = inside[np.argmax(depth)]
+        between = lower + part * (upper - lower)
+        behind = (between[2] - (start[2] + depth.max())) * whole.unit_mm
+        assert (whole.faces[first] >= skin.n_vertices).all()
+        assert -1.0 < behind < 8.0, (part, behind)
+        assert rays.face_normals[first][2] > 0.5
 
 
 def test_no_gap_is_left_between_lids_and_corners(skin, whole, variant) -> None:

@@ -19,20 +19,27 @@ EXPONENT = 20.0
 """Exponent of a roughness of 0.3: where none is given, and the images left out aren't predicted better by another."""
 
 
-def levelled(albedo: NDArray, fitted: NDArray, mean: NDArray) -> NDArray:
+FAINTEST = 0.2
+"""Part of the mean face's level, in its darkest channel, down to which a fitted albedo's contrasts are believed."""
+
+
+def levelled(albedo: NDArray, mean: NDArray, face: NDArray, mean_face: NDArray) -> NDArray:
     """Albedo with the level and colour of the morphable model's mean face.
 
     Stage 1 finds albedo beside light that is free, which says nothing of their product's split; its priors then decide,
-    and they made skin half as bright and four times as yellow as it was on path-traced heads. Differences between
-    places are told by images, so those stay.
+    and they made skin half as bright and four times as yellow as it was on path-traced heads, and in light far from
+    white drove a channel below nothing. Differences between places are told by images, so those stay, up to where they
+    would be magnified beyond belief.
 
     Parameters
     ----------
-    albedo : (N, 3)
-        Of the fitted model.
-    fitted, mean : (V, 3)
-        Albedo of the fitted model and of its mean at the vertices of the face.
+    albedo, mean : (N, 3)
+        Of the fitted model and of its mean at the points wanted.
+    face, mean_face : (V, 3)
+        The same at the vertices of the face, whose averages are the levels.
     """
-    wanted = np.maximum(np.asarray(mean, dtype=np.float64).mean(axis=0), 1e-3)
-    found = np.maximum(np.asarray(fitted, dtype=np.float64).mean(axis=0), 1e-3)
-    return albedo * (wanted / found)
+    wanted = np.maximum(np.asarray(mean_face, dtype=np.float64).mean(axis=0), 1e-3)
+    found = np.asarray(face, dtype=np.float64).mean(axis=0)
+    # The largest part of the way from the mean face to the fitted one that leaves every channel some light.
+    way = float(np.min((1.0 - FAINTEST) * wanted / np.maximum(wanted - found, (1.0 - FAINTEST) * wanted)))
+    return (mean + way * (albedo - mean)) * (wanted / (wanted + way * (found - wanted)))
