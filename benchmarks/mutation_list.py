@@ -36,6 +36,16 @@ CONVENTIONS = [
       "tests/capture/test_capture.py"),
 ]  # fmt: skip
 
+FOREIGN_HEADS = [
+    M("folds as noisy as the open sky", "mifit/appearance/*.py", r"dr\.fma\(seen, t, \(s - seen \* w\) / samples\)",
+      "t + (s - w) / samples", "tests/appearance/test_occlusion.py"),
+    M("a black channel's contrasts believed", STAGES, r"way = float\(np\.min\(.*", "way = 1.0", "tests/stages/test_skin_priors.py"),
+    M("lenses without a prior", CAPTURE, r"noise \* _unlikely\(one, size\)", "0.0 * _unlikely(one, size)",
+      "tests/capture/test_board_adjustment.py"),
+    M("frames out of step kept", CAPTURE, r"OUT_OF_STEP = 0\.5", "OUT_OF_STEP = 500.0",
+      "tests/capture/test_board_adjustment.py"),
+]  # fmt: skip
+
 MEASURES = [
     M("PSNR of powers", CORE, r"20\.0 \* math\.log10\(peak / error\)", "10.0 * math.log10(peak / error)",
       "tests/core/test_metrics.py"),
@@ -261,4 +271,18 @@ VIDEO = [
       "on_surface(model, posed.at((timestep,)), geometry.displacement)", "tests/test_resurfacing.py"),
 ]  # fmt: skip
 
-MUTATIONS = [*CONVENTIONS, *MEASURES, *LIGHT, *GEOMETRY, *MESH, *TERMS, *SURFACE, *EYES, *NEAR, *CAMERAS, *TIME, *VIDEO]
+MUTATIONS = [
+    *CONVENTIONS,
+    *FOREIGN_HEADS,
+    *MEASURES,
+    *LIGHT,
+    *GEOMETRY,
+    *MESH,
+    *TERMS,
+    *SURFACE,
+    *EYES,
+    *NEAR,
+    *CAMERAS,
+    *TIME,
+    *VIDEO,
+]
