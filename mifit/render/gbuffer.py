@@ -167,8 +167,9 @@ class SurfaceScene:
             np.full(shape, -1, np.int32), np.zeros((*shape, 3), np.float32), np.full(shape, np.inf, np.float32)
         )
         out.face[box], out.depth[box] = face, depth
-        valid = face >= 0
-        out.weights[box][valid] = np.stack([1.0 - u[valid] - v[valid], u[valid], v[valid]], axis=1)
+        weights = out.weights[box]
+        weights[..., 1], weights[..., 2] = u, v
+        np.subtract(1.0 - u, v, out=weights[..., 0], where=face >= 0)
         return out
 
     def _hits(self, camera: Camera) -> _Hits:
@@ -181,13 +182,12 @@ class SurfaceScene:
         if full in self._kept:
             return self._kept[full]
         box = self._box(camera)
-        centres = camera.pixel_centres()[box]
-        part = centres.shape[:2]
-        if not centres.size:
+        part = tuple(len(range(size)[side]) for side, size in zip(box, (camera.height, camera.width), strict=True))
+        if not all(part):
             nothing = np.zeros(part, np.float32)
             return box, np.full(part, -1, np.int32), nothing, nothing, nothing
-        directions = camera.pixel_rays(centres.reshape(-1, 2))
-        ray = mi.Ray3f(mi.Point3f(camera.position), on_device(mi.Vector3f, directions))
+        directions = camera.box_rays(*box)
+        ray = mi.Ray3f(mi.Point3f(camera.position), on_device(mi.Vector3f, directions.T))
         hit = self.rays.ray_intersect_preliminary(ray, coherent=True)
         dr.eval(hit.t, hit.prim_uv, hit.prim_index)  # one kernel: each array read would trace the rays again
         t = np.array(hit.t, dtype=np.float32)
@@ -196,7 +196,7 @@ class SurfaceScene:
         # Rays that hit nothing hold any bits in their coordinates: zeros, so that no sum of them warns.
         u, v = (np.where(valid, np.array(x, dtype=np.float32), np.float32(0)) for x in hit.prim_uv)
         depth = np.full(t.shape, np.inf, np.float32)
-        depth[valid] = t[valid] * (directions[valid] @ camera.rotation[2])
+        np.multiply(t, camera.rotation[2] @ directions, out=depth, where=valid, casting="same_kind")
         found = (box, *(x.reshape(part) for x in (face, u, v, depth)))
         while self._kept and len(self._kept) >= KEPT_VIEWS:
             self._kept.pop(next(iter(self._kept)))

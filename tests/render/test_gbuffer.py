@@ -109,7 +109,7 @@ def test_what_a_camera_saw_is_kept_until_the_mesh_moves(variant: str, ball, came
     scene = SurfaceScene(vertices, faces)
     first = scene.gbuffer(camera)
     first.face[:] = 7  # the caller's own
-    monkeypatch.setattr(Camera, "pixel_rays", lambda *_: pytest.fail("rays were sent again"))
+    monkeypatch.setattr(Camera, "box_rays", lambda *_: pytest.fail("rays were sent again"))
     again = scene.gbuffer(camera)
     monkeypatch.undo()
     fresh = SurfaceScene(vertices, faces).gbuffer(camera)
