@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from mifit.core.mesh import vertex_normals
 from mifit.core.ply import write_ply
 from mifit.core.split_mesh import SplitMesh, split_at_seams, tangent_space_map
 from mifit.core.subdivision import split_faces
+from mifit.core.threads import on_all_cores
 from mifit.result.ownership import claim, replacing_files
 from mifit.result.record import Result
 
@@ -41,18 +43,16 @@ def save(result: Result, folder: Path, write_scene: Callable[[Path], None], forc
     claim(folder, force)
     with replacing_files(folder, only=True) as new:
         surfaces = _surfaces(result)
-        for timestep in result.timesteps:
-            _write_timestep(result, new, timestep, surfaces)
+        files = [partial(_write_timestep, result, new, timestep, surfaces) for timestep in result.timesteps]
         if result.reflectance is not None:
-            for name in ("diffuse", "specular", "confidence"):
-                write_image(new / "maps" / f"{name}.exr", getattr(result.reflectance, name))
-            for name in ("frames", "relief"):
+            for name in ("diffuse", "specular", "confidence", "frames", "relief"):
                 found = getattr(result.reflectance, name)
                 if found is not None:
-                    write_image(new / "maps" / f"{name}.exr", found)
-            write_image(new / "lighting.exr", result.lighting.to_latlong())
+                    files.append(partial(write_image, new / "maps" / f"{name}.exr", found))
+            files.append(partial(write_image, new / "lighting.exr", result.lighting.to_latlong()))
             for (camera, timestep), labels in zip(result.reflectance.labelled, result.reflectance.labels, strict=True):
-                write_bytes(new / label_file(camera, timestep), encode_png(labels))
+                files.append(partial(_write_labels, new / label_file(camera, timestep), labels))
+        on_all_cores(lambda write: write(), files)
         if result.geometry.displacement is not None:
             np.savez(new / "geometry" / "displacement.npz", displacement=result.geometry.displacement)
         write_scene(new / "scene.xml")
@@ -126,6 +126,10 @@ def _write_timestep(result: Result, folder: Path, timestep: int, surfaces: Seque
         vertices = result.mesh.vertices[k]
         surfaces[1].write(folder, timestep, vertices, vertex_normals(vertices, result.mesh.faces))
         write_image(folder / "maps" / f"displacement_{timestep:04d}.exr", result.mesh.displacement[k])
+
+
+def _write_labels(path: Path, labels: NDArray[np.uint8]) -> None:
+    write_bytes(path, encode_png(labels))
 
 
 def write_data_png(path: Path, values: NDArray) -> None:
