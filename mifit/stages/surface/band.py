@@ -15,6 +15,8 @@ DARKEST = 4e-3
 """Added before the logarithm, in linear image units: below it the noise of 8-bit images outweighs the signal."""
 WINDOW = 3.0
 """Wide blur of the band, pixels of the level."""
+SAMPLED = 4096
+"""Points that are looked up at a time: what they need stays in a core's cache."""
 LARGEST = 0.3
 """Contrast in the logarithm above which a feature stops growing: highlights, hair, the edges of cast shadows."""
 
@@ -48,19 +50,21 @@ class FeatureImage:
         x, y, z = (start * (camera.fx * factor, camera.fy * factor, 1.0)).T.astype(np.float32)
         dx, dy, dz = (slope * (camera.fx * factor, camera.fy * factor, 1.0)).T.astype(np.float32)
         middle = np.float32(camera.cx * factor - 0.5), np.float32(camera.cy * factor - 0.5)
-        out = np.empty((len(offsets), len(start), self.values.shape[-1]), np.float32)
-        pixels = np.empty((len(start), 2), np.float32)
-        for k, offset in enumerate(np.asarray(offsets, np.float32)):
-            depth = z + offset * dz
+        steps = np.asarray(offsets, np.float32)[:, None]
+        out = np.empty((len(steps), len(start), self.values.shape[-1]), np.float32)
+        for first in range(0, len(start), SAMPLED):
+            part = slice(first, first + SAMPLED)
+            depth = z[part] + steps * dz[part]
             behind = depth <= 1e-12
             if behind.any():
                 depth[behind] = np.nan
-            np.divide(x + offset * dx, depth, out=pixels[:, 0])
-            np.divide(y + offset * dy, depth, out=pixels[:, 1])
+            pixels = np.empty((*depth.shape, 2), np.float32)
+            np.divide(x[part] + steps * dx[part], depth, out=pixels[..., 0])
+            np.divide(y[part] + steps * dy[part], depth, out=pixels[..., 1])
             pixels += middle
             if behind.any():
                 pixels[behind] = -10.0
-            out[k] = look_up(self.values, pixels)
+            out[:, part] = _remapped(self.values, pixels)
         return out
 
 
@@ -95,5 +99,9 @@ def look_up(values: NDArray, pixels: NDArray, columns: int = 4096) -> NDArray[np
     padded = np.full((-(-max(count, 1) // columns) * columns, 2), -10.0, np.float32)
     padded[:count] = pixels
     grid = padded.reshape(-1, columns, 2)
-    out = cv2.remap(values, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    return out.reshape(-1, values.shape[-1])[:count]
+    return _remapped(values, grid).reshape(-1, values.shape[-1])[:count]
+
+
+def _remapped(values: NDArray, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The same at (rows, columns, 2) positions, of not more columns than OpenCV takes."""
+    return cv2.remap(values, pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)

@@ -39,6 +39,8 @@ LEAST_APART, BEST_APART, FARTHEST_APART = 5.0, 25.0, 50.0
 """Angle between views of different timesteps that are compared, degrees."""
 MOST_PAIRS = 12
 """Of views of different timesteps."""
+ROWS = 32
+"""Of a map that are worked on at a time: what they need stays in a core's cache."""
 LEAST_SCORE = 0.4
 """Correlation below which a texel counts as not matched."""
 
@@ -135,7 +137,11 @@ def _shown(step: Posed, view: int, offsets: NDArray) -> _Shown:
     """What a view shows of texels moved by offsets, of those that it sees."""
     way = step.normal if step.shift is None else step.shift[view]
     rows = np.flatnonzero(step.seen[view] > 0)
-    at = step.images[view].sample(step.position[rows], way[rows], offsets)  # (K, n, 3)
+    if way[rows].any():
+        at = step.images[view].sample(step.position[rows], way[rows], offsets)  # (K, n, 3)
+    else:  # a view whose texels stay shows the same at every offset
+        still = step.images[view].sample(step.position[rows], way[rows], np.zeros(1))
+        at = np.broadcast_to(still, (len(offsets), *still.shape[1:]))
     feature = np.zeros((len(offsets), len(step.position)), np.float32)
     valid, bright = np.zeros(feature.shape[1], bool), np.zeros(feature.shape[1], np.float32)
     feature[:, rows], bright[rows] = at[..., 0], at[len(offsets) // 2, :, 2]
@@ -208,14 +214,22 @@ def _correlate(
 ) -> NDArray[np.float32]:
     """Correlation of two textures in windows, towards 0 where the contrast is noise."""
     x, y = texels.to_map(a) * mask, texels.to_map(b) * mask
-    stack = np.stack([x, y, x * x, y * y], axis=-1)
-    size = (window, window)
-    sums = cv2.blur(stack, size)
-    xy = cv2.blur(x * y, size)
-    n = np.maximum(inside, 1e-6)
-    mx, my = sums[..., 0] / n, sums[..., 1] / n
-    vx, vy = sums[..., 2] / n - mx * mx, sums[..., 3] / n - my * my
-    return (xy / n - mx * my) / np.sqrt((np.maximum(vx, 0) + NOISE**2) * (np.maximum(vy, 0) + NOISE**2))
+    sums = [cv2.blur(values, (window, window)) for values in (x, y, x * x, y * y, x * y)]
+    out = np.empty_like(x)
+    for start in range(0, len(x), ROWS):
+        rows = slice(start, start + ROWS)
+        n = np.maximum(inside[rows], np.float32(1e-6))
+        mx, my, vx, vy, xy = (values[rows] / n for values in sums)
+        vx -= mx * mx
+        vy -= my * my
+        for variance in (vx, vy):
+            np.maximum(variance, 0, out=variance)
+            variance += NOISE**2
+        vx *= vy
+        mx *= my
+        xy -= mx
+        np.divide(xy, np.sqrt(vx, out=vx), out=out[rows])
+    return out
 
 
 def _peak(score: NDArray, weight: NDArray, offsets: NDArray) -> Found:
