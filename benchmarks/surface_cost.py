@@ -72,8 +72,8 @@ def count_work(amounts: dict[str, float], stack: ExitStack) -> None:
         amounts["sweeps: texels x offsets x views"] += looks * len({view for pair in pairs for view in pair})
         amounts["sweeps: texels x offsets x pairs"] += looks * len(pairs)
 
-    def bordered(capture: Any, scene: SurfaceScene, name: str, timestep: int, factor: float) -> None:
-        amounts["borders: images"] += 1
+    def bordered(capture: Any, scene: SurfaceScene, names: Any, timestep: int, factor: float) -> None:
+        amounts["borders: images"] += len(names)
 
     def looked(scene: SurfaceScene, camera: Any) -> None:
         amounts["rays: images"] += 1

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 CHUNK_VALUES = 1 << 22
 """Texels x images that are held at a time."""
+JUDGED = 1 << 14
+"""Texels whose images are compared at a time: what they need stays in a core's cache."""
 
 
 @dataclass(frozen=True)
@@ -343,7 +345,9 @@ class Surface:
         step = np.array([m.step for m in self._images])
         right = np.float32(1.0) - wrong
         if self.trust:
-            right = agreement(colour, weight, wrong, clipped, step)
+            rows = [slice(at, at + JUDGED) for at in range(0, n, JUDGED)]
+            parts = on_all_cores(lambda r: agreement(colour[r], weight[r], wrong[r], clipped[r], step), rows)
+            right = np.concatenate(parts) if parts else right
             weight *= np.minimum(right, 1.0 - wrong)  # confirmed or not, a twin of a view adds nothing new
         return Observations(
             texel,

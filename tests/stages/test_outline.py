@@ -28,7 +28,7 @@ def borders(model, capture, inwards=0.0, factor=1.0):
     """In the left view of the true surface, moved inwards by so many millimetres; a unit is a centimetre."""
     truth = capture.vertices[0]
     moved = truth - 0.1 * inwards * vertex_normals(truth, model.faces)
-    return find_borders(capture, SurfaceScene(moved, model.faces), "left", 0, factor)
+    return find_borders(capture, SurfaceScene(moved, model.faces), ("left",), 0, factor)
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.5])
@@ -74,7 +74,7 @@ def test_where_the_mesh_ends_there_is_no_border(model, capture):
     towards = normalize(capture.camera("left").position - capture.vertices[0])
     kept = ((inner * towards).sum(1) > 0.7)[model.faces].all(1)
     scene = SurfaceScene(capture.vertices[0], model.faces[kept])
-    assert len(find_borders(capture, scene, "left", 0, 1.0).offset) == 0
+    assert len(find_borders(capture, scene, ("left",), 0, 1.0).offset) == 0
 
 
 def test_neighbours_outvote_a_stray_one():

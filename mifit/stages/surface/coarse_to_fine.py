@@ -165,7 +165,7 @@ class Search:
             2.0 * 0.5**level, 1.0
         )  # where the image mixes skin and background in a pixel the border is doubtful
         scene = self.scenes.at(timestep, vertices)
-        return joined([find_borders(self._capture, scene, camera, timestep, finer) for camera in self._cameras])
+        return find_borders(self._capture, scene, self._cameras, timestep, finer)
 
     def _sweep(self, texels: TexelMap, posed: Sequence[Posed], level: int, half: int, further: Sequence) -> Swept:
         """One sweep of a surface, with ``further`` pairs of views beside those of each timestep."""

@@ -9,6 +9,7 @@ solved exactly by one pass in either direction).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,12 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from mifit.core.camera import Camera
 from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.render.gbuffer import SurfaceScene
+from mifit.core.threads import on_all_cores
+from mifit.render.gbuffer import GBuffer, SurfaceScene
 from mifit.stages.surface.band import look_up
 
 if TYPE_CHECKING:
-    from mifit.capture import Capture
+    from mifit.capture import Capture, Frame
 
 REACH = 8
 """Farthest that the border is looked for to either side of the fitted silhouette, pixels of the level."""
@@ -81,32 +84,37 @@ class Borders:
     precision: NDArray[np.float64]
 
 
-def find_borders(capture: Capture, scene: SurfaceScene, name: str, timestep: int, factor: float) -> Borders:
-    """Borders of the surface that ``scene`` holds in one image.
+def find_borders(capture: Capture, scene: SurfaceScene, names: Sequence[str], timestep: int, factor: float) -> Borders:
+    """Borders of the surface that ``scene`` holds in the images of one timestep.
 
     Parameters
     ----------
     capture : Capture
     scene : SurfaceScene
         World space.
-    name : str
-        Camera.
+    names : sequence of str
+        Cameras.
     timestep : int
     factor : float
         Pixels of the level per pixel of the image, at most 1.
     """
-    camera, frame = capture.camera(name).resized(factor), capture.frame(name, timestep)
+    normals = vertex_normals(scene.vertices, scene.faces)
+    views = [(capture.camera(name).resized(factor), capture.frame(name, timestep)) for name in names]
+    # Rays take all cores by themselves.
+    seen = [(camera, frame, scene.gbuffer(camera)) for camera, frame in views]
+    return joined(on_all_cores(lambda view: _borders(*view, scene, normals), seen))
+
+
+def _borders(camera: Camera, frame: Frame, buffer: GBuffer, scene: SurfaceScene, normals: NDArray) -> Borders:
+    """Borders in one image, from what a camera at the level's resolution sees of the surface."""
     image, valid = (
         cv2.resize(values.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         for values in (frame.image, frame.valid)
     )
     log = np.log(image + np.float32(DARKEST))
-    buffer = scene.gbuffer(camera)
     vertices, faces = scene.vertices, scene.faces
-    pieces = _pieces(buffer.mask)
-    normals = vertex_normals(vertices, faces)
     found = []
-    for pixels in pieces:
+    for pixels in _pieces(buffer.mask):
         at = pixels[:, 1], pixels[:, 0]
         face, weights = buffer.face[at], buffer.weights[at].astype(np.float64)
         position = interpolate(vertices, faces, face, weights)
