@@ -93,6 +93,13 @@ def start(model, bumpy):
 
 
 @pytest.fixture(scope="module")
+def small(model):
+    """The same head in images of half the size, for what doesn't ask how near the surface comes, and a fit of it."""
+    capture = captured(model, bumps(model), width=255, height=180)
+    return capture, fitted_to(model, capture)
+
+
+@pytest.fixture(scope="module")
 def found(model, bumpy, start):
     return find_surface(bumpy, model, start, BOTH)
 
@@ -419,24 +426,27 @@ def test_the_width_of_the_face_is_that_in_the_images(model, bumpy, start):
     assert 1.0 < start.report.details["face_width_pixels"] / width < 1.2
 
 
-def test_a_refit_on_which_the_views_agree_less_is_dropped(model, bumpy, start, monkeypatch):
-    def misled(capture, model, geometry, *_, **__):
+def test_a_refit_on_which_the_views_agree_less_is_dropped(model, small, monkeypatch):
+    capture, start = small
+
+    def misled(_capture, model, geometry, *_, **__):
         return replace(geometry, vertices=geometry.vertices + np.float32(0.6), translation=geometry.translation + 0.6)
 
     monkeypatch.setattr("mifit.stages.find_surface.fit_model", misled)
     monkeypatch.setattr("mifit.stages.find_surface.landmarks_are_biased", lambda _: True)
-    kept = find_surface(bumpy, model, start, BOTH)
+    kept = find_surface(capture, model, start, BOTH)
     last = kept.report.details["phases"][-1]
     assert last["refitted"] is False and last["between_views"][0] < last["between_views"][1]
-    alone = find_surface(bumpy, model, start, BOTH, SurfaceConfig(refit=False))
+    alone = find_surface(capture, model, start, BOTH, SurfaceConfig(refit=False))
     assert np.array_equal(kept.vertices, alone.vertices)
 
 
-def test_a_single_timestep_gets_another_try(model, bumpy, start, monkeypatch):
+def test_a_single_timestep_gets_another_try(model, small, monkeypatch):
     """With other points and pixels, as a refit may end in a wrong place; several timesteps hold each other."""
+    capture, start = small
     seeds = []
 
-    def misled(capture, model, geometry, cameras, planes, sweeps, config, seed, **_):
+    def misled(_capture, model, geometry, cameras, planes, sweeps, config, seed, **_):
         seeds.append(seed)
         off = np.float32(0.6 if seed == 0 else 0.0)
         return replace(geometry, vertices=geometry.vertices + off, translation=geometry.translation + off)
@@ -446,43 +456,38 @@ def test_a_single_timestep_gets_another_try(model, bumpy, start, monkeypatch):
     errors = iter([[1.0, 2.0], [1.0, 0.9]])
     monkeypatch.setattr("mifit.stages.find_surface.errors_between_views", lambda *_: next(errors))
     config = SurfaceConfig(finest=2)
-    kept = find_surface(bumpy, model, start.at([0]), BOTH, config).report.details["phases"][-1]
+    kept = find_surface(capture, model, start.at([0]), BOTH, config).report.details["phases"][-1]
     assert seeds == [0, 1] and kept["refitted"] is True and kept["between_views"] == [1.0, 0.9]
     errors = iter([[1.0, 2.0]])
-    kept = find_surface(bumpy, model, start, BOTH, config).report.details["phases"][-1]
+    kept = find_surface(capture, model, start, BOTH, config).report.details["phases"][-1]
     assert seeds == [0, 1, 0] and kept["refitted"] is False
 
 
-def test_halves_are_compared_where_landmarks_are_biased_alone(model, bumpy, start, monkeypatch):
+def test_halves_are_compared_where_landmarks_are_biased_alone(model, small, monkeypatch):
     """A head within the model's span is as symmetric as its modes make it."""
+    capture, start = small
     given = []
     plate = Plate.of
     monkeypatch.setattr(Plate, "of", lambda *a, **k: given.append(k["symmetry"]) or plate(*a, **k))
     for biased in (False, True):
         monkeypatch.setattr("mifit.stages.find_surface.landmarks_are_biased", lambda _, biased=biased: biased)
-        find_surface(bumpy, model, start, BOTH, SurfaceConfig(refit=False, finest=2))
+        find_surface(capture, model, start, BOTH, SurfaceConfig(refit=False, finest=2))
         assert (given[-1] is model.symmetry) if biased else (given[-1] is None)
 
 
-def test_the_outcome_tells_whether_the_last_sweep_still_moved_the_surface(model, bumpy, start, monkeypatch):
-    """One sweep is only a start; at the level that it started at, further ones settle."""
-    ends = []
-    monkeypatch.setattr("mifit.stages.find_surface.SETTLING", 0)
-    for count in (1, 5):
-        monkeypatch.setattr("mifit.stages.find_surface.sweeps", lambda *_, count=count: [(0, 6)] * count)
-        ends.append(find_surface(bumpy, model, start, BOTH).report.details["phases"][-1])
-    assert [end["outcome"] for end in ends] == ["max_iterations", "converged"]
-    assert ends[1]["moved_last_mm"] < 0.3 * ends[0]["moved_last_mm"]
-
-
 def test_the_finest_sweep_is_repeated_until_the_surface_has_settled(model, bumpy, start, monkeypatch):
-    """At most twice, and not once where it has settled."""
-    ends = []
-    for count in (1, 5):
-        monkeypatch.setattr("mifit.stages.find_surface.sweeps", lambda *_, count=count: [(0, 6)] * count)
-        ends.append(find_surface(bumpy, model, start, BOTH).report.details["phases"][-1])
-    assert 1 < len(ends[0]["levels"]) <= 3 and len(ends[1]["levels"]) == 5
-    assert ends[0]["outcome"] == "converged" or len(ends[0]["levels"]) == 3
+    """One sweep is only a start; at the level that it started at two more follow at most, and none where it settled."""
+
+    def swept(count: int, settling: int) -> dict:
+        monkeypatch.setattr("mifit.stages.find_surface.sweeps", lambda *_: [(0, 6)] * count)
+        monkeypatch.setattr("mifit.stages.find_surface.SETTLING", settling)
+        return find_surface(bumpy, model, start, BOTH).report.details["phases"][-1]
+
+    once, again, settled = swept(1, 0), swept(1, 2), swept(5, 2)
+    assert [end["outcome"] for end in (once, settled)] == ["max_iterations", "converged"]
+    assert settled["moved_last_mm"] < 0.3 * once["moved_last_mm"]
+    assert len(once["levels"]) == 1 < len(again["levels"]) <= 3 and len(settled["levels"]) == 5
+    assert again["outcome"] == "converged" or len(again["levels"]) == 3
 
 
 def test_a_camera_off_its_calibration_is_told_by_the_epipolar_lines(model, bumpy, start, found):
