@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mifit.appearance.formation import form_image
 from mifit.appearance.reception import fibonacci_sphere
 from mifit.core.sh import bands, basis
+from mifit.core.threads import on_all_cores
 from mifit.solve import Outcome
 from mifit.stages.reflectance.lighting_equations import (
     PRIORS,
@@ -35,6 +36,8 @@ SLACK = 1.02
 """A step may raise the energy by this factor: robust weights and the gauge move between steps."""
 GROSS = 0.1
 """Linear colour beyond which a residual tells of something that no shading model here explains."""
+WEIGHTED = 1 << 18
+"""Residuals that are weighted at a time."""
 CAUCHY = 3.0
 """Residuals of this many robust standard deviations get half the weight."""
 
@@ -213,15 +216,22 @@ def active_weight(
     weight: NDArray, clipped: NDArray, residual: NDArray, robust: bool
 ) -> tuple[NDArray[np.float32], float]:
     """Weights of this iteration: clipped observations count only where the model is too dark, outliers less."""
-    measured = (weight > 0) & ~clipped[..., None]
-    values = np.abs(residual[measured])
-    sigma = 1.4826 * float(np.median(values[:: max(1, len(values) // 200_000)])) if len(values) else 0.0
-    bound = clipped[..., None]
-    active = np.where(bound & (residual <= 0), np.float32(0.0), weight)
-    if robust:
-        # Not for bounds: a highlight far below its bound is missing, not an outlier.
-        active = np.where(bound, active, active / (1.0 + (residual / max(CAUCHY * sigma, 1e-4)) ** 2))
-    return active.astype(np.float32), sigma
+    measured = np.flatnonzero((weight > 0) & ~clipped[..., None])
+    some = measured[:: max(1, len(measured) // 200_000)]
+    sigma = 1.4826 * float(np.median(np.abs(residual.reshape(-1)[some]))) if len(some) else 0.0
+    active = np.empty(np.broadcast_shapes(weight.shape, residual.shape), np.float32)
+
+    def fill(rows: slice) -> None:
+        bound, off = clipped[rows, ..., None], residual[rows]
+        part = np.where(bound & (off <= 0), np.float32(0.0), weight[rows])
+        if robust:
+            # Not for bounds: a highlight far below its bound is missing, not an outlier.
+            part = np.where(bound, part, part / (1.0 + (off / max(CAUCHY * sigma, 1e-4)) ** 2))
+        active[rows] = part
+
+    step = max(1, WEIGHTED * len(active) // max(active.size, 1))
+    on_all_cores(fill, [slice(at, at + step) for at in range(0, len(active), step)])
+    return active, sigma
 
 
 def bounded_weight(problem: LightingProblem | SeenRows, residual: NDArray) -> NDArray[np.float32]:
