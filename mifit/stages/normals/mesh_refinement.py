@@ -13,6 +13,7 @@ from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate,
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.mesh_update import MeshUpdater, displacement, interior_vertices, wanted_face_normals
 from mifit.core.subdivision import split_faces
+from mifit.core.threads import on_all_cores
 from mifit.core.uv import rasterize_uv
 from mifit.progress import Progress, silent
 from mifit.solve import Outcome
@@ -56,11 +57,13 @@ def refine_mesh(
     steps = normals.timesteps
     vertices = np.empty((len(steps), refiner.topology.n_vertices, 3), dtype=np.float32)
     heights = np.empty(normals.normal_object.shape[:3], dtype=np.float32)
-    outcomes = []
-    for i, timestep in enumerate(steps):
-        progress("refine mesh", i, len(steps))
-        vertices[i], heights[i], outcome = refiner.refine(geometry, timestep, normals.normal_object[i])
-        outcomes.append(outcome)
+    progress("refine mesh", 0, len(steps))
+
+    def refine(i: int) -> Outcome:
+        vertices[i], heights[i], outcome = refiner.refine(geometry, steps[i], normals.normal_object[i])
+        return outcome
+
+    outcomes = on_all_cores(refine, range(len(steps)))
     progress("refine mesh", len(steps), len(steps))
     seconds = time.perf_counter() - factorised
     details = {
