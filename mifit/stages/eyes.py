@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import vertex_normals
+from mifit.core.threads import on_all_cores
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs, leading_faces
 
@@ -39,21 +40,26 @@ def behind_lids(model: MorphableModel, geometry: GeometryEstimate) -> GeometryEs
     lids = leading_faces(model, min(int(eye.min()) for eye in eyes))
     unit = float(geometry.scale) / model.unit_mm  # of world length in a millimetre
     vertices = geometry.vertices.copy()
-    for world in (world for world in vertices for _ in range(PASSES)):
-        normals = vertex_normals(world, model.faces)
-        for eye in eyes:
-            points = world[eye].astype(np.float64)
-            own = np.isin(model.faces[:, 0], eye)
-            near = np.linalg.norm(world - points.mean(axis=0), axis=1) < np.ptp(points, axis=0).max()
-            covering = ~own & near[model.faces].any(axis=1)
-            skin = model.faces[covering if lids is None else covering & lids]
-            depth = _depth_outside(points, normals[eye], world.astype(np.float64), skin, SEARCH_MM * unit)
-            # Its neighbours go with a vertex: an edge from one behind the skin to one at it may cut the skin.
-            inner = np.searchsorted(eye, model.faces[own])
-            deepest = depth.copy()
-            np.maximum.at(deepest, inner, depth[inner].max(axis=1, keepdims=True))
-            moved = np.where(deepest > 0, deepest + GAP_MM * unit, 0.0)
-            world[eye] = (points - moved[:, None] * normals[eye]).astype(np.float32)
+
+    def place(world: NDArray[np.float32]) -> None:
+        """Move one timestep's eyeballs, in place."""
+        for _ in range(PASSES):
+            normals = vertex_normals(world, model.faces)
+            for eye in eyes:
+                points = world[eye].astype(np.float64)
+                own = np.isin(model.faces[:, 0], eye)
+                near = np.linalg.norm(world - points.mean(axis=0), axis=1) < np.ptp(points, axis=0).max()
+                covering = ~own & near[model.faces].any(axis=1)
+                skin = model.faces[covering if lids is None else covering & lids]
+                depth = _depth_outside(points, normals[eye], world.astype(np.float64), skin, SEARCH_MM * unit)
+                # Its neighbours go with a vertex: an edge from one behind the skin to one at it may cut the skin.
+                inner = np.searchsorted(eye, model.faces[own])
+                deepest = depth.copy()
+                np.maximum.at(deepest, inner, depth[inner].max(axis=1, keepdims=True))
+                moved = np.where(deepest > 0, deepest + GAP_MM * unit, 0.0)
+                world[eye] = (points - moved[:, None] * normals[eye]).astype(np.float32)
+
+    on_all_cores(place, list(vertices))
     return replace(geometry, vertices=vertices)
 
 
