@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
+from mifit.core.threads import on_all_cores
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.surface.band import feature_image
@@ -44,15 +45,15 @@ def pose_texels(
     """
     position = interpolate(vertices, faces, texels.face, texels.weights)
     normal = normalize(interpolate(vertex_normals(vertices, faces), faces, texels.face, texels.weights))
-    images, seen = [], np.zeros((len(cameras), len(position)), np.float32)
-    for row, name in enumerate(cameras):
+    shown, seen = [], np.zeros((len(cameras), len(position)), np.float32)
+    for row, name in enumerate(cameras):  # rays take all cores by themselves
         camera, frame = capture.camera(name), capture.frame(name, timestep)
-        valid = frame.valid & ~frame.clipped & shows_surface(scene, camera)
-        images.append(feature_image(camera, frame.image, valid, factor))
+        shown.append((camera, frame.image, frame.valid & ~frame.clipped & shows_surface(scene, camera)))
         cosine = (normalize(camera.position - position) * normal).sum(1)
         towards = np.flatnonzero(cosine > GRAZING_COSINE)
         towards = towards[scene.visible_from(position[towards], camera.position)]
         seen[row, towards] = cosine[towards]
+    images = on_all_cores(lambda view: feature_image(*view, factor), shown)
     return Posed(position, normal, tuple(images), seen)
 
 
