@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mifit.capture import Capture
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
+from mifit.core.threads import on_all_cores
 from mifit.morphable import MorphableModel
 from mifit.render.gbuffer import GBuffer, SurfaceScene
 from mifit.stages.geometry.consistency import TextureView
@@ -124,7 +125,7 @@ class Visibility:
 
     def textures(self, state: State, points: SurfacePoints, sigma: float, window: float) -> tuple[TextureView, ...]:
         """Log-texture of every image and the points it sees."""
-        out = []
+        looks, shown = [], []
         rows = points.basis
         for step, vertices in enumerate(self.world(state)):
             scene = self._look(step, vertices)
@@ -143,9 +144,13 @@ class Visibility:
                     continue
                 pick = (3 * seen[:, None] + np.arange(3)).ravel()
                 basis = PointBasis(rows.mean[pick], rows.identity[pick], rows.expression[pick])
-                image = texture_level(frame.image, usable, sigma, window)
-                out.append(TextureView(step, camera, image, seen, cosine[seen], basis))
-        return tuple(out)
+                looks.append((step, camera, seen, cosine[seen], basis))
+                shown.append((frame.image, usable))
+        # Rays, above, take all cores by themselves.
+        images = on_all_cores(lambda one: texture_level(*one, sigma, window), shown)
+        return tuple(
+            TextureView(step, camera, image, *seen) for (step, camera, *seen), image in zip(looks, images, strict=True)
+        )
 
     def pixels(self, state: State, count: int, sigma: float, seed: int, anew: bool = True) -> tuple[PixelView, ...]:
         """Up to ``count`` facial pixels of every image, chosen evenly at random.
