@@ -16,6 +16,8 @@ ANY = "mifit/**/*.py"
 CONVENTIONS = [
     M("pixel centres at integers", CORE, r"return np\.stack\(\[x \+ 0\.5, y \+ 0\.5\]", "return np.stack([x, y]",
       "tests/core/test_camera.py"),
+    M("rays of a box go through its pixels' corners", CORE, r"np\.arange\(self\.width\)\[columns\] \+ 0\.5", "np.arange(self.width)[columns]",
+      "tests/core/test_camera.py"),
     M("camera axes of OpenGL not turned", CORE, r"OPENGL_FROM_OPENCV = np\.diag\(\[1\.0, -1\.0, -1\.0, 1\.0\]\)",
       "OPENGL_FROM_OPENCV = np.diag([1.0, 1.0, 1.0, 1.0])", "tests/core/test_camera.py"),
     M("a point behind the camera projects", CORE, r"np\.where\(p\[\.\.\., 2\] > 1e-12, p\[\.\.\., 2\], np\.nan\)",
