@@ -15,9 +15,10 @@ from mifit.config import ReflectanceConfig
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate
 from mifit.progress import Progress
 from mifit.stages.observations import Observations, Surface
-from mifit.stages.reflectance.choice import choose_lighting, fit_lighting
+from mifit.stages.reflectance.choice import choose_lighting
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution
+from mifit.stages.reflectance.trials import fit_lighting
 
 
 def choose_diffuse_lighting(

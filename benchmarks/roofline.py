@@ -51,10 +51,10 @@ from mifit.stages.normals.normal_refinement import frame_problem
 from mifit.stages.normals.solvers import adam_steps, gauss_newton
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.als import LIGHTING_TEXELS
-from mifit.stages.reflectance.choice import lighting_problem
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import solve_lighting
 from mifit.stages.reflectance.maps import Smoothness, TexelSystems, solve_maps
+from mifit.stages.reflectance.trials import lighting_problem
 
 CAMERAS, TIMESTEPS = ("left", "right"), (0, 1, 2, 3)
 RAY_OPERATIONS = 800

@@ -126,7 +126,7 @@ class ReflectanceConfig:
     )
     shading: Annotated[str, pydantic.AfterValidator(_known_shading)] = one_of(
         "auto",
-        "image-formation model: paper, prefiltered, shadowed, keyed (shadowed with a distant compact light), near "
+        "image-formation model: paper, prefiltered, shadowed, keyed (shadowed with distant compact lights), near "
         "(with one at a place), matt (shadowed without specular reflection), or another that is registered; auto takes "
         "the one of the last four that best predicts images that are left out",
     )

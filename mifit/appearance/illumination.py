@@ -32,7 +32,14 @@ class Light(Protocol):
     colour : (3,)
         Linear Rec. 709. Of a distant light the irradiance of a surface that faces it, of a near one that irradiance
         at its centre.
+    direction : (3,)
+        Unit vector towards it, of a near light from its centre.
     """
+
+    @property
+    def direction(self) -> NDArray[np.float64]:
+        """(3,) unit vector."""
+        ...
 
     @property
     def colour(self) -> NDArray[np.float64]:

@@ -319,12 +319,13 @@ def _choice(result: Result) -> str:
     if not tried:
         return ""
     rows = "".join(
-        f"<tr><td>{html.escape(t['shading'])}</td><td>{t['exponent'] or 'none'}</td><td>{t['error']:.4f}</td></tr>"
+        f"<tr><td>{html.escape(t['shading'])}</td><td>{t.get('lights', '')}</td><td>{t['exponent'] or 'none'}</td>"
+        f"<td>{t['error']:.4f}</td></tr>"
         for t in tried
     )
     return f"""<p class="soft">Chosen: {html.escape(shading["chosen"])}, by how well {html.escape(shading["left_out"])}
 left out in turn are predicted (root mean square error of linear colour).</p>
-<table><tr><th>shading</th><th>exponent</th><th>error</th></tr>{rows}</table>"""
+<table><tr><th>shading</th><th>compact lights</th><th>exponent</th><th>error</th></tr>{rows}</table>"""
 
 
 def _convergence(result: Result) -> str:

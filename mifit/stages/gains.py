@@ -32,10 +32,10 @@ from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate
 from mifit.progress import Progress, silent
 from mifit.stages.observations import Observations, Surface
-from mifit.stages.reflectance.choice import lighting_problem
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution, solve_lighting
 from mifit.stages.reflectance.lighting_equations import LightingProblem
+from mifit.stages.reflectance.trials import lighting_problem
 
 if TYPE_CHECKING:
     from mifit.capture import Capture

@@ -19,8 +19,9 @@ from mifit.errors import InputError
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface
-from mifit.stages.reflectance.choice import fit_lighting, lighting_problem, plain_forward
+from mifit.stages.reflectance.choice import plain_forward
 from mifit.stages.reflectance.key import Candidates
+from mifit.stages.reflectance.trials import fit_lighting, lighting_problem
 from tests.shaded import light_columns, shade_points
 
 CONFIG = ReflectanceConfig(texture_size=SIZE, shading="keyed", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
@@ -171,7 +172,7 @@ def test_it_is_looked_for_beside_smoother_lighting_too(walled, monkeypatch):
     monkeypatch.setattr(choice, "_with_light", hidden_at_first)
     part = replace(CONFIG, texture_size=24, shading="auto")
     estimate = infer_reflectance(walled, walled.model, walled.geometry, ("left", "right"), part)
-    assert tried == [1.0, 10.0]
+    assert tried == [1.0, 10.0, 10.0]  # a second light is looked for beside what showed the first
     assert estimate.report.details["shading"]["chosen"] == "keyed"
     (key,) = estimate.illumination.lights
     assert np.degrees(np.arccos(key.direction @ KEY.direction)) < 2.0

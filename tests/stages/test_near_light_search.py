@@ -17,9 +17,9 @@ from mifit.errors import InputError
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface
-from mifit.stages.reflectance.choice import fit_lighting, lighting_problem
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.near import Judge, find_near, without_edges
+from mifit.stages.reflectance.trials import fit_lighting, lighting_problem
 from tests.shaded import appearance
 
 CONFIG = ReflectanceConfig(texture_size=SIZE, shading="auto", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
@@ -28,10 +28,10 @@ LAMP = NearLight(MIDDLE + 3.0 * normalize(np.array([0.6, 0.35, 0.75])), 0.03, np
 CAMERAS = ("left", "right")
 
 
-def dome_under(light: DistantLight | NearLight, steps: int = 3) -> TurningDome:
-    """The turning dome with a compact light beside the smooth one."""
+def dome_under(*lights: DistantLight | NearLight, steps: int = 3) -> TurningDome:
+    """The turning dome with compact lights beside the smooth one."""
     dome = turning_dome(steps=steps)
-    look = appearance(np.zeros((16, 3)), EXPONENT, "prefiltered", True, dome.fresnel, lights=(light,))
+    look = appearance(np.zeros((16, 3)), EXPONENT, "prefiltered", True, dome.fresnel, lights=lights)
     for (name, t), frame in dome.frames.items():
         view, v, faces = dome.camera(name), dome.geometry.vertices[t], dome.model.faces
         scene = SurfaceScene(v, faces)
@@ -39,7 +39,7 @@ def dome_under(light: DistantLight | NearLight, steps: int = 3) -> TurningDome:
         face, weights = buffer.face[buffer.mask], buffer.weights[buffer.mask]
         point = interpolate(v, faces, face, weights)
         normal = normalize(interpolate(vertex_normals(v, faces), faces, face, weights))
-        shadows = replace(OPEN, visible=(light.visible(scene, point, normal),))
+        shadows = replace(OPEN, visible=tuple(light.visible(scene, point, normal) for light in lights))
         matt, glossy = look.shade(normal, normalize(view.position - point), shadows, point)
         uv = interpolate(dome.model.uv, dome.model.faces_uv, face, weights)
         image = frame.image.copy()

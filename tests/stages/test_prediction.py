@@ -15,10 +15,10 @@ from mifit.config import ReflectanceConfig
 from mifit.core.mesh import interpolate
 from mifit.progress import silent
 from mifit.stages.observations import Surface
-from mifit.stages.reflectance import choice, prediction
-from mifit.stages.reflectance.choice import lighting_problem
+from mifit.stages.reflectance import prediction, trials
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.prediction import folds, predict
+from mifit.stages.reflectance.trials import lighting_problem
 
 
 @pytest.fixture(scope="module")
@@ -93,13 +93,13 @@ def test_a_camera_that_sees_nothing_predicts_nothing(scene):
 def test_trials_are_fitted_to_all_images_only_where_that_is_asked_for(scene, monkeypatch):
     seen, problem = scene
     fitted = []
-    real = choice.solve_held
-    monkeypatch.setattr(choice, "solve_held", lambda *given: fitted.append(given) or real(*given))
-    trials = choice._Trials(seen, problem().albedo, ReflectanceConfig(), silent)
+    real = trials.solve_held
+    monkeypatch.setattr(trials, "solve_held", lambda *given: fitted.append(given) or real(*given))
+    tried = trials.Trials(seen, problem().albedo, ReflectanceConfig(), silent)
     plain = Forward.of(models.get("prefiltered"), 4, Lobe(EXPONENT, 8.0))
-    right = trials.add("right", plain)
-    trials.add("right", plain.with_lobe(Lobe(EXPONENT / 8, 8.0)))
-    assert not fitted and right.score < trials.done[1].score
-    figures = trials.figures()
+    right = tried.add("right", plain)
+    tried.add("right", plain.with_lobe(Lobe(EXPONENT / 8, 8.0)))
+    assert not fitted and right.score < tried.done[1].score
+    figures = tried.figures()
     assert len(fitted) == 1 and figures["residuals"] == {"right": right.found.unexplained}
     assert len(fitted) == 1 and len(figures["predicted"]) == 2

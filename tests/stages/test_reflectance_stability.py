@@ -19,12 +19,12 @@ from mifit.core.uv import sample_map
 from mifit.errors import InputError
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface
-from mifit.stages.reflectance import choice
-from mifit.stages.reflectance.choice import fit_lighting, lighting_problem
+from mifit.stages.reflectance import trials
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import solve_lighting
 from mifit.stages.reflectance.lighting_equations import LightingPriors
 from mifit.stages.reflectance.maps import Smoothness, TexelSystems, laplacian, solve_maps
+from mifit.stages.reflectance.trials import fit_lighting, lighting_problem
 
 SIZE = 24
 CONFIG = ReflectanceConfig(texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
@@ -206,7 +206,7 @@ WEAK = LightingPriors(roughness=1e-10, negative=0.0, albedo=1e-6, specular=1e-6)
 def recover(scene, shading, bands, exponent, fresnel, monkeypatch):
     """Lighting and maps from the fast solver's own start, both solved to the end."""
     weak = {"priors": WEAK, "tolerance": 1e-7}
-    monkeypatch.setattr(choice, "solve_lighting", lambda *a, **k: solve_lighting(*a, **{**k, **weak}))
+    monkeypatch.setattr(trials, "solve_lighting", lambda *a, **k: solve_lighting(*a, **{**k, **weak}))
     surface, seen, forward, albedo = problem_of(scene, shading, bands, exponent, fresnel, FINE)
     config = replace(CONFIG, shading=shading, bands=bands, exponent=exponent)
     light = fit_lighting(seen, forward, albedo, config, 100)

@@ -18,8 +18,8 @@ from mifit.stages.absorb.information import Information
 from mifit.stages.absorb.linear import linear_shading
 from mifit.stages.normals.carried import CarriedTangents
 from mifit.stages.observations import Surface
-from mifit.stages.reflectance.choice import noise_weight
 from mifit.stages.reflectance.lighting import active_weight
+from mifit.stages.reflectance.trials import noise_weight
 
 if TYPE_CHECKING:
     from mifit.capture import Capture

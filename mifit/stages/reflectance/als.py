@@ -14,12 +14,13 @@ from mifit.core.threads import on_all_cores
 from mifit.progress import Progress
 from mifit.solve import Outcome
 from mifit.stages.observations import Observations, Surface
-from mifit.stages.reflectance.choice import choose_lighting, noise_weight
+from mifit.stages.reflectance.choice import choose_lighting
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution, active_weight
 from mifit.stages.reflectance.lighting_equations import expected_specular, specular_pull
 from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, solve_maps
 from mifit.stages.reflectance.objective import energies
+from mifit.stages.reflectance.trials import noise_weight
 
 LIGHTING_TEXELS = 6000
 """Texels that determine the lighting; a few hundred unknowns against 24 values of eight images each."""

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance import models
-from mifit.appearance.illumination import DistantLight
+from mifit.appearance.illumination import DistantLight, NearLight
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
 from mifit.config import ReflectanceConfig
@@ -19,24 +17,16 @@ from mifit.core.sh import LUMINANCE
 from mifit.progress import Progress
 from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.key import RADII, STEPS, TEXELS, Candidates, WideLights, find_lights, search
-from mifit.stages.reflectance.lighting import LightingSolution, solve_lighting
-from mifit.stages.reflectance.lighting_equations import PRIORS, LightingPriors, LightingProblem
+from mifit.stages.reflectance.key import RADII, STEPS, Candidates, WideLights, find_lights, search
+from mifit.stages.reflectance.lighting import LightingSolution
+from mifit.stages.reflectance.lighting_equations import PRIORS, LightingPriors
 from mifit.stages.reflectance.near import TEXELS as PLACE_TEXELS
 from mifit.stages.reflectance.near import UNKNOWN_SKIN, Judge, approach, find_near, without_edges
-from mifit.stages.reflectance.prediction import Prediction, predict
-from mifit.stages.reflectance.priors import EXPONENT, NORMAL_REFLECTANCE
+from mifit.stages.reflectance.priors import EXPONENT
+from mifit.stages.reflectance.trials import TRIAL_ITERATIONS, Trial, Trials, fit_lighting, lighting_problem
 
-NOISE_FLOOR = 0.03
-"""Read noise over shot noise, as variance in units of linear colour; 8-bit sRGB is coded about so as well."""
 MARGIN = 0.03
 """Another way to explain the images is taken where it lowers the error of predicted images by more than this part."""
-LEAN = 0.005
-"""Logarithm of the predicted error by which a lobe an octave off the physical one has to predict better, fourfold for
-two octaves: a normal prior of one octave beside a hundred independent measurements, which is about how many patches of
-a face with their own error there are."""
-EXPONENTS = (10.0, 160.0)
-"""Exponents between which a lobe is looked for, an octave at a time: Beckmann roughness 0.4 to 0.1."""
 JUDGES = 1200
 """Texels by which ways to explain the images are compared."""
 PLACE_ITERATIONS = 20
@@ -46,6 +36,8 @@ PLACE_SEARCHES, APPROACH = 3, 0.3
 NEARER, CLEARLY = 0.015, 0.1
 """Part by which a compact light at a place has to lower the error of predicted images below that of the same light far
 away, which has one unknown less; and, where no image can be left out, that of the fit."""
+LIGHTS = 3
+"""Compact lights at the most: a face shows a few lamps apart, and what more there are is smooth light to it."""
 FAINT = 0.2
 """Irradiance of a compact light, relative to that of all other light: below, it is taken for a flaw of the model."""
 START_ITERATIONS = 5
@@ -53,8 +45,8 @@ START_ITERATIONS = 5
 SMOOTH = LightingPriors(roughness=10.0 * PRIORS.roughness)
 """Where no compact light helps beside lighting with the usual priors, one is looked for beside smoother lighting: on a
 mesh that is millimetres off, ten bands twist themselves until they leave nothing for it to explain."""
-TRIAL_ITERATIONS = 8
-"""Gauss-Newton iterations of a way to explain the images that is only compared with others."""
+SETTLING_ITERATIONS = 8
+"""Gauss-Newton iterations of a fit about which the places of compact lights are searched again."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +114,7 @@ def choose_lighting(
     plain = plain_forward(model, config.exponent or model.exponent or EXPONENT, config, surface)
     plain = replace(plain, glossy=way.glossy)
     step = max(1, len(seen.texel) // JUDGES)
-    trials = _Trials(seen.take(slice(0, None, step)), albedo[::step], config, progress)
+    trials = Trials(seen.take(slice(0, None, step)), albedo[::step], config, progress)
     chosen = trials.add(way.model if way.lights else config.shading if not auto else "shadowed", plain)
     free = config.exponent is None and model.exponent is None and way.glossy
     if free:
@@ -131,17 +123,16 @@ def choose_lighting(
     if auto or way.lights:
         why = "no compact light explains enough"
         wide = WideLights.of(trials.seen.take(trials.few), chosen.forward)
-        for priors in (PRIORS, SMOOTH):
-            lit = _with_light(trials, chosen, priors, wide)
+        beside: tuple[LightingPriors, ...] = (PRIORS, SMOOTH)
+        while len(chosen.forward.lights) < LIGHTS:
+            lit = _lit(trials, chosen, wide, way, auto, beside)
             if lit is None:
-                continue
-            keyed, why = trials.add("keyed", lit), "as configured"
-            best = _nearer(trials, keyed, way.near) if auto or way.near else keyed
-            if way.near and best is keyed:
-                why = "the compact light is too far away to have a place"
-            if not auto or best.error < (1.0 - MARGIN) * chosen.error:
-                chosen = trials.best_exponent(best) if free else best
                 break
+            best, priors = lit
+            beside, why = (priors,), "as configured"  # what showed the first light is what may show another
+            if way.near and best.name != "near":
+                why = "the compact light is too far away to have a place"
+            chosen = trials.best_exponent(best) if free else best
     if auto:
         why = f"predicts images left out better than others by more than {MARGIN:.0%}, or is the likeliest beforehand"
         if chosen.prediction is not None:
@@ -153,111 +144,43 @@ def choose_lighting(
     return chosen.forward, found, {"chosen": chosen.name, "why": why, **trials.figures()}
 
 
-@dataclass(frozen=True)
-class Trial:
-    """A way to explain the images, fitted to some of the texels.
+def _lit(
+    trials: Trials,
+    chosen: Trial,
+    wide: WideLights,
+    way: Candidate,
+    auto: bool,
+    beside: Sequence[LightingPriors],
+) -> tuple[Trial, LightingPriors] | None:
+    """A trial with one compact light more, or two, and beside which lighting they were found.
 
-    Attributes
-    ----------
-    name : str
-        Of the candidate.
-    forward : Forward
-    fit : callable
-        Finds the lighting by all images.
-    prediction : Prediction or None
-        None where there is nothing to leave out.
+    None where it doesn't predict better; the first one that is asked for is taken all the same.
     """
-
-    name: str
-    forward: Forward
-    fit: Callable[[], LightingSolution] = field(repr=False)
-    prediction: Prediction | None
-
-    @cached_property
-    def found(self) -> LightingSolution:
-        """The fit to all images: what is compared are predictions, so that most trials do without."""
-        return self.fit()
-
-    @property
-    def exponent(self) -> float:
-        """Of its lobe."""
-        return self.forward.lobe.typical
-
-    @property
-    def error(self) -> float:
-        """Error of predicted images; of the fitted ones where none can be predicted."""
-        return self.found.unexplained if self.prediction is None else self.prediction.error
-
-    @property
-    def score(self) -> float:
-        """Logarithm of the error, and of how unlikely the lobe is beforehand."""
-        return float(np.log(max(self.error, 1e-12)) + LEAN * np.log2(self.exponent / EXPONENT) ** 2)
+    first = not chosen.forward.lights
+    if not first and chosen.prediction is None:
+        return None  # the fit's own error is lower with every light
+    for priors in beside:
+        lit = _with_light(trials, chosen, priors, wide)
+        if lit is None:
+            continue
+        best, limit = trials.add("near" if _has_near(lit) else "keyed", lit), (1.0 - MARGIN) * chosen.error
+        # The strongest light tells best how far away it is: beside one that is distant the others stay so as well.
+        if (auto or way.near) and (first or (_has_near(chosen.forward) and best.error < limit)):
+            best = _nearer(trials, best, len(lit.lights) - len(chosen.forward.lights), way.near and first)
+        if (first and not auto) or best.error < limit:
+            return best, priors
+    return None
 
 
-class _Trials:
-    """Ways to explain some of the texels, each tried once."""
-
-    def __init__(self, seen: Observations, albedo: NDArray, config: ReflectanceConfig, progress: Progress) -> None:
-        self.seen, self.albedo, self.config, self.progress = seen, albedo, config, progress
-        self.done: list[Trial] = []
-
-    @property
-    def few(self) -> slice:
-        """Those of the texels by which compact lights are looked for."""
-        return slice(0, None, max(1, len(self.seen.texel) // TEXELS))
-
-    def add(self, name: str, forward: Forward) -> Trial:
-        """Fit one, and let it predict."""
-        self.progress("Reflectance lighting", len(self.done), len(self.done) + 1)
-        config, prediction = self.config, None
-        specular = NORMAL_REFLECTANCE if forward.glossy else 0.0
-        if forward.model.turns:
-            fit = partial(fit_lighting, self.seen, forward, self.albedo, config, TRIAL_ITERATIONS, specular)
-        else:
-            problem = lighting_problem(self.seen, forward, forward.dark, self.albedo, config.robust)
-            fit = partial(solve_held, problem, forward, config, TRIAL_ITERATIONS, specular)
-            if config.robust:
-                prediction = predict(self.seen, problem, specular)
-        self.done.append(Trial(name, forward, fit, prediction))
-        return self.done[-1]
-
-    def best_exponent(self, best: Trial) -> Trial:
-        """The exponent that predicts best, beginning with a trial's; its own where there is nothing to predict."""
-        if best.prediction is None:
-            return best
-        start = best
-        for factor in (2.0, 0.5):
-            while EXPONENTS[0] <= factor * best.exponent <= EXPONENTS[1]:
-                lobe = replace(best.forward.lobe, exponent=factor * best.exponent)
-                trial = self.add(start.name, best.forward.with_lobe(lobe))
-                if not trial.score < best.score:
-                    break
-                best = trial
-            if best is not start:
-                break
-        return best
-
-    def figures(self) -> dict[str, Any]:
-        """Errors of images: fitted, by candidate with the exponent that predicts best, and predicted, by exponent."""
-        best: dict[str, Trial] = {}
-        for trial in self.done:
-            if trial.name not in best or trial.score < best[trial.name].score:
-                best[trial.name] = trial
-        residuals = {name: float(trial.found.unexplained) for name, trial in best.items()}
-        predicted = [
-            {"shading": t.name, "exponent": t.exponent if t.forward.glossy else None, "error": t.prediction.error}
-            for t in self.done
-            if t.prediction is not None
-        ]
-        left_out = next((t.prediction.left_out for t in self.done if t.prediction is not None), None)
-        return {"residuals": residuals, "predicted": predicted, "left_out": left_out}
+def _has_near(forward: Forward) -> bool:
+    return any(isinstance(light, NearLight) for light in forward.lights)
 
 
-def _with_light(trials: _Trials, chosen: Trial, priors: LightingPriors, wide: WideLights) -> Forward | None:
-    """A model with a compact light where one explains enough, found on some of the texels.
+def _with_light(trials: Trials, chosen: Trial, priors: LightingPriors, wide: WideLights) -> Forward | None:
+    """A model with compact lights more where they explain enough, found on some of the texels.
 
-    The search starts from the fit without the light, which had to make up for it; a second one starts from the fit
-    with it.
+    The search starts from the fit without them, which had to make up for them; a second one starts from the fit with
+    them.
     """
     seen, config, forward, found = trials.seen, trials.config, chosen.forward, chosen.found
     if priors is not PRIORS:
@@ -266,32 +189,68 @@ def _with_light(trials: _Trials, chosen: Trial, priors: LightingPriors, wide: Wi
     part, expected = seen.take(few), trials.albedo[few]
     found = replace(found, diffuse=found.diffuse[few], specular=found.specular[few])
     problem = lighting_problem(part, forward, found.light, expected, config.robust)
-    for light in find_lights(Candidates.about(part, forward, problem, found, priors), wide):
-        lit = forward.with_lights((light,))
-        fitted = fit_lighting(part, lit, expected, config, 8, priors=priors)
-        mean = np.sqrt(np.pi) / 2.0 * fitted.light[0]  # irradiance from everywhere, pi times the mean radiance
-        (irradiance,) = (light.colour for light in lit.under(fitted.light).illumination.lights)
-        if irradiance @ LUMINANCE < FAINT * mean @ LUMINANCE:
+    for lights in find_lights(Candidates.about(part, forward, problem, found, priors, forward.lights), wide):
+        if len(forward.lights) + len(lights) > LIGHTS:
             continue
-        problem = lighting_problem(part, lit, fitted.light, expected, config.robust)
-        candidates = Candidates.about(part, lit, problem, fitted, priors)
-        _, light = search(candidates, light.direction, light.radius, 0.25 * STEPS[0])
-        if light.radius < RADII[1]:
-            return forward.with_lights((light,))
+        lit = _settled(part, forward.with_lights((*forward.lights, *lights)), expected, config, priors)
+        if lit is not None:
+            return lit
     return None
 
 
-def _nearer(trials: _Trials, keyed: Trial, wanted: bool) -> Trial:
-    """The same with its compact light at a place, where that predicts better or is wanted; itself otherwise.
+def _settled(
+    seen: Observations, forward: Forward, albedo: NDArray, config: ReflectanceConfig, priors: LightingPriors
+) -> Forward | None:
+    """The same with each distant compact light, the last one first, searched again beside all others.
+
+    Each was found where others were missing or elsewhere. None where one turns out faint, or not compact.
+    """
+    for _ in forward.lights:
+        *others, light = forward.lights
+        fitted = fit_lighting(seen, forward, albedo, config, SETTLING_ITERATIONS, priors=priors)
+        mean = np.sqrt(np.pi) / 2.0 * fitted.light[0]  # irradiance from everywhere, pi times the mean radiance
+        if fitted.light[-1] @ LUMINANCE < FAINT * mean @ LUMINANCE:
+            return None
+        if isinstance(light, DistantLight):
+            problem = lighting_problem(seen, forward, fitted.light, albedo, config.robust)
+            candidates = Candidates.about(seen, forward, problem, fitted, priors, tuple(others))
+            _, light = search(candidates, light.direction, light.radius, 0.25 * STEPS[0])
+            if not light.radius < RADII[1]:
+                return None
+        forward = forward.with_lights((light, *others))  # once around, they are in their order again
+    return forward
+
+
+def _nearer(trials: Trials, keyed: Trial, count: int, wanted: bool) -> Trial:
+    """The same with some of its last compact lights at places, where that predicts better.
+
+    Where it doesn't for any of them, but is wanted, the last one gets its place all the same.
+    """
+    best, unlikely = keyed, None
+    for number in range(count):
+        near = _placed(trials, best, -1 - number)
+        if near is None:
+            continue
+        margin = NEARER if near.prediction is not None else CLEARLY
+        if near.error < (1.0 - margin) * best.error:
+            best = near
+        else:
+            unlikely = unlikely or near
+    return unlikely if wanted and best is keyed and unlikely is not None else best
+
+
+def _placed(trials: Trials, keyed: Trial, number: int) -> Trial | None:
+    """The same with one of its compact lights at a place, and last; None where it is too far away to have one.
 
     The place is searched again from a fit with the light at the last one.
     """
     seen, config = trials.seen, trials.config
     step = max(1, len(seen.texel) // PLACE_TEXELS)
     part, expected = seen.take(slice(0, None, step)), trials.albedo[::step]
-    light = keyed.forward.lights[0]
+    others = list(keyed.forward.lights)
+    light = others.pop(number)
     for _ in range(PLACE_SEARCHES):
-        forward = keyed.forward.with_lights((light,))
+        forward = keyed.forward.with_lights((*others, light))
         certain = without_edges(part, forward)
         found = fit_lighting(certain, forward, expected, config, PLACE_ITERATIONS, priors=UNKNOWN_SKIN)
         problem = lighting_problem(certain, forward, found.light, expected, config.robust)
@@ -299,75 +258,5 @@ def _nearer(trials: _Trials, keyed: Trial, wanted: bool) -> Trial:
         far = isinstance(light, DistantLight)
         light = find_near(judge, light, part.point) if far else approach(judge, light, APPROACH)
         if light is None:
-            return keyed
-    near = trials.add("near", keyed.forward.with_lights((light,)))
-    margin = NEARER if near.prediction is not None else CLEARLY
-    return near if wanted or near.error < (1.0 - margin) * keyed.error else keyed
-
-
-def noise_weight(colour: NDArray, robust: bool) -> NDArray[np.float32]:
-    """(..., 3) inverse variance of read and shot noise, 1 at mid-grey; 1 everywhere when not robust."""
-    if not robust:
-        return np.ones_like(colour)
-    return ((NOISE_FLOOR + 0.3) / (NOISE_FLOOR + np.clip(colour, 0.0, 1.0))).astype(np.float32)
-
-
-def lighting_problem(
-    seen: Observations, forward: Forward, light: NDArray, albedo: NDArray, robust: bool
-) -> LightingProblem:
-    """Collect the transfer vectors and weights of some texels."""
-    diffuse, specular = forward.transfers(seen, light)
-    weight = seen.weight[..., None] * noise_weight(seen.colour, robust)
-    return LightingProblem(seen.colour, weight, seen.clipped, diffuse, specular, albedo, forward.order)
-
-
-def fit_lighting(
-    seen: Observations,
-    forward: Forward,
-    albedo: NDArray,
-    config: ReflectanceConfig,
-    iterations: int,
-    specular: float = NORMAL_REFLECTANCE,
-    priors: LightingPriors = PRIORS,
-) -> LightingSolution:
-    """Lighting and the subset's albedos; a model that turns with the lighting is linearised anew."""
-    if not forward.model.turns:
-        problem = lighting_problem(seen, forward, forward.dark, albedo, config.robust)
-        return solve_held(problem, forward, config, iterations, specular, priors)
-    # Without highlights first, so that there is lighting to linearise about.
-    problem = lighting_problem(seen, forward, forward.dark, albedo, config.robust)
-    problem = replace(problem, specular=np.zeros_like(problem.specular))
-    ambient = forward.model.has_ambient
-    found = solve_lighting(problem, priors=priors, robust=config.robust, with_ambient=ambient, iterations=6)
-    energy = list(found.energy)
-    for _ in range(4):
-        problem = lighting_problem(seen, forward, found.light, albedo, config.robust)
-        found = solve_lighting(
-            problem,
-            found.light,
-            priors=priors,
-            robust=config.robust,
-            with_ambient=ambient,
-            iterations=max(2, iterations // 4),
-        )
-        energy += found.energy
-    return replace(found, energy=energy)
-
-
-def solve_held(
-    problem: LightingProblem,
-    forward: Forward,
-    config: ReflectanceConfig,
-    iterations: int,
-    specular: float = NORMAL_REFLECTANCE,
-    priors: LightingPriors = PRIORS,
-) -> LightingSolution:
-    """Lighting and albedos under a model that doesn't turn with the lighting."""
-    return solve_lighting(
-        problem,
-        specular=specular if forward.glossy else 0.0,
-        priors=priors,
-        robust=config.robust,
-        with_ambient=forward.model.has_ambient,
-        iterations=iterations,
-    )
+            return None
+    return trials.add("near", keyed.forward.with_lights((*others, light)))

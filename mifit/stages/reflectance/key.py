@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.formation import form_image
-from mifit.appearance.illumination import DistantLight
+from mifit.appearance.illumination import DistantLight, Light
 from mifit.appearance.reception import fibonacci_sphere
 from mifit.core.threads import on_all_cores
 from mifit.stages.observations import Observations
@@ -29,35 +29,38 @@ SPACING, WIDE = np.radians([12.0, 8.0])
 LEAST = 0.05
 """Part of the texels that a light must reach to be looked at."""
 STARTS, APART = 3, np.radians(30.0)
-"""Second searches, and the least angle between their starts."""
+"""Second searches, and the least angle between their starts, and to compact lights that there are."""
 STEPS = np.radians([4.0, 0.2])
 """Second search: from the first step to the last one."""
 RADII = np.radians([0.25, 10.0])
 """Angular radii that count as compact; a search that ends at the upper one has found no compact light."""
-WORTH = 0.03
-"""Part of the energy that a compact light must explain to be tried."""
+WORTH, WORTH_BESIDE = 0.03, 0.01
+"""Part of the energy that a compact light must explain to be tried: the first one, and one beside another, which is
+weaker than that. This spares time; whether a light is kept is told by prediction."""
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """What a lighting leaves unexplained, ready to judge compact lights.
+    """What a lighting leaves unexplained, ready to judge compact lights beside those that it has.
 
     Attributes
     ----------
     seen : Observations
         n texels in J images.
     forward : Forward
-        The model without a compact light.
+        The model without compact lights.
     columns : callable
         What a compact light sends off the texels, `Forward.light_columns`.
     rows : three of (n * J, K)
-        Derivative of the image by the lighting, per channel.
+        Derivative of the image by the lighting, compact lights that are kept included, per channel.
     weight, residual, diffuse_light, specular_light : (n, J, 3)
     diffuse : (n, 3), specular_albedo : (n,)
     inverse : (n, 4, 4), diffuse_cross : (3, n, K), specular_cross : (n, 3K), own_right : (n, 4)
         The texels' blocks of the normal equations (`LightingEquations`).
     factor : (3K, 3K), right : (3K,)
         Inverse and right-hand side of the equations for the lighting with the texels eliminated.
+    kept : tuple of Light
+        Compact lights that are among the lighting.
     """
 
     seen: Observations
@@ -76,6 +79,7 @@ class Candidates:
     own_right: NDArray
     factor: NDArray
     right: NDArray
+    kept: tuple[Light, ...] = ()
 
     @classmethod
     def about(
@@ -85,9 +89,13 @@ class Candidates:
         problem: LightingProblem,
         found: LightingSolution,
         priors: LightingPriors = PRIORS,
+        kept: tuple[Light, ...] = (),
     ) -> Candidates:
-        """Linearise about a solution, whose own compact light, if any, is taken away: candidates are to replace it."""
-        k = forward.order**2
+        """Linearise about a solution with the first of its compact lights kept.
+
+        The others are taken away: candidates are to replace them.
+        """
+        k = forward.order**2 + len(kept)
         light = found.light.astype(np.float32)
         x, y = found.diffuse[:, None], found.specular[:, None, None]
         residual = problem.colour - form_image(0.0, x, problem.diffuse @ light, y, problem.specular @ light)
@@ -128,6 +136,7 @@ class Candidates:
             normal.own_right,
             np.linalg.inv(remaining.reduced),
             remaining.right,
+            kept,
         )
 
     def explained(self, lights: Sequence[DistantLight], open_sky: NDArray[np.uint32] | None = None) -> NDArray:
@@ -212,27 +221,43 @@ class WideLights:
 
 
 def starts(candidates: Candidates, wide: WideLights) -> list[NDArray[np.float64]]:
-    """Directions from which a search is worth a trial, the most promising first, `APART` from one another.
+    """Directions from which a search is worth a trial, the most promising first.
+
+    They are `APART` from one another and from lights that are kept: what seems to stand beside a lamp is its shape.
 
     A wide light in a wrong place may explain as much as one in the right place: only the narrow ones that the searches
     end with tell them apart.
     """
     directions, gains = wide.directions, wide.explained(candidates)
+    worth = WORTH_BESIDE if candidates.kept else WORTH
     energy = float((candidates.weight * candidates.residual**2).sum())
     found: list[NDArray[np.float64]] = []
     for number in np.argsort(-gains):
-        if len(found) == STARTS or not gains[number] > WORTH * energy:
+        if len(found) == STARTS or not gains[number] > worth * energy:
             break
-        if all(direction @ directions[number] < np.cos(APART) for direction in found):
+        if apart(directions[number], [*(light.direction for light in candidates.kept), *found]):
             found.append(directions[number])
     return found
 
 
-def find_lights(candidates: Candidates, wide: WideLights) -> list[DistantLight]:
-    """Compact lights, each the best about one of `starts`, the one that explains most first; none where none does."""
+def apart(direction: NDArray, others: Sequence[NDArray]) -> bool:
+    """Whether a direction is `APART` from all others."""
+    return all(direction @ other < np.cos(APART) for other in others)
+
+
+def find_lights(candidates: Candidates, wide: WideLights) -> list[tuple[DistantLight, ...]]:
+    """What to try beside the lights that there are, the most promising first; none where nothing explains enough.
+
+    Compact lights, each the best about one of `starts`. Where two lights are missing a search for one may widen to make
+    up for the other: so the two best places of any size come last, together.
+    """
     found = [search(candidates, direction, WIDE, STEPS[0]) for direction in starts(candidates, wide)]
-    compact = [(gain, light) for gain, light in found if light.radius < RADII[1]]
-    return [light for _, light in sorted(compact, key=lambda pair: -pair[0])]
+    ranked: list[DistantLight] = []
+    for _, light in sorted(found, key=lambda pair: -pair[0]):
+        if apart(light.direction, [other.direction for other in (*candidates.kept, *ranked)]):
+            ranked.append(light)
+    compact = [(light,) for light in ranked if light.radius < RADII[1]]
+    return [*compact, *([tuple(ranked[:2])] if len(ranked) > 1 else [])]
 
 
 def search(

@@ -46,16 +46,16 @@ middle of a face to its rim, as skin itself does, and over whole regions the alb
 
 @dataclass(frozen=True)
 class Judge:
-    """A fit with one compact light, ready to judge others in its place.
+    """A fit with compact lights, ready to judge others in the place of the last one.
 
     Attributes
     ----------
     columns : callable
         What a compact light sends off the texels, `Forward.light_columns`.
     problem : LightingProblem
-        The smooth light's columns alone.
+        The columns of all other light.
     found : LightingSolution
-        With the colour of the compact light last.
+        With the colour of the compact light that is to be replaced last.
     weight : (M, 3)
         Of the observations that there are, under the light that was fitted.
     priors : LightingEquations
@@ -80,8 +80,8 @@ class Judge:
         found: LightingSolution,
         priors: LightingPriors = PRIORS,
     ) -> Judge:
-        """Linearise about a fit of a model with one compact light to observations without `edges`."""
-        bands = forward.order**2
+        """Linearise about a fit to observations without `edges`; the last compact light is the one to be replaced."""
+        rest = forward.unknowns - 1
         rows = problem.rows()
         light = found.light.astype(np.float32)
         diffuse, specular = rows.diffuse @ light, rows.specular @ light
@@ -94,9 +94,9 @@ class Judge:
         added = LightingEquations(
             **{name: getattr(whole, name) - getattr(plain, name) for name in plain.__dataclass_fields__}
         )
-        smooth = replace(problem, diffuse=problem.diffuse[..., :bands], specular=problem.specular[..., :bands])
+        others = replace(problem, diffuse=problem.diffuse[..., :rest], specular=problem.specular[..., :rest])
         columns = forward.with_lights(()).light_columns(seen)
-        return cls(columns, smooth, found, weight, added, forward.visible(seen, [forward.lights[0]])[0])
+        return cls(columns, others, found, weight, added, forward.visible(seen, [forward.lights[-1]])[0])
 
     def unexplained(self, lights: Sequence[Light]) -> NDArray[np.float64]:
         """(M,) energy that each of some compact lights leaves once all else has followed it by a step."""
@@ -132,8 +132,8 @@ class Judge:
 
 
 def without_edges(seen: Observations, forward: Forward) -> Observations:
-    """Observations where the compact light of a model, were it `EDGE` in radius, would be seen whole or not at all."""
-    light = forward.lights[0]
+    """Observations where a model's last compact light, were it `EDGE` in radius, would be seen whole or not at all."""
+    light = forward.lights[-1]
     assert isinstance(light, (DistantLight, NearLight))
     distance = light.distance if isinstance(light, NearLight) else 1.0
     bits = forward.visible(seen, [replace(light, radius=EDGE * distance)])[0]

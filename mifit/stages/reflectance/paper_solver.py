@@ -16,8 +16,9 @@ from mifit.solve import Outcome
 from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.adam import HISTORY, Samples, minimize_by_adam
 from mifit.stages.reflectance.als import Fitted
-from mifit.stages.reflectance.choice import candidate, fit_lighting, noise_weight, plain_forward
+from mifit.stages.reflectance.choice import candidate, plain_forward
 from mifit.stages.reflectance.forward import Forward
+from mifit.stages.reflectance.trials import fit_lighting, noise_weight
 
 PAPER_EXPONENT = 5.0
 """Exponent where none is given, as in the paper, whatever the model."""

@@ -1,0 +1,86 @@
+"""Several compact lights, of both kinds, in saved results, renders, scene files, reports, glTF and relighting."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mifit.appearance.illumination import DistantLight, NearLight
+from mifit.core.mesh import normalize
+from mifit.output.export import export
+from mifit.output.report import _lighting
+from mifit.output.scene import write_scene
+from mifit.reconstruction import Reconstruction
+
+FAR = DistantLight(normalize(np.array([-0.6, 0.5, 0.6])), 0.01, np.array([1.0, 1.5, 2.0]))
+NEAR = NearLight(np.array([12.0, 10.0, 24.0]), 0.1, np.array([2.0, 1.5, 1.0]), np.zeros(3))
+
+
+def under(result, *lights):
+    illumination = replace(result.illumination, lights=lights)
+    reflectance = replace(result.reflectance, shading_model="prefiltered", illumination=illumination)
+    return replace(result, reflectance=reflectance, normals=None, mesh=None)
+
+
+@pytest.fixture(scope="module")
+def lit(ball, variant):
+    return under(ball, FAR, NEAR)
+
+
+def test_they_survive_saving_in_their_order(lit, tmp_path):
+    lit.save(tmp_path)
+    far, near = Reconstruction.load(tmp_path, lit.model).illumination.lights
+    np.testing.assert_array_equal(far.direction, FAR.direction)
+    np.testing.assert_array_equal(far.colour, FAR.colour)
+    assert isinstance(near, NearLight)
+    np.testing.assert_allclose(near.position, NEAR.position)
+    np.testing.assert_allclose(near.colour, NEAR.colour)
+
+
+@pytest.mark.parametrize(("integrator", "samples"), [("local", 2), ("path", 128)])
+def test_each_adds_to_a_render_what_it_adds_alone(lit, integrator, samples):
+    results = [lit, under(lit, FAR), under(lit, NEAR), under(lit)]
+    images = [r.render(lit.cameras[0], 0, "diffuse", integrator, samples, seed=1) for r in results]
+    both, far, near, dark = (image[images[0][..., 3] == 1][:, :3] for image in images)
+    alone = [(part - dark).mean(0) for part in (far, near)]
+    assert min(part.min() for part in alone) > 0.005
+    np.testing.assert_allclose((both - dark).mean(0), sum(alone), rtol=1e-3 if integrator == "local" else 0.03)
+
+
+def test_scene_files_hold_an_emitter_each(lit, tmp_path):
+    write_scene(lit, tmp_path / "scene.xml", 0)
+    for name in ("scene.xml", "scene_stock.xml"):
+        text = (tmp_path / name).read_text()
+        assert text.index('id="light_1"') < text.index('id="light_2"')
+        assert 'type="directional"' in text and 'type="point"' in text
+
+
+def test_the_report_says_where_each_is(lit):
+    text = _lighting(lit)
+    assert all(light.describe(lit.unit_mm) in text for light in (FAR, NEAR))
+
+
+def test_glb_files_name_each(lit, tmp_path):
+    export(lit, "glb", tmp_path / "ball.glb")
+    data = (tmp_path / "ball.glb").read_bytes()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+
+    def lists(value):
+        if isinstance(value, dict):
+            return [value["lights"]] if "lights" in value else [x for v in value.values() for x in lists(v)]
+        return [x for v in value for x in lists(v)] if isinstance(value, list) else []
+
+    (found,) = (each for each in lists(document) if each and "radius" in each[0])
+    assert found == json.loads(json.dumps([FAR.document(), NEAR.document()]))
+
+
+def test_relighting_turns_all_of_them(lit):
+    far, near = lit.relight(lit.illumination, rotate=90.0).illumination.lights
+    x, y, z = FAR.direction
+    np.testing.assert_allclose(far.direction, [z, y, -x], atol=1e-6)
+    middle = lit.geometry.vertices[0].mean(0)
+    x, y, z = NEAR.position - middle
+    np.testing.assert_allclose(near.position - middle, [z, y, -x], atol=1e-4)
