@@ -285,11 +285,25 @@ VIDEO = [
       "on_surface(model, posed.at((timestep,)), geometry.displacement)", "tests/test_resurfacing.py"),
 ]  # fmt: skip
 
+GLOSS = [
+    M("a cornea without its coat", OUTPUT, r"\*\(\[_eyes\(skin\)\] if balls\.any\(\) else \[\]\)", "*([{**skin, 'name': 'eyes'}] if balls.any() else [])",
+      "tests/output/test_export.py -k coat"),
+    M("a specular map believed wherever it was seen", STAGES, r"\(quality, quality \* told\.share\)", "(quality, quality)",
+      "tests/stages/test_fill.py"),
+    M("a texel's errors are its own", STAGES, r"side = 2 \* max\(1, round\(SURROUNDINGS \* texels\.size\)\) \+ 1", "side = 1",
+      "tests/stages/test_told.py"),
+    M("residuals in the dark count as large as others", STAGES, r"np\.abs\(residual\) \* np\.sqrt\(weight\), np\.float32\(-1\.0\)",
+      "np.abs(residual), np.float32(-1.0)", "tests/stages/test_told.py"),
+    M("what the diffuse albedo could show told of the specular one", STAGES, r"np\.maximum\(self\.ss - taken\.sum\(1\)", "np.maximum(self.ss",
+      "tests/stages/test_told.py"),
+]  # fmt: skip
+
 MUTATIONS = [
     *CONVENTIONS,
     *FOREIGN_HEADS,
     *MEASURES,
     *LIGHT,
+    *GLOSS,
     *GEOMETRY,
     *MESH,
     *TERMS,

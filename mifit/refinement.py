@@ -258,18 +258,20 @@ class Refinement(Generic[R]):
         images = len(added) * len(result.cameras)
         quality = np.minimum(information.quality / max(1.0, 0.35 * images), 1.0)
         albedo = interpolate(result.geometry.vertex_albedo, model.faces, texels.face, texels.weights)
-        diffuse, specular, confidence = blend_unseen(model, texels, albedo, found.maps, quality)
-        parted = part_relief(model, texels, diffuse, confidence) if result.reflectance.relief is not None else None
+        filled = blend_unseen(model, texels, albedo, found.maps, quality, found.told)
+        parts = result.reflectance.relief is not None
+        parted = part_relief(model, texels, filled.diffuse, filled.confidence) if parts else None
         reflectance = replace(
             result.reflectance,
-            diffuse=diffuse if parted is None else parted.skin,
+            diffuse=filled.diffuse if parted is None else parted.skin,
             relief=None if parted is None else parted.relief,
-            specular=specular,
-            confidence=confidence,
+            specular=filled.specular,
+            confidence=filled.confidence,
+            specular_confidence=filled.specular_confidence,
             frames=texels.to_map(information.frames.astype(np.float32)),
         )
         facial = np.where(absorber.facial[:, None], 1.0, 0.0)
-        shown = Rows(len(result.timesteps), diffuse.shape, np.float32)
+        shown = Rows(len(result.timesteps), filled.diffuse.shape, np.float32)
         for timestep in result.timesteps:
             normals = normalize(bend(*absorber.carried.frame(result.geometry.at((timestep,))), found.offsets))
             shown.add(texels.to_map((normals * facial).astype(np.float32)))

@@ -174,6 +174,9 @@ class ReflectanceEstimate:
     relief : (S, S) float32 or None
         Factor of the diffuse light of the capture that mesh and lighting don't explain: relief finer than the mesh,
         edges of shadows. None where nothing was parted from the albedo, and under any other light.
+    specular_confidence : (S, S) float32 or None
+        `confidence` of the specular map: 0 as well where a texel was seen but told nothing of its specular albedo. None
+        in results of older versions.
     """
 
     diffuse: NDArray
@@ -187,6 +190,7 @@ class ReflectanceEstimate:
     labelled: tuple[tuple[str, int], ...] = ()
     frames: NDArray | None = None
     relief: NDArray | None = None
+    specular_confidence: NDArray | None = None
 
     @property
     def lit_diffuse(self) -> NDArray:

@@ -18,17 +18,24 @@ from mifit.core.files import replacing
 from mifit.core.image import encode_png, to_8_bit
 from mifit.core.mesh import vertex_normals
 from mifit.core.split_mesh import SplitMesh, part_of, split_at_seams, tangent_space_map, tangents
+from mifit.morphable.openings import eyeballs
 from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
     from mifit.core.camera import Camera
     from mifit.core.estimate import GeometryEstimate
+    from mifit.morphable import MorphableModel
     from mifit.result import Result
 
 _KINDS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 DIELECTRIC_F0 = 0.04
 """Reflectance at normal incidence of glTF's dielectric, which KHR_materials_specular scales."""
+CORNEA_F0, CORNEA_ROUGHNESS = 0.025, 0.05
+"""Reflectance at normal incidence of the tear film on a cornea (index of refraction 1.376), and its roughness in glTF's
+terms: as smooth as viewers bear."""
+SKIN, REST, EYES = range(3)
+"""Materials, in their order."""
 
 
 class _Buffer:
@@ -75,8 +82,9 @@ def write_glb(
     The head is in metres, in object space, under a node that holds its pose; the fitted cameras stand beside it.
     Faces with a place in the atlas have the maps: base colour, tangent-space normals, and the specular albedo through
     KHR_materials_specular. glTF has GGX lobes, so the Blinn-Phong exponent m becomes alpha = sqrt(2 / (m + 2)), the
-    usual relation, and roughness = sqrt(alpha). The other faces have vertex colours. The model's expressions are
-    morph targets, with the timestep's coefficients as weights. Recovered lighting is in the scene's ``extras``:
+    usual relation, and roughness = sqrt(alpha). Eyeballs have a material of their own, which is that of the skin under
+    the clear coat of a cornea (KHR_materials_clearcoat). The other faces have vertex colours. The model's expressions
+    are morph targets, with the timestep's coefficients as weights. Recovered lighting is in the scene's ``extras``:
     glTF has no spherical harmonics.
 
     Parameters
@@ -107,7 +115,9 @@ def write_glb(
     albedo = vertex_materials(reconstruction, skin=True)[:, :3]
     primitives = []
     mapped = mapped_faces(reconstruction)
-    for material, selected in enumerate((mapped, ~mapped)):
+    balls = mapped & _eyeball_faces(model)
+    parts = {SKIN: mapped & ~balls, REST: ~mapped, EYES: balls}
+    for material, selected in parts.items():
         if selected.any():
             part = part_of(mesh, selected)
             primitives.append(_primitive(out, part, base, normals, targets, material, albedo))
@@ -131,9 +141,14 @@ def write_glb(
     for camera in reconstruction.cameras:
         nodes.append(_camera_node(camera, len(cameras), metre))
         cameras.append(_camera(camera))
+    materials = [
+        skin,
+        {"name": "rest", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}},
+        *([_eyes(skin)] if balls.any() else []),
+    ]
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"mifit {mifit.__version__}"},
-        "extensionsUsed": ["KHR_materials_specular"],
+        "extensionsUsed": sorted({name for material in materials for name in material.get("extensions", {})}),
         "scene": 0,
         "scenes": [
             {
@@ -148,10 +163,7 @@ def write_glb(
         ],
         "nodes": nodes,
         "meshes": [{"name": model.name, "primitives": primitives}],
-        "materials": [
-            skin,
-            {"name": "rest", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}},
-        ],
+        "materials": materials,
         "textures": textures,
         "images": images,
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
@@ -177,13 +189,13 @@ def _primitive(
     material: int,
     albedo: NDArray,
 ) -> dict[str, Any]:
-    """One primitive: with texture coordinates and tangents (material 0), or with vertex colours (material 1)."""
+    """One primitive: with texture coordinates and tangents, or of the material without maps with vertex colours."""
     n = normals[part.origin]
     attributes = {
         "POSITION": out.accessor(base[part.origin], "<f4", bounds=True),
         "NORMAL": out.accessor(n, "<f4"),
     }
-    if material == 0:
+    if material != REST:
         tangent, sign = tangents(base[part.origin], n, part.uv, part.faces)
         attributes["TANGENT"] = out.accessor(np.column_stack([tangent, sign]), "<f4")
         attributes["TEXCOORD_0"] = out.accessor(part.uv * (1, -1) + (0, 1), "<f4")
@@ -245,6 +257,17 @@ def _skin(
         },
     }
     return images, textures, skin
+
+
+def _eyes(skin: dict[str, Any]) -> dict[str, Any]:
+    """Material of eyeballs: what the maps show, under a clear coat with the mesh's own smooth normals."""
+    coat = {"clearcoatFactor": CORNEA_F0 / DIELECTRIC_F0, "clearcoatRoughnessFactor": CORNEA_ROUGHNESS}
+    return {**skin, "name": "eyes", "extensions": {**skin["extensions"], "KHR_materials_clearcoat": coat}}
+
+
+def _eyeball_faces(model: MorphableModel) -> NDArray[np.bool_]:
+    """(F,) faces of the model's eyeballs."""
+    return np.isin(model.faces[:, 0], np.concatenate([np.zeros(0, np.int64), *eyeballs(model)]))
 
 
 def _animation(

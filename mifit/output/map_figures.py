@@ -25,6 +25,9 @@ def picture_maps(result: Result, timestep: int) -> str:
         _grey("Specular albedo", reflectance.specular),
         _grey("Confidence: how often and how well each texel was seen", reflectance.confidence, 1.0),
     ]
+    if reflectance.specular_confidence is not None:
+        caption = "Confidence of the specular albedo: how far images tell it"
+        figures.append(_grey(caption, reflectance.specular_confidence, 1.0))
     if reflectance.relief is not None:
         figures.append(
             _grey(

@@ -249,7 +249,11 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
     radiance = _array(lighting["radiance"], (order * order, 3), "radiance")
     diffuse = _read_map(folder / "maps" / "diffuse.exr", 3)
     labels = _labels(folder, document)
-    frames, relief = (folder / "maps" / name for name in ("frames.exr", "relief.exr"))
+
+    def optional(name: str) -> NDArray[np.float32] | None:
+        path = folder / "maps" / f"{name}.exr"
+        return _read_map(path, 1, len(diffuse)) if path.exists() else None
+
     return ReflectanceEstimate(
         diffuse=diffuse,
         specular=_read_map(folder / "maps" / "specular.exr", 1, len(diffuse)),
@@ -260,8 +264,9 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
         report=_report(document, "reflectance"),
         labels=tuple(labels.values()),
         labelled=tuple(labels),
-        frames=_read_map(frames, 1, len(diffuse)) if frames.exists() else None,
-        relief=_read_map(relief, 1, len(diffuse)) if relief.exists() else None,
+        frames=optional("frames"),
+        relief=optional("relief"),
+        specular_confidence=optional("specular_confidence"),
     )
 
 

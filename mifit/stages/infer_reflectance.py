@@ -99,7 +99,7 @@ def infer_reflectance(
     if not (np.isfinite(fitted.maps).all() and np.isfinite(illumination.unknowns).all()):
         raise ConvergenceError("stage 2 (reflectance): the maps or the lighting are not finite; see the images' range")
     quality = surface.quality()
-    diffuse, specular, confidence = blend_unseen(model, surface.texels, albedo, fitted.maps, quality, mirrored)
+    filled = blend_unseen(model, surface.texels, albedo, fitted.maps, quality, fitted.told, mirrored)
     if fitted.outcome is Outcome.MAX_ITERATIONS:
         warnings = (*warnings, "the lighting had not converged when the iterations ran out; raise max_iterations")
     details: dict = {
@@ -118,16 +118,17 @@ def infer_reflectance(
         light = illumination.unknowns, illumination.ambient
         terms = energies(surface, forward, *light, fitted.maps, albedo, config)
         details["objective"] = {**terms, "total": sum(terms.values())}
-    relief = None
+    diffuse, relief = filled.diffuse, None
     if config.robust and config.relief and config.solver == "als":
-        parted = part_relief(model, surface.texels, diffuse, confidence)
+        parted = part_relief(model, surface.texels, diffuse, filled.confidence)
         diffuse, relief = parted.skin, parted.relief
         details["spread"] = {"symmetric": parted.symmetric, "sided": parted.sided}
     return ReflectanceEstimate(
         diffuse=diffuse,
         relief=relief,
-        specular=specular,
-        confidence=confidence,
+        specular=filled.specular,
+        confidence=filled.confidence,
+        specular_confidence=filled.specular_confidence,
         illumination=illumination,
         lobe=fitted.appearance.lobe,
         shading_model=fitted.appearance.model.name,

@@ -15,6 +15,7 @@ from mifit.core.mesh import vertex_normals
 from mifit.core.split_mesh import split_at_seams, tangents
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
+from mifit.output.map_figures import picture_maps
 from mifit.reconstruction import Reconstruction
 
 
@@ -53,6 +54,16 @@ def test_gains_of_cameras_round_trip(ball, tmp_path):
     geometry = dataclasses.replace(ball.geometry, gains={"left": (1.0, 1.0, 1.0), "right": (1.25, 0.9, 1.1)})
     dataclasses.replace(ball, geometry=geometry).save(tmp_path)
     assert Reconstruction.load(tmp_path, ball.model).geometry.gains == geometry.gains
+
+
+def test_confidence_of_the_specular_map_round_trips(ball, tmp_path):
+    shares = np.random.default_rng(0).random(ball.reflectance.confidence.shape, np.float32)
+    reflectance = dataclasses.replace(ball.reflectance, specular_confidence=shares)
+    dataclasses.replace(ball, reflectance=reflectance).save(tmp_path)
+    again = Reconstruction.load(tmp_path, ball.model).reflectance
+    np.testing.assert_array_equal(again.specular_confidence, shares)
+    assert "Confidence of the specular albedo" in picture_maps(dataclasses.replace(ball, reflectance=reflectance), 0)
+    assert "Confidence of the specular albedo" not in picture_maps(ball, 0)
 
 
 def test_folder_holds_the_files_of_the_contract(saved):

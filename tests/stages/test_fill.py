@@ -30,14 +30,25 @@ def test_the_unseen_side_takes_what_the_other_shows(half_seen):
     albedo = np.full((len(truth), 3), 0.4, np.float32)
     errors = []
     for mirrored in (None, mirrored_coordinates(model, texels)):
-        diffuse, specular, confidence = blend_unseen(
-            model, texels, albedo, texels.to_map(found), seen.astype(float), mirrored
-        )
-        filled = np.concatenate([texels.from_map(diffuse), texels.from_map(specular)[:, None]], axis=1)
+        told = np.ones(len(truth), np.float32)
+        blend = blend_unseen(model, texels, albedo, texels.to_map(found), seen.astype(float), told, mirrored)
+        filled = np.concatenate([texels.from_map(blend.diffuse), texels.from_map(blend.specular)[:, None]], axis=1)
         errors.append(np.sqrt(np.mean((filled - truth)[~seen] ** 2)))
         np.testing.assert_allclose(filled[seen], truth[seen], atol=0.03)
-        np.testing.assert_array_equal(texels.from_map(confidence), seen)
+        np.testing.assert_array_equal(texels.from_map(blend.confidence), seen)
+        np.testing.assert_array_equal(blend.specular_confidence, blend.confidence)
     assert errors[1] < 0.01 and errors[1] < 0.3 * errors[0]
+
+
+def test_what_was_seen_but_told_nothing_of_its_gloss_says_so(half_seen):
+    """The maps stay as they were found; the specular one's confidence is its own."""
+    model, texels, truth, _, seen = half_seen
+    told = np.where(np.arange(len(truth)) % 3 == 0, 0.0, 0.8).astype(np.float32)
+    albedo = np.full((len(truth), 3), 0.4, np.float32)
+    blend = blend_unseen(model, texels, albedo, texels.to_map(truth), seen.astype(float), told)
+    np.testing.assert_array_equal(texels.from_map(blend.specular_confidence), seen * told)
+    np.testing.assert_array_equal(texels.from_map(blend.confidence), seen)
+    np.testing.assert_allclose(texels.from_map(blend.specular)[seen], truth[seen, 3], atol=0.03)
 
 
 def test_a_model_without_symmetry_is_refused(half_seen):

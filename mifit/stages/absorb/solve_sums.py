@@ -13,6 +13,7 @@ from mifit.stages.absorb.information import Information
 from mifit.stages.absorb.normals import reduced, solve_offsets
 from mifit.stages.reflectance.lighting_equations import specular_pull
 from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, solve_maps
+from mifit.stages.reflectance.told import find_told
 
 ROUNDS = 4
 """Of maps and normals in turn."""
@@ -36,12 +37,15 @@ class Solved:
         Standard deviation of the residuals, linear colour.
     outcome : Outcome
         Of the normals' last solve.
+    told : (N,) float32
+        Share of the images in the specular albedo (`told.find_told`).
     """
 
     maps: NDArray[np.float32]
     offsets: NDArray[np.float64]
     sigma: float
     outcome: Outcome
+    told: NDArray[np.float32]
 
 
 def solve_sums(
@@ -77,10 +81,11 @@ def solve_sums(
     share = min(1.0, IMAGES / max(images, 1))
     counted = 3.0 * max(float(information.weight.sum()), 1e-12)
     face = take(information, rows)
-    noise, outcome = 0.0, Outcome.MAX_ITERATIONS
+    noise, outcome, expected = 0.0, Outcome.MAX_ITERATIONS, float(prior[..., 3].max())
     for _ in range(ROUNDS):
         texel = maps.reshape(-1, 4)[texels.index].astype(np.float64)
-        noise = float(information.residual(texel[:, :3], texel[:, 3], offsets).sum()) / counted
+        squares = information.residual(texel[:, :3], texel[:, 3], offsets)
+        noise = float(squares.sum()) / counted
         system, right = reduced(face, texel[rows, :3], texel[rows, 3], max(noise, 1e-8))
         offsets = offsets.copy()
         offsets[rows], outcome = solve_offsets(system, right, neighbours, texels.size, offsets[rows])
@@ -96,9 +101,12 @@ def solve_sums(
                 )
             )
         )
-        pull = specular_pull(float(prior[..., 3].max()), float(np.sqrt(noise)))
+        pull = specular_pull(expected, float(np.sqrt(noise)))
         maps = solve_maps(systems, texels.index, prior, smoothness, maps, specular_pull=pull, splits=splits)
-    return Solved(maps, offsets, float(np.sqrt(noise)), outcome)
+    sigma = float(np.sqrt(noise))
+    errors = np.sqrt(squares / np.maximum(3.0 * information.weight, 1e-12))
+    told = find_told(texels, systems, errors, information.weight, expected, sigma)
+    return Solved(maps, offsets, sigma, outcome, told)
 
 
 def take(information: Information, rows: NDArray) -> Information:

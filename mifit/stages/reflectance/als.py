@@ -20,6 +20,7 @@ from mifit.stages.reflectance.lighting import LightingSolution, active_weight
 from mifit.stages.reflectance.lighting_equations import expected_specular, specular_pull
 from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, solve_maps
 from mifit.stages.reflectance.objective import energies
+from mifit.stages.reflectance.told import deviations, find_told, robust_deviation, whitened
 from mifit.stages.reflectance.trials import noise_weight
 
 LIGHTING_TEXELS = 6000
@@ -53,6 +54,8 @@ class Fitted:
         Of the lighting, or of the whole objective where that is minimised.
     maps_outcome : Outcome
         Of the last solve for the maps.
+    told : (N,) float32
+        Share of the images in the specular albedo (`told.find_told`).
     """
 
     appearance: Appearance
@@ -61,6 +64,31 @@ class Fitted:
     energies: dict[str, list[float]]
     outcome: Outcome
     maps_outcome: Outcome
+    told: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class SolvedMaps:
+    """Maps for a lighting.
+
+    Attributes
+    ----------
+    maps : (S, S, 4) float32
+        Diffuse and specular albedo.
+    energy : dict of str to list of float
+        Per pass.
+    sigma : float
+        Robust standard deviation of the residuals in linear colour.
+    outcome : Outcome
+    told : (N,) float32
+        Share of the images in the specular albedo (`told.find_told`).
+    """
+
+    maps: NDArray[np.float32]
+    energy: dict[str, list[float]]
+    sigma: float
+    outcome: Outcome
+    told: NDArray[np.float32]
 
 
 def fit_maps(
@@ -71,19 +99,19 @@ def fit_maps(
     config: ReflectanceConfig,
     progress: Progress,
     start: NDArray | None = None,
-) -> tuple[NDArray[np.float32], dict[str, list[float]], float, Outcome]:
-    """Maps for a lighting: (S, S, 4), energies per pass, robust standard deviation of the residuals, how they ended."""
+) -> SolvedMaps:
+    """Maps for a lighting."""
     chunks = surface.chunks()
     pairs = surface.pairs
     index = surface.texels.index
     smoothness = Smoothness(config.smoothness_weight, config.smoothness_weight * config.specular_smoothness)
     maps: NDArray[np.float32] | None = start
     energy: dict[str, list[float]] = {"data": []}
-    passes = MAP_PASSES if config.robust else 1
+    passes, expected = MAP_PASSES if config.robust else 1, float(prior[0, 0, 3])
     kept: tuple[Observations, NDArray, NDArray] | None = None
     sigma = found.sigma
     for number in range(passes):
-        systems, data, sigmas = [], 0.0, []
+        systems, data, sigmas, units, errors = [], 0.0, [], [], []
         for done, chunk in enumerate(chunks):
             progress("Reflectance maps", number * len(chunks) + done, passes * len(chunks))
             if kept is None:
@@ -102,6 +130,9 @@ def fit_maps(
                 residual = target - form_image(
                     0.0, texel[:, None, :3], diffuse_light, texel[:, 3, None, None], specular_light
                 )
+                sizes = whitened(weight, seen.clipped, residual)
+                units.append(robust_deviation(sizes))
+                errors.append(deviations(sizes))
                 weight, deviation = active_weight(weight, seen.clipped, residual, config.robust)
                 data += float((weight * residual**2).sum())
                 sigmas.append(deviation)
@@ -115,7 +146,8 @@ def fit_maps(
         if sigmas:
             energy["data"].append(data)
             sigma = float(np.median(sigmas))
-        pull = specular_pull(float(prior[0, 0, 3]), sigma) if config.robust else 0.0
+        unit = float(np.median(units)) if units else 0.0
+        pull = specular_pull(expected, sigma) if config.robust else 0.0
         splits = Splits()
         joined = TexelSystems.join(systems)
         maps = solve_maps(
@@ -123,7 +155,11 @@ def fit_maps(
         )
     progress("Reflectance maps", passes * len(chunks), passes * len(chunks))
     assert maps is not None
-    return maps, energy, sigma, splits.outcome
+    told = np.ones(len(index), np.float32)
+    if errors and config.robust:
+        size, count = (np.concatenate(part) for part in zip(*errors, strict=True))
+        told = find_told(surface.texels, joined, size, count, expected, unit)
+    return SolvedMaps(maps, energy, sigma, splits.outcome, told)
 
 
 def fit_als(
@@ -146,12 +182,20 @@ def fit_als(
     prior[surface.texels.index, :3] = albedo
     prior[:, 3] = expected_specular(found.specular, seen.weight > 0)
     prior = prior.reshape(surface.texels.size, surface.texels.size, 4)
-    maps, energy, sigma, maps_outcome = fit_maps(surface, forward, found, prior, config, progress)
+    solved = fit_maps(surface, forward, found, prior, config, progress)
+    maps, energy = solved.maps, {"lighting": found.energy}
     if not config.robust:
         found, maps, energy = alternate(surface, forward, found, maps, prior, albedo, config, progress)
-    energy = {"lighting": found.energy} if config.robust else energy
     return (
-        Fitted(forward.under(found.light, found.ambient), maps, sigma, energy, found.outcome, maps_outcome),
+        Fitted(
+            forward.under(found.light, found.ambient),
+            maps,
+            solved.sigma,
+            energy,
+            found.outcome,
+            solved.outcome,
+            solved.told,
+        ),
         choice,
         (),
     )
@@ -181,7 +225,7 @@ def alternate(
         for length in (3.0, 1.0, 0.3, 0.1):  # alternation creeps: the longer step is right more often than not
             mixed = found.light + length * (light - found.light)
             trial = replace(found, light=mixed, ambient=found.ambient + length * (ambient - found.ambient))
-            trial_maps, *_ = fit_maps(surface, forward, trial, prior, config, progress, start=maps)
+            trial_maps = fit_maps(surface, forward, trial, prior, config, progress, start=maps).maps
             trial_terms = energies(surface, forward, mixed, trial.ambient, trial_maps, albedo, config)
             if sum(trial_terms.values()) < before:
                 break

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,14 +20,32 @@ STIFFNESS = 0.02
 """Of the membrane, beside texels of confidence 1."""
 
 
+@dataclass(frozen=True)
+class Filled:
+    """Maps without gaps, and how far they are what images told.
+
+    Attributes
+    ----------
+    diffuse : (S, S, 3), specular : (S, S) float32
+    confidence, specular_confidence : (S, S) float32
+        Of the diffuse and of the specular map. They count what was seen, not what was filled in.
+    """
+
+    diffuse: NDArray[np.float32]
+    specular: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    specular_confidence: NDArray[np.float32]
+
+
 def blend_unseen(
     model: MorphableModel,
     texels: TexelMap,
     albedo: NDArray,
     maps: NDArray,
     quality: NDArray,
+    told: NDArray,
     mirrored: NDArray | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+) -> Filled:
     """Replace texels that were hardly seen by the model's albedo plus an offset that continues the seen ones.
 
     The offset is a membrane over the mesh (`core.membrane`), so that it crosses the atlas's seams.
@@ -40,20 +60,17 @@ def blend_unseen(
         Diffuse and specular albedo from the images.
     quality : (N,)
         How often and how well each texel was seen, 0..1.
+    told : (N,)
+        Share of what images tell of the specular albedo, 0..1: a texel that was well seen may tell nothing of it, in
+        deep shade or where no lobe points at a light.
     mirrored : (N, 2), optional
         Texture coordinates of the point opposite to each texel: a texel that was hardly seen first takes the offset
         found there.
-
-    Returns
-    -------
-    diffuse : (S, S, 3), specular : (S, S), confidence : (S, S) float32
-        Confidence counts what was seen, not what was filled in.
     """
-    confidence = texels.to_map(quality.astype(np.float32))
+    confidence, of_specular = (texels.to_map(np.asarray(x, np.float32)) for x in (quality, quality * told))
     expected = texels.to_map(albedo.astype(np.float32))
-    offset = maps.copy()
+    offset, known = maps.copy(), confidence
     offset[..., :3] -= expected
-    known = confidence
     if mirrored is not None:
         there = texels.to_map(sample_map(confidence, mirrored))
         opposite = texels.to_map(sample_map(offset * confidence[..., None], mirrored))
@@ -67,10 +84,9 @@ def blend_unseen(
     share = (known / (known + BLEND))[..., None]
     blended = share * offset + (1.0 - share) * smooth
     blended[..., :3] += expected
-    blended = np.clip(blended, 0.0, 1.0)
-    outside = ~texels.mask
-    blended[outside] = 0.0
-    return blended[..., :3].astype(np.float32), blended[..., 3].astype(np.float32), confidence
+    blended = np.clip(blended, 0.0, 1.0).astype(np.float32)
+    blended[~texels.mask] = 0.0
+    return Filled(blended[..., :3], blended[..., 3], confidence, of_specular)
 
 
 def mirrored_coordinates(model: MorphableModel, texels: TexelMap) -> NDArray[np.float64]:

@@ -83,6 +83,12 @@ class TexelSystems:
             return parts[0]
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
+    @property
+    def specular_information(self) -> NDArray[np.float32]:
+        """(N,) curvature of the specular albedo once the diffuse ones follow it."""
+        taken = self.ds**2 / np.maximum(self.dd, np.float32(1e-12))
+        return np.maximum(self.ss - taken.sum(1), np.float32(0.0))
+
     def solve(self, x0: NDArray, y0: NDArray, px: NDArray | float, py: NDArray | float) -> tuple[NDArray, NDArray]:
         """Minimise each block plus ``px |x - x0|^2 + py (y - y0)^2`` within 0..1: x (N, 3) and y (N,)."""
         weight = np.append(np.broadcast_to(px, 3), py).astype(self.dd.dtype)[:, None]

@@ -71,6 +71,7 @@ def fit_adam(
         result.history,
         outcome,
         outcome,
+        np.ones(len(surface.texels.index), np.float32),
     )
     why = "as configured" if config.shading != "auto" else "the paper's model: it is the paper's solver"
     return fitted, {"chosen": name, "why": why, "exponent": forward.lobe.typical}, ()
