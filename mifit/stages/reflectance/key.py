@@ -151,7 +151,7 @@ class Candidates:
         m, n, k = len(by_diffuse), len(self.diffuse), self.rows[0].shape[1]
         system, right = np.zeros((m, 3, 3)), np.zeros((m, 3))
         across, moved = np.zeros((m, 3, 3 * k)), np.zeros((m, n, 4, 3))
-        own = np.zeros((m, n, 4, 3), np.float32)
+        own = np.zeros((m, n, 4, 3), self.weight.dtype)
         for c in range(3):
             column = self.diffuse[:, None, c] * by_diffuse + self.specular_albedo[:, None] * by_specular
             weighted = self.weight[..., c] * column
@@ -164,7 +164,7 @@ class Candidates:
                 moved[..., c] += self.inverse[:, :, unknown] * own[:, :, unknown, c, None]
         system -= np.einsum("mnia,mnib->mab", own, moved, optimize=True)
         right -= np.tensordot(moved, self.own_right, ([1, 2], [0, 1]))
-        single = moved.astype(np.float32).transpose(2, 0, 3, 1)  # (4, M, 3, n)
+        single = moved.astype(self.specular_cross.dtype).transpose(2, 0, 3, 1)  # (4, M, 3, n)
         across -= (single[3].reshape(-1, n) @ self.specular_cross).reshape(m, 3, -1)
         for c in range(3):
             across[..., c * k : (c + 1) * k] -= (single[c].reshape(-1, n) @ self.diffuse_cross[c]).reshape(m, 3, -1)
