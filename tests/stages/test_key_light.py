@@ -203,7 +203,8 @@ def test_lights_judged_together_are_judged_as_each_alone(walled):
     together = candidates.explained(lights)
     assert np.ptp(together) > 0.1 * together.max() > 0.0
     # In double precision to the digit; what the equations leave of sums in single precision is a thousandth of them.
-    parts = {name: getattr(candidates, name).astype(np.float64) for name in ("weight", "diffuse_cross", "specular_cross")}
+    names = ("weight", "diffuse_cross", "specular_cross")
+    parts = {name: getattr(candidates, name).astype(np.float64) for name in names}
     fine = replace(candidates, rows=[rows.astype(np.float64) for rows in candidates.rows], **parts)
     exact = fine.explained(lights)
     np.testing.assert_allclose(exact, [fine.explained([light])[0] for light in lights], rtol=1e-9)
