@@ -14,6 +14,7 @@ import cv2
 import pytest
 
 from mifit.capture import Capture
+from mifit.capture.boards import Board
 from mifit.capture.colmap import write_colmap
 from mifit.capture.stereo import write_stereo
 from mifit.cli import build_parser, main
@@ -22,6 +23,7 @@ from mifit.output.sequence import write_video
 from mifit.plan import load_plan
 from mifit.schema import read_toml
 from tests.capture import photogrammetry
+from tests.capture.board_video import Studio, pair, poses
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -96,6 +98,7 @@ def workspace(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_stereo(folder / "stereo.yml", capture.camera("left"), capture.camera("right"))
     write_colmap(folder / "sparse" / "0", [(capture.camera(n), f"{n}/0000.png") for n in ("left", "right")])
     _photogrammetry(folder, head, capture)
+    _film_a_board(folder / "filmed")
     shutil.copytree(head, folder / "scene")
     shutil.copytree(head, folder / "CAPTURE")
     shutil.copy(ROOT / "scenes" / "relighting" / "studio.hdr", folder)
@@ -106,6 +109,17 @@ def workspace(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(folder / "RESULT", folder / "out" / "face")
     shutil.copytree(head, folder / "out" / "head")
     return folder
+
+
+def _film_a_board(folder: Path) -> None:
+    """A calibration board before two cameras."""
+    board = Board.parse("charuco:9x6:30:22")
+    places = poses(10, board, 470.0)
+    for name, camera in zip(("left", "right"), pair(), strict=True):
+        studio = Studio(board, camera)
+        (folder / name).mkdir(parents=True)
+        for i, place in enumerate(places):
+            cv2.imwrite(str(folder / name / f"{i:04d}.png"), studio.render(place, i))
 
 
 def _photogrammetry(folder: Path, head: Path, capture: Capture) -> None:
