@@ -14,6 +14,8 @@ from mifit.capture.boards import BoardPoints
 
 LENS, POSE = 9, 6
 """Unknowns of a lens (fx, fy, cx, cy, k1, k2, p1, p2, k3) and of a pose (rotation vector, translation)."""
+PRIORS = 8
+"""Residuals of a lens's prior."""
 _STEP = 1e-6
 CENTRE, ASPECT = 0.03, 0.01
 """Deviations beforehand of the principal point from the image's middle, in longer sides, and of fy / fx from 1."""
@@ -150,9 +152,6 @@ def adjust(
         [float(deviations[LENS * c : LENS * c + 2].max()) for c in range(count)],
         errors,
     )
-
-
-PRIORS = 8
 
 
 def _unlikely(lens: NDArray, size: tuple[int, int]) -> NDArray[np.float64]:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mifit.capture.board_adjustment import adjust
-from mifit.capture.board_calibration import Watched, _together
+from mifit.capture.board_calibration import _together
+from mifit.capture.board_camera import Watched
 from mifit.capture.boards import Board, BoardPoints
 from tests.capture.board_video import opencv_matrix, pair, poses
 

@@ -1,0 +1,199 @@
+"""One camera's look at a calibration board: the frames that serve, and lens and focal length from them alone.
+
+Frames are chosen (sharp, different from each other) and the camera is calibrated by itself (Zhang, "A Flexible New
+Technique for Camera Calibration", 2000, as OpenCV implements it with radial and tangential distortion).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.capture.boards import Board, BoardPoints, edge_width
+from mifit.capture.sources import Source
+from mifit.core.image import decode_image, to_8_bit
+from mifit.errors import InputError
+from mifit.progress import Progress
+
+MAX_LOOKED_AT = 300
+"""Frames of a video in which the board is looked for, spread evenly."""
+MAX_USED = 40
+"""Frames that a camera is calibrated from; more add time and little else."""
+LEAST_FRAMES = 6
+LEAST_PART = 0.4
+"""Part of the board's points below which it is only partly seen."""
+MAX_BLUR, BLUR_FACTOR = 4.0, 1.6
+"""Edges wider than this many pixels, or than this many times those of a camera's sharper frames, are blurred."""
+OUTLIER, LEAST_OUTLIER = 3.0, 0.3
+"""Frames whose error is this many times the median, and at least so many pixels, are left out."""
+CONTRADICTS = "contradicts the others: error {:.2f} pixels, {:.2f} is the limit"
+GRID = 6
+"""Cells across and down of the picture of coverage."""
+BAD_FOCAL, BAD_ERROR = 0.03, 2.0
+"""Refuse beyond this relative deviation of the focal length and this error in pixels."""
+
+
+@dataclass(frozen=True)
+class Watched:
+    """One camera's look at the board.
+
+    Attributes
+    ----------
+    used : dict of int to BoardPoints
+        Frames that the calibration uses.
+    errors : dict of int to float
+        Root-mean-square reprojection error of each, pixels.
+    left_out : dict of int to str
+        Frames that it doesn't, and why.
+    """
+
+    name: str
+    size: tuple[int, int]
+    matrix: NDArray[np.float64] = field(repr=False)
+    distortion: tuple[float, ...]
+    focal_deviation: float
+    used: dict[int, BoardPoints] = field(repr=False)
+    errors: dict[int, float] = field(repr=False)
+    left_out: dict[int, str] = field(repr=False)
+
+    @property
+    def error(self) -> float:
+        """Root-mean-square reprojection error over all frames, pixels."""
+        return float(np.sqrt(np.mean(np.square(list(self.errors.values())))))
+
+    @property
+    def coverage(self) -> float:
+        """Part of the cells of a grid over the image in which the board was seen."""
+        return float(covered_cells(self).mean())
+
+
+def covered_cells(seen: Watched) -> NDArray[np.bool_]:
+    """(GRID, GRID) cells of the image in which the board was seen."""
+    covered = np.zeros((GRID, GRID), dtype=bool)
+    for found in seen.used.values():
+        cell = np.clip((found.pixels / seen.size * GRID).astype(int), 0, GRID - 1)
+        covered[cell[:, 1], cell[:, 0]] = True
+    return covered
+
+
+def look(
+    source: Source, board: Board, done: int, total: int, progress: Progress
+) -> tuple[dict[int, tuple[BoardPoints, float]], dict[int, str]]:
+    """Boards found and their blur by frame, and frames without one that can be used, with the reason."""
+    every = -(-source.length // MAX_LOOKED_AT)
+    found: dict[int, tuple[BoardPoints, float]] = {}
+    left_out: dict[int, str] = {}
+    for k, (_, content) in enumerate(source.files(0, every)):
+        progress("Looking for the board", done + k, total)
+        i = k * every
+        codes = to_8_bit(decode_image(content, f"{source.name}: frame {i}").pixels)
+        grey = np.asarray(cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        seen = board.find(grey)
+        wanted = max(6, round(LEAST_PART * len(board.points)))
+        if len(seen) >= wanted:
+            found[i] = seen, edge_width(grey, seen)
+        elif board.kind != "chessboard" and len(board.find(np.ascontiguousarray(grey[:, ::-1]))) >= wanted:
+            left_out[i] = "mirrored: the board is read in the mirrored image only; turn off the camera's mirror mode"
+        elif len(seen):
+            left_out[i] = f"partly seen: {len(seen)} of {len(board.points)} points, expected at least {wanted}"
+        else:
+            left_out[i] = "no board found: out of the image, blurred, too small or too dark"
+    return found, left_out
+
+
+def calibrate_one(
+    source: Source, board: Board, found: dict[int, tuple[BoardPoints, float]], left_out: dict[int, str]
+) -> Watched:
+    """Intrinsics of one camera from its best frames."""
+    if found:
+        sharp = float(np.percentile([width for _, width in found.values()], 25))
+        for i, (_, width) in list(found.items()):
+            if width > max(min(MAX_BLUR, BLUR_FACTOR * sharp), 2.0):
+                left_out[i] = f"blurred: edges {width:.1f} pixels wide, {sharp:.1f} in sharp frames"
+                del found[i]
+    used = {i: seen for i, (seen, _) in found.items()}
+    chosen = _varied(used, source.size)
+    spare = {i: "like other frames" for i in used if i not in chosen}
+    while True:
+        if len(chosen) < LEAST_FRAMES:
+            raise InputError(_too_few(source, len(chosen), left_out))
+        matrix, distortion, deviation, errors = _solve({i: used[i] for i in chosen}, board, source.size)
+        limit = max(OUTLIER * float(np.median(list(errors.values()))), LEAST_OUTLIER)
+        bad = [i for i, error in errors.items() if error > limit]
+        if not bad:
+            break
+        for i in bad:
+            left_out[i] = CONTRADICTS.format(errors[i], limit)
+        chosen = [i for i in chosen if i not in bad]
+    focal = deviation / float(matrix[0, 0])
+    seen = Watched(
+        source.name, source.size, matrix, distortion, focal, {i: used[i] for i in chosen}, errors, {**left_out, **spare}
+    )
+    if seen.error > BAD_ERROR or focal > BAD_FOCAL:
+        raise InputError(
+            f"{source.name}: found an error of {seen.error:.2f} pixels, a focal length known to {100 * focal:.1f} %, "
+            f"expected at most {BAD_ERROR:g} pixels and {100 * BAD_FOCAL:g} %; hold the board at different angles and "
+            "distances, up to the image's corners, and check --board against the printed one"
+        )
+    return seen
+
+
+def _too_few(source: Source, count: int, left_out: dict[int, str]) -> str:
+    reasons: dict[str, int] = {}
+    for text in left_out.values():
+        reasons[text.split(":")[0]] = reasons.get(text.split(":")[0], 0) + 1
+    told = ", ".join(f"{n} {reason}" for reason, n in sorted(reasons.items(), key=lambda item: -item[1]))
+    return (
+        f"{source.name}: found {count} frames that can be used of {count + len(left_out)} ({told or 'none else'}), "
+        f"expected at least {LEAST_FRAMES} with the whole board, sharp, not mirrored; check --board too"
+    )
+
+
+def _varied(found: dict[int, BoardPoints], size: tuple[int, int]) -> list[int]:
+    """At most `MAX_USED` frames in which the board's place, size and tilt differ most, the first at the most points."""
+    keys = sorted(found)
+    if len(keys) <= MAX_USED:
+        return keys
+    features = np.array([_feature(found[i], size) for i in keys])
+    features /= features.std(axis=0) + 1e-9
+    chosen = [int(np.argmax([len(found[i]) for i in keys]))]
+    nearest = np.linalg.norm(features - features[chosen[0]], axis=1)
+    while len(chosen) < MAX_USED:
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.linalg.norm(features - features[chosen[-1]], axis=1))
+    return sorted(keys[k] for k in chosen)
+
+
+def _feature(found: BoardPoints, size: tuple[int, int]) -> NDArray[np.float64]:
+    """Place, size and shape of the board in the image."""
+    centre = found.pixels.mean(axis=0)
+    spread = np.linalg.svd(found.pixels - centre, full_matrices=False)
+    axes = spread.S / np.sqrt(len(found))
+    angle = np.arctan2(*spread.Vh[0][::-1])
+    return np.array([*centre / max(size), *np.log(np.maximum(axes, 1e-3)), np.cos(2 * angle), np.sin(2 * angle)])
+
+
+def _solve(
+    used: dict[int, BoardPoints], board: Board, size: tuple[int, int]
+) -> tuple[NDArray[np.float64], tuple[float, ...], float, dict[int, float]]:
+    """Matrix (OpenCV's pixel centres), distortion, deviation of the focal length in pixels, error of each frame."""
+    objects = [board.points[f.ids].astype(np.float32) for f in used.values()]
+    images = [(f.pixels - 0.5).astype(np.float32) for f in used.values()]
+    try:
+        _, matrix, distortion, _, _, deviations, _, errors = cv2.calibrateCameraExtended(
+            objects,
+            images,
+            size,
+            None,
+            None,  # type: ignore[call-overload]  # the stubs know no start of None
+        )
+    except cv2.error as error:
+        raise InputError(f"the board's views allow no calibration ({' '.join(str(error).split())[-100:]})") from None
+    found = dict(zip(used, map(float, np.ravel(errors)), strict=True))
+    deviation = float(np.max(np.ravel(deviations)[:2]))
+    if not (np.isfinite(matrix).all() and np.isfinite(deviation)):
+        raise InputError("the board's views allow no calibration: all of them are alike; tilt and move the board")
+    return np.asarray(matrix, dtype=np.float64), tuple(map(float, np.ravel(distortion)[:5])), deviation, found
