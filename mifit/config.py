@@ -38,6 +38,10 @@ class GeometryConfig:
         "find each camera's exposure and white balance relative to the first one's; auto: where they surely differ and "
         "more than one timestep tells",
     )
+    exposures: bool = flag(
+        True,
+        "find images whose exposure differs surely from that of their camera's first timestep, and divide it out",
+    )
     refine_cameras: bool = flag(
         False,
         "adjust poses and focal lengths of two or more calibrated cameras by dense matches between them, with the "
@@ -254,7 +258,9 @@ class FitConfig:
         that with values of 0..1 it is 0.001 / 255.
         """
         return cls(
-            geometry=GeometryConfig(objective="paper", as_written=True, camera_gains="never", eyes=False),
+            geometry=GeometryConfig(
+                objective="paper", as_written=True, camera_gains="never", exposures=False, eyes=False
+            ),
             surface=SurfaceConfig(enabled=False),
             reflectance=ReflectanceConfig(
                 solver="adam",

@@ -108,7 +108,7 @@ def refine(
     if folder is not None:
         names = [camera.name for camera in result.cameras]
         key = checkpoint.digest([_digest(result), capture.digest(names, wanted), wanted, seed])
-    seen = capture.with_fitted(result.cameras, result.calibration)
+    seen = result.seen(capture)
     result = resurfaced(result, seen, fitted_jointly(result), wanted, seed, progress, folder, key)
     refinement = Refinement(result, capture, seed)
     if folder is not None:
@@ -161,7 +161,7 @@ class Refinement(Generic[R]):
         assert result.reflectance is not None
         self._began = time.perf_counter()
         self._result, self._seed = result, seed
-        self._capture = capture.with_fitted(result.cameras, result.calibration)
+        self._capture = result.seen(capture)
         names = [camera.name for camera in result.cameras]
         size, model = len(result.reflectance.diffuse), result.model
         surface = Surface(self._capture, model, result.geometry.at(result.timesteps[:1]), names, size, whole=True)

@@ -149,7 +149,8 @@ def _followed(
         name: np.concatenate([getattr(one, name) for one in (home, *found)])
         for name in ("expression", "rotation", "translation", "vertices")
     }
-    return replace(home, timesteps=(*fitted, *(one.timesteps[0] for one in found)), **parts)
+    exposures = {name: (*factors, *(1.0 for _ in found)) for name, factors in home.exposures.items()}
+    return replace(home, timesteps=(*fitted, *(one.timesteps[0] for one in found)), exposures=exposures, **parts)
 
 
 def _on(result: R, found: _Surface) -> R:

@@ -228,7 +228,9 @@ def run_steps(
 
 
 def _seen(source: Source, inputs: Inputs) -> Source:
-    """The source with refined cameras where a step is given any."""
+    """The source with refined cameras and the exposures found, where a step is given any."""
+    if "geometry" in inputs and inputs["geometry"].exposures:
+        source = replace(source, capture=source.capture.with_exposures(inputs["geometry"].exposed))
     if "cameras" not in inputs or not inputs["cameras"].names:
         return source
     capture, cameras = source.capture, inputs["cameras"]

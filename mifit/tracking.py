@@ -84,7 +84,7 @@ def track_into(
     with locked(folder):
         result, room = _with_room(result, len(timesteps))
         for frame in track(
-            capture.with_fitted(result.cameras, result.calibration),
+            result.seen(capture),
             result.model,
             result.geometry,
             result.reflectance,
@@ -110,7 +110,7 @@ def with_frame_offsets(result: R, capture: Capture) -> R:
     if result.normals is None:
         return result
     names = [camera.name for camera in result.cameras]
-    seen = capture.with_fitted(result.cameras, result.calibration)
+    seen = result.seen(capture)
     found = frame_offsets(seen, result.model, result.geometry, names)
     report = result.normals.report
     details = {**report.details, "frame_offsets": {name: asdict(offset) for name, offset in found.items()}}
@@ -196,6 +196,7 @@ def extend(
             name: np.concatenate([getattr(a, name), getattr(b, name)])
             for name in ("expression", "rotation", "translation")
         },
+        exposures={name: (*factors, 1.0) for name, factors in a.exposures.items()},
     )
     before = result.normals or NormalsEstimate((), frame.normal_object[None][:0], Report("converged"))
     details = {
@@ -254,6 +255,10 @@ def _without(result: R, dropped: Sequence[int]) -> R:
             geometry,
             timesteps=left(geometry.timesteps),
             **{name: kept(getattr(geometry, name), geometry.timesteps) for name in parts},
+            exposures={
+                name: tuple(f for t, f in zip(geometry.timesteps, factors, strict=True) if t not in dropped)
+                for name, factors in geometry.exposures.items()
+            },
         ),
         normals=NormalsEstimate(
             left(normals.timesteps), kept(normals.normal_object, normals.timesteps), replace(report, details=details)

@@ -117,6 +117,9 @@ class Capture:
         Unit of length of the poses: ``mm``, ``cm``, ``dm`` or ``m``.
     estimated : dict of str to Camera
         Cameras that were estimated, or refined from their calibration; empty where all are as calibrated.
+    exposures : dict of (camera, timestep) to float
+        What images are divided by, where a fit found that their exposure changed (`with_exposures`); files and `digest`
+        stay as they are.
     """
 
     path: Path
@@ -124,6 +127,7 @@ class Capture:
     shots: Mapping[tuple[str, int], Shot] = field(repr=False)
     units: str = "cm"
     estimated: Mapping[str, Camera] = field(default_factory=dict, repr=False)
+    exposures: Mapping[tuple[str, int], float] = field(default_factory=dict, repr=False)
     _cache: _Cache = field(default_factory=lambda: _Cache(CACHE_BYTES), repr=False, compare=False)
 
     @classmethod
@@ -155,8 +159,7 @@ class Capture:
             {view.name: view for view in transforms.views},
             {(shot.camera, shot.timestep): shot for shot in transforms.shots},
             transforms.units,
-            {},
-            _Cache(cache_bytes),
+            _cache=_Cache(cache_bytes),
         )
 
     @property
@@ -216,7 +219,12 @@ class Capture:
         if frame is None:
             frame = self._read(shot)
             self._cache.put((name, timestep), frame)
-        return frame
+        factor = self.exposures.get((name, timestep), 1.0)
+        if factor == 1.0:
+            return frame
+        image = frame.image / np.float32(factor)
+        image.flags.writeable = False
+        return dataclasses.replace(frame, image=image)
 
     def landmarks(self, name: str, timestep: int) -> Landmarks | None:
         """Landmarks of one image in undistorted coordinates, without reading the image; None when there are none."""
@@ -246,6 +254,10 @@ class Capture:
     def with_estimate(self, cameras: Sequence[Camera]) -> Capture:
         """The same capture with estimated cameras, refined ones included; whether it is `calibrated` stays as it is."""
         return dataclasses.replace(self, estimated={camera.name: camera for camera in cameras}, _cache=self._cache)
+
+    def with_exposures(self, exposures: Mapping[tuple[str, int], float]) -> Capture:
+        """The same capture with images divided by the factors of `exposures`, in place of any that it has."""
+        return dataclasses.replace(self, exposures=dict(exposures), _cache=self._cache) if exposures else self
 
     def with_fitted(self, cameras: Sequence[Camera], calibration: Sequence[Camera] = ()) -> Capture:
         """The capture as a fit with these cameras saw it: its own calibration, or else the estimated cameras.

@@ -71,6 +71,9 @@ class GeometryEstimate:
     gains : dict of camera name to (r, g, b)
         Each camera's linear image over the first one's, where asked for; images are divided by it when they are
         observed. A camera that isn't named has gain 1.
+    exposures : dict of camera name to (T,) factors
+        Each image's linear colours over those of its camera's first timestep, where they differ; images are divided by
+        it when they are read (`Capture.with_exposures`). A camera that isn't named has one exposure.
     displacement : (V, 3) float32 or None
         Neutral surface beyond the model's span, object space: ``model.mean`` plus this is what coefficients add to
         (`displaced`). None where the surface is the model's.
@@ -89,6 +92,7 @@ class GeometryEstimate:
     ambient: float
     report: Report
     gains: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    exposures: Mapping[str, Sequence[float]] = field(default_factory=dict)
     displacement: NDArray | None = None
 
     @property
@@ -99,6 +103,15 @@ class GeometryEstimate:
     def gain(self, camera: str) -> NDArray:
         """(3,) float32 gain of a camera; 1 where none is known."""
         return np.array(self.gains.get(camera, (1.0, 1.0, 1.0)), dtype=np.float32)
+
+    @property
+    def exposed(self) -> dict[tuple[str, int], float]:
+        """The images' exposures by camera and timestep."""
+        return {
+            (name, timestep): float(factor)
+            for name, factors in self.exposures.items()
+            for timestep, factor in zip(self.timesteps, factors, strict=True)
+        }
 
     def index(self, timestep: int) -> int:
         """Position of a timestep in the per-timestep arrays; KeyError when it was not fitted."""
@@ -116,6 +129,7 @@ class GeometryEstimate:
             rotation=self.rotation[rows],
             translation=self.translation[rows],
             vertices=self.vertices[rows],
+            exposures={name: tuple(factors[k] for k in rows) for name, factors in self.exposures.items()},
         )
 
 

@@ -215,7 +215,7 @@ def located(capture: Capture, reconstruction: Result, camera: str) -> Capture:
         return capture.with_estimate([*reconstruction.cameras, resect(reconstruction, capture, camera).camera])
     if camera in capture.estimated:
         return capture
-    return capture.with_fitted(reconstruction.cameras, reconstruction.calibration)
+    return reconstruction.seen(capture)
 
 
 def as_photographed(reconstruction: Result, image: NDArray, camera: str) -> NDArray:

@@ -82,7 +82,7 @@ def face_mask(
     InputError
         Unknown camera or timestep.
     """
-    capture = capture.with_fitted(reconstruction.cameras, reconstruction.calibration)
+    capture = reconstruction.seen(capture)
     view, frame = capture.camera(camera), capture.frame(camera, timestep)
     if render is None:
         render = reconstruction.render(view, timestep, reconstruction.methods[-1])

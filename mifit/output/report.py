@@ -81,7 +81,7 @@ def write_report(
     Path
         The file.
     """
-    capture = capture.with_fitted(reconstruction.cameras, reconstruction.calibration)
+    capture = reconstruction.seen(capture)
     shown = reconstruction.timesteps[:SHOWN_TIMESTEPS]
     sections = [
         ("Result", _summary(reconstruction, evaluation)),

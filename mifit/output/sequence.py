@@ -114,7 +114,7 @@ def write_overlay(
     InputError
         The capture has no such camera, or not all timesteps.
     """
-    capture = capture.with_fitted(reconstruction.cameras, reconstruction.calibration)
+    capture = reconstruction.seen(capture)
     view, steps = capture.camera(camera), sorted(reconstruction.timesteps)
 
     def frames() -> Iterable[NDArray[np.uint8]]:

@@ -185,6 +185,10 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
             name: tuple(_array(gain, (3,), f"gain of {name}").tolist())
             for name, gain in document["capture"].get("gains", {}).items()
         },
+        exposures={
+            name: tuple(_array(factors, (n,), f"exposures of {name}").tolist())
+            for name, factors in document["capture"].get("exposures", {}).items()
+        },
         displacement=_displacement(folder, len(model.mean)) if entry.get("displaced") else None,
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,9 @@ from mifit.core.values import same
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.finer import finer_model
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
 
 Method = Literal["full", "diffuse", "pca"]
 METHODS: tuple[Method, ...] = ("pca", "diffuse", "full")
@@ -170,6 +173,11 @@ class Result:
     def timesteps(self) -> tuple[int, ...]:
         """Timesteps with geometry."""
         return self.geometry.timesteps
+
+    def seen(self, capture: Capture) -> Capture:
+        """A capture with the cameras and in the exposures that the fit saw it with."""
+        capture = capture.with_fitted(self.cameras, self.calibration)
+        return capture.with_exposures(self.geometry.exposed) if self.geometry.exposures else capture
 
     @property
     def methods(self) -> tuple[Method, ...]:

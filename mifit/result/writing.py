@@ -167,6 +167,7 @@ def _document(result: Result) -> dict[str, Any]:
                 "cameras": [_camera_document(c) for c in result.cameras],
                 "calibration": [_camera_document(c) for c in result.calibration],
                 "gains": {name: list(gain) for name, gain in geometry.gains.items()},
+                "exposures": {name: list(factors) for name, factors in geometry.exposures.items()},
             },
             "model": {
                 "source": _source(result.model_source),

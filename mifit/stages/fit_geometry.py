@@ -16,6 +16,7 @@ from mifit.errors import ConvergenceError, InputError
 from mifit.morphable import MorphableModel
 from mifit.progress import Progress, silent
 from mifit.solve import Solution
+from mifit.stages.exposures import estimate_exposures
 from mifit.stages.gains import estimate_gains
 from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.displaced import displaced
@@ -26,6 +27,8 @@ from mifit.stages.geometry.refine import Reference, priors_of, refine_by_renderi
 from mifit.stages.geometry.start import FEWEST_LANDMARKS, State, fit_landmarks, initial_state, landmark_views
 from mifit.stages.geometry.summary import Journal, pack
 from mifit.stages.geometry.visibility import Visibility, spread_points
+from mifit.stages.image_factors import MAP_SIZE
+from mifit.stages.observations import Surface
 
 __all__ = ["fit_geometry", "fit_pose_expression", "texture_reference"]
 
@@ -90,12 +93,21 @@ def fit_geometry(
     for message in calibration_warnings(views, model, state.frames.scale, start.noise):
         journal.warn(message)
 
-    def refine(gains: Mapping[str, Sequence[float]]) -> GeometryEstimate:
-        return _refine_and_pack(
+    def refine(
+        capture: Capture, gains: Mapping[str, Sequence[float]], exposures: Mapping[str, Sequence[float]]
+    ) -> GeometryEstimate:
+        found = _refine_and_pack(
             capture, model, cameras, timesteps, config, seed, journal, start.state, used, None, None, gains
         )
+        return replace(found, exposures=exposures)
 
-    found = refine({})
+    found = refine(capture, {}, {})
+    if config.exposures and len(timesteps) > 1:
+        surface = Surface(capture, model, found, cameras, MAP_SIZE)
+        exposures = estimate_exposures(surface, found, cameras, seed, progress)
+        if exposures:
+            capture = capture.with_exposures(replace(found, exposures=exposures).exposed)
+            found = refine(capture, {}, exposures)
     # Where a head stands still, skin that shines towards one camera looks like a camera that is brighter.
     too_few = len(cameras) == 1 or len(timesteps) == 1
     if config.camera_gains == "never" or (config.camera_gains == "auto" and too_few):
@@ -106,7 +118,7 @@ def fit_geometry(
     for name in cameras:
         if name not in gains:
             journal.warn(f"camera {name}: shares too little of the face with {cameras[0]} to tell its gain; taken as 1")
-    return refine(gains)
+    return refine(capture, gains, found.exposures)
 
 
 def fit_pose_expression(

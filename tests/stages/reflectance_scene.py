@@ -64,8 +64,9 @@ def albedos(size=SIZE, gloss=0.12):
     return diffuse.astype(np.float32), specular.astype(np.float32)
 
 
-def turning_dome(shading="prefiltered", fresnel=8.0, gloss=0.12, radiance=None, exponent=EXPONENT, steps=4, depth=1.0):
-    """Render the capture without noise; ``depth`` stretches the dome towards the cameras."""
+def turning_dome(shading="prefiltered", fresnel=8.0, gloss=0.12, radiance=None, exponent=EXPONENT, steps=4, depth=1.0,
+                 swing=1.0):  # fmt: skip
+    """Render the capture without noise; ``depth`` stretches the dome to the cameras, ``swing`` scales its turns."""
     model = dome_model()
     stretched = model.mean * [1.0, 1.0, depth] - [0.0, 0.0, 0.6 * (depth - 1.0)]
     radiance = lighting(3 if shading == "paper" else 4) if radiance is None else radiance
@@ -76,6 +77,7 @@ def turning_dome(shading="prefiltered", fresnel=8.0, gloss=0.12, radiance=None, 
     vertices, rotations = [], []
     centre = np.array([0.0, 0.0, 0.6])
     for yaw, pitch in turns:
+        yaw, pitch = swing * yaw, swing * pitch
         cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
         turn = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
         rotations.append(turn)
