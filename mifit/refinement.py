@@ -261,9 +261,16 @@ class Refinement(Generic[R]):
         filled = blend_unseen(model, texels, albedo, found.maps, quality, found.told)
         parts = result.reflectance.relief is not None
         parted = part_relief(model, texels, filled.diffuse, filled.confidence) if parts else None
+        diffuse, lit_eyes = filled.diffuse if parted is None else parted.skin, result.reflectance.lit_eyes
+        if lit_eyes is not None:
+            # Beneath the film eyes stay as the fit has them: sums don't tell which view was how bright.
+            eye = lit_eyes.any(axis=-1, keepdims=True)
+            lit_eyes = np.where(eye, filled.diffuse, np.float32(0.0))
+            diffuse = np.where(eye, result.reflectance.diffuse, diffuse)
         reflectance = replace(
             result.reflectance,
-            diffuse=filled.diffuse if parted is None else parted.skin,
+            diffuse=diffuse,
+            lit_eyes=lit_eyes,
             relief=None if parted is None else parted.relief,
             specular=filled.specular,
             confidence=filled.confidence,

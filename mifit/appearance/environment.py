@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.arrays import aligned, on_device, stored
+from mifit.appearance.cornea import CORNEA
 from mifit.appearance.kernels import fresnel_factor, light_transfer, normalization, prepare_exponent
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.reception import reception
@@ -207,12 +208,21 @@ class EnvironmentLight:
         return bent / np.maximum(flat, 1e-12)
 
     def specular(
-        self, scene: SurfaceScene, points: MeshPoints, normals: NDArray, view: NDArray, lobe: Lobe, radiosity: NDArray
+        self,
+        image: NDArray,
+        scene: SurfaceScene,
+        points: MeshPoints,
+        normals: NDArray,
+        view: NDArray,
+        lobe: Lobe,
+        radiosity: NDArray,
     ) -> NDArray[np.float32]:
-        """(N, 3) specular radiance at unit specular albedo from the soft part.
+        """(N, 3) specular radiance at unit specular albedo from a part of the environment.
 
         Parameters
         ----------
+        image : (H, W, 3)
+            The part: the soft one where lamps are beside it. A lobe sharper than the lamps' distance looks at all.
         scene : SurfaceScene
         points : MeshPoints
         normals, view : (N, 3)
@@ -230,7 +240,7 @@ class EnvironmentLight:
             return np.zeros((0, 3), np.float32)
         spacing = 8.0 * np.pi / ((lobe.typical + 2.0) * LOOKS)  # solid angle of a look at the lobe's peak
         table = mi.Texture2f(
-            mi.TensorXf(blurred(self.parts()[0], spacing)),
+            mi.TensorXf(blurred(image, spacing)),
             wrap_mode=dr.WrapMode.Repeat,
             filter_mode=dr.FilterMode.Linear,
         )
@@ -266,17 +276,31 @@ class EnvironmentLight:
         return stored([total.x, total.y, total.z], count)
 
     def shade(
-        self, scene: SurfaceScene, points: MeshPoints, normals: NDArray, view: NDArray, lobe: Lobe, albedo: NDArray
+        self,
+        scene: SurfaceScene,
+        points: MeshPoints,
+        normals: NDArray,
+        view: NDArray,
+        lobe: Lobe,
+        albedo: NDArray,
+        eye: NDArray[np.bool_] | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Diffuse and specular radiance (N, 3) of points at unit albedo; ``albedo`` (V, 3) is that of the vertices.
 
-        Shadows belong to the mesh; bent normals change what an open surface would receive.
+        Shadows belong to the mesh; bent normals change what an open surface would receive. Where ``eye`` (N,) says so
+        the lobe is the cornea's.
         """
         soft, whole = self.at_vertices(scene, albedo)
         diffuse = interpolate(soft, scene.faces, points.face, points.barycentric) / np.float32(np.pi)
-        specular = self.specular(scene, points, normals, view, lobe, whole * albedo / np.float32(np.pi))
+        radiosity = whole * albedo / np.float32(np.pi)
+        specular = self.specular(self.parts()[0], scene, points, normals, view, lobe, radiosity)
         matt, glossy = self.lamps(scene, points, normals, view, lobe)
-        return (diffuse * self.bend(normals, points.normal) + matt).astype(np.float32), specular + glossy
+        specular += glossy
+        rows = np.flatnonzero(eye) if eye is not None else []
+        if len(rows):
+            wet = points.take(rows), normals[rows], view[rows]
+            specular[rows] = self.specular(self.image, scene, *wet, CORNEA, radiosity)
+        return (diffuse * self.bend(normals, points.normal) + matt).astype(np.float32), specular
 
 
 def blurred(image: NDArray, solid_angle: float) -> NDArray[np.float32]:

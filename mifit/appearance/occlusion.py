@@ -48,6 +48,10 @@ class MeshPoints:
     face: NDArray
     barycentric: NDArray
 
+    def take(self, rows: NDArray | slice) -> MeshPoints:
+        """Some of the points."""
+        return MeshPoints(self.position[rows], self.normal[rows], self.face[rows], self.barycentric[rows])
+
 
 class OccludingMesh:
     """A mesh that shadows itself; what is traced at its vertices is kept.

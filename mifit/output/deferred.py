@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.cornea import REFLECTANCE, shade_eyes
 from mifit.appearance.environment import EnvironmentLight
 from mifit.appearance.formation import Appearance, form_image
 from mifit.appearance.occlusion import MeshPoints
@@ -19,7 +20,7 @@ from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.sh import basis
 from mifit.core.uv import sample_map
-from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
+from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials
 from mifit.render.occluders import occluding_mesh
 
 if TYPE_CHECKING:
@@ -141,6 +142,7 @@ def surface_material(reconstruction: Result, surface: VisibleSurface, timestep: 
     uv = interpolate(model.uv, model.faces_uv, surface.face[inside], surface.weights[inside])
     diffuse[inside] = sample_map(maps.diffuse, uv)
     specular[inside] = sample_map(maps.specular, uv)
+    specular[eye_faces(reconstruction)[surface.face]] = REFLECTANCE
     normal[inside] = normalize(sample_map(maps.normal, uv)) @ rotation.T
     return SampledMaterial(normal.astype(np.float32), diffuse.astype(np.float32), specular)
 
@@ -172,15 +174,15 @@ def shade_methods(
         base = _mesh_normals(reconstruction, surface, timestep)
         appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: _look_up(model, surface, m)))
         points = MeshPoints(surface.points, base, surface.face, surface.weights)
-        mesh = occluding_mesh(vertices, model.faces)
+        mesh, eye = occluding_mesh(vertices, model.faces), eye_faces(reconstruction)[surface.face]
         if reconstruction.environment is not None and appearance.lobe.fresnel is not None:
             turn = reconstruction.environment_rotation
             light = EnvironmentLight(reconstruction.environment, np.eye(3) if turn is None else turn)
             albedo = _vertex_albedo(reconstruction)
-            shaded = light.shade(mesh.scene, points, material.normal, surface.view, appearance.lobe, albedo)
+            shaded = light.shade(mesh.scene, points, material.normal, surface.view, appearance.lobe, albedo, eye)
         else:
             occlusion = appearance.trace(mesh, points)
-            shaded = appearance.shade_bent(material.normal, base, surface.view, occlusion, surface.points)
+            shaded = shade_eyes(appearance, eye, material.normal, base, surface.view, occlusion, surface.points)
         ambient = np.float32(reflectance.illumination.ambient)
         for method in finer:
             specular = material.specular[:, None] if method == "full" else np.float32(0.0)

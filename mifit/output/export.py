@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from mifit.appearance.cornea import CORNEA, REFLECTANCE
 from mifit.core.files import replacing, write_text
 from mifit.core.image import encode_png, linear_to_srgb, to_8_bit, write_image
 from mifit.core.mesh import vertex_normals
@@ -14,7 +15,7 @@ from mifit.core.ply import write_ply
 from mifit.core.split_mesh import part_of, split_at_seams, tangent_space_map
 from mifit.errors import InputError
 from mifit.output.gltf import write_glb
-from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
+from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
     from mifit.result import Result
@@ -94,7 +95,7 @@ def export(
 
 
 def _write_obj(reconstruction: Result, path: Path, timestep: int) -> None:
-    """OBJ with ``vt`` and ``vn``; the face area and the rest are two groups with a material each."""
+    """OBJ with ``vt`` and ``vn``; what has maps, eyes and the rest are groups with a material each."""
     model, i = reconstruction.model, reconstruction.index(timestep)
     vertices = reconstruction.geometry.vertices[i]
     normals = vertex_normals(vertices, model.faces)
@@ -113,10 +114,12 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int) -> None:
     rest = part_of(mesh, ~mapped) if not mapped.all() else None
     grey = albedo[rest.origin].mean(0) if rest else np.full(3, 0.5)
     colour = " ".join(f"{c:.5f}" for c in linear_to_srgb(np.clip(grey, 0, 1)))
+    film, eyes = " ".join([f"{REFLECTANCE:.5f}"] * 3), eye_faces(reconstruction, skin=True)
     write_text(
         path.with_suffix(".mtl"),
         f"newmtl skin\nillum 2\nKd 1 1 1\nKs 1 1 1\nNs {reconstruction.lobe.typical:.6g}\n"
         f"map_Kd {stem}_diffuse.png\nmap_Ks {stem}_specular.png\nnorm {stem}_normal.png\n\n"
+        f"newmtl eyes\nillum 2\nKd 1 1 1\nKs {film}\nNs {CORNEA.typical:.6g}\nmap_Kd {stem}_diffuse.png\n\n"
         f"newmtl rest\nillum 1\nKd {colour}\nKs 0 0 0\n",
     )
     codes = to_8_bit(albedo) / 255.0
@@ -127,7 +130,9 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int) -> None:
     ]
     lines += [f"vt {u:.7g} {v:.7g}" for u, v in model.uv.tolist()]
     lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in normals.tolist()]
-    for name, selected in (("skin", mapped), ("rest", ~mapped)):
+    for name, selected in (("skin", mapped & ~eyes), ("eyes", eyes), ("rest", ~mapped)):
+        if name == "eyes" and not eyes.any():
+            continue
         lines += [f"g {name}", f"usemtl {name}"]
         for f, t in zip((model.faces[selected] + 1).tolist(), (model.faces_uv[selected] + 1).tolist(), strict=True):
             lines.append("f " + " ".join(f"{a}/{b}/{a}" for a, b in zip(f, t, strict=True)))

@@ -14,26 +14,25 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import mifit
+from mifit.appearance.cornea import REFLECTANCE
 from mifit.core.files import replacing
 from mifit.core.image import encode_png, to_8_bit
 from mifit.core.mesh import vertex_normals
 from mifit.core.split_mesh import SplitMesh, part_of, split_at_seams, tangent_space_map, tangents
-from mifit.morphable.openings import eyeballs
+from mifit.morphable.openings import eyeball_faces
 from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
     from mifit.core.camera import Camera
     from mifit.core.estimate import GeometryEstimate
-    from mifit.morphable import MorphableModel
     from mifit.result import Result
 
 _KINDS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 DIELECTRIC_F0 = 0.04
 """Reflectance at normal incidence of glTF's dielectric, which KHR_materials_specular scales."""
-CORNEA_F0, CORNEA_ROUGHNESS = 0.025, 0.05
-"""Reflectance at normal incidence of the tear film on a cornea (index of refraction 1.376), and its roughness in glTF's
-terms: as smooth as viewers bear."""
+CORNEA_ROUGHNESS = 0.05
+"""Of the film of tears on an eye, in glTF's terms: as smooth as viewers bear."""
 SKIN, REST, EYES = range(3)
 """Materials, in their order."""
 
@@ -115,7 +114,7 @@ def write_glb(
     albedo = vertex_materials(reconstruction, skin=True)[:, :3]
     primitives = []
     mapped = mapped_faces(reconstruction)
-    balls = mapped & _eyeball_faces(model)
+    balls = mapped & eyeball_faces(model)
     parts = {SKIN: mapped & ~balls, REST: ~mapped, EYES: balls}
     for material, selected in parts.items():
         if selected.any():
@@ -261,13 +260,8 @@ def _skin(
 
 def _eyes(skin: dict[str, Any]) -> dict[str, Any]:
     """Material of eyeballs: what the maps show, under a clear coat with the mesh's own smooth normals."""
-    coat = {"clearcoatFactor": CORNEA_F0 / DIELECTRIC_F0, "clearcoatRoughnessFactor": CORNEA_ROUGHNESS}
+    coat = {"clearcoatFactor": REFLECTANCE / DIELECTRIC_F0, "clearcoatRoughnessFactor": CORNEA_ROUGHNESS}
     return {**skin, "name": "eyes", "extensions": {**skin["extensions"], "KHR_materials_clearcoat": coat}}
-
-
-def _eyeball_faces(model: MorphableModel) -> NDArray[np.bool_]:
-    """(F,) faces of the model's eyeballs."""
-    return np.isin(model.faces[:, 0], np.concatenate([np.zeros(0, np.int64), *eyeballs(model)]))
 
 
 def _animation(

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.cornea import CORNEA, REFLECTANCE
+from mifit.appearance.lobe import Lobe
 from mifit.core.camera import Camera
 from mifit.core.files import write_text
 from mifit.core.image import write_image
@@ -24,7 +26,7 @@ from mifit.core.sh import SHLighting
 from mifit.core.split_mesh import SplitMesh, part_of, split_at_seams
 from mifit.core.uv import rasterize_uv
 from mifit.output.deferred import visible_surface
-from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
+from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials
 from mifit.render.description import Parameter, to_mitsuba, to_xml
 from mifit.render.sensor import sensor_description
 
@@ -53,10 +55,10 @@ def write_scene(
     lobe's rise and the refined normals as slopes, and the light is ``shenv``. In ``NAME_stock.xml`` the skin blends
     ``diffuse`` with a ``roughconductor`` of Beckmann roughness sqrt(2 / (m + 2)), which doesn't rise, under a
     ``normalmap``, and the light is a lat-long ``envmap``. A relit reconstruction has its environment as ``envmap`` in
-    both. A compact light is a stock ``directional`` or, where it is near, ``point`` emitter in both. The ambient
-    term stands for light that local shading leaves out, such as interreflection, so a path-traced scene doesn't
-    have it. A camera whose pixels aren't square is mifit's ``pinhole`` in ``NAME.xml``; in ``NAME_stock.xml`` it
-    has square ones
+    both, and its eyes are under a film of tears: their lobe is the cornea's. A compact light is a stock
+    ``directional`` or, where it is near, ``point`` emitter in both. The ambient term stands for light that local
+    shading leaves out, such as interreflection, so a path-traced scene doesn't have it. A camera whose pixels aren't
+    square is mifit's ``pinhole`` in ``NAME.xml``; in ``NAME_stock.xml`` it has square ones
     (`Camera.with_square_pixels`).
 
     Parameters
@@ -118,8 +120,7 @@ def _write_files(reconstruction: Result, files: Path, timestep: int, method: Met
     mesh = split_at_seams(model)
     files.mkdir(parents=True, exist_ok=True)
     albedo = vertex_materials(reconstruction)[:, :3]
-    mapped = mapped_faces(reconstruction)
-    for name, selected in (("face", mapped), ("rest", ~mapped)):
+    for name, selected in _parts(reconstruction).items():
         if selected.any():
             part = part_of(mesh, selected)
             write_ply(
@@ -146,6 +147,12 @@ def _write_files(reconstruction: Result, files: Path, timestep: int, method: Met
     if environment is None:
         environment = np.maximum(SHLighting(reconstruction.illumination.radiance).to_latlong(128, 256), 0.0)
     write_image(files / "environment.exr", environment)
+
+
+def _parts(reconstruction: Result) -> dict[str, NDArray[np.bool_]]:
+    """(F,) faces of each shape, by its name: with maps, an eye's, and without maps."""
+    mapped, eyes = mapped_faces(reconstruction), eye_faces(reconstruction)
+    return {"face": mapped & ~eyes, "eyes": eyes, "rest": ~mapped}
 
 
 def _slopes(
@@ -222,7 +229,7 @@ def scene_description(
     """The scene of `write_scene` as a plain dictionary (`render.description`), its files in the folder ``files``.
 
     Ids are ours, not the user's: ``skin`` and ``light`` (maps and lighting), ``light_1`` ... (compact lights),
-    ``face`` and ``rest`` (shapes), and ``camera_NAME`` (see `sensor_ids`).
+    ``face``, ``eyes`` and ``rest`` (shapes), and ``camera_NAME`` (see `sensor_ids`).
     """
     if method == "pca":
         reconstruction = replace(reconstruction, reflectance=None, normals=None)
@@ -232,7 +239,10 @@ def scene_description(
         scene[name] = sensor_description(camera.with_square_pixels() if stock else camera, samples)
     scene["skin"] = _skin(reconstruction, files, stock)
     scene["face"] = _shape(f"{files}/face.ply", {"type": "ref", "id": "skin"})
-    if not mapped_faces(reconstruction).all():
+    parts = _parts(reconstruction)
+    if parts["eyes"].any():
+        scene["eyes"] = _shape(f"{files}/eyes.ply", _eyes(files, stock, method))
+    if parts["rest"].any():
         scene["rest"] = _shape(f"{files}/rest.ply", _vertex_albedo(stock))
     if stock or reconstruction.environment is not None:
         scene["light"] = {"type": "envmap", "filename": f"{files}/environment.exr"}
@@ -266,22 +276,29 @@ def _texture(file: str, raw: bool = True) -> dict[str, Any]:
 
 
 def _skin(reconstruction: Result, files: str, stock: bool) -> dict[str, Any]:
+    found = _mapped(reconstruction.lobe, files, stock)
     if stock:
-        mirror = {
-            "type": "roughconductor",
-            "material": "none",
-            "distribution": "beckmann",
-            "alpha": reconstruction.lobe.roughness,
-        }
+        return {"type": "normalmap", "normalmap": _texture(f"{files}/normal.exr"), "nested": found}
+    return {**found, "normal_correction": _texture(f"{files}/slopes.exr")}
+
+
+def _eyes(files: str, stock: bool, method: Method) -> dict[str, Any]:
+    """The BSDF of eyes: the diffuse map under a film of tears, with the mesh's own smooth normals."""
+    return _mapped(CORNEA, files, stock, REFLECTANCE if method == "full" else 0.0)
+
+
+def _mapped(lobe: Lobe, files: str, stock: bool, specular: float | None = None) -> dict[str, Any]:
+    """The BSDF of the diffuse map with a lobe, by the specular map unless a number stands for it."""
+    strength = _texture(f"{files}/specular.exr") if specular is None else specular
+    if stock:
+        mirror = {"type": "roughconductor", "material": "none", "distribution": "beckmann", "alpha": lobe.roughness}
         base = {"type": "diffuse", "reflectance": _texture(f"{files}/diffuse_stock.exr", False)}
-        blend = {"type": "blendbsdf", "weight": _texture(f"{files}/specular.exr"), "base": base, "lobe": mirror}
-        return {"type": "normalmap", "normalmap": _texture(f"{files}/normal.exr"), "nested": blend}
+        return {"type": "blendbsdf", "weight": strength, "base": base, "lobe": mirror}
     return {
         "type": "blinnphong",
         "diffuse_reflectance": _texture(f"{files}/diffuse.exr", False),
-        "specular_reflectance": _texture(f"{files}/specular.exr"),
-        "normal_correction": _texture(f"{files}/slopes.exr"),
-        **reconstruction.lobe.parameters(),
+        "specular_reflectance": strength,
+        **lobe.parameters(),
     }
 
 

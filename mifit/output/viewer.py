@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.cornea import CORNEA, REFLECTANCE
 from mifit.core.image import to_8_bit
 from mifit.core.mesh import vertex_normals
 from mifit.core.sh import SHLighting, bands, cosine_coefficients
 from mifit.core.split_mesh import part_of, split_at_seams
 from mifit.output.figures import jpeg_uri, png_uri
-from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
+from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
     from mifit.result import Result
@@ -24,28 +25,27 @@ def viewer_data(reconstruction: Result, timestep: int) -> str:
     """JSON for the 3D view of one timestep; quantised, for looking at only.
 
     Positions have 16 bits of the bounding sphere, normals 8, texture coordinates 16; the alpha of the vertex
-    colour tells whether a face has maps.
+    colour tells whether a face has maps (1), is an eye with maps (0.5), or has none.
     """
     model, geometry = reconstruction.model, reconstruction.geometry
     i = reconstruction.index(timestep)
     rotation, translation, scale = geometry.rotation[i], geometry.translation[i], geometry.scale
     vertices = (geometry.vertices[i] - translation) @ rotation / scale
     mesh = split_at_seams(model)
-    # Two parts that share no vertex: with maps, and without.
-    mapped = mapped_faces(reconstruction)
-    parts = [part_of(mesh, mapped), part_of(mesh, ~mapped)]
+    # Parts that share no vertex: with maps, eyes with maps, and without.
+    mapped, eyes = mapped_faces(reconstruction), eye_faces(reconstruction, skin=True)
+    parts = [part_of(mesh, selected) for selected in (mapped & ~eyes, eyes, ~mapped)]
     origin = np.concatenate([p.origin for p in parts])
     uv = np.concatenate([p.uv for p in parts])
-    has_maps = np.arange(len(origin)) < len(parts[0].origin)
-    faces = np.concatenate([parts[0].faces, parts[1].faces + len(parts[0].origin)])
+    starts = np.cumsum([0, *(len(p.origin) for p in parts)])
+    kind = np.repeat([255, 128, 0], np.diff(starts))
+    faces = np.concatenate([p.faces + start for p, start in zip(parts, starts, strict=False)])
     position = vertices[origin]
     normals = vertex_normals(vertices, model.faces)[origin]
     centre = (position.min(0) + position.max(0)) / 2
     radius = float(np.abs(position - centre).max())
     face_centre = vertices[np.unique(model.faces[model.face_mask])]
-    colour = np.column_stack(
-        [to_8_bit(vertex_materials(reconstruction, skin=True)[origin, :3]), has_maps * 255]
-    ).astype(np.uint8)
+    colour = np.column_stack([to_8_bit(vertex_materials(reconstruction, skin=True)[origin, :3]), kind]).astype(np.uint8)
     wide = len(origin) > 65535
     maps = surface_maps(reconstruction, timestep, skin=True)
     peak = max(float(maps.specular.max()), 1e-3)
@@ -92,6 +92,7 @@ def _lighting(reconstruction: Result) -> dict[str, Any]:
         "lobe_tilt": np.polynomial.polynomial.polyfit(cosines, tilt, 5).tolist(),
         "ambient": float(reconstruction.illumination.ambient),
         "exponent": reconstruction.lobe.typical,
+        "film": [REFLECTANCE, CORNEA.grazing - 1.0, CORNEA.typical],
     }
 
 

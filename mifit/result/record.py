@@ -152,12 +152,15 @@ class Result:
                 f"{name}: found shape {array.shape} with values {np.min(array):g} to {np.max(array):g}, "
                 f"expected {before.shape} with reflectances 0 to 1"
             )
-        return replace(self, reflectance=replace(self.reflectance, **{name: array}), residual=None)
+        lit_eyes = None if name == "diffuse" else self.reflectance.lit_eyes
+        edited = replace(self.reflectance, **{name: array}, lit_eyes=lit_eyes)
+        return replace(self, reflectance=edited, residual=None)
 
     def with_illumination(self: R, illumination: Illumination) -> R:
         """The same face in another light, taken as it is; see `Reconstruction.relight` for environment maps.
 
-        What the capture's own light left unexplained (``reflectance.relief``, ``residual``) is gone with it.
+        What the capture's own light left unexplained (``reflectance.relief``, ``residual``) is gone with it, and so are
+        the highlights that its images show on eyes (``reflectance.lit_eyes``).
 
         Raises
         ------
@@ -166,7 +169,7 @@ class Result:
         """
         if self.reflectance is None:
             raise InputError("illumination: this result has no reflectance; fit with --until reflectance")
-        reflectance = replace(self.reflectance, illumination=illumination, relief=None)
+        reflectance = replace(self.reflectance, illumination=illumination, relief=None, lit_eyes=None)
         return replace(self, reflectance=reflectance, residual=None, environment=None, environment_rotation=None)
 
     @property

@@ -137,6 +137,21 @@ def test_maps_come_back_from_wrong_ones(scene, result):
     assert error < 0.25 * np.abs(wrong.reflectance.diffuse - scene.reflectance.diffuse)[mask].mean()
 
 
+def test_eyes_keep_what_the_fit_found_beneath_their_film(scene, result):
+    from mifit.refinement import refine
+
+    beneath = scene.reflectance.diffuse.copy()
+    lit = np.zeros_like(beneath)
+    beneath[20:24, 20:24], lit[20:24, 20:24] = 0.05, 0.9
+    eye = lit.any(axis=-1)
+    reflectance = replace(scene.reflectance, diffuse=beneath, lit_eyes=lit)
+    found = refine(replace(result, reflectance=reflectance), scene, (0, 1)).reflectance
+    assert_array_equal(found.diffuse[eye], beneath[eye])
+    assert_array_equal(found.lit_eyes.any(axis=-1), eye)
+    # In its own light they are what the frames show.
+    assert np.abs(found.lit_diffuse - scene.reflectance.diffuse)[eye].max() < 0.1
+
+
 def test_shuffled_frames_give_the_same(scene, result):
     from mifit.refinement import refine
 
