@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,9 @@ from mifit.errors import InputError
 
 LIGHT_SAMPLES = 16
 """Points of a compact light that has an extent."""
+TILES = 64
+"""Tiles along the maps' sides, in whose order the points of a view are shaded: a tile's gradients stay in the cache."""
+KEPT_LOBES = 8
 KEPT_BYTES, RAY_BYTES = 2**30, 260
 """Of first hits at most, and of one of them with its ray and its point: a dozen views of 680 x 480."""
 
@@ -45,6 +49,16 @@ def make() -> type:
         """The number by which kernels know a shape or a sensor."""
         return int(np.array(dr.reinterpret_array(mi.UInt32, pointer))[0])
 
+    def recording() -> bool:
+        """Are operations noted down for later, so that no value can be looked at?"""
+        return bool(dr.flag(dr.JitFlag.SymbolicScope) or dr.flag(dr.JitFlag.FreezingScope))
+
+    def by_tile(uv: Any) -> Any:
+        """The order of points in which those that share a tile of texels follow one another."""
+        column, row = (np.floor(np.array(x) * TILES).astype(np.int64) % TILES for x in (uv.x, uv.y))
+        order = np.argsort((row * TILES + column).astype(np.uint16), kind="stable")
+        return mi.UInt32(order.astype(np.uint32))
+
     class FirstHits:
         """What primary rays meet, kept for as long as neither they nor the meshes move.
 
@@ -61,8 +75,7 @@ def make() -> type:
             """The points that a sensor's rays meet, and the numbers of their rays; None where each ray has an entry."""
             shapes = scene.shapes()
             plain = dr.is_jit_v(mi.Float) and all(shape.is_mesh() for shape in shapes)
-            recording = dr.flag(dr.JitFlag.SymbolicScope) or dr.flag(dr.JitFlag.FreezingScope)
-            if not plain or recording or self.sensor is None:
+            if not plain or recording() or self.sensor is None:
                 return None, scene.ray_intersect(ray, active)
             with dr.suspend_grad():
                 still = mi.Ray3f(dr.detach(ray))
@@ -73,6 +86,10 @@ def make() -> type:
                 if kept is None or kept["moved"] != moved or not same(kept["ray"], still):
                     hits = scene.ray_intersect_preliminary(still, coherent=True)
                     index = dr.compress(hits.is_valid())
+                    if dr.width(index) > 0:
+                        met = dr.gather(type(hits), hits, index)
+                        met = met.compute_surface_interaction(dr.gather(mi.Ray3f, still, index))
+                        index = dr.gather(mi.UInt32, index, by_tile(met.uv))
                     kept = {"ray": still, "moved": moved, "index": index}
                     if dr.width(index) > 0:
                         kept["hits"] = dr.gather(type(hits), hits, index)
@@ -106,6 +123,10 @@ def make() -> type:
         for a, b in pairs:
             equal &= dr.all(a == b) if dr.depth_v(a) > 1 else a == b
         return bool(dr.all(equal))
+
+    def at(values: Any, index: Any) -> Any:
+        """The entries of an array, whose only one may be that of all."""
+        return values if dr.width(values) == 1 else dr.gather(type(values), values, index)
 
     class SHDirect(ADIntegrator):
         r"""
@@ -150,6 +171,7 @@ def make() -> type:
             self.hide = bool(props.get("hide_emitters", False))
             self._traced: dict[str, Any] = {}
             self._hits = FirstHits()
+            self._lobes: dict[tuple[float, int, bool], kernels.PreparedLobe] = {}
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             if dr.is_jit_v(mi.Float):
@@ -176,6 +198,49 @@ def make() -> type:
             position = corner + mi.Vector2f(film.crop_offset())
             return ray, weight, position if film.rfilter().is_box_filter() else position + inside
 
+        def render(
+            self,
+            scene: Any,
+            sensor: Any = 0,
+            seed: Any = 0,
+            spp: int = 0,
+            develop: bool = True,
+            evaluate: bool = True,
+        ) -> Any:
+            """Image (H, W, 3), or with alpha (H, W, 4).
+
+            One sample per pixel under a box filter is the pixel: it is written to its place, where Mitsuba's way adds
+            it to a block and divides that by its weights.
+            """
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            film = sensor.film()
+            plain = self._is_plain(film) and "pixel_format = rgb" in str(film) and dr.is_jit_v(mi.Float)
+            if not develop or not plain or (spp or sensor.sampler().sample_count()) != 1:
+                return super().render(scene, sensor, seed, spp, develop, evaluate)
+            with dr.suspend_grad():
+                sampler, _ = self.prepare(sensor, seed, spp, self.aov_names())
+                ray, weight, _ = self.sample_rays(scene, sensor, sampler)
+                index, value, behind, hit = self._seen(scene, ray, mi.Bool(True))
+                alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+                width, height = film.crop_size()
+                count = width * height
+                channels = 4 if alpha else 3
+                pixels = dr.zeros(mi.Float, count * channels)
+                if behind is not None or index is None:
+                    index, value = dr.arange(mi.UInt32, count), self._everywhere(index, value, behind, hit)
+                    opaque = dr.select(hit | (behind is not None), 1.0, 0.0)
+                else:
+                    opaque = dr.full(mi.Float, 1.0, dr.width(index))
+                value = value * at(weight, index)
+                for k, entry in enumerate([value.x, value.y, value.z, opaque][:channels]):
+                    dr.scatter(pixels, entry, index * channels + k, mode=dr.ReduceMode.Permute)
+                # What the film itself shows afterwards is formed when somebody asks for it.
+                every = dr.arange(mi.UInt32, count * (channels + 1))
+                pixel, k = every // (channels + 1), every % (channels + 1)
+                block = dr.select(k < channels, dr.gather(mi.Float, pixels, pixel * channels + k, k < channels), 1.0)
+                film.put_block(mi.ImageBlock(mi.TensorXf(block, (height, width, channels + 1))))
+                return mi.TensorXf(pixels, (height, width, channels))
+
         def render_backward(
             self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
         ) -> None:
@@ -186,25 +251,29 @@ def make() -> type:
             """
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             film = sensor.film()
-            special = dr.all(mi.has_flag(film.flags(), mi.FilmFlags.Special))
-            if special or grad_in.shape[2] < 3 or not film.rfilter().is_box_filter():
+            if grad_in.shape[2] < 3 or not self._is_plain(film):
                 super().render_backward(scene, params, grad_in, sensor, seed, spp)
                 return
             with dr.suspend_grad():
                 sampler, spp = self.prepare(sensor, seed, spp, self.aov_names())
-                ray, weight, pos = self.sample_rays(scene, sensor, sampler)
-                corner = mi.Vector2u(pos - mi.Vector2f(film.crop_offset()))
-                at = (corner.y * film.crop_size()[0] + corner.x) * grad_in.shape[2]
-                found = mi.Color3f(*(dr.gather(mi.Float, grad_in.array, at + k) for k in range(3))) * weight / spp
+                ray, weight, _ = self.sample_rays(scene, sensor, sampler)
+                share = dr.opaque(mi.Float, 1.0 / spp)
+
+                def given(samples: Any) -> Any:
+                    """Gradients of samples."""
+                    first = samples // dr.opaque(mi.UInt32, spp) * grad_in.shape[2]
+                    entries = (dr.gather(mi.Float, grad_in.array, first + k) for k in range(3))
+                    return mi.Color3f(*entries) * at(weight, samples) * share
+
+                every = dr.arange(mi.UInt32, dr.width(ray))
                 with dr.resume_grad():
-                    index, si = self._hits.find(scene, ray, mi.Bool(True))
-                    values = [(self._shade(scene, si), found if index is None else dr.gather(mi.Color3f, found, index))]
-                    if not self.hide:
-                        behind = self._emitters(scene)[0].radiance(ray.d)
-                        values.append((dr.select(self._hits.hit(index, si, ray), 0.0, behind), found))
-                    values = [(value, given) for value, given in values if dr.grad_enabled(value)]
-                    for value, given in values:
-                        dr.set_grad(value, given)
+                    index, value, behind, hit = self._seen(scene, ray, mi.Bool(True))
+                    values = [(value, every if index is None else index)]
+                    if behind is not None:
+                        values.append((dr.select(hit, 0.0, behind), every))
+                    values = [(value, samples) for value, samples in values if dr.grad_enabled(value)]
+                    for value, samples in values:
+                        dr.set_grad(value, given(samples))
                         dr.enqueue(dr.ADMode.Backward, value)
                     if values:
                         dr.traverse(dr.ADMode.Backward)
@@ -214,16 +283,27 @@ def make() -> type:
             self, mode: Any, scene: Any, sampler: Any, ray: Any, active: Any = True, **_: Any
         ) -> tuple[Any, Any, list[Any], Any]:
             """Radiance along primary rays; plain automatic differentiation in every mode."""
+            index, value, behind, hit = self._seen(scene, ray, active)
+            return self._everywhere(index, value, behind, hit), hit | (not self.hide), [], None
+
+        def _is_plain(self, film: Any) -> bool:
+            """Is a pixel the mean of its own samples' radiance?"""
+            special = dr.all(mi.has_flag(film.flags(), mi.FilmFlags.Special))
+            return not special and film.rfilter().is_box_filter()
+
+        def _seen(self, scene: Any, ray: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+            """Numbers of the rays that meet something (None: one entry per ray), radiance there, behind, and which."""
             index, si = self._hits.find(scene, ray, active)
-            value = self._shade(scene, si)
-            hit = self._hits.hit(index, si, ray)
+            behind = None if self.hide else self._emitters(scene)[0].radiance(ray.d)
+            return index, self._shade(scene, si), behind, self._hits.hit(index, si, ray)
+
+        def _everywhere(self, index: Any, value: Any, behind: Any, hit: Any) -> Any:
+            """Radiance along every ray, of what `_seen` found."""
             if index is not None:
-                radiance = dr.zeros(mi.Color3f, dr.width(ray))
+                radiance = dr.zeros(mi.Color3f, dr.width(hit))
                 dr.scatter(radiance, value, index, mode=dr.ReduceMode.Permute)
                 value = radiance
-            if not self.hide:
-                value = dr.select(hit, value, self._emitters(scene)[0].radiance(ray.d))
-            return value, hit | (not self.hide), [], None
+            return value if behind is None else dr.select(hit, value, behind)
 
         def _shade(self, scene: Any, si: Any) -> Any:
             """Radiance that leaves points of surfaces towards the camera; nothing where there is none."""
@@ -245,7 +325,7 @@ def make() -> type:
                 specular = dr.select(cosine > 0.0, specular, 0.0)
                 if not self.model.normalized:
                     fresnel = None
-                lobe = kernels.prepare_exponent(exponent, order, self.model.normalized and bsdf.normalized, fresnel)
+                lobe = self._lobe(exponent, order, self.model.normalized and bsdf.normalized, fresnel)
                 if fresnel is not None:
                     # The shading below brings the Fresnel factor; here is only where it stops.
                     factor = kernels.fresnel_factor(cosine, fresnel)
@@ -258,6 +338,16 @@ def make() -> type:
             for light in compact:
                 radiance += self._direct(scene, light, si, hit)
             return radiance
+
+        def _lobe(self, exponent: Any, order: int, normalized: bool, fresnel: Any) -> kernels.PreparedLobe:
+            """The lobe of an exponent, prepared once where all points share it and nothing differentiates by it."""
+            if dr.width(exponent) != 1 or dr.grad_enabled(exponent) or recording():
+                return kernels.prepare_exponent(exponent, order, normalized, fresnel)
+            key = float(np.ravel(exponent)[0]), order, normalized
+            if key not in self._lobes:
+                last = dict(list(self._lobes.items())[1 - KEPT_LOBES :])
+                self._lobes = {**last, key: kernels.prepare_exponent(exponent, order, normalized)}
+            return replace(self._lobes[key], fresnel=fresnel)
 
         def _emitters(self, scene: Any) -> tuple[Any, list[Any]]:
             """The scene's `shenv`, of which there is one, and its other emitters, none of them an environment."""
