@@ -25,13 +25,21 @@ def scaled(scene, camera="right", scale=SCALE):
     return replace(scene, frames=frames)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def fewer_points():
+    """A third of the points: the dome is smooth, and its images are without noise."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mifit.stages.gains.POINTS", 1300)
+        yield
+
+
 @pytest.fixture(scope="module")
 def dome(variant):
     return turning_dome(gloss=0.12)
 
 
 @pytest.fixture(scope="module")
-def gains(dome):
+def gains(dome, fewer_points):
     return estimate_gains(scaled(dome), dome.model, dome.geometry, ("left", "right"))
 
 
