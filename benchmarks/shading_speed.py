@@ -181,7 +181,7 @@ def rendered(
     keys = [k for k in parameters.keys() if k.endswith(("reflectance.data", "correction.data", "coefficients"))]
     assert len(keys) == 4, keys
     # A film with alpha gives images of four channels. Weighing the fourth by nothing costs a pass; image[..., :3] would
-    # cost a scatter that waits for itself in the gradient, half as much again as shading.
+    # cost a scatter in the gradient, an eighth of the iteration.
     colour = mi.TensorXf(np.array([1.0, 1.0, 1.0, 0.0], np.float32).reshape(1, 1, 4) / 0.75)
 
     def run() -> None:
