@@ -41,7 +41,7 @@ CONVENTIONS = [
 FOREIGN_HEADS = [
     M("folds as noisy as the open sky", "mifit/appearance/*.py", r"dr\.fma\(seen, t, \(s - seen \* w\) / samples\)",
       "t + (s - w) / samples", "tests/appearance/test_occlusion.py"),
-    M("a black channel's contrasts believed", STAGES, r"way = float\(np\.min\(.*", "way = 1.0", "tests/stages/test_skin_priors.py"),
+    M("the albedo's level left free", STAGES, r"^LEVEL_PRIOR = .*", "LEVEL_PRIOR = 0.0", "tests/stages/test_geometry_terms.py"),
     M("lenses without a prior", CAPTURE, r"noise \* _unlikely\(one, size\)", "0.0 * _unlikely(one, size)",
       "tests/capture/test_board_adjustment.py"),
     M("frames out of step kept", CAPTURE, r"OUT_OF_STEP = 0\.5", "OUT_OF_STEP = 500.0",

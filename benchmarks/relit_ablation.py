@@ -24,7 +24,6 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from numpy.typing import NDArray
 
 import mifit
 from benchmarks import judge
@@ -58,6 +57,8 @@ class Part:
         Fit lighting and albedo anew without specular reflection.
     normals : bool
         Refine normals.
+    level : float
+        Of stage 1's albedo, relative to the one found.
     """
 
     label: str
@@ -65,6 +66,7 @@ class Part:
     patches: dict[str, Any] = field(default_factory=dict)
     matt: bool = False
     normals: bool = True
+    level: float = 1.0
 
     @contextmanager
     def applied(self) -> Iterator[None]:
@@ -79,11 +81,6 @@ class Part:
                 each.stop()
 
 
-def unlevelled(albedo: NDArray, fitted: NDArray, mean: NDArray) -> NDArray:
-    """Stage 1's albedo with the level and colour that it has, in place of ``priors.levelled``."""
-    return albedo
-
-
 PARTS = (
     Part(BASE),
     Part("lights: no compact one", {"shading": "shadowed"}),
@@ -96,7 +93,7 @@ PARTS = (
     Part("roughness: the one expected of skin (exponent 20)", {"exponent": 20.0}),
     Part("roughness: exponent 10", {"exponent": 10.0}),
     Part("roughness: exponent 160", {"exponent": 160.0}),
-    Part("scale: stage 1's albedo", patches={"mifit.stages.infer_reflectance.levelled": unlevelled}),
+    Part("scale: an albedo half as bright in brighter light", level=0.5),
     Part("specular reflection: none, all refitted", matt=True),
     Part("relief: left in the albedo", {"relief": False}),
     Part("what hides the face: left in", {"segment": False}),
@@ -108,7 +105,8 @@ PARTS = (
 def fit_without(part: Part, capture: Capture, base: Reconstruction, case: Case, size: int) -> Reconstruction:
     """Reflectance and normals on a geometry that is given."""
     config = replace(ReflectanceConfig(texture_size=size), **part.settings)
-    given = capture, base.model, base.geometry
+    geometry = replace(base.geometry, vertex_albedo=np.float32(part.level) * base.geometry.vertex_albedo)
+    given = capture, base.model, geometry
     with part.applied():
         infer = infer_matt if part.matt else mifit.infer_reflectance
         reflectance = infer(*given, case.fitted, config, seed=SEED)

@@ -53,7 +53,12 @@ class GeometryConfig:
     robust_colour: float = number(
         30.0, "objective paper: residual from which a pixel counts as an outlier", "of 255", above=0, most=WEIGHT
     )
-    albedo_prior: float = number(1.0, "objective paper: factor on the prior of the albedo", least=0, most=WEIGHT)
+    albedo_prior: float = number(
+        0.2,
+        "factor on the prior of the albedo; 1: contrasts as the model's modes have them, 0.2: as those of skin",
+        least=0,
+        most=WEIGHT,
+    )
     as_written: bool = flag(
         False,
         "objective paper: the paper's terms and no others, so no robust penalty, no contour that slides, no pull of "

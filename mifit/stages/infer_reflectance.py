@@ -21,12 +21,10 @@ from mifit.solve import Outcome
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.als import fit_als
 from mifit.stages.reflectance.beneath_film import beneath_the_film
-from mifit.stages.reflectance.choice import fitted_models
 from mifit.stages.reflectance.fill import blend_unseen, mirrored_coordinates
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.objective import energies
 from mifit.stages.reflectance.paper_solver import fit_adam
-from mifit.stages.reflectance.priors import levelled
 from mifit.stages.reflectance.relief import part_relief
 from mifit.stages.segment import segment
 
@@ -35,7 +33,10 @@ if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
 
 
-GAUGE = "mean diffuse albedo over seen texels and channels equals that of the morphable model's mean face"
+GAUGE = (
+    "mean diffuse albedo over seen texels and channels equals stage 1's, which has the level of the morphable model's "
+    "mean face unless the paper's objective was fitted as written"
+)
 
 
 @one_blas_thread()
@@ -52,8 +53,9 @@ def infer_reflectance(
 
     All timesteps of the geometry and all named cameras enter; albedo and lighting are shared by them. The product
     of albedo and lighting is all that images show, so the scale between the two is fixed by a convention: the mean
-    diffuse albedo over the seen texels and channels is that of the morphable model's mean face. Texels that no image
-    shows are filled from the model's albedo, shifted smoothly to agree with their surroundings.
+    diffuse albedo over the seen texels and channels is stage 1's, which has the level of the morphable model's mean
+    face. Texels that no image shows are filled from the model's albedo, shifted smoothly to agree with their
+    surroundings.
 
     Parameters
     ----------
@@ -89,12 +91,6 @@ def infer_reflectance(
         surface = surface.without([hidden(image) for image in labels])
     mirrored = mirrored_coordinates(model, surface.texels) if config.symmetric_fill else None
     albedo = interpolate(geometry.vertex_albedo, model.faces, surface.texels.face, surface.texels.weights)
-    # Albedos of a lobe that isn't normalised, such as the paper's, have no physical level: stage 1's is taken as it is.
-    physical = config.robust and config.solver == "als" and all(m.normalized for m in fitted_models(config))
-    if physical:
-        mean = interpolate(model.mean_albedo, model.faces, surface.texels.face, surface.texels.weights)
-        face = np.unique(model.faces[model.face_mask])
-        albedo = levelled(albedo, mean, geometry.vertex_albedo[face], model.mean_albedo[face])
     albedo = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float32)
     solve = fit_adam if config.solver == "adam" else fit_als
     fitted, choice, warnings = solve(surface, albedo, config, seed, progress)
@@ -107,7 +103,7 @@ def infer_reflectance(
         warnings = (*warnings, "the lighting had not converged when the iterations ran out; raise max_iterations")
     details: dict = {
         "shading": choice,
-        "gauge": GAUGE if physical else "mean diffuse albedo over seen texels and channels equals stage 1's",
+        "gauge": GAUGE,
         "residual": float(fitted.sigma),
         "seen": float((quality[surface.facial] > 0).mean()),
         "texels": int(surface.facial.sum()),

@@ -102,6 +102,16 @@ def test_lighting_is_found_up_to_the_albedos_level(model, capture, fitted):
     assert ratio.std() < 0.06 * ratio.mean()
 
 
+def test_the_albedos_level_is_the_mean_faces_in_any_light(model, capture, fitted):
+    face = np.unique(model.faces[model.face_mask])
+    level = model.mean_albedo[face].mean(axis=0)
+    np.testing.assert_allclose(fitted.vertex_albedo[face].mean(axis=0) / level, 1.0, atol=0.01)
+    tint = np.float32([0.5, 0.2, 0.03])
+    orange = capture.changed(lambda camera, timestep, frame: replace(frame, image=frame.image * tint))
+    found = fit_geometry(orange, model, BOTH, (0, 1), QUICK)
+    np.testing.assert_allclose(found.vertex_albedo[face].mean(axis=0) / level, 1.0, atol=0.01)
+
+
 def test_papers_objective_brings_back_a_displaced_head(model):
     """Without paint that the model can't make, rendering and image agree to the noise again."""
     capture = make_capture(model, painted=False)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mifit.core.camera import Camera
+from mifit.core.mesh import normalize
 from mifit.core.sh import basis
 from mifit.stages.geometry.appearance import AppearanceProblem, fit_appearance
 from mifit.stages.geometry.consistency import ConsistencyProblem, TextureView
@@ -340,12 +341,42 @@ def test_appearance_recovers_albedo_and_lighting():
     albedo, mean = rng.normal(size=5), rng.uniform(0.2, 0.6, (n, 3)).astype(np.float32)
     observed = ((mean + modes @ albedo) * (harmonics @ shading) + 0.02).astype(np.float32)
     observed[:100] = 1.0  # a highlight
-    problem = AppearanceProblem(mean, modes, harmonics, observed, np.full(n, 1.0 / n), 30.0, 1e-4)
+    untold = np.zeros((3, 5))
+    problem = AppearanceProblem(mean, modes, harmonics, observed, np.full(n, 1.0 / n), 30.0, 1e-4, untold)
     solution = fit_appearance(problem, 50)
     assert solution.usable
     np.testing.assert_allclose(solution.value[:5], albedo, atol=0.02)
     np.testing.assert_allclose(solution.value[5:-1].reshape(9, 3), shading, atol=0.02)
     np.testing.assert_allclose(solution.value[-1], 0.02, atol=0.005)
+
+
+@pytest.mark.parametrize("tint", [(1.0, 1.0, 1.0), (0.1, 0.1, 0.1), (1.0, 0.4, 0.05)], ids=["white", "dark", "orange"])
+def test_the_level_of_the_albedo_is_held_whatever_the_light(tint):
+    """A mode that darkens the whole face makes the contrasts of all others cheap, and the images show a lot of them."""
+    rng = np.random.default_rng(4)
+    n, whole = 2000, np.array([0.45, 0.27, 0.2])
+    painted = rng.normal(size=(n, 6))
+    painted -= painted.mean(axis=0)
+    mean = np.tile(whole, (n, 1)).astype(np.float32)
+    relative = np.concatenate([np.full((n, 1), 0.3), 0.02 * painted], axis=1)
+    modes = (whole[:, None] * relative[:, None]).astype(np.float32)
+    normals = normalize(rng.normal(size=(n, 3)))
+    harmonics = basis(normals, 3).astype(np.float32)
+    shading = np.zeros((9, 3))
+    shading[0] = 3.0 * np.array(tint)
+    paint = np.array([0.0, 4.0, -4.0, 3.0, -5.0, 4.0, -3.0])
+    observed = ((mean + modes @ paint) * (harmonics @ shading)).astype(np.float32)
+    level = modes.mean(axis=0) / whole[:, None]
+
+    def levels(problem: AppearanceProblem) -> np.ndarray:
+        solution = fit_appearance(problem, 50)
+        assert solution.usable
+        return (mean + modes @ solution.value[:7]).mean(axis=0) / whole
+
+    weight = np.full(n, 1.0 / n)
+    held = AppearanceProblem(mean, modes, harmonics, observed, weight, 30.0, 1.0, level)
+    np.testing.assert_allclose(levels(held), 1.0, atol=2e-3)
+    assert (levels(replace(held, level=np.zeros_like(level))) < 0.95).all()  # what it is held against
 
 
 def test_triangulation_and_pose_are_exact_without_noise():

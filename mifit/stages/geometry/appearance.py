@@ -16,6 +16,15 @@ from mifit.stages.geometry.points import corner_matrix
 from mifit.stages.geometry.rendering import AMBIENT_PRIOR, WHITE, PixelView
 
 SHADING_PRIOR = 1e-4  # of the squared coefficients, 0..255: decides only what the visible normals leave open
+LEVEL_PRIOR = 1.0
+"""Of the squared relative change of the face's mean albedo, per channel, 0..255: fixes the gauge against the lighting.
+
+Images show the product of albedo and light alone, so nothing tells the level; but beside a prior of the modes darker
+skin in brighter light makes all contrasts cheap: without this it falls to half, in light far from white to nothing.
+As a prior alone, 0.28 of the logarithm as skin's luminance spreads is a hundred times too weak to hold it.
+"""
+DARKEST = 1e-3
+"""Level of a face, linear reflectance, below which relative changes mean nothing."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +47,8 @@ class AppearanceProblem:
     robust : float
         Residual in 0..255 where the penalty turns.
     albedo_prior : float
+    level : (3, Ka)
+        Change of the face's mean albedo by each mode, relative to that of the model's mean face.
     """
 
     mean: NDArray
@@ -47,6 +58,7 @@ class AppearanceProblem:
     weight: NDArray
     robust: float
     albedo_prior: float
+    level: NDArray
 
     @property
     def albedo_size(self) -> int:
@@ -87,7 +99,9 @@ class AppearanceProblem:
         """Energy per term."""
         squared = (self._residual(x)[0].astype(np.float64) ** 2).sum(1)
         data = float((self.weight * geman_mcclure(squared, self.robust)[0]).sum())
-        return {"photo": data, "prior": float(self._priors() @ (x * x))}
+        change = self.level @ x[: self.albedo_size]
+        level = LEVEL_PRIOR * WHITE**2 * float(change @ change)
+        return {"photo": data, "prior": float(self._priors() @ (x * x)) + level}
 
     def linearize(self, x: NDArray) -> DenseSystem:
         """Normal equations at x."""
@@ -104,8 +118,9 @@ class AppearanceProblem:
         rows *= np.sqrt(weight).astype(np.float32)[:, None, None]
         flat = rows.reshape(3 * n, a + 29)
         normal = (flat.T @ flat).astype(np.float64)
-        prior = self._priors()
-        return DenseSystem(normal[:-1, :-1] + np.diag(prior), normal[:-1, -1] + prior * x)
+        prior = np.diag(self._priors())
+        prior[:a, :a] += LEVEL_PRIOR * WHITE**2 * self.level.T @ self.level
+        return DenseSystem(normal[:-1, :-1] + prior, normal[:-1, -1] + prior @ x)
 
 
 def gather(
@@ -133,6 +148,8 @@ def gather(
             [np.zeros((0, 9), np.float32)],
         )
         observed, weight = [empty], [np.zeros(0)]
+    face = np.unique(model.faces[model.face_mask])
+    level = model.mean_albedo[face].mean(axis=0, dtype=np.float64)
     return AppearanceProblem(
         np.concatenate(mean),
         np.concatenate(modes),
@@ -141,6 +158,7 @@ def gather(
         np.concatenate(weight),
         robust,
         albedo_prior,
+        model.albedo_modes[face].mean(axis=0, dtype=np.float64) / np.maximum(level, DARKEST)[:, None],
     )
 
 

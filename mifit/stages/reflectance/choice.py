@@ -78,12 +78,6 @@ def candidate(name: str) -> Candidate:
     return CANDIDATES.get(name) or Candidate(name)
 
 
-def fitted_models(config: ReflectanceConfig) -> list[ShadingModel]:
-    """The shading models among which settings leave a choice."""
-    names = list(CANDIDATES) if config.shading == "auto" else [config.shading]
-    return [models.get(candidate(name).model) for name in names]
-
-
 def plain_forward(model: ShadingModel, exponent: float, config: ReflectanceConfig, surface: Surface) -> Forward:
     """A model as it is fitted, with its own number of bands and kind of lobe, without compact lights."""
     lobe = Lobe(exponent, model.fresnel, model.normalized)
