@@ -42,6 +42,8 @@ FOREIGN_HEADS = [
     M("folds as noisy as the open sky", "mifit/appearance/*.py", r"dr\.fma\(seen, t, \(s - seen \* w\) / samples\)",
       "t + (s - w) / samples", "tests/appearance/test_occlusion.py"),
     M("the albedo's level left free", STAGES, r"^LEVEL_PRIOR = .*", "LEVEL_PRIOR = 0.0", "tests/stages/test_geometry_terms.py"),
+    M("gloss believed that predicts nothing", STAGES, r"told = chosen\.error < \(1\.0 - MARGIN\) \* matt\.error", "told = True",
+      "tests/stages/test_infer_reflectance.py"),
     M("lenses without a prior", CAPTURE, r"noise \* _unlikely\(one, size\)", "0.0 * _unlikely(one, size)",
       "tests/capture/test_board_adjustment.py"),
     M("frames out of step kept", CAPTURE, r"OUT_OF_STEP = 0\.5", "OUT_OF_STEP = 500.0",

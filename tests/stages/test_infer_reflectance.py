@@ -285,6 +285,18 @@ def test_few_images_leave_the_specular_albedo_to_what_skin_has():
     assert expected_specular(found, np.ones((9, 2), bool)) == SPECULAR_LIMIT
     assert expected_specular(found, np.ones((9, 8), bool)) == pytest.approx(0.2)
     assert expected_specular(found / 20, np.ones((9, 2), bool)) == pytest.approx(0.01)
+    assert expected_specular(found, np.ones((9, 8), bool), told=False) == SPECULAR_LIMIT
+
+
+def test_gloss_that_predicts_nothing_is_that_of_skin(dome, monkeypatch):
+    """The dome's is four times that, and eight images tell; not so where a matt model is taken to predict as well."""
+    config = replace(CONFIG, shading="auto")
+    told = infer(dome, config)
+    monkeypatch.setattr("mifit.stages.reflectance.choice.MARGIN", 0.5)
+    untold = infer(dome, config)
+    assert told.report.details["shading"]["gloss_told"] and not untold.report.details["shading"]["gloss_told"]
+    levels = [np.median(found.specular[found.confidence > 0.5]) for found in (told, untold)]
+    assert levels[0] > 3.0 * SPECULAR_LIMIT and levels[1] < 0.5 * levels[0]
 
 
 def test_noise_decides_how_far_the_specular_albedo_is_told_by_the_images():

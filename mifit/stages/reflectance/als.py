@@ -17,7 +17,7 @@ from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.choice import choose_lighting
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution, active_weight
-from mifit.stages.reflectance.lighting_equations import expected_specular, specular_pull
+from mifit.stages.reflectance.lighting_equations import specular_pull
 from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, solve_maps
 from mifit.stages.reflectance.objective import energies
 from mifit.stages.reflectance.told import deviations, find_told, robust_deviation, whitened
@@ -180,7 +180,7 @@ def fit_als(
     forward, found, choice = choose_lighting(surface, seen, albedo[subset], config, progress)
     prior = np.zeros((surface.texels.size**2, 4), dtype=np.float32)
     prior[surface.texels.index, :3] = albedo
-    prior[:, 3] = expected_specular(found.specular, seen.weight > 0)
+    prior[:, 3] = found.expected
     prior = prior.reshape(surface.texels.size, surface.texels.size, 4)
     solved = fit_maps(surface, forward, found, prior, config, progress)
     maps, energy = solved.maps, {"lighting": found.energy}

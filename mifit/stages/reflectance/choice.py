@@ -127,15 +127,18 @@ def choose_lighting(
             if way.near and best.name != "near":
                 why = "the compact light is too far away to have a place"
             chosen = trials.best_exponent(best) if free else best
+    told = True
     if auto:
         why = f"predicts images left out better than others by more than {MARGIN:.0%}, or is the likeliest beforehand"
         if chosen.prediction is not None:
             matt = trials.add("matt", replace(plain, glossy=False))
+            # Where images are predicted as well without gloss, they tell none: its level is then that of skin.
+            told = chosen.error < (1.0 - MARGIN) * matt.error
             if matt.error < (1.0 - MARGIN) * chosen.error:
                 chosen = matt
     iterations = config.max_iterations if config.robust else min(START_ITERATIONS, config.max_iterations)
-    found = fit_lighting(seen, chosen.forward, albedo, config, iterations)
-    return chosen.forward, found, {"chosen": chosen.name, "why": why, **trials.figures()}
+    found = fit_lighting(seen, chosen.forward, albedo, config, iterations, priors=replace(PRIORS, gloss_told=told))
+    return chosen.forward, found, {"chosen": chosen.name, "why": why, "gloss_told": told, **trials.figures()}
 
 
 def _lit(

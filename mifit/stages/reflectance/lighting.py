@@ -54,6 +54,8 @@ class LightingSolution:
         The paper's I_a; 0 unless asked for.
     diffuse : (n, 3), specular : (n,)
         Albedos of the subset's texels.
+    expected : float
+        Specular albedo to expect of all others.
     sigma : float
         Robust standard deviation of the residuals, linear colour.
     unexplained : float
@@ -67,6 +69,7 @@ class LightingSolution:
     ambient: float
     diffuse: NDArray[np.float32]
     specular: NDArray[np.float32]
+    expected: float
     sigma: float
     unexplained: float
     energy: list[float]
@@ -158,7 +161,8 @@ def solve_lighting(
         gain = gauge(diffuse, problem.albedo, prior_weight)
         state = light * gain, ambient, (diffuse / gain).astype(np.float32), (specular_albedo / gain).astype(np.float32)
     light, ambient, diffuse, specular_albedo = best
-    return LightingSolution(light, ambient, diffuse, specular_albedo, sigma, unexplained, energy, outcome)
+    expected = expected_specular(specular_albedo, problem.seen, priors.gloss_told)
+    return LightingSolution(light, ambient, diffuse, specular_albedo, expected, sigma, unexplained, energy, outcome)
 
 
 def linearize(
@@ -185,7 +189,7 @@ def linearize(
     extra = k - order * order  # compact lights are kept from negative values one by one
     directions = np.pad(_sphere(order), ((0, extra), (0, extra)))
     directions[NEGATIVE_DIRECTIONS:, order * order :] = np.eye(extra)
-    expected = expected_specular(specular_albedo, problem.seen)
+    expected = expected_specular(specular_albedo, problem.seen, priors.gloss_told)
     system.add_priors(
         priors, light, diffuse, specular_albedo, problem.albedo, _stiffness(order, k), directions, sigma, expected
     )

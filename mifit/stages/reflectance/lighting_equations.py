@@ -14,8 +14,8 @@ from mifit.core.threads import on_all_cores
 SPECULAR_SPREAD = 0.15
 """Standard deviation of the specular albedo over a face, relative to its median."""
 SPECULAR_LIMIT = 0.03
-"""Specular albedo expected of skin where the images are too few to tell: at the most what it reflects at normal
-incidence (index of refraction 1.4)."""
+"""Specular albedo expected of skin where the images don't tell: at the most what it reflects at normal incidence (index
+of refraction 1.4)."""
 FEW_IMAGES = 4
 """Images of a texel from which its four albedos are told by the images."""
 BLOCK = 1 << 20
@@ -134,14 +134,15 @@ def specular_pull(expected: float, sigma: float) -> float:
     return (sigma / (SPECULAR_SPREAD * max(expected, 1e-3))) ** 2
 
 
-def expected_specular(specular: NDArray, seen: NDArray) -> float:
+def expected_specular(specular: NDArray, seen: NDArray, told: bool = True) -> float:
     """Specular albedo to expect of a texel, given those of others (n,) and which images see them (n, J).
 
-    Two or three images of a still head leave it open how much of the broad reflection is specular.
+    Two or three images of a still head leave it open how much of the broad reflection is specular, and so do images
+    that are predicted as well without any (``told`` is false).
     """
     found = float(np.median(specular))
     images = float(np.median(seen.sum(axis=1)))
-    return min(found, SPECULAR_LIMIT) if images < FEW_IMAGES else found
+    return found if told and images >= FEW_IMAGES else min(found, SPECULAR_LIMIT)
 
 
 @dataclass(frozen=True)
@@ -158,12 +159,15 @@ class LightingPriors:
         Pull of the diffuse albedo to the morphable model's: fixes the gauge between albedo and lighting.
     specular : float
         Pull of each texel's specular albedo to the expected one, at the least; see `SPECULAR_SPREAD`.
+    gloss_told : bool
+        Whether the images tell what is expected of it; `SPECULAR_LIMIT` bounds it otherwise.
     """
 
     roughness: float = 1e-7
     negative: float = 0.5
     albedo: float = 1e-2
     specular: float = 2e-2
+    gloss_told: bool = True
 
 
 PRIORS = LightingPriors()
