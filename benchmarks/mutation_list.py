@@ -303,7 +303,7 @@ VIDEO = [
 GLOSS = [
     M("a cornea without its coat", OUTPUT, r"\*\(\[_eyes\(skin\)\] if balls\.any\(\) else \[\]\)", "*([{**skin, 'name': 'eyes'}] if balls.any() else [])",
       "tests/output/test_export.py -k coat"),
-    M("a specular map believed wherever it was seen", STAGES, r"\(quality, quality \* told\.share\)", "(quality, quality)",
+    M("a specular map believed wherever it was seen", STAGES, r"\(quality, quality \* told\)", "(quality, quality)",
       "tests/stages/test_fill.py"),
     M("a texel's errors are its own", STAGES, r"side = 2 \* max\(1, round\(SURROUNDINGS \* texels\.size\)\) \+ 1", "side = 1",
       "tests/stages/test_told.py"),
