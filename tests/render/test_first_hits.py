@@ -96,9 +96,9 @@ def test_a_second_image_traces_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_views_share_an_integrator_and_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     import mitsuba as mi
 
-    from mifit.render.plugins import shdirect
+    from mifit.render import first_hits
 
-    monkeypatch.setattr(shdirect, "KEPT_BYTES", 3 * 32 * 32 * shdirect.RAY_BYTES)
+    monkeypatch.setattr(first_hits, "KEPT_BYTES", 3 * 32 * 32 * first_hits.RAY_BYTES)
     scene = textured()
     integrator = scene.integrator()
     for k in range(6):

@@ -12,11 +12,7 @@ from mifit.errors import InputError
 
 LIGHT_SAMPLES = 16
 """Points of a compact light that has an extent."""
-TILES = 64
-"""Tiles along the maps' sides, in whose order the points of a view are shaded: a tile's gradients stay in the cache."""
 KEPT_LOBES = 8
-KEPT_BYTES, RAY_BYTES = 2**30, 260
-"""Of first hits at most, and of one of them with its ray and its point: a dozen views of 680 x 480."""
 
 
 def make() -> type:
@@ -28,7 +24,8 @@ def make() -> type:
     from mifit.appearance import kernels, models
     from mifit.appearance.formation import form_image
     from mifit.appearance.occlusion import trace_transfer
-    from mifit.render.gbuffer import MESH_BUFFERS, MESH_FACES, MESH_POSITIONS, SurfaceScene
+    from mifit.render.first_hits import FirstHits, recording
+    from mifit.render.gbuffer import MESH_FACES, MESH_POSITIONS, SurfaceScene
 
     class Nested(mi.TraversalCallback):
         """Collects what an object exposes: parameters and objects inside it."""
@@ -39,90 +36,6 @@ def make() -> type:
 
         def put(self, name: str, value: Any, flags: Any) -> None:
             self.found.append(value)
-
-    def buffers_of(mesh: Any) -> list[Any]:
-        """What a point on a mesh is made of: positions, faces, normals and UVs, as far as there are any."""
-        parameters = mi.traverse(mesh)
-        return [parameters[key] for key in MESH_BUFFERS if key in parameters]
-
-    def number_of(pointer: Any) -> int:
-        """The number by which kernels know a shape or a sensor."""
-        return int(np.array(dr.reinterpret_array(mi.UInt32, pointer))[0])
-
-    def recording() -> bool:
-        """Are operations noted down for later, so that no value can be looked at?"""
-        return bool(dr.flag(dr.JitFlag.SymbolicScope) or dr.flag(dr.JitFlag.FreezingScope))
-
-    def by_tile(uv: Any) -> Any:
-        """The order of points in which those that share a tile of texels follow one another."""
-        column, row = (np.floor(np.array(x) * TILES).astype(np.int64) % TILES for x in (uv.x, uv.y))
-        order = np.argsort((row * TILES + column).astype(np.uint16), kind="stable")
-        return mi.UInt32(order.astype(np.uint32))
-
-    class FirstHits:
-        """What primary rays meet, kept for as long as neither they nor the meshes move.
-
-        Optimisers of light and skin look from the same few cameras at the same surface again and again. Rays are
-        compared one by one, which costs a fiftieth of tracing them. Hits hold no derivatives; the point that is made
-        of them does.
-        """
-
-        def __init__(self) -> None:
-            self.sensor: Any = None
-            self.kept: dict[tuple[int, int], dict[str, Any]] = {}
-
-        def find(self, scene: Any, ray: Any, active: Any) -> tuple[Any, Any]:
-            """The points that a sensor's rays meet, and the numbers of their rays; None where each ray has an entry."""
-            shapes = scene.shapes()
-            plain = dr.is_jit_v(mi.Float) and all(shape.is_mesh() for shape in shapes)
-            if not plain or recording() or self.sensor is None:
-                return None, scene.ray_intersect(ray, active)
-            with dr.suspend_grad():
-                still = mi.Ray3f(dr.detach(ray))
-                buffers = [value for shape in shapes for value in buffers_of(shape)]
-                moved = (*(number_of(mi.ShapePtr(shape)) for shape in shapes), *(buffer.index for buffer in buffers))
-                name = number_of(mi.SensorPtr(self.sensor)), dr.width(still.d)
-                kept = self.kept.get(name)
-                if kept is None or kept["moved"] != moved or not same(kept["ray"], still):
-                    hits = scene.ray_intersect_preliminary(still, coherent=True)
-                    index = dr.compress(hits.is_valid())
-                    if dr.width(index) > 0:
-                        met = dr.gather(type(hits), hits, index)
-                        met = met.compute_surface_interaction(dr.gather(mi.Ray3f, still, index))
-                        index = dr.gather(mi.UInt32, index, by_tile(met.uv))
-                    kept = {"ray": still, "moved": moved, "index": index}
-                    if dr.width(index) > 0:
-                        kept["hits"] = dr.gather(type(hits), hits, index)
-                        kept["si"] = kept["hits"].compute_surface_interaction(dr.gather(mi.Ray3f, still, index))
-                    dr.eval(kept)
-                    # While a buffer is kept, no other one can have its index. The scene is not kept: it holds us.
-                    kept["buffers"] = buffers
-                    self.kept.pop(name, None)
-                    self.kept[name] = kept
-                    while sum(RAY_BYTES * rays for _, rays in self.kept) > KEPT_BYTES and len(self.kept) > 1:
-                        self.kept.pop(next(iter(self.kept)))
-            index = kept["index"]
-            if dr.width(index) == 0:
-                return None, dr.zeros(mi.SurfaceInteraction3f, dr.width(still.d))
-            if dr.grad_enabled(ray, buffers):
-                return index, kept["hits"].compute_surface_interaction(dr.gather(mi.Ray3f, mi.Ray3f(ray), index))
-            return index, mi.SurfaceInteraction3f(kept["si"])
-
-        def hit(self, index: Any, si: Any, ray: Any) -> Any:
-            """Which rays meet something, given what `find` found."""
-            if index is None:
-                return si.is_valid()
-            met = dr.zeros(mi.Bool, dr.width(ray))
-            dr.scatter(met, mi.Bool(True), index, mode=dr.ReduceMode.Permute)
-            return met
-
-    def same(one: Any, other: Any) -> bool:
-        """Are two sets of rays equal, each ray and number of them?"""
-        pairs = ((one.o, other.o), (one.d, other.d), (one.maxt, other.maxt))
-        equal = mi.Bool(True)
-        for a, b in pairs:
-            equal &= dr.all(a == b) if dr.depth_v(a) > 1 else a == b
-        return bool(dr.all(equal))
 
     def at(values: Any, index: Any) -> Any:
         """The entries of an array, whose only one may be that of all."""
