@@ -13,22 +13,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mifit.core.estimate import GeometryEstimate
 from mifit.progress import Progress, silent
 from mifit.stages.image_factors import (
-    DARKEST,
     FEWEST_POINTS,
     ROUNDS,
     factors_by_lighting,
+    gains_by_ratios,
     left_by_lighting,
     mean_albedo,
-    robust_mean,
     shared_points,
     usable,
 )
-from mifit.stages.observations import Observations, Surface
+from mifit.stages.observations import Surface
 
 Exposures = dict[str, tuple[float, ...]]
 
@@ -76,7 +74,8 @@ def estimate_exposures(
     told = usable(seen)
     if told.sum(axis=0).min() < FEWEST_POINTS:
         return {}
-    gain = np.exp(_gains(seen, told, len(cameras)))[seen.camera]
+    # Gains stay over time and are found better elsewhere (`gains`), but rounds that start far off end far off.
+    gain = np.exp(gains_by_ratios([seen], len(cameras))[0])[seen.camera]
     seen = replace(seen, colour=(seen.colour / gain).astype(np.float32))
     albedo = mean_albedo(seen, geometry, surface.faces)
     images = np.arange(len(seen.step))
@@ -103,22 +102,3 @@ def estimate_exposures(
         own = np.tile(common, (len(cameras), 1))
     own = own - own[:, :1]
     return {name: tuple(float(f) for f in np.exp(log)) for name, log in zip(cameras, own, strict=True)}
-
-
-def _gains(seen: Observations, told: NDArray, cameras: int) -> NDArray[np.float32]:
-    """(C, 3) log gains of cameras by what they see of the same points with the first one; 0 where they share too few.
-
-    They stay over time and are found better elsewhere (`gains`), but rounds that start far off end far off.
-    """
-    level = np.log(np.maximum(seen.colour, DARKEST))
-    out = np.zeros((cameras, 3), np.float32)
-    for camera in range(1, cameras):
-        ratios = []
-        for j in np.flatnonzero(seen.camera == camera):
-            for i in np.flatnonzero((seen.camera == 0) & (seen.step == seen.step[j])):
-                both = told[:, i] & told[:, j]
-                ratios.append(level[both, j] - level[both, i])
-        ratio = np.concatenate([np.zeros((0, 3)), *ratios])
-        if len(ratio) >= FEWEST_POINTS:
-            out[camera] = robust_mean(ratio, np.ones(len(ratio)))
-    return out

@@ -102,17 +102,21 @@ def fit_geometry(
         return replace(found, exposures=exposures)
 
     found = refine(capture, {}, {})
-    if config.exposures and len(timesteps) > 1:
-        surface = Surface(capture, model, found, cameras, MAP_SIZE)
-        exposures = estimate_exposures(surface, found, cameras, seed, progress)
-        if exposures:
-            capture = capture.with_exposures(replace(found, exposures=exposures).exposed)
-            found = refine(capture, {}, exposures)
+    exposing = config.exposures and len(timesteps) > 1
     # Where a head stands still, skin that shines towards one camera looks like a camera that is brighter.
     too_few = len(cameras) == 1 or len(timesteps) == 1
-    if config.camera_gains == "never" or (config.camera_gains == "auto" and too_few):
+    gaining = config.camera_gains == "always" or (config.camera_gains == "auto" and not too_few)
+    if not exposing and not gaining:
         return found
-    gains = estimate_gains(capture, model, found, cameras, seed, progress, certain=config.camera_gains == "auto")
+    surface = Surface(capture, model, found, cameras, MAP_SIZE)
+    exposures = estimate_exposures(surface, found, cameras, seed, progress) if exposing else {}
+    if exposures:
+        capture = capture.with_exposures(replace(found, exposures=exposures).exposed)
+        found = refine(capture, {}, exposures)
+        surface = Surface(capture, model, found, cameras, MAP_SIZE)
+    if not gaining:
+        return found
+    gains = estimate_gains(surface, found, cameras, seed, progress, certain=config.camera_gains == "auto")
     if not gains:
         return found
     for name in cameras:

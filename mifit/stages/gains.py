@@ -17,9 +17,7 @@ error is taken to be as large as itself: the gain lies between the ratios withou
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,20 +26,14 @@ from mifit.core.estimate import GeometryEstimate
 from mifit.progress import Progress, silent
 from mifit.stages.image_factors import (
     DARKEST,
-    FEWEST_POINTS,
-    MAP_SIZE,
     ROUNDS,
     factors_by_lighting,
+    gains_by_ratios,
     mean_albedo,
-    robust_mean,
     shared_points,
     usable,
 )
 from mifit.stages.observations import Observations, Surface
-
-if TYPE_CHECKING:
-    from mifit.capture import Capture
-    from mifit.morphable import MorphableModel
 
 Gains = dict[str, tuple[float, float, float]]
 
@@ -52,8 +44,7 @@ SAME = 0.1
 
 
 def estimate_gains(
-    capture: Capture,
-    model: MorphableModel,
+    surface: Surface,
     geometry: GeometryEstimate,
     cameras: Sequence[str],
     seed: int = 0,
@@ -64,12 +55,12 @@ def estimate_gains(
 
     Parameters
     ----------
-    capture : Capture
-    model : MorphableModel
+    surface : Surface
+        Of the fitted geometry, with no gains applied.
     geometry : GeometryEstimate
-        Fitted vertices and albedo; gains that it already has are not applied.
+        Its fitted albedo is where the lighting starts from.
     cameras : sequence of str
-        Cameras to compare; no other camera of the capture is read.
+        Cameras of the surface.
     seed : int
         Chooses the points that the lighting is fitted to.
     progress : Progress
@@ -82,20 +73,13 @@ def estimate_gains(
     dict of str to (r, g, b)
         The first camera has (1, 1, 1). A camera that shares fewer than `FEWEST_POINTS` surface points with the others
         is left out. Empty where no camera surely differs and that was asked for.
-
-    Raises
-    ------
-    InputError
-        No image shows the face.
     """
     progress("Camera gains", 0, ROUNDS)
-
-    surface = Surface(capture, model, replace(geometry, gains={}), cameras, MAP_SIZE)
 
     def observe(surface: Surface) -> list[Observations]:
         return [surface.observe(part) for part in surface.chunks()]
 
-    log_gain, known = _from_ratios(observe(surface), len(cameras))
+    log_gain, known = gains_by_ratios(observe(surface), len(cameras))
     ratios = log_gain
     if certain and not differ(ratios):  # whatever the lighting says then
         progress("Camera gains", ROUNDS, ROUNDS)
@@ -103,9 +87,9 @@ def estimate_gains(
     if len(known) > 1:
         # Which observations agree, and so are trusted, shows only when the cameras are about equal.
         parts = observe(surface.exposed(_gains(log_gain, known, cameras)))
-        left, _ = _from_ratios(parts, len(cameras))
+        left, _ = gains_by_ratios(parts, len(cameras))
         seen = shared_points(parts, POINTS, np.random.default_rng(seed))
-        albedo = mean_albedo(seen, geometry, model.faces)
+        albedo = mean_albedo(seen, geometry, surface.faces)
         log_gain = log_gain + _from_lighting(seen, albedo, left, known, progress)
     progress("Camera gains", ROUNDS, ROUNDS)
     return {} if certain and not differ(ratios, log_gain) else _gains(log_gain, known, cameras)
@@ -119,35 +103,6 @@ def _gains(log_gain: NDArray, known: Sequence[int], cameras: Sequence[str]) -> G
 def differ(*bounds: NDArray) -> bool:
     """Whether some camera's log gain in some channel is beyond `SAME` at all bounds (C, 3), and to the same side."""
     return bool(any(np.all([side * bound > SAME for bound in bounds], axis=0).any() for side in (1.0, -1.0)))
-
-
-def _from_ratios(parts: Sequence[Observations], cameras: int) -> tuple[NDArray[np.float64], list[int]]:
-    """(C, 3) log gains as if the skin were diffuse alone, and the cameras that shared points join to the first."""
-    links: list[tuple[int, int, NDArray, float]] = []
-    for a in range(cameras):
-        for b in range(a + 1, cameras):
-            ratios, weights = [], []
-            for seen in parts:
-                measured = usable(seen)
-                level = np.log(np.maximum(seen.colour, DARKEST))
-                for step in np.unique(seen.step):
-                    (i,), (j,) = (np.flatnonzero((seen.step == step) & (seen.camera == c)) for c in (a, b))
-                    both = measured[:, i] & measured[:, j]
-                    ratios.append(level[both, j] - level[both, i])
-                    weights.append(np.minimum(seen.weight[both, i], seen.weight[both, j]))
-            ratio, weight = np.concatenate(ratios), np.concatenate(weights)
-            if len(ratio) >= FEWEST_POINTS:
-                links.append((a, b, robust_mean(ratio, weight), float(np.sqrt(weight.sum()))))
-    known = {0}
-    for _ in links:
-        known |= {c for a, b, _, _ in links if a in known or b in known for c in (a, b)}
-    log_gain = np.zeros((cameras, 3))
-    if links:
-        system, right = np.zeros((len(links), cameras)), np.zeros((len(links), 3))
-        for row, (a, b, mean, trust) in enumerate(links):
-            system[row, a], system[row, b], right[row] = -trust, trust, trust * mean
-        log_gain[1:] = np.linalg.lstsq(system[:, 1:], right, rcond=None)[0]  # the first camera's is 0
-    return log_gain, sorted(known)
 
 
 def _from_lighting(

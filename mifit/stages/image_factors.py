@@ -76,6 +76,35 @@ def robust_mean(values: NDArray, weight: NDArray) -> NDArray[np.float64]:
     return np.asarray(centre, dtype=np.float64)
 
 
+def gains_by_ratios(parts: Sequence[Observations], cameras: int) -> tuple[NDArray[np.float64], list[int]]:
+    """(C, 3) log gains as if the skin were diffuse alone, and the cameras that shared points join to the first."""
+    links: list[tuple[int, int, NDArray, float]] = []
+    for a in range(cameras):
+        for b in range(a + 1, cameras):
+            ratios, weights = [], []
+            for seen in parts:
+                measured = usable(seen)
+                level = np.log(np.maximum(seen.colour, DARKEST))
+                for step in np.unique(seen.step):
+                    (i,), (j,) = (np.flatnonzero((seen.step == step) & (seen.camera == c)) for c in (a, b))
+                    both = measured[:, i] & measured[:, j]
+                    ratios.append(level[both, j] - level[both, i])
+                    weights.append(np.minimum(seen.weight[both, i], seen.weight[both, j]))
+            ratio, weight = np.concatenate(ratios), np.concatenate(weights)
+            if len(ratio) >= FEWEST_POINTS:
+                links.append((a, b, robust_mean(ratio, weight), float(np.sqrt(weight.sum()))))
+    known = {0}
+    for _ in links:
+        known |= {c for a, b, _, _ in links if a in known or b in known for c in (a, b)}
+    log_gain = np.zeros((cameras, 3))
+    if links:
+        system, right = np.zeros((len(links), cameras)), np.zeros((len(links), 3))
+        for row, (a, b, mean, trust) in enumerate(links):
+            system[row, a], system[row, b], right[row] = -trust, trust, trust * mean
+        log_gain[1:] = np.linalg.lstsq(system[:, 1:], right, rcond=None)[0]  # the first camera's is 0
+    return log_gain, sorted(known)
+
+
 def mean_albedo(seen: Observations, geometry: GeometryEstimate, faces: NDArray) -> NDArray[np.float32]:
     """(N, 3) albedo of the fitted model at the points, which the lighting starts from."""
     albedo = interpolate(geometry.vertex_albedo, faces, seen.face, seen.barycentric)

@@ -22,6 +22,15 @@ from mifit.stages.normals.mesh_refinement import refine_mesh
 RADIUS = 9.0
 
 
+def mean_geometry(model: MorphableModel) -> GeometryEstimate:
+    """The mean head of a built-in model where it was made, at one timestep."""
+    identity, albedo, expression = (np.zeros(n) for n in (100, 100, len(model.expression_names)))
+    return GeometryEstimate(
+        (0,), identity, albedo, expression[None], np.eye(3)[None], np.zeros((1, 3)), 1.0,
+        model.mean[None].astype(np.float32), model.mean_albedo, np.zeros((9, 3)), 0.0, Report("converged"),
+    )  # fmt: skip
+
+
 def ball_model(rows: int = 16, columns: int = 24) -> MorphableModel:
     """A sphere with a seam: poles on the y axis, face area in front (z > 0), other faces outside the map."""
     theta = np.linspace(0.02, np.pi - 0.02, rows + 1)

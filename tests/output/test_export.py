@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from mifit.core.estimate import GeometryEstimate, Report
 from mifit.core.image import read_image
 from mifit.core.mesh import vertex_normals
 from mifit.core.split_mesh import part_of, split_at_seams
@@ -21,6 +20,7 @@ from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs
 from mifit.output.export import SUFFIXES, export
 from mifit.reconstruction import Reconstruction
+from tests.output.conftest import mean_geometry
 
 
 def read_glb(path):
@@ -111,11 +111,7 @@ def test_gltf_takes_the_fresnel_rise_over(ball, tmp_path):
 
 def test_gltf_gives_eyeballs_a_clear_coat(tmp_path):
     model = MorphableModel.load("builtin:coarse")
-    identity, albedo, expression = (np.zeros(n) for n in (100, 100, len(model.expression_names)))
-    geometry = GeometryEstimate(
-        (0,), identity, albedo, expression[None], np.eye(3)[None], np.zeros((1, 3)), 1.0,
-        model.mean[None].astype(np.float32), model.mean_albedo, np.zeros((9, 3)), 0.0, Report("converged"),
-    )  # fmt: skip
+    geometry = mean_geometry(model)
     result = Reconstruction(model=model, geometry=geometry, config={}, cameras=(), capture_digest="")
     export(result, "glb", tmp_path / "a.glb")
     document, read, _ = read_glb(tmp_path / "a.glb")

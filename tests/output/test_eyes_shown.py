@@ -13,7 +13,7 @@ from mifit.appearance.cornea import CORNEA, REFLECTANCE
 from mifit.appearance.illumination import Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.core.camera import Camera
-from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
+from mifit.core.estimate import ReflectanceEstimate, Report
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeball_faces
@@ -22,6 +22,7 @@ from mifit.output.export import export
 from mifit.output.surface import surface_maps
 from mifit.output.viewer import viewer_data
 from mifit.reconstruction import Reconstruction
+from tests.output.conftest import mean_geometry
 
 SIZE, BENEATH, PAINTED = 256, 0.3, 0.8
 EVEN = Illumination(np.full((1, 3), 2.0))
@@ -31,11 +32,7 @@ EVEN = Illumination(np.full((1, 3), 2.0))
 def head(variant) -> Reconstruction:
     """The mean head with even maps, and eyes that are brighter in its own light."""
     model = MorphableModel.load("builtin:coarse")
-    identity, albedo, expression = (np.zeros(n) for n in (100, 100, len(model.expression_names)))
-    geometry = GeometryEstimate(
-        (0,), identity, albedo, expression[None], np.eye(3)[None], np.zeros((1, 3)), 1.0,
-        model.mean[None].astype(np.float32), model.mean_albedo, np.zeros((9, 3)), 0.0, Report("converged"),
-    )  # fmt: skip
+    geometry = mean_geometry(model)
     texels = rasterize_uv(model.uv, model.faces_uv, SIZE, model.mapped)
     eye = texels.to_map(eyeball_faces(model)[texels.face])[..., None]
     shown = np.where(texels.mask[..., None], np.float32(BENEATH), np.float32(0)).repeat(3, axis=2)

@@ -11,6 +11,7 @@ from stages.test_infer_reflectance import held_out, infer
 
 from mifit.core.estimate import GeometryEstimate
 from mifit.stages.gains import estimate_gains
+from mifit.stages.image_factors import MAP_SIZE
 from mifit.stages.observations import Observations, Surface
 from mifit.synth.compose import expose
 
@@ -33,6 +34,12 @@ def fewer_points():
         yield
 
 
+def gains_of(scene, cameras=("left", "right"), **options):
+    return estimate_gains(
+        Surface(scene, scene.model, scene.geometry, cameras, MAP_SIZE), scene.geometry, cameras, **options
+    )
+
+
 @pytest.fixture(scope="module")
 def dome(variant):
     return turning_dome(gloss=0.12)
@@ -40,7 +47,7 @@ def dome(variant):
 
 @pytest.fixture(scope="module")
 def gains(dome, fewer_points):
-    return estimate_gains(scaled(dome), dome.model, dome.geometry, ("left", "right"))
+    return gains_of(scaled(dome))
 
 
 def test_gains_are_found_on_a_glossy_surface(gains):
@@ -50,7 +57,7 @@ def test_gains_are_found_on_a_glossy_surface(gains):
 
 def test_scaling_a_camera_scales_its_gains_and_no_more(dome, gains):
     """What is trusted and chosen doesn't depend on how unequal the cameras are."""
-    equal = estimate_gains(dome, dome.model, dome.geometry, ("left", "right"))
+    equal = gains_of(dome)
     assert np.allclose(np.divide(gains["right"], equal["right"]), SCALE, rtol=0.005)
 
 
@@ -59,7 +66,7 @@ def test_the_fit_is_as_good_as_without_the_scaling(dome):
     rng = np.random.default_rng(0)
     noisy = dome.changed(lambda f: replace(f, image=np.where(f.valid[..., None], expose(f.image, rng), 0)))
     images = scaled(noisy)
-    gains = estimate_gains(images, dome.model, dome.geometry, ("left", "right"))
+    gains = gains_of(images)
     plain = held_out(noisy, infer(noisy))
     mended = held_out(noisy, infer(images, gains=gains))
     spoilt = held_out(noisy, infer(images))
@@ -78,7 +85,7 @@ def test_unequal_cameras_are_brought_to_the_first(dome, gains):
 
 def test_a_third_camera(dome):
     cameras = ("left", "right", "third")
-    found = estimate_gains(scaled(dome, "third", (0.7, 0.7, 0.7)), dome.model, dome.geometry, cameras)
+    found = gains_of(scaled(dome, "third", (0.7, 0.7, 0.7)), cameras)
     assert np.allclose(found["third"], 0.7, rtol=0.02) and np.allclose(found["right"], 1.0, rtol=0.02)
 
 
@@ -89,7 +96,7 @@ def test_a_camera_that_shares_nothing_is_left_out(dome):
             key: replace(f, valid=np.zeros_like(f.valid)) if key[0] == "right" else f for key, f in dome.frames.items()
         },
     )
-    assert set(estimate_gains(blind, dome.model, dome.geometry, ("left", "right"))) == {"left"}
+    assert set(gains_of(blind)) == {"left"}
 
 
 def test_the_tint_of_sheen_is_the_line_along_which_ratios_scatter() -> None:
@@ -147,18 +154,18 @@ def test_sheen_that_the_lighting_takes_for_granted_makes_no_gain(dome, monkeypat
     """As on meshes that are millimetres off: the cameras' ratios agree, and the lighting says that they shouldn't."""
     opinion = np.log([(1.0, 1.0, 1.0), (0.94, 0.9, 0.87)])
     monkeypatch.setattr("mifit.stages.gains._from_lighting", lambda seen, albedo, ratios, *_: ratios + opinion)
-    assert estimate_gains(dome, dome.model, dome.geometry, ("left", "right"), certain=True) == {}
-    always = estimate_gains(dome, dome.model, dome.geometry, ("left", "right"))
+    assert gains_of(dome, certain=True) == {}
+    always = gains_of(dome)
     assert abs(np.log(always["right"])).max() > 0.1  # or else the test shows nothing
 
 
 def test_a_difference_that_the_lighting_takes_for_sheen_is_not_certain(dome, monkeypatch):
     images = scaled(dome, scale=(1.1, 1.15, 1.2))
     opinion = np.log([(1.0, 1.0, 1.0), (0.92, 0.9, 0.87)])
-    assert set(estimate_gains(images, dome.model, dome.geometry, ("left", "right"), certain=True)) == {"left", "right"}
+    assert set(gains_of(images, certain=True)) == {"left", "right"}
     monkeypatch.setattr("mifit.stages.gains._from_lighting", lambda seen, albedo, ratios, *_: ratios + opinion)
-    assert estimate_gains(images, dome.model, dome.geometry, ("left", "right"), certain=True) == {}
+    assert gains_of(images, certain=True) == {}
 
 
 def test_a_true_gain_is_certain(dome, gains):
-    assert estimate_gains(scaled(dome), dome.model, dome.geometry, ("left", "right"), certain=True) == gains
+    assert gains_of(scaled(dome), certain=True) == gains
