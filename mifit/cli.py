@@ -227,7 +227,11 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("result", type=arguments.path, help="result folder of mifit fit")
     p.add_argument("--capture", type=arguments.path, required=True, help="capture that has the view")
     p.add_argument("--camera", required=True, help="camera to judge by, one that was not fitted")
-    p.add_argument("--timesteps", type=arguments.timesteps, help="default: all of the result")
+    p.add_argument(
+        "--timesteps",
+        type=arguments.timesteps,
+        help="default: all of the result; at one without a fit landmarks place the head",
+    )
     p.add_argument(
         "--region", choices=["model", "truth"], default="model", help="whose face area counts (default: model)"
     )

@@ -29,7 +29,7 @@ def evaluate(arguments: Namespace) -> None:
 
 def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> None:
     """`evaluate` of a result that has been read, or just been made and written into ``arguments.result``."""
-    from mifit.output.evaluate import Comparison, evaluate
+    from mifit.output.evaluate import Comparison, evaluate, held_out
     from mifit.output.report import SHOWN_TIMESTEPS, write_report
     from mifit.pipeline import fitted_to
 
@@ -46,7 +46,7 @@ def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> Non
     )
     if not fitted_to(result, capture):
         say(arguments, f"mifit: warning: {arguments.capture}: isn't the capture that was fitted, or has changed since")
-    if arguments.camera in [camera.name for camera in result.cameras]:
+    if not held_out(result, found):
         say(arguments, f"mifit: warning: camera {arguments.camera!r} was fitted, so this is no held-out error")
     if arguments.json:
         write_text(arguments.json, json.dumps(found, indent=2) + "\n")
@@ -55,6 +55,11 @@ def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> Non
         print(
             f"camera {found['camera']} is not calibrated: placed from its landmarks against the fitted head, "
             f"{found['resected']['landmark_pixels']:.1f} pixels beside them"
+        )
+    for timestep, placed in found.get("posed", {}).items():
+        print(
+            f"timestep {timestep} was not fitted: the head was placed by its landmarks, "
+            f"{placed['landmark_pixels']:.1f} pixels beside them"
         )
     _print_measures(found["methods"])
     if "baseline" in found:

@@ -20,6 +20,7 @@ from mifit.core.npz import read_npz
 from mifit.errors import InputError
 from mifit.morphable.openings import leading_faces
 from mifit.output.deferred import shade_methods, trace_mesh, visible_surface
+from mifit.output.pose import pose_head
 from mifit.output.resect import needs_resection, resect
 from mifit.progress import Progress, silent
 from mifit.render.image_based import image_based
@@ -48,6 +49,8 @@ class Comparison:
         Image-based rendering from the fitted views on the fitted mesh (`render.image_based`), where asked for.
     seen : (H, W) bool, optional
         Pixels of the region whose point a fitted view sees: those that the baseline is compared on.
+    landmark_pixels : float, optional
+        Of a timestep that wasn't fitted: how far the head that its landmarks placed lies beside them.
     """
 
     timestep: int
@@ -56,6 +59,7 @@ class Comparison:
     renders: dict[Method, NDArray[np.uint8]]
     baseline: NDArray[np.uint8] | None = None
     seen: NDArray[np.bool_] | None = None
+    landmark_pixels: float | None = None
 
 
 def evaluate(
@@ -75,7 +79,9 @@ def evaluate(
     Pixels that undistortion left without a value do not count. Over several timesteps the squared error is pooled
     over all pixels before PSNR and RMSE are taken.
 
-    A camera of an uncalibrated capture that was not fitted is placed from its landmarks against the fitted head.
+    A camera of an uncalibrated capture that was not fitted is placed from its landmarks against the fitted head. At a
+    timestep that was not fitted the head is placed by its landmarks (`output.pose`), and image-based rendering takes
+    its colours from all fitted ones.
 
     Parameters
     ----------
@@ -100,18 +106,20 @@ def evaluate(
         "flip"}}, "per_timestep": [{"timestep", "region_pixels", "methods"}]}``; PSNR in dB, RMSE 0..255, FLIP 0..1.
         With ``baseline`` also ``"baseline": {"region_pixels", "methods"}``, over the pixels of the region that a
         fitted view sees, with ``"image_based"`` among the methods; for a camera that had to be placed,
-        ``"resected": {"landmark_pixels", "focal_pixels"}``.
+        ``"resected": {"landmark_pixels", "focal_pixels"}``, and for timesteps that had no head
+        ``"posed": {timestep: {"landmark_pixels"}}``.
 
     Raises
     ------
     InputError
-        Unknown camera or timestep, no ground truth, or a face area that is not visible.
+        Unknown camera or timestep, a head or a camera that has too few landmarks to be placed by, no ground truth, or
+        a face area that is not visible.
     """
     steps = reconstruction.timesteps if timesteps is None else tuple(timesteps)
     placed = resect(reconstruction, capture, camera) if needs_resection(reconstruction, capture, camera) else None
     if placed is not None:
         capture = capture.with_estimate([*reconstruction.cameras, placed.camera])
-    per_timestep = []
+    per_timestep, posed = [], {}
     whole, seen = _Sums(), _Sums()
     progress("Evaluating", 0, len(steps))
     for done, timestep in enumerate(steps):
@@ -121,6 +129,8 @@ def evaluate(
         if found.baseline is not None and found.seen is not None:
             seen.add({"image_based": found.baseline, **renders}, found.photograph, found.seen)
         per_timestep.append({"timestep": timestep, "region_pixels": int(found.region.sum()), "methods": figures})
+        if found.landmark_pixels is not None:
+            posed[str(timestep)] = {"landmark_pixels": found.landmark_pixels}
         if watch is not None:
             watch(found)
         progress("Evaluating", done + 1, len(steps))
@@ -134,6 +144,8 @@ def evaluate(
     }
     if baseline:
         out["baseline"] = {"region_pixels": seen.pixels, "methods": seen.figures()}
+    if posed:
+        out["posed"] = posed
     if placed is not None:
         out["resected"] = {"landmark_pixels": placed.landmark_pixels, "focal_pixels": placed.camera.fx}
     return out
@@ -184,29 +196,38 @@ def compare(
     """Render one view by some methods (default: all) and find the region in which to compare it; see `evaluate`."""
     capture = located(capture, reconstruction, camera)
     view = capture.camera(camera)
-    reconstruction.index(timestep)
-    if timestep not in capture.timesteps:
+    shown, moments, off = reconstruction, None, None
+    if timestep not in reconstruction.timesteps:
+        shown, off = pose_head(reconstruction, capture, timestep)
+        moments = dict(zip(reconstruction.timesteps, reconstruction.geometry.vertices, strict=True))
+    elif timestep not in capture.timesteps:
         raise InputError(f"timestep {timestep} is not in the capture; it has {', '.join(map(str, capture.timesteps))}")
     frame = capture.frame(camera, timestep)
-    surface = visible_surface(reconstruction, view, timestep, oversampling)
-    linear = shade_methods(reconstruction, surface, timestep, methods or reconstruction.methods)
+    surface = visible_surface(shown, view, timestep, oversampling)
+    linear = shade_methods(shown, surface, timestep, methods or shown.methods)
+    model, vertices = shown.model, shown.geometry.vertices[shown.index(timestep)]
     if region == "model":
-        model, i = reconstruction.model, reconstruction.index(timestep)
-        area = face_area(reconstruction.geometry.vertices[i], model.faces, model.face_mask, view)
+        area = face_area(vertices, model.faces, model.face_mask, view)
     elif region == "truth":
-        vertices, faces, mask = _truth(capture, reconstruction, timestep)
-        area = face_area(vertices, faces, mask, view)
+        area = face_area(*_truth(capture, reconstruction, timestep), view)
     else:
         raise InputError(f"region: found {region!r}, expected 'model' or 'truth'")
     area &= frame.valid
     if not area.any():
         raise InputError(f"camera {camera}, timestep {timestep}: the face area is not visible, nothing to evaluate")
     renders = {m: rgba_8_bit(as_photographed(reconstruction, image, camera)) for m, image in linear.items()}
+    photograph = to_8_bit(frame.image)
     if not baseline:
-        return Comparison(timestep, to_8_bit(frame.image), area, renders)
-    vertices, gains = reconstruction.geometry.vertices[reconstruction.index(timestep)], reconstruction.geometry.gains
-    shown = image_based(capture, reconstruction.cameras, view, timestep, vertices, reconstruction.model.faces, gains)
-    return Comparison(timestep, to_8_bit(frame.image), area, renders, to_8_bit(shown.colour), area & shown.seen)
+        return Comparison(timestep, photograph, area, renders, landmark_pixels=off)
+    cameras, gains = shown.cameras, shown.geometry.gains
+    base = image_based(capture, cameras, view, timestep, vertices, model.faces, gains, moments=moments)
+    return Comparison(timestep, photograph, area, renders, to_8_bit(base.colour), area & base.seen, off)
+
+
+def held_out(reconstruction: Result, found: Mapping[str, Any]) -> bool:
+    """Whether nothing that an evaluation compared with was fitted: another camera, or timesteps without a fit."""
+    fitted = found["camera"] in [c.name for c in reconstruction.cameras]
+    return not fitted or not set(found["timesteps"]) & set(reconstruction.timesteps)
 
 
 def located(capture: Capture, reconstruction: Result, camera: str) -> Capture:

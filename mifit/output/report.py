@@ -15,7 +15,7 @@ import mifit
 from mifit.core.estimate import FURTHER_FRAMES
 from mifit.core.files import write_text
 from mifit.core.image import to_8_bit
-from mifit.output.evaluate import Comparison, as_photographed, compare, rgba_8_bit
+from mifit.output.evaluate import Comparison, as_photographed, compare, held_out, rgba_8_bit
 from mifit.output.face_mask import face_mask
 from mifit.output.figures import (
     CLIPPED_TINT,
@@ -135,8 +135,7 @@ def _subtitle(result: Result) -> str:
 def _summary(result: Result, evaluation: dict[str, Any] | None) -> str:
     parts = []
     if evaluation is not None:
-        held_out = evaluation["camera"] not in [c.name for c in result.cameras]
-        kind = "held out, never fitted" if held_out else "this camera was fitted, so it is no test"
+        kind = "held out, never fitted" if held_out(result, evaluation) else "this camera was fitted, so it is no test"
         rows = "".join(
             f"<tr><td>{NAMES[m]}</td><td>{f['psnr']:.2f}</td><td>{f['rmse']:.2f}</td><td>{f['ssim']:.4f}</td>"
             f"<td>{f['flip']:.4f}</td></tr>"

@@ -60,6 +60,7 @@ def image_based(
     faces: NDArray,
     gains: Mapping[str, Sequence[float]] | None = None,
     scene: SurfaceScene | None = None,
+    moments: Mapping[int, NDArray] | None = None,
 ) -> ImageBased:
     """Render one view of one timestep from the photographs of other views.
 
@@ -78,6 +79,8 @@ def image_based(
         Linear image of each camera over the first one's; 1 for cameras that aren't named.
     scene : SurfaceScene, optional
         The mesh, where one was made of it already.
+    moments : dict of timestep to (V, 3), optional
+        Timesteps whose photographs give the colours, with the mesh's vertices then; ``timestep`` alone by default.
 
     Raises
     ------
@@ -96,21 +99,28 @@ def image_based(
     index, face, normal, point = index[front], face[front], normal[front], point[front]
     total, weight = np.zeros((len(index), 3)), np.zeros(len(index))
     spare, best = np.zeros((len(index), 3)), np.full(len(index), -np.inf)
-    for view in fitted:
-        frame = capture.frame(view.name, timestep)
-        gain = np.asarray((gains or {}).get(view.name, (1.0, 1.0, 1.0)))
-        x, y = (view.project(point) - 0.5).T
-        inside = (x >= 0) & (y >= 0) & (x <= view.width - 1) & (y <= view.height - 1)
-        x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
-        inside &= bilinear(frame.valid.astype(np.float32), x, y) > 0.999
-        colour = bilinear(frame.image, x, y) / gain
-        cosine = np.sum(normal * normalize(view.position - point), axis=1)
-        facing = np.where(inside, cosine, -np.inf)
-        spare[facing > best] = colour[facing > best]
-        best = np.maximum(best, facing)
-        visible = inside & (cosine > LEAST_COSINE) & scene.visible_from(point, view.position)
-        total += np.where(visible, cosine**2, 0.0)[:, None] * colour
-        weight += np.where(visible, cosine**2, 0.0)
+    weights = buffer.weights.reshape(-1, 3)[index]
+    for moment, then in (moments or {timestep: vertices}).items():
+        there = scene
+        if then is not vertices:
+            there = SurfaceScene(then, faces)
+            normal = normalize(face_cross(then, faces)[face])
+            point = interpolate(np.asarray(then, np.float64), faces, face, weights)
+        for view in fitted:
+            frame = capture.frame(view.name, moment)
+            gain = np.asarray((gains or {}).get(view.name, (1.0, 1.0, 1.0)))
+            x, y = (view.project(point) - 0.5).T
+            inside = (x >= 0) & (y >= 0) & (x <= view.width - 1) & (y <= view.height - 1)
+            x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
+            inside &= bilinear(frame.valid.astype(np.float32), x, y) > 0.999
+            colour = bilinear(frame.image, x, y) / gain
+            cosine = np.sum(normal * normalize(view.position - point), axis=1)
+            facing = np.where(inside, cosine, -np.inf)
+            spare[facing > best] = colour[facing > best]
+            best = np.maximum(best, facing)
+            visible = inside & (cosine > LEAST_COSINE) & there.visible_from(point, view.position)
+            total += np.where(visible, cosine**2, 0.0)[:, None] * colour
+            weight += np.where(visible, cosine**2, 0.0)
     total = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-12)[:, None], spare)
     total *= np.asarray((gains or {}).get(camera.name, (1.0, 1.0, 1.0)))
     shape = (camera.height, camera.width)

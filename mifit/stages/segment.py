@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import cv2
@@ -123,20 +124,17 @@ def consensus(surface: Surface, seed: int = 0) -> Consensus:
     places = np.argwhere(seen_at)
     for _ in range(ROUNDS if len(places) else 0):
         flat = level - np.tensordot(shading.T.astype(np.float32), waves, 1)[..., step]
-        trust = weight * share
-
-        def agreed(channel: NDArray, trust: NDArray = trust) -> tuple[NDArray, NDArray, float]:
-            """What the images agree on, how far each is from it, and their robust standard deviation."""
-            middle = _median(channel, trust)
-            apart = channel - middle[:, None]
-            return middle, apart, 1.4826 * float(np.median(np.abs(apart[seen_at])))
-
-        centre, departure, off = (np.stack(part) for part in zip(*on_all_cores(agreed, list(flat)), strict=True))
-        deviation = np.maximum(off, FLOOR)
+        centre = np.stack(on_all_cores(partial(_median, weights=weight * share), list(flat)))
+        departure = flat - centre[..., None]
+        # What lies before the face in every image is neither shaded by the face's normals nor spread as skin is.
+        bare = seen_at.any(axis=1)
+        bare &= ~_no_skin(centre.T, np.median(centre[:, bare], axis=1))
+        apart = on_all_cores(partial(_spread, among=bare[:, None] & seen_at), list(departure))
+        deviation = np.maximum(np.stack(apart), FLOOR)
         departure /= deviation.astype(np.float32)[:, None, None]
         share = 1.0 / (1.0 + np.einsum("kij,kij->ij", departure, departure) / np.float32(3))
         i, j = places[rng.choice(len(places), min(SAMPLES, len(places)), replace=False)].T
-        scale = (share[i, j] * np.sqrt(weight[i, j])).astype(np.float64)
+        scale = (bare[i] * share[i, j] * np.sqrt(weight[i, j])).astype(np.float64)
         rows = (waves[:, i, step[j]] * scale).T
         damping = SMOOTH * float(scale.sum()) * np.eye(9)
         shading = np.linalg.solve(
@@ -237,7 +235,9 @@ def _objects(
     weight = cv2.GaussianBlur(usable.astype(np.float32), (0, 0), blur)
     departure = cv2.GaussianBlur(departure.astype(np.float32), (0, 0), blur) / np.maximum(weight, 1e-3)
     inner = cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 3) > RIM * size
-    covered = _no_skin(colour, agreed) & usable
+    # What covers a point in most images needn't in this one, nor end in all of them at the same point.
+    strange = _no_skin(level - basis(normal, 3) @ agreed.shading, agreed.skin) & usable
+    covered = _no_skin(colour, agreed.skin) & strange
     picture = to_8_bit(image)
     found = _outlines(
         picture,
@@ -249,7 +249,7 @@ def _objects(
         size,
     )
     return found | _outlines(
-        picture, covered & plain & inner, covered, ~covered & plain & usable, facial, LARGE, size, WIDE * REACH
+        picture, covered & plain & inner, strange, ~strange & plain & usable, facial, LARGE, size, WIDE * REACH
     )
 
 
@@ -335,9 +335,9 @@ def _plain(shape: tuple[int, ...], marks: NDArray) -> NDArray[np.bool_]:
     return above & ~features
 
 
-def _no_skin(flat: NDArray, agreed: Consensus) -> NDArray[np.bool_]:
-    """Colours without shading, (H, W, 3) `OPPONENT` logarithms, that are far from those of the face's skin."""
-    unlike = flat - agreed.skin
+def _no_skin(flat: NDArray, skin: NDArray) -> NDArray[np.bool_]:
+    """Colours without shading, (..., 3) `OPPONENT` logarithms, that are far from those of the face's skin."""
+    unlike = flat - skin
     return np.asarray((unlike[..., 0] < -COVERED[0]) | (np.hypot(unlike[..., 1], unlike[..., 2]) > COVERED[1]))
 
 
@@ -361,6 +361,11 @@ def _polygons(shape: tuple[int, ...], marks: NDArray, parts: Sequence[slice]) ->
 def _box(area: NDArray[np.bool_]) -> tuple[slice, slice]:
     rows, columns = np.flatnonzero(area.any(axis=1)), np.flatnonzero(area.any(axis=0))
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+def _spread(values: NDArray, among: NDArray[np.bool_]) -> float:
+    """Robust standard deviation of some of the values."""
+    return 1.4826 * float(np.median(np.abs(values[among])))
 
 
 def _median(values: NDArray, weights: NDArray) -> NDArray:
