@@ -229,7 +229,11 @@ def trace_transfer(
     hits = _Hits(len(p), samples) if bounce_albedo and len(p) else None
     result = _trace(scene.rays, offset, p, n, order, samples, seed + 1, hits)
     if hits is not None:
-        first = _trace(scene.rays, offset, vertices, vertex_normals(vertices, faces), order, samples, seed)
+        facing = vertex_normals(vertices, faces)
+        if np.array_equal(p, vertices) and np.array_equal(n, facing):
+            first = result.copy()  # what the vertices get from the sky is what they throw on one another
+        else:
+            first = _trace(scene.rays, offset, vertices, facing, order, samples, seed)
         result += np.float32((bounce_albedo or 0.0) / samples) * (hits.matrix(faces, len(vertices)) @ first)
     dr.flush_malloc_cache()
     return result
