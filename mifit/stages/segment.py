@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 import cv2
@@ -38,7 +37,11 @@ OPPONENT = np.array([[1 / 3, 1 / 3, 1 / 3], [1.0, -1.0, 0.0], [0.5, 0.5, -1.0]])
 FLOOR = np.array([0.12, 0.03, 0.03])
 """Least standard deviations of the three: texture that a fitted mesh shifts, and shading beyond the normals'."""
 ROUNDS = 6
+SETTLING = 2
+"""Rounds with a shading that is known."""
 SAMPLES = 20_000
+AGREEING = 20_000
+"""Texels that tell the shading, and that are looked at at a time afterwards."""
 SMOOTH = 1e-3
 """Weight of the shading's coefficients against running off where few normals are seen."""
 SURE, LIKELY, CLEAN = 4.0, 3.0, 1.0
@@ -97,6 +100,30 @@ class Consensus:
     skin: NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class _Levels:
+    """Texels (N,) in J images: `OPPONENT` logarithms (3, N, J), basis of the normals (9, N, T), weights (N, J)."""
+
+    level: NDArray[np.float32]
+    waves: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    step: NDArray[np.int64]
+
+    def agreed(self, shading: NDArray, share: NDArray) -> tuple[NDArray, NDArray]:
+        """What the images agree on (3, N) under a shading, and how far each is from it."""
+        flat = self.level - np.tensordot(shading.T.astype(np.float32), self.waves, 1)[..., self.step]
+        trust = self.weight * share
+        middle = np.stack([_median(channel, trust) for channel in flat])
+        flat -= middle[..., None]
+        return middle, flat
+
+
+def _share(departure: NDArray, deviation: NDArray) -> NDArray[np.float32]:
+    """(N, J) Cauchy's weights of departures (3, N, J) from what images agree on."""
+    far = departure / deviation.astype(np.float32)[:, None, None]
+    return np.asarray(1.0 / (1.0 + np.einsum("kij,kij->ij", far, far) / np.float32(3)))
+
+
 def consensus(surface: Surface, seed: int = 0) -> Consensus:
     """What all images together say about the face's colours.
 
@@ -104,45 +131,51 @@ def consensus(surface: Surface, seed: int = 0) -> Consensus:
     order, shared by all images) fitted to what remains, weighted by a Cauchy function.
     """
     texels, levels, weights, normals = [], [], [], []
-    facial = np.flatnonzero(surface.facial)
     for part in surface.chunks():
         rows = part[surface.facial[part]]
         seen = surface.observe(rows)
         texels.append(rows)
         levels.append(np.log(np.maximum(seen.colour, DARKEST)) @ OPPONENT.T.astype(np.float32))
         weights.append(seen.measured)
-        normals.append(basis(seen.normal, 3).astype(np.float32))
+        normals.append(basis(seen.normal.astype(np.float32), 3).astype(np.float32))
         step = seen.step
     # Channels first: medians and sums along three neighbours in memory are slow.
     level, waves = (np.ascontiguousarray(np.concatenate(parts).transpose(2, 0, 1)) for parts in (levels, normals))
     weight = np.concatenate(weights)
-    seen_at = weight > 0
-    shading = np.zeros((9, 3))
-    share, deviation = np.ones_like(weight), FLOOR
-    centre = np.zeros((3, len(facial)), np.float32)
-    rng = np.random.default_rng(seed)
-    places = np.argwhere(seen_at)
+    shading, deviation = np.zeros((9, 3)), FLOOR
+    some = slice(None, None, max(1, weight.shape[0] // AGREEING))
+    few = _Levels(level[:, some], waves[:, some], weight[some], step)
+    share = np.ones_like(few.weight)
+    places, rng = np.argwhere(few.weight > 0), np.random.default_rng(seed)
     for _ in range(ROUNDS if len(places) else 0):
-        flat = level - np.tensordot(shading.T.astype(np.float32), waves, 1)[..., step]
-        centre = np.stack(on_all_cores(partial(_median, weights=weight * share), list(flat)))
-        departure = flat - centre[..., None]
+        centre, departure = few.agreed(shading, share)
         # What lies before the face in every image is neither shaded by the face's normals nor spread as skin is.
-        bare = seen_at.any(axis=1)
+        bare = (few.weight > 0).any(axis=1)
         bare &= ~_no_skin(centre.T, np.median(centre[:, bare], axis=1))
-        apart = on_all_cores(partial(_spread, among=bare[:, None] & seen_at), list(departure))
-        deviation = np.maximum(np.stack(apart), FLOOR)
-        departure /= deviation.astype(np.float32)[:, None, None]
-        share = 1.0 / (1.0 + np.einsum("kij,kij->ij", departure, departure) / np.float32(3))
+        apart = np.abs(departure[:, bare[:, None] & (few.weight > 0)])
+        deviation = np.maximum(1.4826 * np.median(apart, axis=1).astype(np.float64), FLOOR)
+        share = _share(departure, deviation)
         i, j = places[rng.choice(len(places), min(SAMPLES, len(places)), replace=False)].T
-        scale = (bare[i] * share[i, j] * np.sqrt(weight[i, j])).astype(np.float64)
-        rows = (waves[:, i, step[j]] * scale).T
+        scale = (bare[i] * share[i, j] * np.sqrt(few.weight[i, j])).astype(np.float64)
+        rows = (few.waves[:, i, step[j]] * scale).T
         damping = SMOOTH * float(scale.sum()) * np.eye(9)
         shading = np.linalg.solve(
-            rows.T @ rows + damping, rows.T @ ((level[:, i, j] - centre[:, i]) * scale).T.astype(np.float64)
+            rows.T @ rows + damping, rows.T @ ((few.level[:, i, j] - centre[:, i]) * scale).T.astype(np.float64)
         )
         shading[0] = 0.0  # a constant belongs to the colours
-    centre = centre.T
-    known = seen_at.any(axis=1)
+
+    def settled(rows: slice) -> NDArray:
+        """What the images agree on at some of the texels, under the shading that is known now."""
+        part = _Levels(level[:, rows], waves[:, rows], weight[rows], step)
+        trust = np.ones_like(part.weight)
+        for _ in range(SETTLING):
+            middle, departure = part.agreed(shading, trust)
+            trust = _share(departure, deviation)
+        return middle
+
+    every = [slice(at, at + AGREEING) for at in range(0, len(weight), AGREEING)]
+    centre = np.concatenate([np.zeros((3, 0), np.float32), *on_all_cores(settled, every)], axis=1).T
+    known = (weight > 0).any(axis=1)
     size = surface.texels.size
     colour, mask = np.zeros((size * size, 3), np.float32), np.zeros(size * size, np.float32)
     index = surface.texels.index[np.concatenate(texels)][known]
@@ -361,11 +394,6 @@ def _polygons(shape: tuple[int, ...], marks: NDArray, parts: Sequence[slice]) ->
 def _box(area: NDArray[np.bool_]) -> tuple[slice, slice]:
     rows, columns = np.flatnonzero(area.any(axis=1)), np.flatnonzero(area.any(axis=0))
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-
-
-def _spread(values: NDArray, among: NDArray[np.bool_]) -> float:
-    """Robust standard deviation of some of the values."""
-    return 1.4826 * float(np.median(np.abs(values[among])))
 
 
 def _median(values: NDArray, weights: NDArray) -> NDArray:
