@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ MAP_ITERATIONS = 40
 """ADMM iterations of a pass. Every pass starts from its maps alone: going on from the multipliers of the pass before
 saves half of them, but carries over what the last weights took an outlier for (a hand before one camera left 0.016
 instead of less than 0.01 in the albedo under it)."""
-SUMMED = 1 << 15
+SUMMED = 1 << 13
 """Texels whose observations are summed at a time."""
 ROUNDS = 20
 """Rounds of `alternate` at the most."""
@@ -91,6 +91,78 @@ class SolvedMaps:
     told: NDArray[np.float32]
 
 
+@dataclass(frozen=True)
+class _Shaded:
+    """Those of some texels that images show, n of N: what these see there, and what is reflected at unit albedo.
+
+    Attributes
+    ----------
+    texel : (n,) int
+        Positions in the `TexelMap`.
+    rows : (n,) int
+        Places among the N.
+    count : int
+        N.
+    colour, weight, diffuse, specular : (n, J, 3) float32
+        Without ambient; weights before any residual is looked at.
+    clipped : (n, J) bool
+    """
+
+    texel: NDArray[np.int64]
+    rows: NDArray[np.intp]
+    count: int
+    colour: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    diffuse: NDArray[np.float32]
+    specular: NDArray[np.float32]
+    clipped: NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls, surface: Surface, texels: NDArray[np.int64], forward: Forward, found: LightingSolution, robust: bool
+    ) -> _Shaded:
+        """Read and shade texels; half of a head's may be turned away from all images."""
+        seen = surface.observe(texels)
+        rows = np.flatnonzero((seen.weight > 0).any(axis=1))
+        seen = seen.take(rows)
+        diffuse, specular = forward.shade(seen, found.light)
+        weight = seen.weight[..., None] * noise_weight(seen.colour, robust)
+        colour = seen.colour - np.float32(found.ambient)
+        return cls(seen.texel, rows, len(texels), colour, weight, diffuse, specular, seen.clipped)
+
+    @property
+    def _parts(self) -> list[slice]:
+        return [slice(at, at + SUMMED) for at in range(0, len(self.rows), SUMMED)]
+
+    def residual(self, albedo: NDArray) -> NDArray[np.float32]:
+        """(n, J, 3) what images show beyond albedos (n, 4)."""
+        found = np.empty_like(self.colour)
+
+        def fill(part: slice) -> None:
+            x, y = albedo[part, None, :3], albedo[part, 3, None, None]
+            found[part] = self.colour[part] - form_image(0.0, x, self.diffuse[part], y, self.specular[part])
+
+        on_all_cores(fill, self._parts)
+        return found
+
+    def systems(self, weight: NDArray, pairs: NDArray, difference: float) -> TexelSystems:
+        """Blocks of all N texels, zero where nothing is seen, under weights (n, J, 3)."""
+
+        def accumulate(part: slice) -> TexelSystems:
+            values = (array[part] for array in (self.colour, weight, self.diffuse, self.specular))
+            return TexelSystems.accumulate(*values, pairs, difference)
+
+        parts = on_all_cores(accumulate, self._parts or [slice(0, 0)])
+        joined = TexelSystems.join(parts)
+        return TexelSystems(*(self.spread(getattr(joined, f.name)) for f in fields(joined)))
+
+    def spread(self, values: NDArray) -> NDArray:
+        """Values (n, ...) among zeros (N, ...)."""
+        out = np.zeros((self.count, *values.shape[1:]), values.dtype)
+        out[self.rows] = values
+        return out
+
+
 def fit_maps(
     surface: Surface,
     forward: Forward,
@@ -108,41 +180,26 @@ def fit_maps(
     maps: NDArray[np.float32] | None = start
     energy: dict[str, list[float]] = {"data": []}
     passes, expected = MAP_PASSES if config.robust else 1, float(prior[0, 0, 3])
-    kept: tuple[Observations, NDArray, NDArray] | None = None
+    kept: _Shaded | None = None
     sigma = found.sigma
     for number in range(passes):
         systems, data, sigmas, units, errors = [], 0.0, [], [], []
         for done, chunk in enumerate(chunks):
             progress("Reflectance maps", number * len(chunks) + done, passes * len(chunks))
-            if kept is None:
-                seen = surface.observe(chunk)
-                diffuse_light, specular_light = forward.shade(seen, found.light)
-            else:
-                seen, diffuse_light, specular_light = kept
+            shaded = kept or _Shaded.of(surface, chunk, forward, found, config.robust)
             if len(chunks) == 1:
-                kept = seen, diffuse_light, specular_light
-            weight = seen.weight[..., None] * noise_weight(seen.colour, config.robust)
-            target = seen.colour - np.float32(found.ambient)
+                kept = shaded
             if maps is None or not config.robust:
-                weight = np.where(seen.clipped[..., None], np.float32(0.0), weight)
+                weight = np.where(shaded.clipped[..., None], np.float32(0.0), shaded.weight)
             else:
-                texel = maps.reshape(-1, 4)[index[chunk]]
-                residual = target - form_image(
-                    0.0, texel[:, None, :3], diffuse_light, texel[:, 3, None, None], specular_light
-                )
-                sizes = whitened(weight, seen.clipped, residual)
+                residual = shaded.residual(maps.reshape(-1, 4)[index[shaded.texel]])
+                sizes = whitened(shaded.weight, shaded.clipped, residual)
                 units.append(robust_deviation(sizes))
-                errors.append(deviations(sizes))
-                weight, deviation = active_weight(weight, seen.clipped, residual, config.robust)
+                errors.append([shaded.spread(values) for values in deviations(sizes)])
+                weight, deviation = active_weight(shaded.weight, shaded.clipped, residual, config.robust)
                 data += float((weight * residual**2).sum())
                 sigmas.append(deviation)
-            observed = target, weight, diffuse_light, specular_light
-
-            def accumulate(rows: slice, observed: tuple[NDArray, ...] = observed) -> TexelSystems:
-                values = (part[rows] for part in observed)
-                return TexelSystems.accumulate(*values, pairs, config.specular_difference_weight)
-
-            systems += on_all_cores(accumulate, [slice(at, at + SUMMED) for at in range(0, len(chunk), SUMMED)])
+            systems.append(shaded.systems(weight, pairs, config.specular_difference_weight))
         if sigmas:
             energy["data"].append(data)
             sigma = float(np.median(sigmas))
