@@ -12,7 +12,7 @@ the normal equations are dense in the timesteps' parameters; they are a few hund
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,14 +82,26 @@ class ConsistencyProblem:
     landmarks: LandmarkTerm
     priors: dict[str, float]
     known: tuple[NDArray, NDArray] | None = None
+    _last: dict[bytes, list] = field(default_factory=dict, init=False, repr=False, compare=False)
 
-    def _observe(self, x: NDArray, gradient: bool) -> list:
-        """Per view: projection, values, gradients and weights (0 where the image has no valid pixel)."""
+    def _observe(self, x: NDArray) -> list:
+        """Per view: projection, values, gradients and weights (0 where the image has no valid pixel).
+
+        The last ones are kept: where a step's energy is accepted its equations are wanted next.
+        """
+        key = x.tobytes()
+        if key not in self._last:
+            self._last.clear()
+            self._last[key] = self._look(x)
+        return self._last[key]
+
+    def _look(self, x: NDArray) -> list:
+        """`_observe`, where it isn't known yet."""
 
         def observe(view: TextureView) -> tuple:
             points = view.basis.evaluate(x[self.layout.at("identity")], x[self.layout.at("expression", view.step)])
-            projection = project(view.camera, self.frames.pose(self.layout, x, view.step), points, gradient)
-            values, slope, inside = view.image.sample(projection.pixels, gradient)
+            projection = project(view.camera, self.frames.pose(self.layout, x, view.step), points)
+            values, slope, inside = view.image.sample(projection.pixels)
             weight = np.where(inside & (projection.depth > 0), view.weight, 0.0)
             return view, projection, values.astype(np.float64), slope, weight
 
@@ -134,13 +146,13 @@ class ConsistencyProblem:
 
     def texture(self, x: NDArray) -> tuple[NDArray, NDArray]:
         """The eliminated values a (N, C) at x and the weight (N,) behind each."""
-        mean, total, *_ = self._reweighted(self._observe(x, gradient=False))
+        mean, total, *_ = self._reweighted(self._observe(x))
         return mean, total
 
     def energies(self, x: NDArray) -> dict[str, float]:
         """Energy per term."""
         return {
-            "consistency": self._reweighted(self._observe(x, gradient=False))[3],
+            "consistency": self._reweighted(self._observe(x))[3],
             "landmarks": self.landmarks.energy(self.layout, self.frames, x),
             "prior": prior_energy(self.layout, x, self.priors),
         }
@@ -148,7 +160,7 @@ class ConsistencyProblem:
     def linearize(self, x: NDArray) -> DenseSystem:
         """Normal equations with the free values eliminated."""
         layout = self.layout
-        observed = self._observe(x, gradient=True)
+        observed = self._observe(x)
         mean, total, weights, _ = self._reweighted(observed)
         factor = self.independence / self.noise**2
         equations = NormalEquations(layout)
@@ -184,7 +196,7 @@ class ConsistencyProblem:
 
     def spread(self, x: NDArray) -> float:
         """Robust standard deviation of the log-texture between images at x: the noise level."""
-        observed = self._observe(x, gradient=False)
+        observed = self._observe(x)
         mean, *_ = self._reweighted(observed)
         residual = [(values - mean[view.points])[weight > 0] for view, _, values, _, weight in observed]
         together = np.abs(np.concatenate(residual)) if residual else np.zeros(0)
