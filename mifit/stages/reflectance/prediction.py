@@ -25,6 +25,9 @@ LEAST = 50
 ITERATIONS = 8
 """Gauss-Newton iterations without the images left out. They start anew: a few from the solution with all images still
 knew what was left out, and made sheen look good that no other view had."""
+TOLERANCE = 5e-3
+"""Relative change of the energy at which they end: predicted errors, which are compared by parts of some hundredths, move
+by a few thousandths afterwards."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ def predict(seen: Observations, problem: LightingProblem, specular: float, robus
         known = np.any((rest.weight > 0).any(axis=2) & ~rest.clipped, axis=1)
         if known.sum() < LEAST:
             return None  # a camera that sees next to nothing can't predict the others
-        solved = solve_lighting(rest, specular=specular, robust=robust, iterations=ITERATIONS)
+        solved = solve_lighting(rest, specular=specular, robust=robust, iterations=ITERATIONS, tolerance=TOLERANCE)
         judged = replace(
             problem,
             colour=problem.colour[:, out],
