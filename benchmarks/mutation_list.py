@@ -41,6 +41,12 @@ CONVENTIONS = [
 FOREIGN_HEADS = [
     M("folds as noisy as the open sky", "mifit/appearance/*.py", r"dr\.fma\(seen, t, \(s - seen \* w\) / samples\)",
       "t + (s - w) / samples", "tests/appearance/test_occlusion.py"),
+    M("maps start from the model and not from a coarser map", STAGES, r"offset = cv2\.resize\(found - small, ", "offset = cv2.resize(0.0 * found, ",
+      "tests/stages/test_infer_reflectance.py"),
+    M("offsets on the coarser map without those of the specular part", STAGES, r"total\(systems\.sr - \(systems\.ds \* fine\)\.sum\(1\)\)",
+      "total(systems.sr)", "tests/stages/test_infer_reflectance.py"),
+    M("images at other parameters taken for those that are asked for", STAGES, r"if key not in self\._last:", "if not self._last:",
+      "tests/stages/test_geometry_terms.py"),
     M("the albedo's level left free", STAGES, r"^LEVEL_PRIOR = .*", "LEVEL_PRIOR = 0.0", "tests/stages/test_geometry_terms.py"),
     M("gloss believed that predicts nothing", STAGES, r"told = chosen\.error < \(1\.0 - MARGIN\) \* matt\.error", "told = True",
       "tests/stages/test_infer_reflectance.py"),

@@ -297,6 +297,29 @@ def test_consistency_jacobian(scene):
     check_gradient(replace(problem, known=known), x, 1e-4)
 
 
+def test_images_are_looked_up_once_at_a_step_that_is_accepted(scene, monkeypatch):
+    layout, looks = Layout(1, 4, 3), []
+    x = 0.1 * scene.rng.normal(size=layout.size)
+    face, weights = random_points(scene.rng, scene.model, 10)
+    views = tuple(
+        TextureView(0, cam, smooth_image(scene.rng), np.arange(10), np.ones(10), basis_on(scene.model, face, weights))
+        for cam in scene.cameras
+    )
+    given = layout, scene.frames, 10, views, 1.0, 3.0, 1.0, LandmarkTerm((), np.inf), {"identity": 1e-3}
+    fresh = ConsistencyProblem(*given).linearize(x)
+    look = ConsistencyProblem._look
+    monkeypatch.setattr(ConsistencyProblem, "_look", lambda self, at: looks.append(at.copy()) or look(self, at))
+    problem = ConsistencyProblem(*given)
+    here = problem.energies(x)
+    elsewhere = problem.energies(x + 0.01)
+    assert len(looks) == 2 and here != elsewhere
+    assert problem.energies(x) == here
+    found = problem.linearize(x)
+    assert len(looks) == 3
+    np.testing.assert_array_equal(found.hessian, fresh.hessian)
+    np.testing.assert_array_equal(found.gradient, fresh.gradient)
+
+
 def test_elimination_equals_explicit_values(scene):
     """H after elimination is the Schur complement of the system that keeps every point's value."""
     layout = Layout(1, 4, 3)
@@ -321,7 +344,7 @@ def test_elimination_equals_explicit_values(scene):
     for i in range(layout.size):
         d = np.zeros(layout.size)
         d[i] = 1e-6
-        up, down = (np.stack([o[2] for o in problem._observe(x + s * d, False)]) for s in (1, -1))
+        up, down = (np.stack([o[2] for o in problem._observe(x + s * d)]) for s in (1, -1))
         rows.append((up - down) / 2e-6)
     jacobian = np.stack(rows, -1)  # (views, points, channels, n)
     centred = (jacobian - jacobian.mean(0)).reshape(-1, layout.size)

@@ -26,8 +26,8 @@ ITERATIONS = 8
 """Gauss-Newton iterations without the images left out. They start anew: a few from the solution with all images still
 knew what was left out, and made sheen look good that no other view had."""
 TOLERANCE = 5e-3
-"""Relative change of the energy at which they end: predicted errors, which are compared by parts of some hundredths, move
-by a few thousandths afterwards."""
+"""Relative change of the energy at which they end: predicted errors, which are compared by parts of some hundredths,
+move by a few thousandths afterwards."""
 
 
 @dataclass(frozen=True)
