@@ -45,7 +45,7 @@ FOREIGN_HEADS = [
       "tests/stages/test_infer_reflectance.py"),
     M("offsets on the coarser map without those of the specular part", STAGES, r"total\(systems\.sr - \(systems\.ds \* fine\)\.sum\(1\)\)",
       "total(systems.sr)", "tests/stages/test_infer_reflectance.py"),
-    M("images at other parameters taken for those that are asked for", STAGES, r"if key not in self\._last:", "if not self._last:",
+    M("images at other parameters taken for those that are asked for", "mifit/stages/geometry/consistency.py", r"if key not in self\._last:", "if not self._last:",
       "tests/stages/test_geometry_terms.py"),
     M("the albedo's level left free", STAGES, r"^LEVEL_PRIOR = .*", "LEVEL_PRIOR = 0.0", "tests/stages/test_geometry_terms.py"),
     M("gloss believed that predicts nothing", STAGES, r"told = chosen\.error < \(1\.0 - MARGIN\) \* matt\.error", "told = True",
