@@ -42,6 +42,14 @@ class GeometryConfig:
         True,
         "find images whose exposure differs surely from that of their camera's first timestep, and divide it out",
     )
+    falloff: bool = flag(
+        True,
+        "find lenses that surely leave the corners of images darker than the middle, and divide it out",
+    )
+    contrast: bool = flag(
+        True,
+        "find cameras whose response surely has another contrast than the first one's, and take it out",
+    )
     refine_cameras: bool = flag(
         False,
         "adjust poses and focal lengths of two or more calibrated cameras by dense matches between them, with the "
@@ -264,7 +272,13 @@ class FitConfig:
         """
         return cls(
             geometry=GeometryConfig(
-                objective="paper", as_written=True, camera_gains="never", exposures=False, eyes=False
+                objective="paper",
+                as_written=True,
+                camera_gains="never",
+                exposures=False,
+                falloff=False,
+                contrast=False,
+                eyes=False,
             ),
             surface=SurfaceConfig(enabled=False),
             reflectance=ReflectanceConfig(

@@ -126,7 +126,7 @@ class Step:
 
 def steps(config: FitConfig, until: Stage = "normals") -> list[Step]:
     """The steps of a fit with these settings, in order."""
-    measured = replace(config.geometry, refine_cameras=False)
+    measured = replace(config.geometry, refine_cameras=False, falloff=False, contrast=False)
     found = [Step("geometry", "geometry", (), (measured,), _fit_geometry)]
     if config.surface.enabled:
         found.append(Step("surface", "geometry", ("geometry",), (config.surface, measured), _find_surface))
@@ -137,6 +137,9 @@ def steps(config: FitConfig, until: Stage = "normals") -> list[Step]:
             Step("cameras", "cameras", ("geometry",), (), _refine_cameras),
             Step("geometry_refined", "geometry", ("geometry", *seen), (config.surface, measured), _fit_refined),
         ]
+    if config.geometry.falloff or config.geometry.contrast:
+        lenses = replace(config.geometry, refine_cameras=False)
+        found.append(Step("falloff", "geometry", ("geometry", *seen), (lenses,), _find_falloff))
     if until == "geometry":
         return found
     infer = Step("reflectance", "reflectance", ("geometry", *seen), (config.reflectance,), _infer_reflectance)
@@ -228,9 +231,11 @@ def run_steps(
 
 
 def _seen(source: Source, inputs: Inputs) -> Source:
-    """The source with refined cameras and the exposures found, where a step is given any."""
-    if "geometry" in inputs and inputs["geometry"].exposures:
-        source = replace(source, capture=source.capture.with_exposures(inputs["geometry"].exposed))
+    """The source with refined cameras and without exposures, falloff and contrast found, where a step is given any."""
+    found = inputs.get("geometry")
+    if found is not None and found.corrects_images:
+        capture = source.capture.with_exposures(found.exposed).with_lenses(found.falloff, found.contrast)
+        source = replace(source, capture=capture)
     if "cameras" not in inputs or not inputs["cameras"].names:
         return source
     capture, cameras = source.capture, inputs["cameras"]
@@ -281,6 +286,12 @@ def _fit_refined(
     if surface.enabled:
         found = _find_surface(source, {"geometry": found}, progress, surface, geometry)
     return reported(found, cameras, first.report.seconds)
+
+
+def _find_falloff(source: Source, inputs: Inputs, progress: Progress, config: GeometryConfig) -> Any:
+    from mifit.stages.falloff import find_falloff
+
+    return find_falloff(source.capture, source.model, inputs["geometry"], source.cameras, config, source.seed, progress)
 
 
 def _infer_reflectance(source: Source, inputs: Inputs, progress: Progress, config: ReflectanceConfig) -> Any:

@@ -116,8 +116,10 @@ def test_views_from_one_place_bring_a_warning():
 
 
 pytestmark = pytest.mark.usefixtures("variant")
-ORDER = ("geometry", "surface", "reflectance", "geometry_1", "reflectance_1", "normals", "mesh", "residual")
-FIRST = {"geometry": 0, "surface": 1, "reflectance": 2, "shape": 3, "normals": 5, "mesh": 6, "residual": 7}
+ORDER = (
+    "geometry", "surface", "falloff", "reflectance", "geometry_1", "reflectance_1", "normals", "mesh", "residual",
+)  # fmt: skip
+FIRST = {"geometry": 0, "surface": 1, "reflectance": 3, "shape": 4, "normals": 6, "mesh": 7, "residual": 8}
 """Section of the settings -> the first step that reads it; all later ones depend on that one's estimate."""
 
 
@@ -163,6 +165,10 @@ class Stages:
             ("normals.mesh_refinement", "refine_mesh", "mesh"), ("find_residual", "find_residual", "residual"),
         ):  # fmt: skip
             monkeypatch.setattr(f"mifit.stages.{module}.{name}", self.stand_in(name, getattr(result, part)))
+        monkeypatch.setattr(
+            "mifit.stages.falloff.find_falloff",
+            lambda capture, model, geometry, *_: self.stand_in("find_falloff", geometry)(capture),
+        )
         self.cameras = CamerasEstimate((), np.zeros((0, 2)), np.zeros((0, 4, 4)), Report("converged"))
         monkeypatch.setattr(
             "mifit.stages.refine_cameras.refine_cameras", lambda *_: self.ran.append("refine_cameras") or self.cameras
@@ -210,6 +216,7 @@ def fitted(stages):
 RUNS = (
     "fit_geometry",
     "find_surface",
+    "find_falloff",
     "infer_reflectance",
     "refine_shape",
     "infer_reflectance",
@@ -235,6 +242,8 @@ def test_a_changed_setting_reruns_the_steps_that_depend_on_it(fitted, tmp_path, 
         assert ran == ["refine_cameras", *RUNS[2:]]  # from the fit that was there, which serves where cameras stay
     elif (section, name) == ("surface", "enabled"):
         assert ran == list(RUNS[2:])
+    elif (section, name) in (("geometry", "falloff"), ("geometry", "contrast")):
+        assert ran == list(RUNS[2:])
     else:
         assert ran == list(RUNS[FIRST[section] :])
 
@@ -253,8 +262,8 @@ def test_a_changed_source_reruns_everything(change):
 
 
 def test_stages_that_a_shorter_fit_ran_serve_a_longer_one(fitted, tmp_path):
-    assert fitted(BASE, tmp_path, until="geometry") == list(RUNS[:2])
-    assert fitted(BASE, tmp_path, until="reflectance") == list(RUNS[2:5])
+    assert fitted(BASE, tmp_path, until="geometry") == list(RUNS[:3])
+    assert fitted(BASE, tmp_path, until="reflectance") == list(RUNS[3:6])
     assert fitted(BASE, tmp_path) == ["refine_normals", "refine_mesh", "find_residual"]
 
 
@@ -291,7 +300,10 @@ def test_what_comes_after_refined_cameras_sees_through_them(stages, tmp_path):
     capture.with_estimate = lambda cameras: estimated.append(cameras) or "refined"
     config = dataclasses.replace(REFINING, shape=mifit.ShapeConfig())
     found = mifit.fit(capture, ball_result().model, config=config)
-    again = ["fit_geometry", "find_surface", "infer_reflectance", "refine_normals", "refine_mesh", "find_residual"]
+    again = [
+        "fit_geometry", "find_surface", "find_falloff", "infer_reflectance", "refine_normals", "refine_mesh",
+        "find_residual",
+    ]  # fmt: skip
     assert stages.ran == [*again[:2], "refine_cameras", *again]
     saw = dict(zip(again, stages.saw[2:], strict=True))
     assert stages.saw[:2] == [capture, capture]

@@ -8,6 +8,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,11 @@ class Capture:
     exposures : dict of (camera, timestep) to float
         What images are divided by, where a fit found that their exposure changed (`with_exposures`); files and `digest`
         stay as they are.
+    falloff : dict of camera to float
+        Logarithm by which the corners of its images are darker than their middle, where a fit found so; images are
+        divided by ``exp(-falloff * radius^2)`` (`Camera.corner_radius`), files and `digest` stay as they are.
+    contrast : dict of camera to float
+        Exponent of its linear colours over the first camera's, where a fit found one, which is undone last.
     """
 
     path: Path
@@ -128,6 +134,8 @@ class Capture:
     units: str = "cm"
     estimated: Mapping[str, Camera] = field(default_factory=dict, repr=False)
     exposures: Mapping[tuple[str, int], float] = field(default_factory=dict, repr=False)
+    falloff: Mapping[str, float] = field(default_factory=dict, repr=False)
+    contrast: Mapping[str, float] = field(default_factory=dict, repr=False)
     _cache: _Cache = field(default_factory=lambda: _Cache(CACHE_BYTES), repr=False, compare=False)
 
     @classmethod
@@ -220,9 +228,13 @@ class Capture:
             frame = self._read(shot)
             self._cache.put((name, timestep), frame)
         factor = self.exposures.get((name, timestep), 1.0)
-        if factor == 1.0:
+        if factor == 1.0 and name not in self.falloff and name not in self.contrast:
             return frame
         image = frame.image / np.float32(factor)
+        if name in self.falloff:
+            image /= _transmission(self.camera(name), self.falloff[name])
+        if name in self.contrast:
+            image = np.sign(image) * np.abs(image) ** np.float32(1.0 / self.contrast[name])
         image.flags.writeable = False
         return dataclasses.replace(frame, image=image)
 
@@ -258,6 +270,12 @@ class Capture:
     def with_exposures(self, exposures: Mapping[tuple[str, int], float]) -> Capture:
         """The same capture with images divided by the factors of `exposures`, in place of any that it has."""
         return dataclasses.replace(self, exposures=dict(exposures), _cache=self._cache) if exposures else self
+
+    def with_lenses(self, falloff: Mapping[str, float], contrast: Mapping[str, float]) -> Capture:
+        """The same capture with falloff and contrast of cameras taken out of their images, in place of any it has."""
+        if not falloff and not contrast:
+            return self
+        return dataclasses.replace(self, falloff=dict(falloff), contrast=dict(contrast), _cache=self._cache)
 
     def with_fitted(self, cameras: Sequence[Camera], calibration: Sequence[Camera] = ()) -> Capture:
         """The capture as a fit with these cameras saw it: its own calibration, or else the estimated cameras.
@@ -322,6 +340,14 @@ def _lens_camera(view: View) -> Camera:
     """Intrinsics and distortion of a view, pose left at the origin."""
     assert view.intrinsics is not None
     return Camera(view.name, view.width, view.height, *view.intrinsics, np.eye(4), distortion=view.distortion)
+
+
+@lru_cache(maxsize=4)
+def _transmission(camera: Camera, falloff: float) -> NDArray[np.float32]:
+    """(H, W, 1) part of the light that a lens lets through to each pixel, 1 in the middle."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    radius = camera.corner_radius(np.stack([x, y], axis=-1))
+    return np.exp(-falloff * radius**2).astype(np.float32)[..., None]
 
 
 def _check_size(shape: tuple[int, ...], view: View, path: Path) -> None:

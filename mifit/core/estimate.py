@@ -74,6 +74,12 @@ class GeometryEstimate:
     exposures : dict of camera name to (T,) factors
         Each image's linear colours over those of its camera's first timestep, where they differ; images are divided by
         it when they are read (`Capture.with_exposures`). A camera that isn't named has one exposure.
+    falloff : dict of camera name to float
+        Logarithm by which the corners of its images are darker than their middle; images are brought to one brightness
+        when they are read (`Capture.with_lenses`). A camera that isn't named has a lens that is bright all over.
+    contrast : dict of camera name to float
+        Exponent of its linear colours over the first camera's, undone when images are read. A camera that isn't named
+        has 1.
     displacement : (V, 3) float32 or None
         Neutral surface beyond the model's span, object space: ``model.mean`` plus this is what coefficients add to
         (`displaced`). None where the surface is the model's.
@@ -93,6 +99,8 @@ class GeometryEstimate:
     report: Report
     gains: Mapping[str, Sequence[float]] = field(default_factory=dict)
     exposures: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    falloff: Mapping[str, float] = field(default_factory=dict)
+    contrast: Mapping[str, float] = field(default_factory=dict)
     displacement: NDArray | None = None
 
     @property
@@ -112,6 +120,11 @@ class GeometryEstimate:
             for name, factors in self.exposures.items()
             for timestep, factor in zip(self.timesteps, factors, strict=True)
         }
+
+    @property
+    def corrects_images(self) -> bool:
+        """Whether exposures, falloff or contrast are to be taken out of images when they are read."""
+        return bool(self.exposures or self.falloff or self.contrast)
 
     def index(self, timestep: int) -> int:
         """Position of a timestep in the per-timestep arrays; KeyError when it was not fitted."""

@@ -189,6 +189,14 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
             name: tuple(_array(factors, (n,), f"exposures of {name}").tolist())
             for name, factors in document["capture"].get("exposures", {}).items()
         },
+        falloff={
+            name: float(_array(value, (), f"falloff of {name}"))
+            for name, value in document["capture"].get("falloff", {}).items()
+        },
+        contrast={
+            name: float(_array(value, (), f"contrast of {name}"))
+            for name, value in document["capture"].get("contrast", {}).items()
+        },
         displacement=_displacement(folder, len(model.mean)) if entry.get("displaced") else None,
     )
 

@@ -178,9 +178,11 @@ class Result:
         return self.geometry.timesteps
 
     def seen(self, capture: Capture) -> Capture:
-        """A capture with the cameras and in the exposures that the fit saw it with."""
+        """A capture with the cameras, in the exposures, without the falloff and contrast that the fit found."""
         capture = capture.with_fitted(self.cameras, self.calibration)
-        return capture.with_exposures(self.geometry.exposed) if self.geometry.exposures else capture
+        if not self.geometry.corrects_images:
+            return capture
+        return capture.with_exposures(self.geometry.exposed).with_lenses(self.geometry.falloff, self.geometry.contrast)
 
     @property
     def methods(self) -> tuple[Method, ...]:

@@ -168,6 +168,8 @@ def _document(result: Result) -> dict[str, Any]:
                 "calibration": [_camera_document(c) for c in result.calibration],
                 "gains": {name: list(gain) for name, gain in geometry.gains.items()},
                 "exposures": {name: list(factors) for name, factors in geometry.exposures.items()},
+                "falloff": dict(geometry.falloff),
+                "contrast": dict(geometry.contrast),
             },
             "model": {
                 "source": _source(result.model_source),

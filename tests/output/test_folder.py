@@ -50,10 +50,13 @@ def test_round_trip_is_exact(ball, saved):
         same(a, b)
 
 
-def test_gains_of_cameras_round_trip(ball, tmp_path):
-    geometry = dataclasses.replace(ball.geometry, gains={"left": (1.0, 1.0, 1.0), "right": (1.25, 0.9, 1.1)})
+def test_what_images_are_divided_by_round_trips(ball, tmp_path):
+    gains = {"left": (1.0, 1.0, 1.0), "right": (1.25, 0.9, 1.1)}
+    geometry = dataclasses.replace(ball.geometry, gains=gains, falloff={"left": 0.25}, contrast={"right": 1.1})
     dataclasses.replace(ball, geometry=geometry).save(tmp_path)
-    assert Reconstruction.load(tmp_path, ball.model).geometry.gains == geometry.gains
+    again = Reconstruction.load(tmp_path, ball.model).geometry
+    assert again.gains == geometry.gains and again.falloff == geometry.falloff
+    assert again.contrast == geometry.contrast
 
 
 def test_confidence_of_the_specular_map_round_trips(ball, tmp_path):

@@ -128,7 +128,7 @@ def test_a_fit_with_a_round_of_shading_keeps_every_stage(tiny_capture, variant, 
 
     plain, found = fit(0), fit(1)
     assert {p.name for p in tmp_path.glob("*.npz")} == {
-        f"{name}.npz" for name in ("geometry", "surface", "reflectance", "geometry_1", "reflectance_1")
+        f"{name}.npz" for name in ("geometry", "surface", "falloff", "reflectance", "geometry_1", "reflectance_1")
     }
     energies = found.geometry.report.energies
     assert sum(v[-1] for v in energies.values()) < sum(v[0] for v in energies.values())
