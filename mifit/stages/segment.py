@@ -1,7 +1,7 @@
 """What each image shows: skin, eyes, mouth, hair, cloth, something in front of the face, or the background.
 
 It starts from the fitted head. Every point of the face has one colour, whatever image shows it, times a shading that
-depends on its normal alone: both are found robustly from all images together, and an image that contradicts them over
+depends on its normal alone: both are found from all images together (`stages.consensus`), and an image that contradicts them over
 an area shows something else there. What is added light alone, such as a highlight, contradicts nothing. What covers a
 point in every image is told by its colour, far from that of the face's skin. GrabCut (Rother et al. 2004), started
 inside what was found and on the skin around it, one object at a time, then finds the objects' outlines.
@@ -12,7 +12,6 @@ No network is involved. A capture's own masks (``mask_path``) replace this for t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import cv2
@@ -24,6 +23,7 @@ from mifit.core.labels import Label
 from mifit.core.mesh import interpolate, normalize
 from mifit.core.sh import basis
 from mifit.core.threads import on_all_cores
+from mifit.stages.consensus import OPPONENT, Consensus, agreed_colour, consensus, no_skin
 from mifit.stages.trust import DARKEST
 
 if TYPE_CHECKING:
@@ -32,22 +32,8 @@ if TYPE_CHECKING:
     from mifit.stages.observations import Seen, Surface
 
 
-OPPONENT = np.array([[1 / 3, 1 / 3, 1 / 3], [1.0, -1.0, 0.0], [0.5, 0.5, -1.0]])
-"""Logarithms of colour to brightness and two differences, which shading changes little."""
-FLOOR = np.array([0.12, 0.03, 0.03])
-"""Least standard deviations of the three: texture that a fitted mesh shifts, and shading beyond the normals'."""
-ROUNDS = 6
-SETTLING = 2
-"""Rounds with a shading that is known."""
-SAMPLES = 20_000
-AGREEING = 20_000
-"""Texels that tell the shading, and that are looked at at a time afterwards."""
-SMOOTH = 1e-3
-"""Weight of the shading's coefficients against running off where few normals are seen."""
 SURE, LIKELY, CLEAN = 4.0, 3.0, 1.0
 """Departures in standard deviations: of what starts an object, may belong to one, and is skin."""
-COVERED = (0.9, 0.45)
-"""Difference in brightness and in chroma (logarithms) from the face's skin that no plain skin has."""
 BLUR = 0.003
 """Standard deviation of the blur against noise and shifted texture, as a part of the face's size in pixels."""
 RIM = 0.012
@@ -73,115 +59,6 @@ MARGIN = 0.08
 """Distance around eyes and brows, as a part of the distance between the eyes' outer corners, that is theirs."""
 LONGEST = 640
 """Pixels along the longer side of a face at which it is looked at."""
-
-
-@dataclass(frozen=True)
-class Consensus:
-    """Colours that the images agree on.
-
-    Attributes
-    ----------
-    colour : (S, S, 3) float32
-        `OPPONENT` logarithms without shading.
-    known : (S, S) float32
-        1 where some image measures the texel.
-    shading : (9, 3) float64
-        Of `core.sh.basis` of the world normal.
-    deviation : (3,) float64
-        Robust standard deviations of what an image shows.
-    skin : (3,) float64
-        Median colour of the face.
-    """
-
-    colour: NDArray[np.float32]
-    known: NDArray[np.float32]
-    shading: NDArray[np.float64]
-    deviation: NDArray[np.float64]
-    skin: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class _Levels:
-    """Texels (N,) in J images: `OPPONENT` logarithms (3, N, J), basis of the normals (9, N, T), weights (N, J)."""
-
-    level: NDArray[np.float32]
-    waves: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    step: NDArray[np.int64]
-
-    def agreed(self, shading: NDArray, share: NDArray) -> tuple[NDArray, NDArray]:
-        """What the images agree on (3, N) under a shading, and how far each is from it."""
-        flat = self.level - np.tensordot(shading.T.astype(np.float32), self.waves, 1)[..., self.step]
-        trust = self.weight * share
-        middle = np.stack([_median(channel, trust) for channel in flat])
-        flat -= middle[..., None]
-        return middle, flat
-
-
-def _share(departure: NDArray, deviation: NDArray) -> NDArray[np.float32]:
-    """(N, J) Cauchy's weights of departures (3, N, J) from what images agree on."""
-    far = departure / deviation.astype(np.float32)[:, None, None]
-    return np.asarray(1.0 / (1.0 + np.einsum("kij,kij->ij", far, far) / np.float32(3)))
-
-
-def consensus(surface: Surface, seed: int = 0) -> Consensus:
-    """What all images together say about the face's colours.
-
-    Per texel the weighted median over the images of its colour without shading, in turns with the shading (second
-    order, shared by all images) fitted to what remains, weighted by a Cauchy function.
-    """
-    texels, levels, weights, normals = [], [], [], []
-    for part in surface.chunks():
-        rows = part[surface.facial[part]]
-        seen = surface.observe(rows)
-        texels.append(rows)
-        levels.append(np.log(np.maximum(seen.colour, DARKEST)) @ OPPONENT.T.astype(np.float32))
-        weights.append(seen.measured)
-        normals.append(basis(seen.normal.astype(np.float32), 3).astype(np.float32))
-        step = seen.step
-    # Channels first: medians and sums along three neighbours in memory are slow.
-    level, waves = (np.ascontiguousarray(np.concatenate(parts).transpose(2, 0, 1)) for parts in (levels, normals))
-    weight = np.concatenate(weights)
-    shading, deviation = np.zeros((9, 3)), FLOOR
-    some = slice(None, None, max(1, weight.shape[0] // AGREEING))
-    few = _Levels(level[:, some], waves[:, some], weight[some], step)
-    share = np.ones_like(few.weight)
-    places, rng = np.argwhere(few.weight > 0), np.random.default_rng(seed)
-    for _ in range(ROUNDS if len(places) else 0):
-        centre, departure = few.agreed(shading, share)
-        # What lies before the face in every image is neither shaded by the face's normals nor spread as skin is.
-        bare = (few.weight > 0).any(axis=1)
-        bare &= ~_no_skin(centre.T, np.median(centre[:, bare], axis=1))
-        apart = np.abs(departure[:, bare[:, None] & (few.weight > 0)])
-        deviation = np.maximum(1.4826 * np.median(apart, axis=1).astype(np.float64), FLOOR)
-        share = _share(departure, deviation)
-        i, j = places[rng.choice(len(places), min(SAMPLES, len(places)), replace=False)].T
-        scale = (bare[i] * share[i, j] * np.sqrt(few.weight[i, j])).astype(np.float64)
-        rows = (few.waves[:, i, step[j]] * scale).T
-        damping = SMOOTH * float(scale.sum()) * np.eye(9)
-        shading = np.linalg.solve(
-            rows.T @ rows + damping, rows.T @ ((few.level[:, i, j] - centre[:, i]) * scale).T.astype(np.float64)
-        )
-        shading[0] = 0.0  # a constant belongs to the colours
-
-    def settled(rows: slice) -> NDArray:
-        """What the images agree on at some of the texels, under the shading that is known now."""
-        part = _Levels(level[:, rows], waves[:, rows], weight[rows], step)
-        trust = np.ones_like(part.weight)
-        for _ in range(SETTLING):
-            middle, departure = part.agreed(shading, trust)
-            trust = _share(departure, deviation)
-        return middle
-
-    every = [slice(at, at + AGREEING) for at in range(0, len(weight), AGREEING)]
-    centre = np.concatenate([np.zeros((3, 0), np.float32), *on_all_cores(settled, every)], axis=1).T
-    known = (weight > 0).any(axis=1)
-    size = surface.texels.size
-    colour, mask = np.zeros((size * size, 3), np.float32), np.zeros(size * size, np.float32)
-    index = surface.texels.index[np.concatenate(texels)][known]
-    colour[index], mask[index] = centre[known], 1.0
-    skin = np.median(centre[known].astype(np.float64), axis=0) if known.any() else np.zeros(3)
-    return Consensus(colour.reshape(size, size, 3), mask.reshape(size, size), shading, deviation, skin)
 
 
 def segment(surface: Surface, capture: Capture, model: MorphableModel, seed: int = 0) -> tuple[NDArray[np.uint8], ...]:
@@ -258,7 +135,7 @@ def _objects(
     at, shape = (face.ravel(), weights.reshape(-1, 3)), face.shape
     uv = interpolate(model.uv, model.faces_uv, *at).reshape(*shape, 2)
     normal = normalize(interpolate(view.normals, model.faces, *at)).reshape(*shape, 3)
-    known, colour = _look_up(agreed, uv)
+    known, colour = agreed_colour(agreed, uv)
     usable = usable & (known > 0.5)
     predicted = colour + basis(normal, 3) @ agreed.shading
     smooth = cv2.GaussianBlur(image, (0, 0), 0.5 * blur)
@@ -269,8 +146,8 @@ def _objects(
     departure = cv2.GaussianBlur(departure.astype(np.float32), (0, 0), blur) / np.maximum(weight, 1e-3)
     inner = cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 3) > RIM * size
     # What covers a point in most images needn't in this one, nor end in all of them at the same point.
-    strange = _no_skin(level - basis(normal, 3) @ agreed.shading, agreed.skin) & usable
-    covered = _no_skin(colour, agreed.skin) & strange
+    strange = no_skin(level - basis(normal, 3) @ agreed.shading, agreed.skin) & usable
+    covered = no_skin(colour, agreed.skin) & strange
     picture = to_8_bit(image)
     found = _outlines(
         picture,
@@ -368,21 +245,6 @@ def _plain(shape: tuple[int, ...], marks: NDArray) -> NDArray[np.bool_]:
     return above & ~features
 
 
-def _no_skin(flat: NDArray, skin: NDArray) -> NDArray[np.bool_]:
-    """Colours without shading, (..., 3) `OPPONENT` logarithms, that are far from those of the face's skin."""
-    unlike = flat - skin
-    return np.asarray((unlike[..., 0] < -COVERED[0]) | (np.hypot(unlike[..., 1], unlike[..., 2]) > COVERED[1]))
-
-
-def _look_up(agreed: Consensus, uv: NDArray) -> tuple[NDArray, NDArray]:
-    """How well texture coordinates (H, W, 2) are known, and the colour there."""
-    size = len(agreed.known)
-    x, y = (uv[..., 0] * size - 0.5).astype(np.float32), ((1.0 - uv[..., 1]) * size - 0.5).astype(np.float32)
-    known = cv2.remap(agreed.known, x, y, cv2.INTER_LINEAR)
-    colour = cv2.remap(agreed.colour, x, y, cv2.INTER_LINEAR)
-    return known, (colour / np.maximum(known, 1e-3)[..., None]).astype(np.float32)
-
-
 def _polygons(shape: tuple[int, ...], marks: NDArray, parts: Sequence[slice]) -> NDArray[np.bool_]:
     area = np.zeros(shape, np.uint8)
     for part in parts:
@@ -394,11 +256,3 @@ def _polygons(shape: tuple[int, ...], marks: NDArray, parts: Sequence[slice]) ->
 def _box(area: NDArray[np.bool_]) -> tuple[slice, slice]:
     rows, columns = np.flatnonzero(area.any(axis=1)), np.flatnonzero(area.any(axis=0))
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-
-
-def _median(values: NDArray, weights: NDArray) -> NDArray:
-    """(N,) weighted median of the rows of (N, J) values."""
-    order = np.argsort(values, axis=1)
-    total = np.cumsum(np.take_along_axis(weights, order, axis=1) + 1e-12, axis=1)
-    middle = (total >= 0.5 * total[:, -1:]).argmax(axis=1)
-    return np.asarray(np.take_along_axis(values, order, axis=1)[np.arange(len(values)), middle])
