@@ -1,10 +1,10 @@
 """What each image shows: skin, eyes, mouth, hair, cloth, something in front of the face, or the background.
 
 It starts from the fitted head. Every point of the face has one colour, whatever image shows it, times a shading that
-depends on its normal alone: both are found from all images together (`stages.consensus`), and an image that contradicts them over
-an area shows something else there. What is added light alone, such as a highlight, contradicts nothing. What covers a
-point in every image is told by its colour, far from that of the face's skin. GrabCut (Rother et al. 2004), started
-inside what was found and on the skin around it, one object at a time, then finds the objects' outlines.
+depends on its normal alone: both are found from all images together (`stages.consensus`), and an image that contradicts
+them over an area shows something else there. What is added light alone, such as a highlight, contradicts nothing. What
+covers a point in every image is told by its colour, far from that of the face's skin. GrabCut (Rother et al. 2004),
+started inside what was found and on the skin around it, one object at a time, then finds the objects' outlines.
 
 No network is involved. A capture's own masks (``mask_path``) replace this for the images that have one.
 """
