@@ -1,11 +1,10 @@
-"""Imports go one way, Mitsuba and Dr.Jit come late and only where images are formed, and names mean one thing."""
+"""Imports go one way; Mitsuba and Dr.Jit come late and only where images are formed."""
 
 from __future__ import annotations
 
 import ast
 import subprocess
 import sys
-from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -13,41 +12,34 @@ import pytest
 import mifit
 
 PACKAGE = Path(mifit.__file__).parent
-BASE = {"errors", "progress"}
-DATA = BASE | {"config", "core"}
-FORMATION = {"appearance", "render"}
-MAY_IMPORT = {
-    "errors": set(),
-    "progress": set(),
-    "schema": BASE,
-    "config": BASE | {"schema"},
-    "core": BASE | {"config"},
-    "morphable": DATA,
-    "capture": DATA,
-    "solve": DATA,
-    "appearance": DATA,
-    "checkpoint": DATA | {"appearance"},
-    "render": DATA | {"appearance"},
-    "synth": DATA | FORMATION | {"morphable", "capture"},
-    "stages": DATA | FORMATION | {"morphable", "capture", "solve"},
-    "result": DATA | {"appearance", "morphable"},
-    "output": DATA | FORMATION | {"morphable", "capture", "result"},
-    "reconstruction": DATA | {"morphable", "result", "output"},
-    "steps": DATA | {"morphable", "capture", "checkpoint", "stages"},
-    "tracking": DATA | {"morphable", "capture", "stages", "result"},
-    "resurfacing": DATA | {"capture", "checkpoint", "stages", "result"},
-    "refinement": DATA | {"morphable", "capture", "checkpoint", "stages", "result", "tracking", "resurfacing"},
-    "pipeline": DATA | {"morphable", "capture", "render", "stages", "steps", "reconstruction"},
-    "fitting": DATA | {"morphable", "capture", "result", "reconstruction", "steps", "pipeline"},
-    "experiment_settings": DATA | {"schema"},
-    "plan": DATA | {"schema", "experiment_settings", "morphable", "capture", "checkpoint", "pipeline"},
-    "study": DATA,
-    "experiment": DATA
-    | FORMATION
-    | {"morphable", "capture", "checkpoint", "pipeline", "experiment_settings", "plan", "synth", "output", "study"},
-    "console": BASE | {"core"},
-}
+LAYERS = (
+    {"errors", "progress"},
+    {"schema"},
+    {"config"},
+    {"core"},
+    {"optim", "solve"},
+    {"morphable", "capture"},
+    {"appearance"},
+    {"cache", "checkpoint"},
+    {"render"},
+    {"sampling"},
+    {"synth", "stages", "result"},
+    {"output"},
+    {"reconstruction"},
+    {"steps", "tracking"},
+    {"resurfacing"},
+    {"refinement"},
+    {"pipeline"},
+    {"fitting", "fit"},
+    {"experiment_settings"},
+    {"plan", "study"},
+    {"experiment", "experiments"},
+    {"extras", "console"},
+)
+"""Parts from the lowest to the highest: a part imports only those of lower rows."""
 TOP = {"commands", "cli", "__main__", "__init__"}  # may import everything
+NEVER = {"result": {"render"}, "output": {"stages"}}
+"""Lower parts that a part has no business with: a result renders nothing, what is written fits nothing."""
 KERNELS = {"render", "appearance"}
 """Parts whose functions may import Mitsuba and Dr.Jit."""
 KERNEL_FILES = {
@@ -99,19 +91,15 @@ def part_of(name: str) -> str:
 
 @pytest.mark.parametrize("name", FILES)
 def test_imports_go_one_way(name):
+    """Downwards in LAYERS; so nothing of the core imports extras, and no two parts import one another."""
     part = part_of(name)
     if part in TOP:
         return
-    assert part in MAY_IMPORT, f"say in MAY_IMPORT what mifit.{part} may import"
+    rows = [row for row, parts in enumerate(LAYERS) if part in parts]
+    assert len(rows) == 1, f"say in LAYERS where mifit.{part} stands"
+    lower = set().union(*LAYERS[: rows[0]]) - NEVER.get(part, set())
     parts = {module.split(".")[1] for module in imports_of(TREES[name], types=False) if module != "mifit"}
-    assert parts <= MAY_IMPORT[part] | {part}
-
-
-def test_the_layers_are_in_order():
-    """What a part may import is listed before it, so that no two parts can import one another."""
-    order = list(MAY_IMPORT)
-    for part, allowed in MAY_IMPORT.items():
-        assert all(order.index(other) < order.index(part) for other in allowed)
+    assert parts <= lower | {part}
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -136,39 +124,6 @@ def test_no_modules_import_one_another():
             changed |= bool(more)
             targets |= more
     assert [sorted(o for o in reach[m] if m in reach[o]) for m in reach if m in reach[m]] == []
-
-
-SAME_MEANING = {
-    "main": "the entry of a program",
-    "make": "the class of a Mitsuba plugin, for the current variant",
-    "evaluate": "judging a result", "export": "writing a result for other programs", "relight": "lighting a result",
-    "resect": "placing a camera from landmarks",
-    "calibrate": "estimating cameras", "fit": "fitting a capture", "track": "fitting further timesteps",
-    "landmarks": "the 68 iBUG points",
-    "turntable": "views around a head", "model": "the morphable model", "doctor": "checking the set-up",
-    "save": "writing a stage or a result", "load": "reading a stage or a result",
-    "head": "the making of a head",
-    "refine": "making a fit better with all of its images",
-    "normalization": "the factor of a lobe, plain and as a kernel",
-}  # fmt: skip
-"""Names that several places share because they mean the same there: commands and what they call, and a few more."""
-
-
-NOT_YET = {"Source", "scene", "Surface"}
-"""Names that still mean several things; none may be added."""
-
-
-def test_names_mean_one_thing():
-    """No two modules, classes or public functions of one name, but a module and what it is named after."""
-    places = defaultdict(set)
-    for name, tree in TREES.items():
-        if Path(name).stem not in ("__init__", "__main__"):
-            places[Path(name).stem].add(name)
-        for node in tree.body:
-            if isinstance(node, (ast.ClassDef, ast.FunctionDef)) and not node.name.startswith("_"):
-                places[node.name].add(name)
-    known = SAME_MEANING.keys() | NOT_YET
-    assert {name: sorted(p) for name, p in places.items() if len(p) > 1 and name not in known} == {}
 
 
 def test_importing_mifit_leaves_mitsuba_unloaded():
