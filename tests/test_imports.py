@@ -34,10 +34,10 @@ LAYERS = (
     {"experiment_settings"},
     {"plan", "study"},
     {"experiment", "experiments"},
-    {"extras", "console"},
+    {"extras"},
 )
 """Parts from the lowest to the highest: a part imports only those of lower rows."""
-TOP = {"commands", "cli", "__main__", "__init__"}  # may import everything
+TOP = {"cli", "__main__", "__init__"}  # may import everything
 NEVER = {"result": {"render"}, "output": {"stages"}}
 """Lower parts that a part has no business with: a result renders nothing, what is written fits nothing."""
 KERNELS = {"render", "appearance"}
@@ -127,7 +127,7 @@ def test_no_modules_import_one_another():
 
 
 def test_importing_mifit_leaves_mitsuba_unloaded():
-    code = "import sys, mifit, mifit.cli, mifit.commands; sys.exit(bool({'mitsuba', 'drjit'} & set(sys.modules)))"
+    code = "import sys, mifit, mifit.cli; sys.exit(bool({'mitsuba', 'drjit'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

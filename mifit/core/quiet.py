@@ -1,7 +1,7 @@
 """What C libraries print by themselves while they decode: left alone by the library, dropped by the command line.
 
 Standard error belongs to the program. Redirecting its descriptor from a library would race with the program's other
-threads, so decoders only mark where they run; `mifit.console` decides what that means for the ``mifit`` command.
+threads, so decoders only mark where they run; `mifit.cli.console` decides what that means for the ``mifit`` command.
 """
 
 from __future__ import annotations

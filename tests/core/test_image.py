@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from mifit import console
+from mifit.cli import console
 from mifit.core import quiet
 from mifit.core.image import (
     image_size,

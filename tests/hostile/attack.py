@@ -48,7 +48,7 @@ def preload() -> None:
     import yaml  # noqa: F401
 
     import mifit
-    import mifit.commands
+    import mifit.cli
     import mifit.experiment
     import mifit.output.evaluate
     import mifit.output.export

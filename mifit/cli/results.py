@@ -7,8 +7,9 @@ import sys
 from argparse import Namespace
 from typing import TYPE_CHECKING
 
-from mifit.commands.common import say, use_variant
-from mifit.console import console_progress
+from mifit.cli import arguments as types
+from mifit.cli.arguments import say, use_variant
+from mifit.cli.console import console_progress
 from mifit.core.files import write_text
 from mifit.errors import InputError
 
@@ -170,3 +171,86 @@ def export(arguments: Namespace) -> None:
         fps=arguments.fps,
     )
     print(f"Export: {arguments.out}")
+
+
+def add_commands(add: types.Add) -> None:
+    """Add these commands to the parser."""
+    p = add("evaluate", evaluate, "error on a held-out view")
+    p.add_argument("result", type=types.path, help="result folder of mifit fit")
+    p.add_argument("--capture", type=types.path, required=True, help="capture that has the view")
+    p.add_argument("--camera", required=True, help="camera to judge by, one that was not fitted")
+    p.add_argument(
+        "--timesteps",
+        type=types.timesteps,
+        help="default: all of the result; at one without a fit landmarks place the head",
+    )
+    p.add_argument(
+        "--region", choices=["model", "truth"], default="model", help="whose face area counts (default: model)"
+    )
+    p.add_argument("--baseline", action="store_true", help="compare image-based rendering on the same mesh and pixels")
+    p.add_argument("--json", type=types.path, help="file to write the figures to")
+
+    p = add("render", render, "render a reconstruction from a camera of the capture, or from any side")
+    p.add_argument("result", type=types.path, help="result folder of mifit fit")
+    p.add_argument("--capture", type=types.path, help="capture that --camera is of; default: the fitted cameras")
+    p.add_argument("--camera", help="default: a view of the face from --yaw, --pitch and --distance")
+    p.add_argument("--yaw", type=types.real, help="degrees about the vertical; 0 is the front")
+    p.add_argument("--pitch", type=types.real, help="degrees upwards")
+    p.add_argument(
+        "--distance", type=types.rate, help="from the face, the result's units; default: the fitted cameras'"
+    )
+    p.add_argument("--timestep", type=types.at_least(0), help="default: the first of the result")
+    p.add_argument("--out", type=types.path, required=True, help="image to write: .png (8-bit sRGB) or .exr (linear)")
+    p.add_argument(
+        "--method",
+        choices=["full", "diffuse", "pca"],
+        default="full",
+        help="everything (default), without specular, the model alone",
+    )
+    p.add_argument(
+        "--integrator", choices=["local", "path"], default="local", help="closed form (default) or path tracing"
+    )
+
+    p = add("turntable", turntable, "novel views about the vertical axis, with and without specular")
+    p.add_argument("result", type=types.path, help="result folder of mifit fit")
+    p.add_argument("--out", type=types.path, required=True, help="folder to write")
+    p.add_argument("--from", dest="start", type=types.real, default=-35.0, help="first angle in degrees (default: -35)")
+    p.add_argument("--to", dest="stop", type=types.real, default=35.0, help="last angle in degrees (default: 35)")
+    p.add_argument("--steps", type=types.at_least(1), default=7, help="number of views (default: 7)")
+    p.add_argument(
+        "--sequence",
+        action="store_true",
+        help="play the timesteps while the camera turns: sequence.mp4, one frame per timestep in place of --steps",
+    )
+    types.add_rate(p)
+
+    p = add("view", view, "a live view in the browser: turn the head and the light, switch parts, load an environment")
+    p.add_argument("result", type=types.path, help="result folder")
+    types.add_address(p)
+
+    p = add("relight", relight, "relit views under a measured environment")
+    p.add_argument("result", type=types.path, help="result folder of mifit fit")
+    p.add_argument("--env", type=types.path, required=True, help="lat-long environment, .hdr or .exr")
+    p.add_argument("--out", type=types.path, required=True, help="folder to write")
+    p.add_argument(
+        "--rotate",
+        type=types.real,
+        default=0.0,
+        help="turn the environment about the vertical, degrees (default: 0)",
+    )
+    p.add_argument("--sequence", action="store_true", help="also play the timesteps from the front: sequence.mp4")
+    types.add_rate(p)
+
+    p = add("export", export, "geometry with its maps for other programs")
+    p.add_argument("result", type=types.path, help="result folder of mifit fit")
+    p.add_argument("--format", choices=["glb", "obj", "ply", "mitsuba"], required=True, help="kind of file")
+    p.add_argument("--out", type=types.path, required=True, help="file to write")
+    p.add_argument("--timestep", type=types.at_least(0), help="default: the first of the result")
+    p.add_argument("--animate", action="store_true", help="glb: play all timesteps, from --timestep's maps")
+    types.add_rate(p)
+    p.add_argument(
+        "--mesh",
+        choices=["fitted", "refined"],
+        default="fitted",
+        help="refined: with the refined normals as shape, and its displacement map (default: fitted)",
+    )

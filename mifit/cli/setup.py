@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    pass
+from mifit.cli import arguments as types
 
 
 def doctor(arguments: Namespace) -> int:
@@ -49,3 +48,22 @@ def model(arguments: Namespace) -> None:
         loaded = mifit.MorphableModel.load(arguments.source, **options)
         (with_eyes(loaded) if arguments.eyes else loaded).save(arguments.out)
         print(f"Model: {arguments.out}")
+
+
+def add_commands(add: types.Add) -> None:
+    """Add these commands to the parser."""
+    p = add("doctor", doctor, "what of the set-up works, what doesn't, and the command that mends it")
+    p.add_argument("--json", action="store_true", help="print JSON")
+    p.add_argument("--install", choices=["landmarks"], help="fetch the networks that find landmarks, then check")
+
+    p = add("model", model, "inspect and convert morphable models")
+    actions = p.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=types.Parser)
+    common = types.common_options()
+    q = actions.add_parser("info", help="print a table", parents=[common])
+    q.add_argument("model", help="a path or builtin")
+    q.add_argument("--preview", type=types.path, help="also write a sheet of the mean and the first modes")
+    q = actions.add_parser("convert", help="write a model in mifit's own format", parents=[common])
+    q.add_argument("source", type=types.path, help="file of a model, of any known kind")
+    q.add_argument("out", type=types.path, help="file to write, .npz")
+    q.add_argument("--kind", help="format of SOURCE; default: recognised by content")
+    q.add_argument("--eyes", action="store_true", help="put simple eyes and a mouth's inside where the model has holes")

@@ -1,13 +1,74 @@
-"""Types of command-line arguments: each reads a text, or says in one line what was expected."""
+"""What commands share: options, and types of arguments that read a text or say in one line what was expected."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
-from mifit.core.limits import MAX_TIMESTEPS
+from mifit.core.limits import MAX_SEED, MAX_TIMESTEPS
+
+LONGEST = 1000
+"""Characters of a message; one that quotes more of an input says nothing."""
+Command = Callable[[Namespace], "int | None"]
+"""A command: given its arguments, it returns the exit code; None is 0."""
+Add = Callable[[str, Command, str], argparse.ArgumentParser]
+"""``add(name, command, help)`` adds a command and returns its parser."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Reports bad usage in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the message and leave with code 2."""
+        self.exit(2, f"{self.prog}: {one_line(message)}; see {self.prog} --help\n")
+
+
+def one_line(text: str) -> str:
+    """A message as one line of a terminal: no control characters, and not without end."""
+    line = " ".join(text.split())
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+    return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
+
+
+def common_options() -> Parser:
+    """Options that every command has."""
+    p = Parser(add_help=False)
+    p.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    p.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    p.add_argument(
+        "--variant", default="auto", help="Mitsuba variant; auto: CUDA where it works, else LLVM (default: auto)"
+    )
+    p.add_argument("--threads", type=whole(1, 1024), help="processor cores to use; default: all")
+    p.add_argument("--seed", type=whole(0, MAX_SEED), default=0, help="seed of everything random (default: 0)")
+    return p
+
+
+def add_rate(p: argparse.ArgumentParser) -> None:
+    """Add ``--fps``."""
+    p.add_argument("--fps", type=rate, default=12.0, help="timesteps per second of what moves (default: 12)")
+
+
+def add_address(p: argparse.ArgumentParser) -> None:
+    """Add ``--host`` and ``--port``."""
+    p.add_argument("--host", default="127.0.0.1", help="of the view: address (default: this machine only)")
+    p.add_argument("--port", type=whole(0, 65535), default=8080, help="of the view (default: 8080); 0: a free one")
+
+
+def use_variant(arguments: Namespace) -> str:
+    """Activate the variant that ``--variant`` names; returns its name. VariantError where it can't fit."""
+    from mifit.render.variant import set_fitting_variant
+
+    return set_fitting_variant(arguments.variant)
+
+
+def say(arguments: Namespace, text: str) -> None:
+    """Print a line on standard error unless ``--quiet``."""
+    if not arguments.quiet:
+        print(text, file=sys.stderr, flush=True)
 
 
 def listed(text: str) -> list[str]:

@@ -7,10 +7,11 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mifit.commands.common import say, use_variant
-from mifit.commands.results import judge
+from mifit.cli import arguments as types
+from mifit.cli.arguments import say, use_variant
+from mifit.cli.console import console_progress
+from mifit.cli.results import judge
 from mifit.config import PRESETS, FitConfig, NormalsConfig, ReflectanceConfig, from_mapping
-from mifit.console import console_progress
 from mifit.core.files import check_file
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
@@ -236,3 +237,55 @@ def run(arguments: Namespace) -> None:
         progress=console_progress(arguments.quiet),
     )
     print(summary)
+
+
+def add_commands(add: types.Add) -> None:
+    """Add these commands to the parser."""
+    p = add("demo", demo, "fit a small capture made on the spot, judge it on the held-out view, write a report")
+    p.add_argument("--out", type=types.path, default=Path("out/demo"), help="folder to write (default: out/demo)")
+
+    p = add("fit", fit, "fit geometry, reflectance and normals to a capture")
+    p.add_argument("capture", type=types.path, help="capture folder, or its transforms.json")
+    p.add_argument("--out", type=types.path, required=True, help="result folder to write")
+    p.add_argument(
+        "--config", type=types.path, help="TOML file with tables geometry, reflectance, shape, normals, mesh"
+    )
+    p.add_argument("--preset", choices=["default", "paper"], help="paper: the paper as written")
+    p.add_argument("--model", default="builtin", help="morphable model: a path or builtin (default)")
+    p.add_argument("--cameras", type=types.listed, help="cameras to use, e.g. left,right; default: the first two")
+    p.add_argument(
+        "--timesteps",
+        type=types.timesteps_or_auto,
+        help="e.g. 0,1,2,3 or 0-3, or auto (auto:6): the four (six) that tell most; default: the first four",
+    )
+    p.add_argument(
+        "--until",
+        choices=["geometry", "reflectance", "normals"],
+        default="normals",
+        help="last stage (default: normals, everything)",
+    )
+    p.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
+    p.add_argument("--force", action="store_true", help="replace an existing result")
+    p.add_argument(
+        "--view", action="store_true", help="show the fit in the browser while it is being fitted, and after"
+    )
+    types.add_address(p)
+
+    p = add("track", track, "geometry and normals of further timesteps, reflectance and lighting fixed")
+    p.add_argument("capture", type=types.path, help="capture folder, or its transforms.json")
+    p.add_argument("--result", type=types.path, required=True, help="result folder of mifit fit; extended in place")
+    p.add_argument("--timesteps", type=types.timesteps, help="default: all that aren't in the result yet")
+    p.add_argument("--resume", action="store_true", help="keep the frames that an earlier run has written")
+    p.add_argument(
+        "--refine", action="store_true", help="also add what the frames show to the maps and normals of the result"
+    )
+    p.add_argument("--overlay", type=types.listed, help="cameras to write overlay videos of; default: the fitted ones")
+    types.add_rate(p)
+
+    p = add("run", run, "a scene-file driven experiment or a sweep of them")
+    p.add_argument("experiment", type=types.path, help="experiment file, TOML")
+    p.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="replace a setting; repeat"
+    )
+    p.add_argument("--out", type=types.path, help="folder of the runs; default: out/NAME")
+    p.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")

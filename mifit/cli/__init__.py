@@ -1,0 +1,98 @@
+"""The ``mifit`` command: parsing and exit codes; one module for each kind of command.
+
+Exit codes: 0 success, 2 bad usage or bad input (one line on stderr), 1 a failure of mifit's own, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+
+import mifit
+from mifit.cli import captures, fits, results, setup
+from mifit.cli.arguments import Command, Parser, common_options, one_line
+from mifit.cli.console import drop_chatter
+from mifit.core.allocator import keep_freed_memory
+from mifit.core.files import FULL
+from mifit.errors import InputError, MifitError
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of all commands; ``run`` of what it parses is the command."""
+    parser = Parser(prog="mifit", description="Facial reflectance and geometry from two views.")
+    parser.add_argument("--version", action="version", version=f"mifit {mifit.__version__}")
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="COMMAND", parser_class=Parser, title="commands"
+    )
+    common = common_options()
+
+    def add(name: str, run: Command, text: str) -> argparse.ArgumentParser:
+        p = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".", parents=[common])
+        p.set_defaults(run=run)
+        return p
+
+    for group in (setup, captures, fits, results):
+        group.add_commands(add)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code.
+
+    Without ``argv`` this is the program itself, which owns its process: what C libraries print is dropped.
+    """
+    parser = build_parser()
+    for word in sys.argv[1:] if argv is None else argv:
+        if word.startswith("--") and word.endswith("=--"):  # argparse would make an empty list of it
+            parser.error(f"argument {word[:-3]}: found '--', expected a value")
+    arguments = parser.parse_args(argv)
+    if argv is None:
+        keep_freed_memory()
+        if not arguments.debug:
+            drop_chatter()
+    try:
+        if arguments.threads:
+            from mifit.core.threads import set_threads
+
+            set_threads(arguments.threads)
+        code = arguments.run(arguments) or 0
+        sys.stdout.flush()  # a full disk behind a redirection is met here
+        return code
+    except KeyboardInterrupt:
+        print("mifit: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of our output has gone; nothing is left to say
+        _give_up_unwritten()
+        return 1
+    except Exception as error:
+        if arguments.debug:
+            raise
+        _give_up_unwritten()
+        return _report(error)
+
+
+def _give_up_unwritten() -> None:
+    """Drop output that can't be written: the interpreter would try again at its end, and fail in words of its own."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _report(error: Exception) -> int:
+    """One line on stderr and the exit code that goes with the error."""
+    message = one_line(str(error))
+    if isinstance(error, MifitError):
+        print(f"mifit: {message}", file=sys.stderr)
+        return 2 if isinstance(error, InputError) else 1
+    if isinstance(error, OSError) and (error.filename or error.errno in FULL):
+        place = error.filename or "an output file"
+        print(one_line(f"mifit: {place}: {error.strerror}; what was there is unchanged"), file=sys.stderr)
+        return 2
+    if isinstance(error, MemoryError):
+        print("mifit: not enough memory; use fewer timesteps, smaller images or smaller maps", file=sys.stderr)
+        return 1
+    print(f"mifit: internal error, {type(error).__name__}: {message}; run again with --debug", file=sys.stderr)
+    return 1
