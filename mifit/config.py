@@ -89,16 +89,6 @@ class GeometryConfig:
             )
 
 
-@settings
-class ShapeConfig:
-    """Stage 1 once more with stage 2's light (``stages.refine_shape``), then stage 2 again."""
-
-    rounds: int = number(0, "how often; 0 leaves it out, and one takes about as long as stage 2", least=0, most=10)
-    shading_weight: float = number(
-        0.015, "independent measurements per pixel of shading, whose errors neighbours share", above=0, most=WEIGHT
-    )
-
-
 SHADINGS = ["auto", "paper", "printed", "prefiltered", "shadowed", "keyed", "near", "matt"]
 """What ``shading`` may be; registering a shading model (``appearance.models``) adds its name."""
 
@@ -255,7 +245,6 @@ class FitConfig:
     reflectance: ReflectanceConfig = part(ReflectanceConfig)
     normals: NormalsConfig = part(NormalsConfig)
     mesh: MeshConfig = part(MeshConfig)
-    shape: ShapeConfig = part(ShapeConfig)
     residual: ResidualConfig = part(ResidualConfig)
 
     @classmethod

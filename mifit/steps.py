@@ -29,7 +29,6 @@ from mifit.config import (
     NormalsConfig,
     ReflectanceConfig,
     ResidualConfig,
-    ShapeConfig,
     SurfaceConfig,
 )
 from mifit.core.estimate import (
@@ -142,16 +141,7 @@ def steps(config: FitConfig, until: Stage = "normals") -> list[Step]:
         found.append(Step("falloff", "geometry", ("geometry", *seen), (lenses,), _find_falloff))
     if until == "geometry":
         return found
-    infer = Step("reflectance", "reflectance", ("geometry", *seen), (config.reflectance,), _infer_reflectance)
-    found.append(infer)
-    # How many rounds there are is no matter of a round: those that are done serve when more are asked for.
-    shape = replace(config.shape, rounds=1)
-    for number in range(1, config.shape.rounds + 1):
-        given = ("geometry", "reflectance", *seen)
-        found += [
-            Step(f"geometry_{number}", "geometry", given, (shape, measured), _refine_shape),
-            replace(infer, name=f"reflectance_{number}"),
-        ]
+    found.append(Step("reflectance", "reflectance", ("geometry", *seen), (config.reflectance,), _infer_reflectance))
     if until == "reflectance":
         return found
     found += [
@@ -306,26 +296,6 @@ def _infer_reflectance(source: Source, inputs: Inputs, progress: Progress, confi
         seed=source.seed,
         progress=progress,
     )
-
-
-def _refine_shape(
-    source: Source, inputs: Inputs, progress: Progress, shape: ShapeConfig, geometry: GeometryConfig
-) -> Any:
-    from mifit.stages.eyes import behind_lids
-    from mifit.stages.refine_shape import refine_shape
-
-    found = refine_shape(
-        source.capture,
-        source.model,
-        inputs["geometry"],
-        inputs["reflectance"],
-        source.cameras,
-        shape,
-        geometry,
-        source.seed,
-        progress,
-    )
-    return behind_lids(source.model, found)
 
 
 def _refine_normals(source: Source, inputs: Inputs, progress: Progress, config: NormalsConfig) -> Any:

@@ -37,7 +37,7 @@ def test_the_preset_has_the_papers_settings():
     # lambda_H = 0.001 for maps and images of 0..255, the same for both maps
     assert r.smoothness_weight == pytest.approx(0.001 * 255 / 255**2) and r.specular_smoothness == 1.0
     assert (n.solver, n.laplacian_weight, n.magnitude_weight, n.robust) == ("adam", 1e-3, 0.3, False)
-    assert not paper.surface.enabled and paper.shape.rounds == 0
+    assert not paper.surface.enabled
     assert PRESETS["paper"]() == paper and PRESETS["default"]() == default != paper
 
 

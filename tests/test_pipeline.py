@@ -117,16 +117,16 @@ def test_views_from_one_place_bring_a_warning():
 
 pytestmark = pytest.mark.usefixtures("variant")
 ORDER = (
-    "geometry", "surface", "falloff", "reflectance", "geometry_1", "reflectance_1", "normals", "mesh", "residual",
+    "geometry", "surface", "falloff", "reflectance", "normals", "mesh", "residual",
 )  # fmt: skip
-FIRST = {"geometry": 0, "surface": 1, "reflectance": 3, "shape": 4, "normals": 6, "mesh": 7, "residual": 8}
+FIRST = {"geometry": 0, "surface": 1, "reflectance": 3, "normals": 4, "mesh": 5, "residual": 6}
 """Section of the settings -> the first step that reads it; all later ones depend on that one's estimate."""
 
 
 def another(section, name, value):
     """The settings of one section with one of them changed to something else that is allowed."""
     allowed = {
-        "objective": "paper", "solver": "adam", "shading": "paper", "rounds": value + 1 if name == "rounds" else 0,
+        "objective": "paper", "solver": "adam", "shading": "paper",
         "exponent": 77.0, "subdivisions": 1, "bands": 5, "camera_gains": "always",
     }  # fmt: skip
     if name in allowed:
@@ -138,7 +138,7 @@ def another(section, name, value):
     return dataclasses.replace(section, **{name: changed})
 
 
-BASE = FitConfig(shape=mifit.ShapeConfig(rounds=1))
+BASE = FitConfig()
 SETTINGS = [
     (section.name, setting.name)
     for section in dataclasses.fields(FitConfig)
@@ -160,7 +160,7 @@ class Stages:
         result = dataclasses.replace(ball_result(), residual=residual)
         for module, name, part in (
             ("fit_geometry", "fit_geometry", "geometry"), ("find_surface", "find_surface", "geometry"),
-            ("infer_reflectance", "infer_reflectance", "reflectance"), ("refine_shape", "refine_shape", "geometry"),
+            ("infer_reflectance", "infer_reflectance", "reflectance"),
             ("normals.normal_refinement", "refine_normals", "normals"),
             ("normals.mesh_refinement", "refine_mesh", "mesh"), ("find_residual", "find_residual", "residual"),
         ):  # fmt: skip
@@ -218,8 +218,6 @@ RUNS = (
     "find_surface",
     "find_falloff",
     "infer_reflectance",
-    "refine_shape",
-    "infer_reflectance",
     "refine_normals",
     "refine_mesh",
     "find_residual",
@@ -231,10 +229,7 @@ def test_a_changed_setting_reruns_the_steps_that_depend_on_it(fitted, tmp_path, 
     assert fitted(BASE, tmp_path) == list(RUNS)
     assert fitted(BASE, tmp_path) == []
     ran = fitted(changed_config(section, name), tmp_path)
-    if (section, name) == ("shape", "rounds"):
-        # One round more: those that were done serve, the new one and what comes after it run.
-        assert ran == ["refine_shape", "infer_reflectance", "refine_normals", "refine_mesh", "find_residual"]
-    elif section == "mesh":
+    if section == "mesh":
         assert ran == ["refine_mesh"]  # the residual is that of the fitted mesh
     elif (section, name) == ("residual", "enabled"):
         assert ran == []
@@ -263,7 +258,7 @@ def test_a_changed_source_reruns_everything(change):
 
 def test_stages_that_a_shorter_fit_ran_serve_a_longer_one(fitted, tmp_path):
     assert fitted(BASE, tmp_path, until="geometry") == list(RUNS[:3])
-    assert fitted(BASE, tmp_path, until="reflectance") == list(RUNS[3:6])
+    assert fitted(BASE, tmp_path, until="reflectance") == list(RUNS[3:4])
     assert fitted(BASE, tmp_path) == ["refine_normals", "refine_mesh", "find_residual"]
 
 
@@ -298,8 +293,7 @@ def test_what_comes_after_refined_cameras_sees_through_them(stages, tmp_path):
     estimated = []
     capture = made_up_capture()
     capture.with_estimate = lambda cameras: estimated.append(cameras) or "refined"
-    config = dataclasses.replace(REFINING, shape=mifit.ShapeConfig())
-    found = mifit.fit(capture, ball_result().model, config=config)
+    found = mifit.fit(capture, ball_result().model, config=REFINING)
     again = [
         "fit_geometry", "find_surface", "find_falloff", "infer_reflectance", "refine_normals", "refine_mesh",
         "find_residual",
