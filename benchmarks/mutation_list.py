@@ -11,6 +11,7 @@ STAGES = "mifit/stages/**/*.py"
 SOLVE = "mifit/solve/*.py"
 OUTPUT = "mifit/output/*.py"
 RENDER = "mifit/render/*.py"
+EXTRAS = "mifit/extras/**/*.py"
 ANY = "mifit/**/*.py"
 
 CONVENTIONS = [
@@ -46,10 +47,10 @@ FOREIGN_HEADS = [
     M("the albedo's level left free", STAGES, r"^LEVEL_PRIOR = .*", "LEVEL_PRIOR = 0.0", "tests/stages/test_geometry_terms.py"),
     M("gloss believed that predicts nothing", STAGES, r"told = chosen\.error < \(1\.0 - MARGIN\) \* matt\.error", "told = True",
       "tests/stages/test_infer_reflectance.py"),
-    M("lenses without a prior", CAPTURE, r"noise \* _unlikely\(one, size\)", "0.0 * _unlikely(one, size)",
-      "tests/capture/test_board_adjustment.py"),
-    M("frames out of step kept", CAPTURE, r"OUT_OF_STEP = 0\.5", "OUT_OF_STEP = 500.0",
-      "tests/capture/test_board_adjustment.py"),
+    M("lenses without a prior", EXTRAS, r"noise \* _unlikely\(one, size\)", "0.0 * _unlikely(one, size)",
+      "tests/extras/test_board_adjustment.py"),
+    M("frames out of step kept", EXTRAS, r"OUT_OF_STEP = 0\.5", "OUT_OF_STEP = 500.0",
+      "tests/extras/test_board_adjustment.py"),
 ]  # fmt: skip
 
 MEASURES = [
@@ -274,20 +275,14 @@ NEAR = [
 ]  # fmt: skip
 
 CAMERAS = [
-    M("cameras move where matches don't tell", STAGES, r"ways\[:, squared > least\*\*2\]", "ways",
-      "tests/stages/test_refine_cameras.py"),
-    M("a refined rig stays where the first camera was", STAGES, r"poses = poses @ step", "poses = poses + 0.0 * step",
-      "tests/stages/test_refine_cameras.py"),
-    M("a camera's turn is taken for one about the origin", STAGES, r"moved\[3:, :3\] = cross_matrix\(shift\)", "pass",
-      "tests/stages/test_refine_cameras.py"),
-    M("refined cameras kept though nothing is better", STAGES, r"if judged\[1\] > BETTER \* judged\[0\] or", "if False and",
-      "tests/stages/test_refine_cameras.py"),
-    M("later steps don't see refined cameras", "mifit/steps.py", r'if "cameras" not in inputs or', "if True or",
-      "tests/test_pipeline.py"),
-    M("refined cameras forced on another calibration", CAPTURE, r"all\(self\.camera\(camera\.name\) == camera for",
-      "all(True for", "tests/capture/test_capture.py"),
-    M("results forget the calibration they refined", "mifit/result/*.py", r'capture\.get\("calibration", \[\]\)', "[]",
-      "tests/test_pipeline.py"),
+    M("cameras move where matches don't tell", EXTRAS, r"ways\[:, squared > least\*\*2\]", "ways",
+      "tests/extras/test_refine_cameras.py"),
+    M("a refined rig stays where the first camera was", EXTRAS, r"poses = poses @ step", "poses = poses + 0.0 * step",
+      "tests/extras/test_refine_cameras.py"),
+    M("a camera's turn is taken for one about the origin", EXTRAS, r"moved\[3:, :3\] = cross_matrix\(shift\)", "pass",
+      "tests/extras/test_refine_cameras.py"),
+    M("refined cameras kept though nothing is better", EXTRAS, r"if judged\[1\] > BETTER \* judged\[0\] or", "if False and",
+      "tests/extras/test_refine_cameras.py"),
 ]  # fmt: skip
 
 TIME = [
@@ -301,15 +296,15 @@ TIME = [
 
 VIDEO = [
     M("a bias told in pixels alone", STAGES, r"SCATTER_OF_FACE \* float\(", "0.0 * float(", "tests/stages/test_find_surface.py -k bias"),
-    M("a surface swept again is always kept", STAGES, r"kept = between\[1\] < between\[0\]", "kept = True",
-      "tests/stages/test_sweep_again.py"),
-    M("what judges is swept too", STAGES, r"swept = \[t for t in geometry\.timesteps if t not in judged\]",
-      "swept = list(geometry.timesteps)", "tests/stages/test_sweep_again.py"),
-    M("more timesteps are more certain", STAGES, r"found\.precision \* min\(1\.0, self\._count_as / len\(posed\)\)",
-      "found.precision", "tests/stages/test_sweep_again.py"),
-    M("frames that disagree are swept", ANY, r"if apart\(one\) < DISAGREES \* usual:", "if True:", "tests/test_resurfacing.py"),
+    M("a surface swept again is always kept", EXTRAS, r"kept = between\[1\] < between\[0\]", "kept = True",
+      "tests/extras/test_sweep_again.py"),
+    M("what judges is swept too", EXTRAS, r"swept = \[t for t in geometry\.timesteps if t not in judged\]",
+      "swept = list(geometry.timesteps)", "tests/extras/test_sweep_again.py"),
+    M("more timesteps are more certain", EXTRAS, r"found\.precision \* min\(1\.0, self\._count_as / len\(posed\)\)",
+      "found.precision", "tests/extras/test_sweep_again.py"),
+    M("frames that disagree are swept", ANY, r"if apart\(one\) < DISAGREES \* usual:", "if True:", "tests/extras/test_resurfacing.py"),
     M("timesteps that aren't swept stay on the old surface", ANY, r"on_surface\(model, posed\.at\(\(timestep,\)\), found\.displacement\)",
-      "on_surface(model, posed.at((timestep,)), geometry.displacement)", "tests/test_resurfacing.py"),
+      "on_surface(model, posed.at((timestep,)), geometry.displacement)", "tests/extras/test_resurfacing.py"),
 ]  # fmt: skip
 
 GLOSS = [

@@ -35,9 +35,9 @@ from mifit import Capture, FitConfig, MorphableModel, Reconstruction
 from mifit.core.files import write_text
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import rasterize_uv
+from mifit.extras.refine import Refinement, refine
 from mifit.fitting import fit_into
 from mifit.output.evaluate import evaluate
-from mifit.refinement import Refinement, refine
 
 CAMERAS = ("left", "right")
 FITTED = 4

@@ -34,7 +34,7 @@ _EXPORTS = {
     "load_scene": "mifit.render.scene",
     "fit": "mifit.pipeline",
     "track": "mifit.stages.track",
-    "refine": "mifit.refinement",
+    "refine": "mifit.extras.refine",
     "choose_frames": "mifit.capture.choose_frames",
     "fit_geometry": "mifit.stages.fit_geometry",
     "find_surface": "mifit.stages.find_surface",

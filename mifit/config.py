@@ -50,11 +50,6 @@ class GeometryConfig:
         True,
         "find cameras whose response surely has another contrast than the first one's, and take it out",
     )
-    refine_cameras: bool = flag(
-        False,
-        "adjust poses and focal lengths of two or more calibrated cameras by dense matches between them, with the "
-        "calibration as a prior, and fit again where matches that were left out agree better then",
-    )
     landmark_weight: float = number(10.0, "objective paper: weight of the landmarks", least=0, most=WEIGHT)
     prior_weight: float = number(5e-5, "objective paper: weight of the model's prior", least=0, most=WEIGHT)
     pixels: int = number(2000, "objective paper: facial pixels per image, chosen at random", least=1, most=1_000_000)

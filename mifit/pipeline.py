@@ -26,14 +26,11 @@ if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
     from mifit.reconstruction import Reconstruction
     from mifit.result import Result
-    from mifit.stages.calibrate_densely import DenseCalibration
 
 T = TypeVar("T")
 ESTIMATED_CAMERAS = "the capture is uncalibrated: focal length, camera poses and so the scale are estimates"
 BASELINE_DEGREES = 3.0
 """Angle between the views below which a person is told that distance is not measured."""
-CALIBRATION_MODES = 30
-"""Identity modes that may move with the cameras when those are estimated from landmarks."""
 
 
 @one_blas_thread()
@@ -110,18 +107,18 @@ def fit(
     given, model = model, fitted_model(model, config)
     estimated: tuple[str, ...] = ()
     if not capture.calibrated:
-        dense = calibrated(capture, model, cameras, timesteps, progress)
+        from mifit.extras.calibrate_densely import calibrate_capture
+
+        dense = calibrate_capture(capture, model, cameras, timesteps, progress)
         capture, estimated = dense.capture, (ESTIMATED_CAMERAS, dense.note)
     source = Source(capture, digest, model, cameras, timesteps, seed)
 
     def result(estimates: Mapping[Part, Any], seconds: float = 0.0) -> Reconstruction:
-        views, refined = tuple(capture.camera(name) for name in cameras), estimates.get("cameras")
         return Reconstruction(
             model=model,
-            **{part: estimate for part, estimate in cast(dict, estimates).items() if part != "cameras"},
+            **cast(dict, estimates),
             config={**dataclasses.asdict(config), "seed": seed},
-            cameras=views if refined is None else tuple(map(refined.refined, views)),
-            calibration=views if refined is not None and refined.names else (),
+            cameras=tuple(capture.camera(name) for name in cameras),
             capture_digest=digest,
             model_source=model.source,
             units=capture.units,
@@ -149,23 +146,6 @@ def fit(
         report = dataclasses.replace(geometry.report, details=details)
         estimates["geometry"] = dataclasses.replace(geometry, report=report)
     return result(estimates, seconds)
-
-
-def calibrated(
-    capture: Capture,
-    model: MorphableModel,
-    cameras: Sequence[str],
-    timesteps: Sequence[int],
-    progress: Progress = silent,
-) -> DenseCalibration:
-    """An uncalibrated capture with cameras estimated from landmarks and the model's, then from dense matches."""
-    from mifit.capture.calibrate import calibrate_heads
-    from mifit.stages.calibrate_densely import calibrate_densely
-
-    scale = model.unit_mm / capture.unit_mm
-    mean, modes = model.mean[model.landmarks], model.identity[model.landmarks][..., :CALIBRATION_MODES]
-    start = calibrate_heads(capture, scale * mean, scale * modes, cameras, timesteps)
-    return calibrate_densely(start, model, cameras, timesteps, progress)
 
 
 def check_images(capture: Capture, cameras: Sequence[str], timesteps: Sequence[int]) -> None:

@@ -1,7 +1,7 @@
 """The steps of a fit: a list of what runs, with which inputs and settings, and the cache that skips what is done.
 
 A step sees nothing but what it is given: the source (capture, model, cameras, timesteps, seed), the estimates that it
-names as inputs, and its settings. One that names refined cameras sees the capture with them. The key of its checkpoint
+names as inputs, and its settings. The key of its checkpoint
 is made of exactly these, so that any change of one runs it anew, with all that depends on it, and a change of anything
 else doesn't.
 
@@ -32,7 +32,6 @@ from mifit.config import (
     SurfaceConfig,
 )
 from mifit.core.estimate import (
-    CamerasEstimate,
     GeometryEstimate,
     MeshEstimate,
     NormalsEstimate,
@@ -47,10 +46,9 @@ if TYPE_CHECKING:
 
 Stage = Literal["geometry", "reflectance", "normals"]
 STAGES: tuple[Stage, ...] = ("geometry", "reflectance", "normals")
-Part = Literal["geometry", "cameras", "reflectance", "normals", "mesh", "residual"]
+Part = Literal["geometry", "reflectance", "normals", "mesh", "residual"]
 PARTS: dict[Part, type] = {
     "geometry": GeometryEstimate,
-    "cameras": CamerasEstimate,
     "reflectance": ReflectanceEstimate,
     "normals": NormalsEstimate,
     "mesh": MeshEstimate,
@@ -125,31 +123,23 @@ class Step:
 
 def steps(config: FitConfig, until: Stage = "normals") -> list[Step]:
     """The steps of a fit with these settings, in order."""
-    measured = replace(config.geometry, refine_cameras=False, falloff=False, contrast=False)
+    measured = replace(config.geometry, falloff=False, contrast=False)
     found = [Step("geometry", "geometry", (), (measured,), _fit_geometry)]
     if config.surface.enabled:
         found.append(Step("surface", "geometry", ("geometry",), (config.surface, measured), _find_surface))
-    seen: tuple[Part, ...] = ()
-    if config.geometry.refine_cameras:
-        seen = ("cameras",)
-        found += [
-            Step("cameras", "cameras", ("geometry",), (), _refine_cameras),
-            Step("geometry_refined", "geometry", ("geometry", *seen), (config.surface, measured), _fit_refined),
-        ]
     if config.geometry.falloff or config.geometry.contrast:
-        lenses = replace(config.geometry, refine_cameras=False)
-        found.append(Step("falloff", "geometry", ("geometry", *seen), (lenses,), _find_falloff))
+        found.append(Step("falloff", "geometry", ("geometry",), (config.geometry,), _find_falloff))
     if until == "geometry":
         return found
-    found.append(Step("reflectance", "reflectance", ("geometry", *seen), (config.reflectance,), _infer_reflectance))
+    found.append(Step("reflectance", "reflectance", ("geometry",), (config.reflectance,), _infer_reflectance))
     if until == "reflectance":
         return found
     found += [
-        Step("normals", "normals", ("geometry", "reflectance", *seen), (config.normals,), _refine_normals),
+        Step("normals", "normals", ("geometry", "reflectance"), (config.normals,), _refine_normals),
         Step("mesh", "mesh", ("geometry", "normals"), (config.mesh,), _refine_mesh),
     ]
     if config.residual.enabled:
-        given = ("geometry", "reflectance", "normals", *seen)
+        given: tuple[Part, ...] = ("geometry", "reflectance", "normals")
         found.append(Step("residual", "residual", given, (config.residual,), _find_residual))
     return found
 
@@ -221,15 +211,12 @@ def run_steps(
 
 
 def _seen(source: Source, inputs: Inputs) -> Source:
-    """The source with refined cameras and without exposures, falloff and contrast found, where a step is given any."""
+    """The source without the exposures, falloff and contrast that its geometry has found."""
     found = inputs.get("geometry")
-    if found is not None and found.corrects_images:
-        capture = source.capture.with_exposures(found.exposed).with_lenses(found.falloff, found.contrast)
-        source = replace(source, capture=capture)
-    if "cameras" not in inputs or not inputs["cameras"].names:
+    if found is None or not found.corrects_images:
         return source
-    capture, cameras = source.capture, inputs["cameras"]
-    return replace(source, capture=capture.with_estimate([cameras.refined(capture.camera(n)) for n in cameras.names]))
+    capture = source.capture.with_exposures(found.exposed).with_lenses(found.falloff, found.contrast)
+    return replace(source, capture=capture)
 
 
 def _alone(path: Path) -> contextlib.AbstractContextManager:
@@ -256,26 +243,6 @@ def _find_surface(
 
     found = find_surface(source.capture, source.model, inputs["geometry"], source.cameras, config, progress, geometry)
     return behind_lids(source.model, found)
-
-
-def _refine_cameras(source: Source, inputs: Inputs, progress: Progress) -> Any:
-    from mifit.stages.refine_cameras import refine_cameras
-
-    return refine_cameras(source.capture, source.model, inputs["geometry"], source.cameras, progress)
-
-
-def _fit_refined(
-    source: Source, inputs: Inputs, progress: Progress, surface: SurfaceConfig, geometry: GeometryConfig
-) -> Any:
-    from mifit.stages.refine_cameras import reported
-
-    first, cameras = inputs["geometry"], inputs["cameras"]
-    if not cameras.names:
-        return reported(first, cameras)
-    found = _fit_geometry(source, {}, progress, geometry)
-    if surface.enabled:
-        found = _find_surface(source, {"geometry": found}, progress, surface, geometry)
-    return reported(found, cameras, first.report.seconds)
 
 
 def _find_falloff(source: Source, inputs: Inputs, progress: Progress, config: GeometryConfig) -> Any:

@@ -12,7 +12,7 @@ from mifit.core.threads import set_threads, threads
 from tests.variant import VARIANT
 
 LONGEST = (
-    "tests/docs/test_commands.py", "tests/stages/test_find_surface.py", "tests/capture/test_boards.py",
+    "tests/docs/test_commands.py", "tests/stages/test_find_surface.py", "tests/extras/test_boards.py",
     "tests/test_experiment_page.py", "tests/stages/test_fit_geometry.py", "tests/test_experiment.py",
     "tests/test_foreign.py", "tests/hostile/test_promises.py", "tests/test_resume.py",
 )  # fmt: skip

@@ -27,14 +27,12 @@ LAYERS = (
     {"output"},
     {"reconstruction"},
     {"steps", "tracking"},
-    {"resurfacing"},
-    {"refinement"},
+    {"extras"},
     {"pipeline"},
     {"fitting", "fit"},
     {"experiment_settings"},
     {"plan", "study"},
     {"experiment", "experiments"},
-    {"extras"},
 )
 """Parts from the lowest to the highest: a part imports only those of lower rows."""
 TOP = {"cli", "__main__", "__init__"}  # may import everything
@@ -44,8 +42,8 @@ KERNELS = {"render", "appearance"}
 """Parts whose functions may import Mitsuba and Dr.Jit."""
 KERNEL_FILES = {
     f"stages/{name}.py"
-    for name in ("absorb/linear", "normals/chart", "normals/problem", "normals/solvers", "reflectance/adam")
-}
+    for name in ("normals/chart", "normals/problem", "normals/solvers", "reflectance/adam")
+} | {"extras/absorb/linear.py"}
 """Further files that may, relative to the package: solvers of stages."""
 
 FILES = {str(path.relative_to(PACKAGE)): path for path in sorted(PACKAGE.rglob("*.py"))}
@@ -111,6 +109,16 @@ def test_mitsuba_and_drjit_are_imported_late_and_only_by_what_forms_images(name)
     for node in TREES[name].body:
         if isinstance(node, (ast.Import, ast.ImportFrom)):
             assert not {n.split(".")[0] for n in imported_names(node)} & kernels
+
+
+def test_the_core_does_without_extras():
+    """Commands load them when they are wanted, and `mifit.fit` for a capture without calibration."""
+    users = {part_of(name) for name in FILES if any(m.startswith("mifit.extras") for m in imports_of(TREES[name]))}
+    assert users <= {"extras", "cli", "pipeline", "fit"}
+    for name, tree in TREES.items():
+        top = [node for node in tree.body if isinstance(node, (ast.Import, ast.ImportFrom))]
+        early = {found for node in top for found in imports_of(ast.Module([node], []))}
+        assert part_of(name) == "extras" or not any(module.startswith("mifit.extras") for module in early)
 
 
 def test_no_modules_import_one_another():

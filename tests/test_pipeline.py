@@ -8,7 +8,7 @@ import pytest
 
 import mifit
 from mifit.config import FitConfig
-from mifit.core.estimate import CamerasEstimate, GeometryEstimate, Report, ResidualEstimate
+from mifit.core.estimate import GeometryEstimate, Report, ResidualEstimate
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs, with_eyes
@@ -169,10 +169,6 @@ class Stages:
             "mifit.stages.falloff.find_falloff",
             lambda capture, model, geometry, *_: self.stand_in("find_falloff", geometry)(capture),
         )
-        self.cameras = CamerasEstimate((), np.zeros((0, 2)), np.zeros((0, 4, 4)), Report("converged"))
-        monkeypatch.setattr(
-            "mifit.stages.refine_cameras.refine_cameras", lambda *_: self.ran.append("refine_cameras") or self.cameras
-        )
 
     def stand_in(self, name, estimate):
         def run(capture, *arguments, **options):
@@ -233,8 +229,6 @@ def test_a_changed_setting_reruns_the_steps_that_depend_on_it(fitted, tmp_path, 
         assert ran == ["refine_mesh"]  # the residual is that of the fitted mesh
     elif (section, name) == ("residual", "enabled"):
         assert ran == []
-    elif (section, name) == ("geometry", "refine_cameras"):
-        assert ran == ["refine_cameras", *RUNS[2:]]  # from the fit that was there, which serves where cameras stay
     elif (section, name) == ("surface", "enabled"):
         assert ran == list(RUNS[2:])
     elif (section, name) in (("geometry", "falloff"), ("geometry", "contrast")):
@@ -263,58 +257,9 @@ def test_stages_that_a_shorter_fit_ran_serve_a_longer_one(fitted, tmp_path):
 
 
 def test_a_step_is_given_what_its_key_is_made_of():
-    """Names of inputs and settings are those that its function takes: there is nothing else that it could read.
-
-    Refined cameras are given to a step with its capture.
-    """
-    for step in (*steps(BASE), *steps(REFINING)):
+    """Names of inputs and settings are those that its function takes: there is nothing else that it could read."""
+    for step in steps(BASE):
         code = step.run.__code__
         assert step.run.__closure__ is None and code.co_argcount == 3 + len(step.settings)
         read = {c for c in code.co_consts if c in PARTS}
-        assert read | {"cameras"} == {*step.inputs, "cameras"} and read <= set(step.inputs)
-
-
-REFINING = dataclasses.replace(BASE, geometry=mifit.GeometryConfig(refine_cameras=True))
-
-
-def test_steps_that_read_images_are_given_refined_cameras():
-    given = {step.name: "cameras" in step.inputs for step in steps(REFINING)}
-    assert [name for name, cameras in given.items() if not cameras] == ["geometry", "surface", "cameras", "mesh"]
-
-
-def test_what_comes_after_refined_cameras_sees_through_them(stages, tmp_path):
-    """The fit is done again with them, the result has them, and a result that is read back too."""
-    truth = {c.name: c for c in ball_result().cameras}
-    poses = np.array([ball_camera(name, degrees).world_to_camera for name, degrees in (("left", -21), ("right", 20.5))])
-    focal = np.array([(1.01 * c.fx, 1.01 * c.fy) for c in truth.values()])
-    stages.cameras = CamerasEstimate(
-        tuple(truth), focal, poses, Report("converged", {}, 2.0, ("moved",), {"kept": None})
-    )
-    estimated = []
-    capture = made_up_capture()
-    capture.with_estimate = lambda cameras: estimated.append(cameras) or "refined"
-    found = mifit.fit(capture, ball_result().model, config=REFINING)
-    again = [
-        "fit_geometry", "find_surface", "find_falloff", "infer_reflectance", "refine_normals", "refine_mesh",
-        "find_residual",
-    ]  # fmt: skip
-    assert stages.ran == [*again[:2], "refine_cameras", *again]
-    saw = dict(zip(again, stages.saw[2:], strict=True))
-    assert stages.saw[:2] == [capture, capture]
-    assert all(seen == "refined" for name, seen in saw.items() if name != "refine_mesh")
-    assert list(found.cameras) == estimated[0] and found.calibration == tuple(truth.values())
-    assert [c.fx for c in found.cameras] == pytest.approx([1.01 * c.fx for c in truth.values()])
-    np.testing.assert_array_equal(found.cameras[1].world_to_camera, poses[1])
-    report = found.geometry.report
-    assert "moved" in report.warnings and report.details["phases"][-1]["name"] == "cameras"
-    once = ball_result().geometry.report.seconds
-    assert report.seconds == pytest.approx(2 * once)
-    found.save(tmp_path / "result")
-    back = mifit.Reconstruction.load(tmp_path / "result", found.model)
-    assert back.cameras == found.cameras and back.calibration == found.calibration
-
-
-def test_a_fit_that_refines_no_cameras_has_no_other_calibration(stages):
-    found = mifit.fit(made_up_capture(), ball_result().model, config=REFINING)  # matches agree with it
-    assert found.calibration == () and found.cameras == ball_result().cameras
-    assert stages.ran == ["fit_geometry", "find_surface", "refine_cameras", *RUNS[2:]]
+        assert read == set(step.inputs)

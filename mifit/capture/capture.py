@@ -209,8 +209,8 @@ class Capture:
         if not view.calibrated:
             missing = "intrinsics (fl_x ...)" if view.intrinsics is None else "pose (transform_matrix)"
             raise InputError(
-                f"{self.path}: camera {name!r} has no {missing}; estimate it with mifit.capture.calibrate or import "
-                "the capture with its calibration"
+                f"{self.path}: camera {name!r} has no {missing}; estimate it with mifit calibrate or import the "
+                "capture with its calibration"
             )
         return view.camera()
 
@@ -264,7 +264,7 @@ class Capture:
         return result.hexdigest()
 
     def with_estimate(self, cameras: Sequence[Camera]) -> Capture:
-        """The same capture with estimated cameras, refined ones included; whether it is `calibrated` stays as it is."""
+        """The same capture with estimated cameras; whether it is `calibrated` stays as it is."""
         return dataclasses.replace(self, estimated={camera.name: camera for camera in cameras}, _cache=self._cache)
 
     def with_exposures(self, exposures: Mapping[tuple[str, int], float]) -> Capture:
@@ -277,18 +277,9 @@ class Capture:
             return self
         return dataclasses.replace(self, falloff=dict(falloff), contrast=dict(contrast), _cache=self._cache)
 
-    def with_fitted(self, cameras: Sequence[Camera], calibration: Sequence[Camera] = ()) -> Capture:
-        """The capture as a fit with these cameras saw it: its own calibration, or else the estimated cameras.
-
-        Cameras that were refined from a ``calibration`` take the place of the capture's own where these are the same
-        still: one that was calibrated anew, or another capture's, stands.
-        """
-        if not self.calibrated:
-            return self.with_estimate(cameras) if cameras else self
-        named = set(self.views) >= {camera.name for camera in calibration}
-        if calibration and named and all(self.camera(camera.name) == camera for camera in calibration):
-            return self.with_estimate(cameras)
-        return self
+    def with_fitted(self, cameras: Sequence[Camera]) -> Capture:
+        """The capture as a fit with these cameras saw it: its own calibration, or else the estimated cameras."""
+        return self if self.calibrated or not cameras else self.with_estimate(cameras)
 
     def save(self) -> None:
         """Write ``transforms.json`` anew (whole or not at all); images and landmarks stay as they are."""

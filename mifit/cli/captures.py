@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from argparse import Namespace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mifit.cli import arguments as types
 from mifit.cli.arguments import use_variant
 from mifit.cli.console import console_progress
 from mifit.core.limits import MAX_RENDERED_PIXELS, MAX_SAMPLES
 from mifit.errors import InputError
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
 
 
 def synth(arguments: Namespace) -> None:
@@ -110,9 +115,9 @@ def calibrate(arguments: Namespace) -> None:
     if arguments.capture is not None:
         _calibrate_from_heads(arguments)
         return
-    from mifit.capture.board_calibration import calibrate_boards, write_calibration
-    from mifit.capture.boards import Board
     from mifit.capture.sources import open_sources
+    from mifit.extras.board_calibration import calibrate_boards, write_calibration
+    from mifit.extras.boards import Board
 
     out: Path | None = arguments.out
     board = Board.parse(arguments.board)
@@ -135,17 +140,22 @@ def calibrate(arguments: Namespace) -> None:
 
 def _calibrate_from_heads(arguments: Namespace) -> None:
     import mifit
-    from mifit.capture.place import calibrate_others, write_cameras
-    from mifit.pipeline import calibrated, choose, choose_timesteps
+    from mifit.extras.calibrate_densely import calibrate_capture
+    from mifit.extras.place import calibrate_others, write_cameras
+    from mifit.pipeline import choose, choose_timesteps
 
     capture = mifit.Capture.load(arguments.capture)
-    if capture.calibrated:
-        raise InputError(f"{arguments.capture}: is calibrated already; nothing to do")
+    if capture.calibrated != arguments.refine:
+        state = "calibrated already; --refine adjusts it" if capture.calibrated else "uncalibrated; leave out --refine"
+        raise InputError(f"{arguments.capture}: is {state}")
     cameras = choose("camera", capture.cameras, arguments.cameras, 2)
     timesteps = choose_timesteps(capture, arguments.timesteps)
     use_variant(arguments)
     model = mifit.MorphableModel.load(arguments.model)
-    dense = calibrated(capture, model, cameras, timesteps, console_progress(arguments.quiet))
+    if arguments.refine:
+        _refine_calibration(arguments, capture, model, cameras, timesteps)
+        return
+    dense = calibrate_capture(capture, model, cameras, timesteps, console_progress(arguments.quiet))
     capture = dense.capture
     found = calibrate_others(capture, cameras, timesteps)
     write_cameras(arguments.capture, capture, [camera for camera, _ in found.values()])
@@ -154,6 +164,34 @@ def _calibrate_from_heads(arguments: Namespace) -> None:
         print(f"{name}: {role}, focal length {camera.fx:.0f} pixels, landmarks {error:.1f} pixels beside the others'")
     print(dense.note[0].upper() + dense.note[1:])
     print(f"Capture: {arguments.capture}; its scale is the model's, its cameras are estimates")
+
+
+def _refine_calibration(
+    arguments: Namespace,
+    capture: Capture,
+    model: MorphableModel,
+    cameras: tuple[str, ...],
+    timesteps: tuple[int, ...],
+) -> None:
+    """Fit the geometry with the calibration as it is, and adjust that where dense matches agree better then."""
+    import mifit
+    from mifit.core.files import write_bytes
+    from mifit.extras.place import write_cameras
+    from mifit.extras.refine_cameras import refine_cameras
+
+    folder: Path = arguments.capture
+    file = folder if folder.is_file() else folder / "transforms.json"
+    before = file.with_name("transforms_before.json")
+    if before.exists():
+        raise InputError(f"{before}: is there already, from an adjustment before; move it away first")
+    progress = console_progress(arguments.quiet)
+    geometry = mifit.fit(capture, model, cameras, timesteps, until="geometry", progress=progress).geometry
+    found = refine_cameras(capture, model, geometry, cameras, progress)
+    print(found.finding[0].upper() + found.finding[1:])
+    if found.cameras:
+        write_bytes(before, file.read_bytes())
+        write_cameras(file, capture, found.cameras)
+        print(f"Capture: {file}; the calibration as it was: {before}")
 
 
 def landmarks(arguments: Namespace) -> None:
@@ -241,10 +279,8 @@ def add_commands(add: types.Add) -> None:
     p.add_argument("--count", type=types.at_least(1), help="number of frames to keep")
     p.add_argument("--out", type=types.path, required=True, help="capture folder to write")
 
-    p = add(
-        "calibrate", calibrate, "cameras from a calibration board, or of an uncalibrated capture from the heads in it"
-    )
-    p.add_argument("capture", type=types.path, nargs="?", help="uncalibrated capture; the cameras are written into it")
+    p = add("calibrate", calibrate, "cameras from a calibration board, or of a capture from the heads in it")
+    p.add_argument("capture", type=types.path, nargs="?", help="the cameras are written into it")
     p.add_argument(
         "--video", type=types.path, action="append", default=[], help="one camera's video of the board; repeat"
     )
@@ -260,6 +296,12 @@ def add_commands(add: types.Add) -> None:
     p.add_argument("--model", default="builtin", help="of a capture: morphable model, a path or builtin (default)")
     p.add_argument("--cameras", type=types.listed, help="of a capture: cameras that decide; default: the first two")
     p.add_argument("--timesteps", type=types.timesteps, help="of a capture: timesteps to use; default: the first four")
+    p.add_argument(
+        "--refine",
+        action="store_true",
+        help="of a calibrated capture: adjust poses and focal lengths to dense matches between the views, where these "
+        "agree better then; the calibration as it was is kept beside it",
+    )
     p.add_argument("--out", type=types.path, help="of a board: folder to write")
 
     p = add("landmarks", landmarks, "detect 68 landmarks in every image and write them into the capture")

@@ -132,7 +132,7 @@ def fit(arguments: Namespace) -> None:
         timesteps = _chosen(arguments, capture, timesteps)
     progress, view = console_progress(arguments.quiet), None
     if arguments.view:
-        from mifit.output.live_view import FitView
+        from mifit.extras.live_view import FitView
 
         view = FitView(progress, lambda address: print(f"View: {address}", flush=True), arguments.host, arguments.port)
     result = fit_into(
@@ -152,7 +152,7 @@ def fit(arguments: Namespace) -> None:
     write_report(out, result, capture)
     print(f"Result: {out}", flush=True)
     if view:
-        from mifit.output.live_view import serve
+        from mifit.extras.live_view import serve
 
         view.watch(result)  # where nothing had to be fitted it is the first
         assert view.live is not None
@@ -185,7 +185,7 @@ def track(arguments: Namespace) -> None:
     from mifit.tracking import sequence_left, track_into
 
     for name in arguments.overlay or ():  # an unknown one is refused now, not after the work
-        capture.with_fitted(result.cameras, result.calibration).camera(name)
+        capture.with_fitted(result.cameras).camera(name)
     timesteps = sequence_left(result, capture, arguments.resume)
     if arguments.timesteps:
         timesteps = choose("timestep", capture.timesteps, arguments.timesteps, 0)
@@ -209,8 +209,8 @@ def track(arguments: Namespace) -> None:
 
 def _with_refined(arguments: Namespace, result: Reconstruction, capture: Capture, progress: Progress) -> Reconstruction:
     """The result with all of its frames absorbed into its maps and normals, written into its folder."""
+    from mifit.extras.refine import refine
     from mifit.output.report import write_report
-    from mifit.refinement import refine
     from mifit.result.ownership import CHECKPOINTS, locked
 
     folder: Path = arguments.result

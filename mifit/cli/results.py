@@ -89,7 +89,7 @@ def render(arguments: Namespace) -> None:
     if not arguments.camera:
         camera = result.orbit(**turned, timestep=timestep)
     elif arguments.capture:
-        capture = mifit.Capture.load(arguments.capture).with_fitted(result.cameras, result.calibration)
+        capture = mifit.Capture.load(arguments.capture).with_fitted(result.cameras)
         camera = capture.camera(arguments.camera)
     else:
         camera = result.camera(arguments.camera)
@@ -127,7 +127,7 @@ def turntable(arguments: Namespace) -> None:
 def view(arguments: Namespace) -> None:
     """Show a result in the browser until the user ends it."""
     result = _result_and_variant(arguments)
-    from mifit.output.live_view import LiveView, serve
+    from mifit.extras.live_view import LiveView, serve
 
     live = LiveView(result, arguments.host, arguments.port)
     print(f"View: {live.address}", flush=True)

@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.camera import Camera
-
 if TYPE_CHECKING:
     from mifit.appearance.illumination import Illumination
     from mifit.appearance.lobe import Lobe
@@ -144,34 +142,6 @@ class GeometryEstimate:
             vertices=self.vertices[rows],
             exposures={name: tuple(factors[k] for k in rows) for name, factors in self.exposures.items()},
         )
-
-
-@dataclass(frozen=True)
-class CamerasEstimate:
-    """Calibrated cameras that matches have adjusted (`stages.refine_cameras`).
-
-    Attributes
-    ----------
-    names : tuple of str
-        Empty where the calibration stays.
-    focal : (C, 2)
-        Focal lengths fx and fy, pixels of the undistorted images.
-    world_to_camera : (C, 4, 4)
-        OpenCV axes.
-    """
-
-    names: tuple[str, ...]
-    focal: NDArray
-    world_to_camera: NDArray
-    report: Report
-
-    def refined(self, camera: Camera) -> Camera:
-        """A camera as it was refined, or as it is."""
-        if camera.name not in self.names:
-            return camera
-        k = self.names.index(camera.name)
-        fx, fy = map(float, self.focal[k])
-        return replace(camera, fx=fx, fy=fy, world_to_camera=self.world_to_camera[k])
 
 
 @dataclass(frozen=True)

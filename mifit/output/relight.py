@@ -207,7 +207,7 @@ def evaluate_relit(
     if camera in [c.name for c in reconstruction.cameras]:
         raise InputError(f"camera {camera}: was fitted; expected another one to judge by")
     lit = relit(reconstruction, environment, rotate)
-    capture = capture.with_fitted(reconstruction.cameras, reconstruction.calibration)
+    capture = capture.with_fitted(reconstruction.cameras)
     steps = [t for t in lit.timesteps if t in capture.timesteps]
     if not steps:
         raise InputError(f"the capture has none of the timesteps {', '.join(map(str, lit.timesteps))}")

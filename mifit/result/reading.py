@@ -69,7 +69,6 @@ def load(cls: type[R], folder: Path, model: MorphableModel | None = None) -> R:
             residual=None if reflectance is None else _residual(folder, document, len(reflectance.diffuse)),
             config=document["config"],
             cameras=tuple(_camera(entry) for entry in capture["cameras"]),
-            calibration=tuple(_camera(entry) for entry in capture.get("calibration", [])),
             capture_digest=capture["digest"],
             units=capture["units"],
             unit_mm=float(capture["unit_mm"]),

@@ -56,8 +56,6 @@ class Result:
         Settings as used (``dataclasses.asdict`` of the FitConfig, and the seed).
     cameras : tuple of Camera
         Cameras that were fitted; the views that `relight` and turntables start from.
-    calibration : tuple of Camera
-        The same cameras as the capture has them, where the fit has refined them; empty where it hasn't.
     capture_digest : str
         Digest of the images and calibration that were fitted.
     units : str
@@ -96,7 +94,6 @@ class Result:
     mesh: MeshEstimate | None = field(default=None, repr=False)
     residual: ResidualEstimate | None = field(default=None, repr=False)
     environment_rotation: NDArray[np.float64] | None = field(default=None, repr=False)
-    calibration: tuple[Camera, ...] = ()
 
     def __eq__(self, other: object) -> bool:
         """Whether two results are the same, to the last bit."""
@@ -179,7 +176,7 @@ class Result:
 
     def seen(self, capture: Capture) -> Capture:
         """A capture with the cameras, in the exposures, without the falloff and contrast that the fit found."""
-        capture = capture.with_fitted(self.cameras, self.calibration)
+        capture = capture.with_fitted(self.cameras)
         if not self.geometry.corrects_images:
             return capture
         return capture.with_exposures(self.geometry.exposed).with_lenses(self.geometry.falloff, self.geometry.contrast)

@@ -165,7 +165,6 @@ def _document(result: Result) -> dict[str, Any]:
                 "units": result.units,
                 "unit_mm": result.unit_mm,
                 "cameras": [_camera_document(c) for c in result.cameras],
-                "calibration": [_camera_document(c) for c in result.calibration],
                 "gains": {name: list(gain) for name, gain in geometry.gains.items()},
                 "exposures": {name: list(factors) for name, factors in geometry.exposures.items()},
                 "falloff": dict(geometry.falloff),

@@ -6,7 +6,6 @@ import json
 import math
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,21 +49,6 @@ def test_only_the_named_camera_is_ever_read(folder: Path) -> None:
         capture.frame("right", 0)
     with pytest.raises(InputError, match=r"no such file"):
         capture.digest()
-
-
-def test_refined_cameras_stand_where_the_calibration_is_that_they_come_from(folder: Path) -> None:
-    capture = Capture.load(folder)
-    before = [capture.camera(name) for name in capture.cameras]
-    refined = [replace(camera, fx=1.01 * camera.fx) for camera in before]
-    seen = capture.with_fitted(refined, before)
-    assert seen.calibrated and [seen.camera(camera.name) for camera in refined] == refined
-    assert seen.with_fitted(refined, before) is seen
-    assert seen.frame("left", 0).landmarks is not None
-    assert capture.with_fitted(refined) is capture  # as they are after a fit without refinement
-    anew = [before[0], replace(before[1], cx=before[1].cx + 1e-9)]  # one of them was calibrated anew since
-    assert capture.with_fitted(refined, anew) is capture
-    elsewhere = [replace(camera, name=f"{camera.name}2") for camera in before]
-    assert capture.with_fitted(refined, elsewhere) is capture
 
 
 def test_digest_changes_with_pixels_and_calibration_of_what_is_named(folder: Path, document) -> None:

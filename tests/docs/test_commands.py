@@ -14,16 +14,16 @@ import cv2
 import pytest
 
 from mifit.capture import Capture
-from mifit.capture.boards import Board
 from mifit.capture.colmap import write_colmap
 from mifit.capture.stereo import write_stereo
 from mifit.cli import build_parser, main
 from mifit.core.image import to_8_bit
+from mifit.extras.boards import Board
 from mifit.output.sequence import write_video
 from mifit.plan import load_plan
 from mifit.schema import read_toml
 from tests.capture import photogrammetry
-from tests.capture.board_video import Studio, pair, poses
+from tests.extras.board_video import Studio, pair, poses
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -141,7 +141,7 @@ def _photogrammetry(folder: Path, head: Path, capture: Capture) -> None:
 
 NOT_HERE = {
     "landmarks": "needs a detector and its networks",
-    "view": "serves until it is stopped: tests/output/test_live_view.py",
+    "view": "serves until it is stopped: tests/extras/test_live_view.py",
     "demo": "make demo, and every part of it above",
 }
 """Commands that are understood, but not run."""

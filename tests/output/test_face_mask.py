@@ -31,7 +31,7 @@ class Photographs:
     def frame(self, name, timestep):
         return self.scene.frame(name, timestep)
 
-    def with_fitted(self, cameras, calibration):
+    def with_fitted(self, cameras):
         return self
 
 

@@ -40,7 +40,7 @@ class FakeCapture:
     def camera(self, name):
         return next(c for c in self.cameras if c.name == name)
 
-    def with_fitted(self, cameras, calibration):
+    def with_fitted(self, cameras):
         return self
 
     def frame(self, name, t):

@@ -75,7 +75,7 @@ class Scene:
     def camera(self, name: str) -> Camera:
         return self.cameras[name]
 
-    def with_fitted(self, cameras: object, calibration: object) -> Scene:
+    def with_fitted(self, cameras: object) -> Scene:
         return self
 
     def digest(self, cameras: Sequence[str], timesteps: Sequence[int]) -> str:

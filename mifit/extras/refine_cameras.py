@@ -9,22 +9,19 @@ the views converge nearer, can't be told from depth: there the calibration stays
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
-from mifit.core.estimate import CamerasEstimate, GeometryEstimate, Report
+from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate
 from mifit.core.threads import one_blas_thread
 from mifit.core.uv import rasterize_uv
-from mifit.progress import Progress, silent
-from mifit.stages.calibrate_densely import MATCH_DEVIATION, MATCH_SIDE, MOST_TIMESTEPS
-from mifit.stages.calibration.adjustment import (
+from mifit.extras.bundle import (
     AdjustedBundle,
     Bundle,
     Intrinsics,
@@ -32,13 +29,15 @@ from mifit.stages.calibration.adjustment import (
     adjust_bundle,
     camera_information,
 )
-from mifit.stages.calibration.rig import (
+from mifit.extras.calibrate_densely import MATCH_DEVIATION, MATCH_SIDE, MOST_TIMESTEPS
+from mifit.extras.rig import (
     pose_precisions,
     rig_precision,
     settled_rig,
     told_ways,
 )
-from mifit.stages.calibration.tracks import follow_points, unwrap_image
+from mifit.extras.tracks import follow_points, unwrap_image
+from mifit.progress import Progress, silent
 from mifit.stages.surface.views import texture_size
 
 if TYPE_CHECKING:
@@ -70,6 +69,28 @@ FARTHEST = 3.0
 
 
 @dataclass(frozen=True)
+class RefinedCameras:
+    """A calibration that matches have judged.
+
+    Attributes
+    ----------
+    cameras : tuple of Camera
+        With other poses and focal lengths; empty where the calibration stays.
+    finding : str
+        In a line: how far it is off, or why it stays.
+    doubtful : bool
+        Whether the calibration stays although matches don't agree with it, or too few of them were found.
+    figures : dict
+        Residuals, movements and counts, as far as they were found.
+    """
+
+    cameras: tuple[Camera, ...]
+    finding: str
+    doubtful: bool
+    figures: dict[str, Any]
+
+
+@dataclass(frozen=True)
 class _Matches:
     """Points seen by two cameras or more at one timestep."""
 
@@ -98,7 +119,7 @@ def refine_cameras(
     geometry: GeometryEstimate,
     cameras: Sequence[str],
     progress: Progress = silent,
-) -> CamerasEstimate:
+) -> RefinedCameras:
     """Adjust the calibration of two or more cameras to dense matches.
 
     Parameters
@@ -114,11 +135,9 @@ def refine_cameras(
 
     Returns
     -------
-    CamerasEstimate
+    RefinedCameras
         No cameras where the calibration stays: it can't be adjusted, the adjustment disagrees with it by more than
-        `FARTHEST` deviations or didn't settle, or matches that were left out don't agree better. ``report.details``
-        says why under ``"kept"`` (None where cameras were refined), and has residuals and movements. A warning says
-        what was done and why, but where matches that were left out simply agree with the calibration.
+        `FARTHEST` deviations or didn't settle, or matches that were left out don't agree better.
 
     Notes
     -----
@@ -127,11 +146,10 @@ def refine_cameras(
     cameras stay. All cameras move: of rigs that explain matches alike the one that differs least from the calibration
     is taken, so that the world frame, and with it cameras that weren't fitted, stay valid.
     """
-    began = time.perf_counter()
     if not capture.calibrated:
-        return _kept("the capture is uncalibrated: its cameras are estimates already", {}, began)
+        return _kept("the capture is uncalibrated: its cameras are estimates already", {})
     if len(cameras) < 2:
-        return _kept("one camera has nothing to be matched with", {}, began)
+        return _kept("one camera has nothing to be matched with", {})
     views = [capture.camera(name) for name in cameras]
     scale = max(max(max(view.width, view.height) for view in views) / MATCH_SIDE, 1.0)
     matches = _match(capture, model, geometry, views, MATCH_DEVIATION * scale, progress)
@@ -139,7 +157,7 @@ def refine_cameras(
     counts = {"matches": int(used.sum()), "matches_left_out": int((~used).sum())}
     if min(counts.values()) < FEWEST_MATCHES:
         found = f"{len(used)} points of the face are matched between them"
-        return _kept(f"{found}, expected at least {2 * FEWEST_MATCHES}; more timesteps help", counts, began)
+        return _kept(f"{found}, expected at least {2 * FEWEST_MATCHES}; more timesteps help", counts)
     taken, left = matches.some(used), matches.some(~used)
     centre = geometry.vertices[:, np.unique(model.faces[model.face_mask])].reshape(-1, 3).mean(axis=0)
     poses = np.array([view.world_to_camera for view in views])
@@ -163,36 +181,18 @@ def refine_cameras(
     farthest = float(np.abs(rig.moved).max(initial=0.0))
     before_after = f"{judged[0]:.2f} pixels off with it, {judged[1]:.2f} with adjusted cameras"
     if not adjusted.settled:
-        return _kept("the adjustment to dense matches hasn't settled", details, began)
+        return _kept("the adjustment to dense matches hasn't settled", details)
     if farthest > FARTHEST:
         found = f"dense matches are off by {farthest:.1f} of the deviations that a calibration is taken to have"
-        return _kept(f"{found}, expected at most {FARTHEST:g}; calibrate the cameras anew", details, began)
+        return _kept(f"{found}, expected at most {FARTHEST:g}; calibrate the cameras anew", details)
     if judged[1] > LEFT_PIXELS * scale:
         found = f"dense matches are {before_after}, expected at most {LEFT_PIXELS * scale:.2g}"
-        return _kept(f"{found}; the cameras may be out of step, or their lenses distort otherwise", details, began)
+        return _kept(f"{found}; the cameras may be out of step, or their lenses distort otherwise", details)
     if judged[1] > BETTER * judged[0] or judged[0] ** 2 - judged[1] ** 2 < (SHARED_PIXELS * scale) ** 2:
-        return _kept(f"matches that were left out are {before_after}", details, began, warn=False)
+        return _kept(f"matches that were left out are {before_after}", details, doubtful=False)
     away = ", in ".join(f"{name} by {way['at_head_mm']:.1f}" for name, way in details["moved"].items())
-    note = f"the calibration is off: dense matches are {before_after}, which shift the head in {away} mm"
-    return CamerasEstimate(
-        tuple(view.name for view in views),
-        np.array([(view.fx, view.fy) for view in moved]),
-        rig.cameras,
-        Report("converged", {}, time.perf_counter() - began, (note,), {**details, "kept": None}),
-    )
-
-
-def reported(geometry: GeometryEstimate, cameras: CamerasEstimate, seconds: float = 0.0) -> GeometryEstimate:
-    """A fit whose report says what became of the cameras, and counts further ``seconds`` of work before it."""
-    before, found = geometry.report, cameras.report
-    phase = {"name": "cameras", "outcome": found.outcome, **found.details, "seconds": found.seconds}
-    report = replace(
-        before,
-        seconds=before.seconds + seconds,
-        warnings=(*before.warnings, *found.warnings),
-        details={**before.details, "phases": [*before.details.get("phases", []), phase]},
-    )
-    return replace(geometry, report=report)
+    finding = f"the calibration is off: dense matches are {before_after}, which shift the head in {away} mm"
+    return RefinedCameras(tuple(moved), finding, False, details)
 
 
 def _free(focal: NDArray) -> Intrinsics:
@@ -212,11 +212,9 @@ def _triangulated(matches: _Matches, rig: Bundle) -> AdjustedBundle:
     return adjust_bundle(replace(rig, points=matches.points), seen, _free(rig.focal), _rigid(matches), still)
 
 
-def _kept(why: str, details: dict, began: float, warn: bool = True) -> CamerasEstimate:
+def _kept(why: str, figures: dict[str, Any], doubtful: bool = True) -> RefinedCameras:
     """The calibration as it is, and why."""
-    warnings = (f"the cameras stay as they were calibrated: {why}",) if warn else ()
-    report = Report("converged", {}, time.perf_counter() - began, warnings, {**details, "kept": why})
-    return CamerasEstimate((), np.zeros((0, 2)), np.zeros((0, 4, 4)), report)
+    return RefinedCameras((), f"the cameras stay as they were calibrated: {why}", doubtful, figures)
 
 
 def _match(

@@ -16,8 +16,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.capture.board_adjustment import LEAST_NOISE, adjust
-from mifit.capture.board_camera import (
+from mifit.capture.sources import Source, check_synchronous
+from mifit.capture.stereo import write_stereo
+from mifit.capture.transforms import UNITS_MM, Shot, View, write_transforms
+from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
+from mifit.core.files import file_name, write_bytes, write_text
+from mifit.core.image import encode_png
+from mifit.errors import InputError
+from mifit.extras.board_adjustment import LEAST_NOISE, adjust
+from mifit.extras.board_camera import (
     BAD_ERROR,
     CONTRADICTS,
     GRID,
@@ -29,14 +36,7 @@ from mifit.capture.board_camera import (
     covered_cells,
     look,
 )
-from mifit.capture.boards import Board
-from mifit.capture.sources import Source, check_synchronous
-from mifit.capture.stereo import write_stereo
-from mifit.capture.transforms import UNITS_MM, Shot, View, write_transforms
-from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
-from mifit.core.files import file_name, write_bytes, write_text
-from mifit.core.image import encode_png
-from mifit.errors import InputError
+from mifit.extras.boards import Board
 from mifit.progress import Progress, silent
 
 LEAST_SHARED = 3

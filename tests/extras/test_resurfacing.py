@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mifit import resurfacing
 from mifit.core.estimate import GeometryEstimate, Report
 from mifit.errors import ConvergenceError
+from mifit.extras import resurface as resurfacing
+from mifit.extras.resurface import MOST, resurfaced
+from mifit.extras.sweep_again import on_surface
 from mifit.morphable import MorphableModel
 from mifit.result.record import Result
-from mifit.resurfacing import MOST, resurfaced
-from mifit.stages.sweep_again import on_surface
 
 FITTED = (0, 1, 2, 3)
 STEPS = 60

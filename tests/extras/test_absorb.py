@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mifit.core.estimate import NormalsEstimate, Report
 from mifit.errors import InputError
-from mifit.stages.absorb.information import Information
+from mifit.extras.absorb.information import Information
 
 CAMERAS = ("left", "right")
 FRAMES = 6
@@ -24,7 +24,7 @@ def angles(a, b):
 @pytest.fixture(scope="module")
 def scene(variant):
     """Six timesteps of one bumpy dome; the first two are fitted."""
-    from normal_scene import build
+    from tests.stages.normal_scene import build
 
     scene = build(timesteps=FRAMES, noise=0.02)
     scene.timesteps = tuple(range(FRAMES))
@@ -90,7 +90,7 @@ def test_the_order_of_images_is_rounding():
 def test_slopes_are_those_of_differences(scene):
     from mifit.appearance.formation import Appearance
     from mifit.core.bend import bend, tangent_plane
-    from mifit.stages.absorb.linear import linear_shading
+    from mifit.extras.absorb.linear import linear_shading
 
     rng = np.random.default_rng(2)
     normals = rng.normal(size=(50, 3)) * 0.2 + [0.0, 0.0, 1.0]
@@ -112,7 +112,7 @@ def test_slopes_are_those_of_differences(scene):
 
 
 def test_normals_sharpen_with_every_frame(scene, result):
-    from mifit.refinement import refine
+    from mifit.extras.refine import refine
 
     scene.requested.clear()
     few, many = refine(result, scene, (0, 1)), refine(result, scene)
@@ -127,7 +127,7 @@ def test_normals_sharpen_with_every_frame(scene, result):
 
 
 def test_maps_come_back_from_wrong_ones(scene, result):
-    from mifit.refinement import refine
+    from mifit.extras.refine import refine
 
     mask = np.linalg.norm(scene.normal_map, axis=-1) > 0
     truth = NormalsEstimate((0, 1), np.stack([scene.normal_map] * 2), Report("converged"))
@@ -138,7 +138,7 @@ def test_maps_come_back_from_wrong_ones(scene, result):
 
 
 def test_eyes_keep_what_the_fit_found_beneath_their_film(scene, result):
-    from mifit.refinement import refine
+    from mifit.extras.refine import refine
 
     beneath = scene.reflectance.diffuse.copy()
     lit = np.zeros_like(beneath)
@@ -153,7 +153,7 @@ def test_eyes_keep_what_the_fit_found_beneath_their_film(scene, result):
 
 
 def test_shuffled_frames_give_the_same(scene, result):
-    from mifit.refinement import refine
+    from mifit.extras.refine import refine
 
     one, other = refine(result, scene), refine(result, scene, (5, 2, 4, 3))
     assert_allclose(one.reflectance.diffuse, other.reflectance.diffuse, atol=1e-3)
@@ -161,7 +161,7 @@ def test_shuffled_frames_give_the_same(scene, result):
 
 
 def test_a_killed_run_goes_on_to_the_same(scene, result, tmp_path, monkeypatch):
-    from mifit import refinement
+    from mifit.extras import refine as refinement
 
     monkeypatch.setattr(refinement, "EVERY", 2)
     expected = refinement.refine(result, scene)
@@ -194,7 +194,7 @@ def test_a_killed_run_goes_on_to_the_same(scene, result, tmp_path, monkeypatch):
 
 
 def test_a_frame_in_other_light_is_left_out_and_named(scene, result):
-    from mifit.refinement import refine
+    from mifit.extras.refine import refine
 
     frames = dict(scene.frames)
     for name in CAMERAS:
@@ -209,7 +209,7 @@ def test_a_frame_in_other_light_is_left_out_and_named(scene, result):
 
 
 def test_memory_does_not_grow_with_frames(scene, result):
-    from mifit.refinement import refine
+    from mifit.extras.refine import refine
 
     refine(result, scene, (2,))  # kernels and caches
     peaks = []
@@ -222,7 +222,7 @@ def test_memory_does_not_grow_with_frames(scene, result):
 
 
 def test_what_cannot_be_refined_is_refused(scene, result):
-    from mifit.refinement import refine
+    from mifit.extras.refine import refine
 
     with pytest.raises(InputError, match="without reflectance"):
         refine(replace(result, reflectance=None), scene)
@@ -231,8 +231,8 @@ def test_what_cannot_be_refined_is_refused(scene, result):
 
 
 def test_frames_per_texel_are_in_the_folder(scene, result, tmp_path):
+    from mifit.extras.refine import refine
     from mifit.reconstruction import Reconstruction
-    from mifit.refinement import refine
 
     scene.model.save(tmp_path / "dome.npz")
     found = refine(replace(result, model_source=str(tmp_path / "dome.npz")), scene)
@@ -243,8 +243,8 @@ def test_frames_per_texel_are_in_the_folder(scene, result, tmp_path):
 
 
 def test_what_makes_a_frame_disagree():
-    from mifit.refinement import _disagreement
-    from mifit.stages.absorb.frame import FrameFit
+    from mifit.extras.absorb.frame import FrameFit
+    from mifit.extras.refine import _disagreement
 
     fitted = [FrameFit(0.01, 0.06, 0.9, 0.8), FrameFit(0.012, 0.05, 0.9, 0.9)]
     usual = FrameFit(0.015, 0.08, 0.9, 0.8)
@@ -256,7 +256,7 @@ def test_what_makes_a_frame_disagree():
 def test_detail_falls_with_blur(scene):
     from scipy.ndimage import gaussian_filter
 
-    from mifit.stages.absorb.frame import Absorber
+    from mifit.extras.absorb.frame import Absorber
     from mifit.stages.observations import Surface
 
     texture = np.random.default_rng(3).uniform(0.2, 0.6, scene.reflectance.diffuse.shape).astype(np.float32)

@@ -14,8 +14,8 @@ from mifit.appearance.occlusion import MeshPoints
 from mifit.core.bend import texel_neighbours, unbend
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
 from mifit.core.mesh import normalize
-from mifit.stages.absorb.information import Information
-from mifit.stages.absorb.linear import linear_shading
+from mifit.extras.absorb.information import Information
+from mifit.extras.absorb.linear import linear_shading
 from mifit.stages.normals.carried import CarriedTangents
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.lighting import active_weight

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.capture.boards import Board, BoardPoints, edge_width
 from mifit.capture.sources import Source
 from mifit.core.image import decode_image, to_8_bit
 from mifit.errors import InputError
+from mifit.extras.boards import Board, BoardPoints, edge_width
 from mifit.progress import Progress
 
 MAX_LOOKED_AT = 300

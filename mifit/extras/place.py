@@ -1,7 +1,7 @@
 """Cameras of an uncalibrated capture that took no part in its calibration: placed by their landmarks, and all written.
 
-The cameras that decide (`mifit.capture.calibrate`) give every landmark a place in space; another camera is the one that
-sees them where its own landmarks are. So a held-out camera moves none of the others.
+The cameras that decide (`calibrate_heads`) give every landmark a place in space; another camera is the one that sees
+them where its own landmarks are. So a held-out camera moves none of the others.
 """
 
 from __future__ import annotations
@@ -150,10 +150,10 @@ def calibrate_others(
 
 
 def write_cameras(path: str | Path, capture: Capture, cameras: Sequence[Camera]) -> None:
-    """Write intrinsics and poses into the entries of a capture's ``transforms.json``; all else in it stays."""
+    """Write intrinsics and poses of some cameras into a capture's ``transforms.json``; all else in it stays."""
     by_name = {camera.name: camera for camera in cameras}
     changes: dict[tuple[str, int], dict[str, Any]] = {}
-    for key in capture.shots:
+    for key in (shot for shot in capture.shots if shot[0] in by_name):
         camera = by_name[key[0]]
         inverse = np.linalg.inv(camera.world_to_camera) @ OPENGL_FROM_OPENCV
         numbers = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}

@@ -20,10 +20,10 @@ from mifit.config import GeometryConfig, SurfaceConfig, from_mapping
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.rows import Rows
 from mifit.errors import ConvergenceError
+from mifit.extras.sweep_again import on_surface, sweep_again
 from mifit.progress import Progress, silent
 from mifit.result.record import R, Result
 from mifit.stages.surface.prediction_between_views import errors_between_views
-from mifit.stages.sweep_again import on_surface, sweep_again
 from mifit.stages.track import Follower
 
 if TYPE_CHECKING:

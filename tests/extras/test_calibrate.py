@@ -10,12 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mifit.capture import Capture
-from mifit.capture.calibrate import calibrate
 from mifit.capture.landmark_files import Landmarks, write_landmarks
 from mifit.capture.transforms import Shot, View, write_transforms
 from mifit.core.camera import Camera
 from mifit.core.image import write_image
 from mifit.errors import InputError
+from mifit.extras.calibrate_heads import calibrate
 from mifit.synth.compose import place_cameras
 
 

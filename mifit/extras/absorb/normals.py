@@ -6,8 +6,8 @@ import numpy as np
 import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
 
+from mifit.extras.absorb.information import Information
 from mifit.solve import Outcome
-from mifit.stages.absorb.information import Information
 
 BEND = 0.10
 """Standard deviation of a correction, radians."""

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mifit.capture.boards import Board
 from mifit.capture.lens import opencv_matrix
 from mifit.core.camera import Camera
+from mifit.extras.boards import Board
 
 FINER = 2
 """Samples across a pixel."""

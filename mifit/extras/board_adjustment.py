@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from mifit.capture.boards import BoardPoints
+from mifit.extras.boards import BoardPoints
 
 LENS, POSE = 9, 6
 """Unknowns of a lens (fx, fy, cx, cy, k1, k2, p1, p2, k3) and of a pose (rotation vector, translation)."""

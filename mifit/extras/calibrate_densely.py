@@ -15,20 +15,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.capture.calibrate import FOCAL_PRIOR, HeadCalibration
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.core.mesh import interpolate
 from mifit.core.threads import one_blas_thread
 from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.extras.bundle import AdjustedBundle, Bundle, Intrinsics, Sightings, adjust_bundle
+from mifit.extras.calibrate_heads import FOCAL_PRIOR, HeadCalibration, calibrate_heads
+from mifit.extras.tracks import FEWEST_IMAGES, Tracks, follow_points, unwrap_image
 from mifit.progress import Progress, silent
-from mifit.stages.calibration.adjustment import AdjustedBundle, Bundle, Intrinsics, Sightings, adjust_bundle
-from mifit.stages.calibration.tracks import FEWEST_IMAGES, Tracks, follow_points, unwrap_image
 from mifit.stages.surface.views import texture_size
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
+MODES = 30
+"""Identity modes that may move with the cameras when those are estimated from landmarks."""
 LARGEST_MAP = 320
 """Side of the unwrapped images, texels, at most."""
 MATCH_DEVIATION = 0.3
@@ -63,6 +65,20 @@ class DenseCalibration:
     note: str
     deviation: float | None = None
     residual: float | None = None
+
+
+def calibrate_capture(
+    capture: Capture,
+    model: MorphableModel,
+    cameras: Sequence[str],
+    timesteps: Sequence[int],
+    progress: Progress = silent,
+) -> DenseCalibration:
+    """An uncalibrated capture with cameras estimated from landmarks and the model's, then from dense matches."""
+    scale = model.unit_mm / capture.unit_mm
+    mean, modes = model.mean[model.landmarks], model.identity[model.landmarks][..., :MODES]
+    start = calibrate_heads(capture, scale * mean, scale * modes, cameras, timesteps)
+    return calibrate_densely(start, model, cameras, timesteps, progress)
 
 
 @one_blas_thread()

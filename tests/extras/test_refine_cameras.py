@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from memory_capture import MemoryCapture, make_capture
 from scipy.spatial.transform import Rotation
 
 from mifit.core.camera import Camera
-from mifit.core.estimate import CamerasEstimate, GeometryEstimate, Report
+from mifit.core.estimate import GeometryEstimate, Report
+from mifit.extras import bundle
+from mifit.extras.refine_cameras import refine_cameras
+from mifit.extras.rig import movements, pose_precisions, rig_precision, settled_rig, told_ways
 from mifit.morphable import MorphableModel
-from mifit.stages.calibration import adjustment
-from mifit.stages.calibration.rig import movements, pose_precisions, rig_precision, settled_rig, told_ways
-from mifit.stages.refine_cameras import refine_cameras, reported
+from tests.stages.memory_capture import MemoryCapture, make_capture
 
 BOTH = ("left", "right")
 TURNS = [(0, 0, 0), (-8, 14, 3), (9, -12, -4)]
@@ -76,20 +76,16 @@ def miss(capture: Calibrated, cameras) -> float:
     return float(np.sqrt(np.mean((0.5 * b.fx * np.sum(normal * rays[1], axis=1)) ** 2)))
 
 
-def refined(found: CamerasEstimate, capture: Calibrated) -> list[Camera]:
-    return [found.refined(capture.camera(name)) for name in BOTH]
-
-
 @pytest.mark.parametrize("steps", [1, 3])
 def test_what_matches_see_of_a_wrong_camera_is_undone(model, true, steps: int) -> None:
     """Roll, pitch and focal length of one camera, from three timesteps or one."""
     wrong = true.with_camera(off(true.camera("right"), (0.3, 0.0, 0.3), 1.005))
     found = refine_cameras(wrong, model, fit_of(true, model, steps), BOTH)
-    assert found.names == BOTH and found.report.details["kept"] is None
-    assert found.report.warnings[0].startswith("the calibration is off: dense matches are ")
-    before, after = miss(true, [wrong.camera(name) for name in BOTH]), miss(true, refined(found, wrong))
+    assert tuple(camera.name for camera in found.cameras) == BOTH and not found.doubtful
+    assert found.finding.startswith("the calibration is off: dense matches are ")
+    before, after = miss(true, [wrong.camera(name) for name in BOTH]), miss(true, found.cameras)
     assert before > 1.5 and after < 0.1 * before
-    told = found.report.details
+    told = found.figures
     for key in ("residual_pixels", "residual_left_out_pixels"):
         assert told[key][0] > 1.0 and told[key][1] < 0.2
     assert 0.5 < max(told["moved"][name]["at_head_mm"] for name in BOTH) < 6.0
@@ -97,41 +93,40 @@ def test_what_matches_see_of_a_wrong_camera_is_undone(model, true, steps: int) -
 
 def test_a_right_calibration_stays(model, true) -> None:
     found = refine_cameras(true, model, fit_of(true, model, 3), BOTH)
-    assert found.names == () and found.report.warnings == ()
-    assert "matches that were left out are 0.0" in found.report.details["kept"]
-    assert max(found.report.details["deviations"]) < 0.1
-    assert refined(found, true) == [true.camera(name) for name in BOTH]
+    assert found.cameras == () and not found.doubtful
+    assert "matches that were left out are 0.0" in found.finding
+    assert max(found.figures["deviations"]) < 0.1
 
 
 def test_matches_do_not_tell_how_far_views_converge(model, true) -> None:
     """A turn along the baseline moves matches along their epipolar lines: depth explains it as well."""
     wrong = true.with_camera(off(true.camera("right"), (0.0, 0.3, 0.0)))
     found = refine_cameras(wrong, model, fit_of(true, model, 3), BOTH)
-    assert found.names == ()
-    for moved in found.report.details["moved"].values():
+    assert found.cameras == ()
+    for moved in found.figures["moved"].values():
         assert moved["degrees"] < 0.05 and moved["position_mm"] < 0.5
 
 
 def test_another_calibration_is_not_adjusted(model, true) -> None:
     wrong = true.with_camera(off(true.camera("right"), focal=1.06))
     found = refine_cameras(wrong, model, fit_of(true, model, 1), BOTH)
-    assert found.names == ()
-    assert "of the deviations that a calibration is taken to have, expected at most 3" in found.report.warnings[0]
+    assert found.cameras == () and found.doubtful
+    assert "of the deviations that a calibration is taken to have, expected at most 3" in found.finding
 
 
 def test_what_cameras_do_not_explain_is_said(model, true) -> None:
     """A roll that images this small don't tell for certain: the other ways can't make up for it."""
     wrong = true.with_camera(off(true.camera("right"), (0.0, 0.0, 4.0)))
     found = refine_cameras(wrong, model, fit_of(true, model, 1), BOTH)
-    assert found.names == ()
-    assert found.report.warnings[0].endswith("the cameras may be out of step, or their lenses distort otherwise")
+    assert found.cameras == () and found.doubtful
+    assert found.finding.endswith("the cameras may be out of step, or their lenses distort otherwise")
 
 
 def test_an_adjustment_that_does_not_settle_is_dropped(model, true, monkeypatch) -> None:
     wrong = true.with_camera(off(true.camera("right"), (0.3, 0.0, 0.3), 1.005))
-    monkeypatch.setattr(adjustment, "STEPS", 1)
+    monkeypatch.setattr(bundle, "STEPS", 1)
     found = refine_cameras(wrong, model, fit_of(true, model, 1), BOTH)
-    assert found.names == () and found.report.warnings[0].endswith("hasn't settled")
+    assert found.cameras == () and found.doubtful and found.finding.endswith("hasn't settled")
 
 
 def test_captures_that_cannot_be_matched_are_left_alone(model, true) -> None:
@@ -143,19 +138,7 @@ def test_captures_that_cannot_be_matched_are_left_alone(model, true) -> None:
         (flat, BOTH, "0 points of the face are matched between them, expected at least 400"),
     ):
         found = refine_cameras(capture, model, fit, cameras)
-        assert found.names == () and why in found.report.warnings[0]
-
-
-def test_a_fit_reports_what_became_of_the_cameras(model, true) -> None:
-    fit = fit_of(true, model, 1)
-    fit = replace(fit, report=Report("converged", {}, 3.0, ("a",), {"phases": [{"name": "surface"}]}))
-    cameras = CamerasEstimate(
-        (), np.zeros((0, 2)), np.zeros((0, 4, 4)), Report("converged", {}, 2.0, ("b",), {"kept": "c"})
-    )
-    found = reported(fit, cameras, 10.0).report
-    assert found.seconds == 13.0 and found.warnings == ("a", "b")
-    assert [phase["name"] for phase in found.details["phases"]] == ["surface", "cameras"]
-    assert found.details["phases"][1]["kept"] == "c"
+        assert found.cameras == () and found.doubtful and why in found.finding
 
 
 def rig(count: int = 3) -> tuple[np.ndarray, np.ndarray]:

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from memory_capture import make_capture
 
 from mifit.core.estimate import GeometryEstimate, Report
 from mifit.core.mesh import vertex_normals
+from mifit.extras.sweep_again import on_surface, openings_closed, sweep_again
 from mifit.morphable import MorphableModel
 from mifit.stages.surface.displace import solve_displacement
-from mifit.stages.sweep_again import on_surface, openings_closed, sweep_again
+from tests.stages.memory_capture import make_capture
 from tests.stages.test_find_surface import bumps, seen_vertices
 
 BOTH = ("left", "right")
@@ -63,7 +63,7 @@ def off_mm(model, filmed, found):
 
 
 def judged_as(monkeypatch, *errors):
-    monkeypatch.setattr("mifit.stages.sweep_again.errors_between_views", lambda *_: list(errors))
+    monkeypatch.setattr("mifit.extras.sweep_again.errors_between_views", lambda *_: list(errors))
 
 
 def test_more_timesteps_mend_the_surface(model, filmed, flat):
@@ -115,7 +115,7 @@ def test_more_timesteps_are_no_more_certain_than_a_few(model, filmed, flat, monk
     monkeypatch.setattr("mifit.stages.surface.coarse_to_fine.solve_displacement", solve)
     first = []
     for count in (2.0, 4.0, 40.0):  # of four: more than there are is each for itself
-        monkeypatch.setattr("mifit.stages.sweep_again.COUNT_AS", count)
+        monkeypatch.setattr("mifit.extras.sweep_again.COUNT_AS", count)
         given.clear()
         sweep_again(filmed, model, flat, JUDGED, BOTH)
         first.append(given[0])

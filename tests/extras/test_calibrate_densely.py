@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from memory_capture import make_capture
 from scipy.spatial.transform import Rotation
 
 from mifit.capture import Capture
 from mifit.capture.landmark_files import Landmarks, write_landmarks
 from mifit.capture.transforms import Shot, View, write_transforms
 from mifit.core.image import write_image
+from mifit.extras.bundle import Bundle, Intrinsics, Sightings, adjust_bundle
 from mifit.morphable import MorphableModel
 from mifit.pipeline import calibrated
-from mifit.stages.calibration.adjustment import Bundle, Intrinsics, Sightings, adjust_bundle
+from tests.stages.memory_capture import make_capture
 
 BOTH = ("left", "right")
 TURNS = [(0, 0, 0), (-8, 14, 3), (9, -12, -4)]
@@ -46,7 +46,7 @@ def uncalibrated(model, tmp_path_factory) -> Capture:
 
 
 def test_matches_give_the_focal_length_that_biased_landmarks_miss(model, uncalibrated) -> None:
-    from mifit.capture.calibrate import calibrate
+    from mifit.extras.calibrate_heads import calibrate
 
     marks, modes = model.mean[model.landmarks], model.identity[model.landmarks]
     by_landmarks = calibrate(uncalibrated, marks, modes).camera("left").fx
@@ -64,7 +64,7 @@ def test_matches_give_the_focal_length_that_biased_landmarks_miss(model, uncalib
 
 
 def test_two_images_leave_the_landmarks_value_and_say_so(model, uncalibrated) -> None:
-    from mifit.capture.calibrate import calibrate
+    from mifit.extras.calibrate_heads import calibrate
 
     marks, modes = model.mean[model.landmarks], model.identity[model.landmarks]
     by_landmarks = calibrate(uncalibrated, marks, modes, timesteps=[0])
@@ -85,7 +85,7 @@ def test_many_sightings_are_thinned_by_whole_tracks(model, uncalibrated, monkeyp
 
     found = []
     follow = tracks.follow_points
-    monkeypatch.setattr("mifit.stages.calibrate_densely.follow_points", lambda images: found.append(follow(images)))
+    monkeypatch.setattr("mifit.extras.calibrate_densely.follow_points", lambda images: found.append(follow(images)))
     for most in (10**6, 3000):
         monkeypatch.setattr(tracks, "MOST_SIGHTINGS", most)
         with pytest.raises(AttributeError):  # nothing is handed on

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from mifit.capture.board_adjustment import adjust
-from mifit.capture.board_calibration import _together
-from mifit.capture.board_camera import Watched
-from mifit.capture.boards import Board, BoardPoints
-from tests.capture.board_video import opencv_matrix, pair, poses
+from mifit.extras.board_adjustment import adjust
+from mifit.extras.board_calibration import _together
+from mifit.extras.board_camera import Watched
+from mifit.extras.boards import Board, BoardPoints
+from tests.extras.board_video import opencv_matrix, pair, poses
 
 BOARD = Board.parse("chessboard:10x7:25")
 NOISE = 0.25

@@ -25,12 +25,12 @@ from mifit.core.rows import Rows
 from mifit.core.threads import one_blas_thread
 from mifit.core.uv import TexelMap
 from mifit.errors import ConvergenceError, InputError
+from mifit.extras.absorb.frame import Absorber, FrameFit, carried_offsets
+from mifit.extras.absorb.information import Information
+from mifit.extras.absorb.solve_sums import Solved, solve_sums
+from mifit.extras.resurface import resurfaced
 from mifit.progress import Progress, silent
 from mifit.result.record import R, Result
-from mifit.resurfacing import resurfaced
-from mifit.stages.absorb.frame import Absorber, FrameFit, carried_offsets
-from mifit.stages.absorb.information import Information
-from mifit.stages.absorb.solve_sums import Solved, solve_sums
 from mifit.stages.find_residual import find_residual
 from mifit.stages.normals.carried import CarriedTangents
 from mifit.stages.observations import Surface

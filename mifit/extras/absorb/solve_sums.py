@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.uv import TexelMap
+from mifit.extras.absorb.information import Information
+from mifit.extras.absorb.normals import reduced, solve_offsets
 from mifit.solve import Outcome
-from mifit.stages.absorb.information import Information
-from mifit.stages.absorb.normals import reduced, solve_offsets
 from mifit.stages.reflectance.lighting_equations import specular_pull
 from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, solve_maps
 from mifit.stages.reflectance.told import find_told

@@ -9,17 +9,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from board_video import Studio, pair, poses
 from scipy.spatial.transform import Rotation
 
 from mifit.capture import import_capture
-from mifit.capture.board_calibration import BoardCalibration, calibrate_boards, write_calibration
-from mifit.capture.boards import Board
 from mifit.capture.sources import ImageFiles
 from mifit.capture.stereo import read_stereo
 from mifit.cli import main
 from mifit.core.image import encode_png
 from mifit.errors import InputError
+from mifit.extras.board_calibration import BoardCalibration, calibrate_boards, write_calibration
+from mifit.extras.boards import Board
+from tests.extras.board_video import Studio, pair, poses
 
 CHARUCO = "charuco:9x6:30:22"
 
