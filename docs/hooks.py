@@ -11,11 +11,12 @@ SETTINGS = "<!-- settings of {name} -->"
 
 def settings_tables(text: str) -> str:
     """Put a table in the place of every ``<!-- settings of NAME -->``."""
-    from mifit import config, plan
+    from mifit import config
+    from mifit.experiments.plan import Experiment
 
     tables = {
         "fit": (config.FitConfig, ""),
-        "experiment": (plan.Experiment, ""),
+        "experiment": (Experiment, ""),
     }
     for name, (cls, prefix) in tables.items():
         text = text.replace(SETTINGS.format(name=name), settings_table(cls, prefix, skip=name == "experiment"))

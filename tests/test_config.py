@@ -8,7 +8,8 @@ import pytest
 
 from mifit.config import FitConfig, MeshConfig, ReflectanceConfig
 from mifit.errors import InputError
-from mifit.experiment_settings import (
+from mifit.experiments import load_plan
+from mifit.experiments.plan import (
     EvaluateRun,
     Experiment,
     FitRun,
@@ -18,7 +19,6 @@ from mifit.experiment_settings import (
     RenderRun,
     SynthRun,
 )
-from mifit.plan import load_plan
 from mifit.schema import from_mapping, list_settings
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mifit.errors import InputError, MifitError
-from mifit.experiment import finished, load_plan, run_experiment
+from mifit.experiments import finished, load_plan, run_experiment
 from tests.variant import VARIANT
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
@@ -89,7 +89,7 @@ def test_killed_sweep_finishes_with_the_same_table(done, tmp_path):
     path = write(folder, exponents=(5, 50), name="again.toml")
     out = tmp_path / "out"
     code = (
-        "from mifit.experiment import run_experiment\n"
+        "from mifit.experiments import run_experiment\n"
         f"if __name__ == '__main__': run_experiment({str(path)!r}, overrides=['jobs=1'], out={str(out)!r}, "
         f"variant={VARIANT!r})"
     )

@@ -30,9 +30,7 @@ LAYERS = (
     {"extras"},
     {"pipeline"},
     {"fitting", "fit"},
-    {"experiment_settings"},
-    {"plan", "study"},
-    {"experiment", "experiments"},
+    {"experiments"},
 )
 """Parts from the lowest to the highest: a part imports only those of lower rows."""
 TOP = {"cli", "__main__", "__init__"}  # may import everything

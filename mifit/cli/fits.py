@@ -225,7 +225,7 @@ def _with_refined(arguments: Namespace, result: Reconstruction, capture: Capture
 
 def run(arguments: Namespace) -> None:
     """Run an experiment or a sweep."""
-    from mifit.experiment import run_experiment
+    from mifit.experiments import run_experiment
 
     summary = run_experiment(
         arguments.experiment,

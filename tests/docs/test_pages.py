@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mifit.config import FitConfig
-from mifit.experiment_settings import Experiment
+from mifit.experiments.plan import Experiment
 from mifit.schema import list_settings
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from mifit.config import FitConfig
 from mifit.core.ply import read_ply
 from mifit.errors import InputError
+from mifit.experiments import load_plan
 from mifit.morphable import MorphableModel
-from mifit.plan import load_plan
 from mifit.reconstruction import Reconstruction
 from tests.fuzz.conftest import as_json, bounded, read_or_refuse, spoilt_bytes, spoilt_documents
 from tests.output.conftest import ball_model, ball_result

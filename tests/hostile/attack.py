@@ -49,7 +49,7 @@ def preload() -> None:
 
     import mifit
     import mifit.cli
-    import mifit.experiment
+    import mifit.experiments
     import mifit.output.evaluate
     import mifit.output.export
     import mifit.output.relight

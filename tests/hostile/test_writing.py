@@ -88,8 +88,8 @@ def test_a_failed_import_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_runs_of_a_sweep_have_folders_below_the_experiment() -> None:
-    from mifit.experiment_settings import Experiment
-    from mifit.plan import Run
+    from mifit.experiments import Run
+    from mifit.experiments.plan import Experiment
 
     for key, value in (("render.parameters.a/../../../evil", 1), ("fit.model", "../" * 9), ("x", "é" * 300)):
         folder = Run(Experiment("e"), {key: value}, "0123456789ab").folder

@@ -1,4 +1,4 @@
-"""What a sweep says over subjects: means with confidence intervals, and plots of them."""
+"""Tables and plots of a sweep: a row for each run, and means with confidence intervals over subjects."""
 
 from __future__ import annotations
 
@@ -66,71 +66,79 @@ def _settings(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def interval(values: Sequence[float]) -> tuple[float, float | None]:
-    """Mean, and half the width of its interval, t((1 + `CONFIDENCE`) / 2, n - 1) s / sqrt(n); None for one value."""
-    n = len(values)
-    if n < 2:
+    """Mean, and half the width of its confidence interval; None for one value."""
+    if len(values) < 2:
         return float(values[0]), None
-    return float(np.mean(values)), float(stats.t.ppf(0.5 * (1 + CONFIDENCE), n - 1) * np.std(values, ddof=1) / n**0.5)
+    half = stats.t.ppf(0.5 * (1 + CONFIDENCE), len(values) - 1) * stats.sem(values)
+    return float(np.mean(values)), float(half)
+
+
+def runs_table(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Lines of a Markdown table: a row for each run, its swept values and its metrics."""
+    cells = [{k: f"{v:.4g}" for k, v in row["metrics"].items()} for row in rows]
+    swept = [{k: str(v) for k, v in row["swept"].items()} for row in rows]
+    return _markdown(swept, cells)
 
 
 def subjects_table(groups: Sequence[Group]) -> list[str]:
-    """Lines of a Markdown table: a row per setting, mean ± half width per metric."""
+    """Lines of a Markdown table: a row for each setting, mean ± half width of each metric."""
     if not groups:
         return []
-    keys, metrics = list(groups[0].settings), list(groups[0].metrics)
-    lines = ["", f"Mean and {CONFIDENCE:.0%} confidence interval over subjects:", ""]
-    lines.append("| " + " | ".join([*keys, "subjects", *metrics]) + " |")
-    lines.append("|" + " --- |" * len(keys) + " ---: |" * (1 + len(metrics)))
-    for group in groups:
-        cells = [*(str(group.settings.get(key, "")) for key in keys), str(group.subjects)]
-        for name in metrics:
-            mean, half = group.metrics.get(name, (float("nan"), None))
-            cells.append(f"{mean:.4g}" if half is None else f"{mean:.4g} ± {half:.2g}")
-        lines.append("| " + " | ".join(cells) + " |")
-    return lines
+    settings = [{k: str(v) for k, v in group.settings.items()} for group in groups]
+    cells = [
+        {"subjects": str(group.subjects)}
+        | {k: f"{m:.4g}" if half is None else f"{m:.4g} ± {half:.2g}" for k, (m, half) in group.metrics.items()}
+        for group in groups
+    ]
+    return ["", f"Mean and {CONFIDENCE:.0%} confidence interval over subjects:", "", *_markdown(settings, cells)]
 
 
-def draw(folder: Path, rows: Sequence[dict[str, Any]], groups: Sequence[Group]) -> list[Path]:
-    """Plot every metric over the first swept setting, with intervals where there are subjects; a line per other one.
+def _markdown(left: Sequence[dict[str, str]], right: Sequence[dict[str, str]]) -> list[str]:
+    """A table of named cells, those of ``right`` aligned to the right; a name that a row lacks is left empty."""
+    if not left:
+        return []
+    heads = [list(dict.fromkeys(name for row in side for name in row)) for side in (left, right)]
+    lines = [" | ".join(heads[0] + heads[1]), " | ".join(["---"] * len(heads[0]) + ["---:"] * len(heads[1]))]
+    for one, other in zip(left, right, strict=True):
+        lines.append(" | ".join([*(one.get(n, "") for n in heads[0]), *(other.get(n, "") for n in heads[1])]))
+    return [f"| {line} |" for line in lines]
 
-    Returns
-    -------
-    list of path
-        ``METRIC.svg`` files; empty without matplotlib (extra ``bench``), or with fewer than two settings.
+
+def draw(folder: Path, rows: Sequence[dict[str, Any]], groups: Sequence[Group]) -> None:
+    """Write a plot of every metric over the first swept setting, ``METRIC.svg``; a line for each of the other settings.
+
+    Intervals are drawn where there are subjects. Nothing is written without matplotlib (extra ``bench``), or with fewer
+    than two settings.
     """
     points = list(groups) or [Group(row["swept"], 1, {k: (v, None) for k, v in row["metrics"].items()}) for row in rows]
     if len(points) < 2 or not points[0].settings:
-        return []
+        return
     try:
         from matplotlib import rc_context
         from matplotlib.figure import Figure
     except ImportError:
-        return []
+        return
     first = next(iter(points[0].settings))
-    numeric = all(isinstance(p.settings.get(first), (int, float)) for p in points)
-    places: list[Any] = list(
-        dict.fromkeys(p.settings.get(first) for p in points if not isinstance(p.settings.get(first), list))
-    )
+    points = [p for p in points if first in p.settings]
+    numeric = all(isinstance(p.settings[first], (int, float)) for p in points)
+    names = list(dict.fromkeys(str(p.settings[first]) for p in points))
     series: dict[str, list[Group]] = {}
     for point in points:
         rest = ", ".join(f"{k.rsplit('.', 1)[-1]} {v}" for k, v in point.settings.items() if k != first)
         series.setdefault(rest, []).append(point)
-    written = []
     for metric in points[0].metrics:
         figure = Figure(figsize=(5, 3.2), layout="constrained")
         axes = figure.subplots()
         for label, members in series.items():
-            shown = [p for p in members if metric in p.metrics and p.settings.get(first) in places]
-            x = [p.settings[first] if numeric else places.index(p.settings[first]) for p in shown]
-            y = [p.metrics[metric][0] for p in shown]
-            axes.errorbar(x, y, [p.metrics[metric][1] or 0.0 for p in shown], marker="o", capsize=3, label=label)
+            shown = [p for p in members if metric in p.metrics]
+            x = [p.settings[first] if numeric else names.index(str(p.settings[first])) for p in shown]
+            means, halves = zip(*(p.metrics[metric] for p in shown), strict=True)
+            axes.errorbar(x, means, [half or 0.0 for half in halves], marker="o", capsize=3, label=label)
         if not numeric:
-            axes.set_xticks(range(len(places)), [Path(str(p)).name for p in places])
+            axes.set_xticks(range(len(names)), [Path(name).name for name in names])
         axes.set(xlabel=first, ylabel=metric)
         if len(series) > 1:
             axes.legend()
         path = folder / f"{metric}.svg"
         with replacing(path) as temporary, rc_context({"svg.hashsalt": "mifit"}):  # the same runs, the same file
             figure.savefig(temporary, format="svg", metadata={"Date": None})
-        written.append(path)
-    return written

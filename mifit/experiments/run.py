@@ -24,11 +24,10 @@ from mifit import checkpoint
 from mifit.core.files import FULL, file_name, read_text, replacing, write_text
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError, MifitError
-from mifit.experiment_settings import Experiment, SynthRun
-from mifit.plan import Plan, Run, load_plan
+from mifit.experiments.plan import Experiment, Plan, Run, SynthRun, load_plan
+from mifit.experiments.tables import draw, over_subjects, runs_table, subjects_table
 from mifit.progress import Progress, silent
 from mifit.render.variant import set_fitting_variant
-from mifit.study import draw, over_subjects, subjects_table
 
 FORMAT_VERSION = 1
 
@@ -271,15 +270,5 @@ def _summary(plan: Plan, folder: Path) -> str:
     document = {"name": plan.name, "runs": rows, "over_subjects": [dataclasses.asdict(group) for group in groups]}
     write_text(folder / "summary.json", json.dumps(document, indent=1) + "\n")
     draw(folder / "plots", rows, groups)
-    swept = list(dict.fromkeys(key for row in rows for key in row["swept"]))
-    metrics = list(dict.fromkeys(key for row in rows for key in row["metrics"]))
-    lines = [f"# {plan.name}: {len(rows)} of {len(plan.runs)} runs", ""]
-    if rows:
-        lines.append("| " + " | ".join([*swept, *metrics]) + " |")
-        lines.append("|" + " --- |" * len(swept) + " ---: |" * len(metrics))
-    for row in rows:
-        cells = [str(row["swept"].get(key, "")) for key in swept]
-        cells += [f"{row['metrics'][key]:.4g}" if key in row["metrics"] else "" for key in metrics]
-        lines.append("| " + " | ".join(cells) + " |")
-    lines += subjects_table(groups)
+    lines = [f"# {plan.name}: {len(rows)} of {len(plan.runs)} runs", "", *runs_table(rows), *subjects_table(groups)]
     return "\n".join(lines)

@@ -1,0 +1,378 @@
+"""Experiment files: what one may say, checked whole, and the runs that it asks for."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+import itertools
+import math
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import mifit
+from mifit import checkpoint
+from mifit.config import FitConfig
+from mifit.core.files import check_file, file_digest, file_name
+from mifit.core.limits import MAX_IMAGE_BYTES, MAX_RUNS, MAX_SAMPLES, MAX_SEED, MAX_SETTINGS_BYTES
+from mifit.errors import InputError
+from mifit.schema import (
+    Index,
+    Name,
+    flag,
+    from_mapping,
+    number,
+    one_of,
+    parse_toml,
+    part,
+    part_or_none,
+    read_toml,
+    settings,
+    several,
+    table,
+    text,
+)
+
+
+@settings
+class SynthRun:
+    """A capture made for the experiment (``mifit synth``)."""
+
+    timesteps: int = number(4, "how many", least=1, most=10_000)
+    width: int = number(340, "width of the images", "pixels", least=16, most=16_384)
+    height: int = number(240, "height of the images", "pixels", least=16, most=16_384)
+    spp: int = number(48, "samples per pixel", least=1, most=MAX_SAMPLES)
+    seed: int = number(0, "seed of everything random", least=0, most=MAX_SEED)
+    env: str | None = text(None, "lat-long HDR environment; none: a procedural studio")
+    model: str = text("builtin", "morphable model: a path or builtin")
+
+
+@settings
+class FitRun(FitConfig):
+    """Fit a capture; the settings of ``mifit fit``, those of its stages among them."""
+
+    capture: str | None = text(None, "capture folder")
+    synth: SynthRun | None = part_or_none("a capture made for the experiment, instead of a folder")
+    model: str = text("builtin", "morphable model: a path or builtin")
+    cameras: tuple[Name, ...] = several(("left", "right"), "cameras to use")
+    timesteps: tuple[Index, ...] | None = several(None, "timesteps to use; none: the first four")
+    until: Literal["geometry", "reflectance", "normals"] = one_of("normals", "last stage")
+    seed: int = number(0, "seed of everything random", least=0, most=MAX_SEED)
+
+    @property
+    def config(self) -> FitConfig:
+        """The settings of the stages alone."""
+        return FitConfig(**{f.name: getattr(self, f.name) for f in dataclasses.fields(FitConfig)})
+
+
+@settings
+class EvaluateRun:
+    """Judge the fit on a view; the settings of ``mifit evaluate``."""
+
+    camera: str = text(..., "camera that is not fitted")
+    region: Literal["model", "truth"] = one_of("model", "whose face area counts")
+    timesteps: tuple[Index, ...] | None = several(None, "timesteps to judge; none: all of the fit")
+
+
+@settings
+class RelightRun:
+    """Light the fit by an environment and compare the fast path with path tracing.
+
+    With ``capture``, photographs of the same head under the environment, the relit views are judged by its ``camera``;
+    with ``synth``, that capture is made (``synth.env`` must be the environment).
+    """
+
+    env: str = text(..., "lat-long environment, .hdr or .exr")
+    rotate: float = number(0.0, "turn of the environment about the vertical", "degrees", least=-3600, most=3600)
+    capture: str | None = text(None, "capture folder")
+    synth: SynthRun | None = part_or_none("a capture made for the experiment, instead of a folder")
+    camera: str = text("third", "camera of that capture")
+
+
+@settings
+class RenderRun:
+    """Render a Mitsuba scene; its ``<default>`` names take values from ``parameters``."""
+
+    scene: str = text(..., "scene file")
+    parameters: dict[str, bool | int | float | str] = table("values of the scene's <default> names")
+    spp: int = number(64, "samples per pixel", least=1, most=MAX_SAMPLES)
+    seed: int = number(0, "seed of the samples", least=0, most=MAX_SEED)
+
+
+@settings
+class ReferenceRun:
+    """The render of the same scene that a `RenderRun` is compared with."""
+
+    parameters: dict[str, bool | int | float | str] = table("values of the scene's <default> names")
+    spp: int = number(1024, "samples per pixel", least=1, most=MAX_SAMPLES)
+    seed: int = number(1, "seed of the samples", least=0, most=MAX_SEED)
+
+
+@settings
+class Outputs:
+    """What a run leaves in its folder besides ``run.json``."""
+
+    result: bool = flag(True, "the result folder")
+    report: bool = flag(False, "report.html")
+    images: bool = flag(True, "renders")
+
+
+@settings
+class Jobs:
+    """How many runs at a time."""
+
+    jobs: int = number(1, "processes at a time on one machine", least=1, most=1024)
+
+
+@settings
+class Experiment:
+    """One run: either ``fit`` with ``evaluate`` and ``relight``, or ``render`` with ``reference``."""
+
+    name: str = text(..., "names the folder of the runs", pattern=r"^[^\x00-\x1f/\\\\.][^\x00-\x1f/\\\\]{0,99}$")
+    fit: FitRun | None = part_or_none()
+    evaluate: EvaluateRun | None = part_or_none()
+    relight: RelightRun | None = part_or_none()
+    render: RenderRun | None = part_or_none()
+    reference: ReferenceRun | None = part_or_none()
+    outputs: Outputs = part(Outputs)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One point of a sweep.
+
+    Attributes
+    ----------
+    experiment : Experiment
+        All settings, paths absolute.
+    swept : dict
+        The keys that the sweep sets and their values.
+    digest : str
+        Digest of the settings, the inputs' contents and mifit's version.
+    """
+
+    experiment: Experiment
+    swept: dict[str, Any]
+    digest: str
+
+    @property
+    def folder(self) -> str:
+        """Name of the run's folder: its swept values, readable, and its digest."""
+        words = [f"{_plain(key.rsplit('.', 1)[-1])}={_plain(value)}" for key, value in self.swept.items()]
+        return "_".join([file_name("_".join(words)), self.digest[:10]] if words else [self.digest[:10]])
+
+
+def _plain(value: Any) -> str:
+    text = "-".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+    return "".join(c if c.isalnum() or c in ".-+" else "-" for c in Path(text).name)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A validated experiment file.
+
+    Attributes
+    ----------
+    name : str
+    runs : tuple of Run
+    jobs : int
+        Processes at a time on one machine.
+    """
+
+    name: str
+    runs: tuple[Run, ...]
+    jobs: int
+
+
+def load_plan(path: str | Path, overrides: Sequence[str] = (), seed: int = 0) -> Plan:
+    """Read and validate an experiment file: every run of the sweep, every input that it names.
+
+    Parameters
+    ----------
+    path : path
+    overrides : sequence of str
+        ``KEY=VALUE`` with a dotted key and a TOML value (a bare word is a string).
+    seed : int
+        Seed of the runs where the file gives none.
+
+    Raises
+    ------
+    InputError
+        The file, a key, a value, a sweep or an input is not what it must be.
+    """
+    path = Path(path)
+    check_file(path, MAX_SETTINGS_BYTES, "experiment file")
+    document = read_toml(path)
+    for override in overrides:
+        key, equals, value = override.partition("=")
+        if not equals or not key.strip():
+            raise InputError(f"--set {override}: expected KEY=VALUE, such as --set fit.reflectance.exponent=8")
+        _assign(document, key.strip(), _toml_value(value.strip()), f"--set {override}")
+    sweep = document.pop("sweep", {})
+    jobs = from_mapping(Jobs, {"jobs": document.pop("jobs", 1)}, str(path)).jobs
+    document.setdefault("name", path.stem)
+    points = []
+    for swept in _points(_with_captures(sweep, path), str(path)):
+        point = copy.deepcopy(document)
+        where = f"{path}: sweep {swept}" if swept else str(path)
+        for key, value in swept.items():
+            _assign(point, key, value, where)
+        for kind in ("fit", "render"):
+            if isinstance(point.get(kind), dict):
+                point[kind].setdefault("seed", seed)
+        points.append((_resolved(from_mapping(Experiment, point, where), path.parent, where), swept, where))
+    runs, digest_of = [], functools.cache(_digest)
+    for experiment, swept, where in points:
+        try:
+            inputs = {name: digest_of(*given) for name, given in _inputs(experiment).items()}
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+        key = checkpoint.digest({"version": mifit.__version__, "settings": dataclasses.asdict(experiment), **inputs})
+        runs.append(Run(experiment, swept, key))
+    if len({run.digest for run in runs}) != len(runs):
+        raise InputError(f"{path}: sweep: two runs have the same settings; remove the repeated value")
+    return Plan(runs[0].experiment.name, tuple(runs), jobs)
+
+
+def _toml_value(text: str) -> Any:
+    try:
+        return parse_toml(f"x = {text}")["x"]
+    except (ValueError, RecursionError):
+        return text
+
+
+def _assign(table: dict, key: str, value: Any, where: str) -> None:
+    """Set a dotted key in nested tables, which are made as needed; a capture takes the place of a synthetic one."""
+    *parents, last = key.split(".")
+    for name in parents:
+        table = table.setdefault(name, {})
+        if not isinstance(table, dict):
+            raise InputError(f"{where}: {key}: {name} is a value, expected a table")
+    table[last] = value
+    other = {"capture": "synth", "synth": "capture"}.get(last)
+    if other and parents in (["fit"], ["relight"]):
+        table.pop(other, None)
+
+
+def _points(sweep: Any, where: str) -> Iterator[dict[str, Any]]:
+    """The points of a sweep: the product of ``grid``'s lists, or the tables of ``list``; one point without a sweep."""
+    if not isinstance(sweep, dict) or set(sweep) - {"grid", "list"} or len(sweep) > 1:
+        raise InputError(f"{where}: sweep: found {sweep!r}, expected one table 'grid' or one list 'list'")
+    points: list[Any] = sweep.get("list", [{}])
+    grid = sweep.get("grid", {})
+    if not isinstance(grid, dict):
+        raise InputError(f"{where}: sweep.grid: found {grid!r}, expected a table of lists")
+    grid = dict(_flatten(grid))
+    for key, values in grid.items():
+        if not isinstance(values, list) or not values:
+            raise InputError(f"{where}: sweep.grid: {key}: found {values!r}, expected a list of values")
+    if not isinstance(points, list) or not points or not all(isinstance(p, dict) for p in points):
+        raise InputError(f"{where}: sweep.list: found {points!r}, expected a list of tables")
+    count = len(points) * math.prod(map(len, grid.values()))
+    if count > MAX_RUNS:
+        raise InputError(f"{where}: sweep: found {count} runs, expected at most {MAX_RUNS}; split the sweep")
+    for point, values in itertools.product(points, itertools.product(*grid.values())):
+        yield dict(_flatten(point)) | dict(zip(grid, values, strict=True))
+
+
+def _with_captures(sweep: Any, path: Path) -> Any:
+    """A sweep in whose grid a folder of captures stands for the list of them."""
+    if not isinstance(sweep, dict) or not isinstance(sweep.get("grid"), dict):
+        return sweep
+    grid = dict(_flatten(sweep["grid"]))
+    for key in ("fit.capture", "relight.capture"):
+        if isinstance(grid.get(key), str):
+            folder = grid[key]
+            found = sorted(p.parent.name for p in (path.parent / folder).glob("*/transforms.json"))
+            if not found:
+                raise InputError(f"{path}: sweep.grid: {key}: found no capture in {folder!r}, expected folders of them")
+            grid[key] = [os.path.join(folder, name) for name in found]
+    return {**sweep, "grid": grid}
+
+
+def _flatten(table: dict, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Nested tables -> dotted keys, so that both ``a.b = [1]`` and ``"a.b" = [1]`` work in TOML."""
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _resolved(e: Experiment, folder: Path, where: str) -> Experiment:
+    """Check how the parts go together, and make paths absolute (relative ones are from the file's folder)."""
+    if (e.fit is None) == (e.render is None):
+        raise InputError(f"{where}: expected one of the tables [fit] and [render]")
+    if e.fit is None and (e.evaluate or e.relight):
+        raise InputError(f"{where}: [evaluate] and [relight] need [fit]")
+    if e.render is None and e.reference:
+        raise InputError(f"{where}: [reference] needs [render]")
+    if e.fit and (e.fit.capture is None) == (e.fit.synth is None):
+        raise InputError(f"{where}: fit: expected one of 'capture' and 'synth'")
+    if e.fit and e.evaluate and e.evaluate.camera in e.fit.cameras:
+        raise InputError(
+            f"{where}: evaluate.camera: found {e.evaluate.camera!r}, which fit.cameras names too; "
+            "expected a camera that is not fitted"
+        )
+    e = _absolute(e, folder)
+    if e.relight and e.relight.synth and (e.relight.capture is not None or e.relight.synth.env != e.relight.env):
+        raise InputError(f"{where}: relight.synth: expected its 'env' to be relight.env, and no 'capture'")
+    return e
+
+
+def _absolute(settings: Any, folder: Path) -> Any:
+    """Settings whose paths are absolute, in their parts too."""
+    changed: dict[str, Any] = {}
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if isinstance(value, (FitRun, SynthRun, RelightRun, RenderRun)):
+            changed[field.name] = _absolute(value, folder)
+        elif field.name in ("scene", "env", "capture", "model") and isinstance(value, str):
+            if field.name != "model" or not value.startswith("builtin"):
+                changed[field.name] = os.path.abspath(folder / value)  # links stay: following a loop of them raises
+    return dataclasses.replace(settings, **changed)
+
+
+def _inputs(e: Experiment) -> dict[str, tuple[Any, ...]]:
+    """What a run reads: the arguments of `_digest` for each input."""
+    found: dict[str, tuple[Any, ...]] = {}
+    if e.render:
+        found["scene"] = ("file", e.render.scene)
+    if e.relight:
+        found["env"] = ("file", e.relight.env)
+        if e.relight.capture is not None:
+            found["lit_capture"] = ("capture", e.relight.capture)
+    if e.fit:
+        found["model"] = ("model", e.fit.model)
+        if e.fit.capture is not None:
+            cameras = (*e.fit.cameras, *([e.evaluate.camera] if e.evaluate else []))
+            found["capture"] = ("capture", e.fit.capture, cameras, e.fit.timesteps)
+        elif e.fit.synth and e.fit.synth.env:
+            found["synth_env"] = ("file", e.fit.synth.env)
+    return found
+
+
+def _digest(
+    kind: str, name: str, cameras: tuple[str, ...] | None = None, timesteps: tuple[int, ...] | None = None
+) -> str:
+    """Digest of the content of an input; InputError where it can't be used."""
+    if kind == "file":
+        return file_digest(name, MAX_IMAGE_BYTES).hex()
+    if kind == "model":  # a built-in one is known by mifit's version, which every key holds
+        path = Path(name)
+        stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.exists() else None
+        return name if name in ("builtin", "builtin:coarse") else _model_digest(name, stamp)
+    from mifit.pipeline import choose, choose_timesteps
+
+    capture = mifit.Capture.load(name)
+    if cameras is None:
+        return capture.digest()
+    return capture.digest(choose("camera", capture.cameras, cameras, 2), choose_timesteps(capture, timesteps))
+
+
+@functools.lru_cache(maxsize=32)
+def _model_digest(path: str, stamp: tuple[int, int] | None) -> str:
+    return mifit.MorphableModel.load(path).digest
