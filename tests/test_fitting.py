@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 import mifit
-from mifit import commands
+from mifit.cli import fits
 from mifit.config import FitConfig, MeshConfig, ReflectanceConfig
 from mifit.errors import InputError
 from mifit.fitting import fit_into
@@ -120,8 +121,9 @@ def test_tracked_frames_stay(fit, tracked):
 
 def test_two_fits_into_one_folder_exclude_each_other(fit, tmp_path):
     ownership.claim(tmp_path / "out")
-    with ownership.locked(tmp_path / "out"), pytest.raises(InputError, match="another mifit is writing into it"):
-        fit(tmp_path / "out")
+    with ownership.locked(tmp_path / "out"), ThreadPoolExecutor() as other:
+        with pytest.raises(InputError, match="another mifit is writing into it"):
+            other.submit(fit, tmp_path / "out").result()
 
 
 def test_a_result_knows_the_capture_it_was_fitted_to(fit, tmp_path):
@@ -163,21 +165,21 @@ def test_the_demo_leaves_the_users_capture_alone(variant, tmp_path, monkeypatch)
         (folder / "transforms.json").write_text("{}")
 
     monkeypatch.setattr("mifit.synth.synthesize", synthesize)
-    monkeypatch.setattr(commands.fits, "_fit_and_judge", lambda *arguments: None)
+    monkeypatch.setattr(fits, "_fit_and_judge", lambda *arguments: None)
     arguments = SimpleNamespace(out=tmp_path / "out", quiet=True, debug=False, variant=VARIANT, seed=0)
     mine = tmp_path / "out" / "capture" / "images" / "mine.png"
     mine.parent.mkdir(parents=True)
     mine.write_text("mine")
     with pytest.raises(InputError, match="did not make"):
-        commands.demo(arguments)
+        fits.demo(arguments)
     assert mine.read_text() == "mine" and not made
     arguments.out = tmp_path / "again"
-    commands.demo(arguments)
-    commands.demo(arguments)  # its own capture is replaced
+    fits.demo(arguments)
+    fits.demo(arguments)  # its own capture is replaced
     assert (tmp_path / "again" / "capture" / "transforms.json").is_file() and len(made) == 2
     (tmp_path / "again" / "capture" / "mine.png").write_text("mine")
     with pytest.raises(InputError, match=r"found mine\.png"):
-        commands.demo(arguments)
+        fits.demo(arguments)
     assert (tmp_path / "again" / "capture" / "mine.png").read_text() == "mine"
 
 
@@ -186,7 +188,7 @@ def test_the_demo_shows_a_picture_of_the_first_step_and_reports_once(variant, tm
     early = dataclasses.replace(result, reflectance=None, normals=None, mesh=None)
 
     def fit_into(folder, capture, model, watch, config, **options):
-        assert config.reflectance.texture_size <= commands.fits.DEMO["width"]  # a texel shows in a pixel of its own
+        assert config.reflectance.texture_size <= fits.DEMO["width"]  # a texel shows in a pixel of its own
         ownership.claim(folder)
         watch(early)
         events.append((folder / "first.png").read_bytes())
@@ -199,9 +201,9 @@ def test_the_demo_shows_a_picture_of_the_first_step_and_reports_once(variant, tm
     monkeypatch.setattr("mifit.MorphableModel.load", lambda name: result.model)
     monkeypatch.setattr("mifit.fitting.fit_into", fit_into)
     monkeypatch.setattr("mifit.output.report.write_report", lambda *arguments: reports.append(arguments))
-    monkeypatch.setattr(commands.fits, "judge", lambda arguments, judged, capture: events.append(judged))
+    monkeypatch.setattr(fits, "judge", lambda arguments, judged, capture: events.append(judged))
     arguments = SimpleNamespace(out=tmp_path / "out", quiet=True, seed=0)
-    commands.fits._fit_and_judge(arguments, tmp_path / "capture", lambda *step: None)
+    fits._fit_and_judge(arguments, tmp_path / "capture", lambda *step: None)
     picture = cv2.imread(str(tmp_path / "out" / "first.png"))
     assert (tmp_path / "out" / "first.png").read_bytes() == events[0]  # of the first step, and still there
     assert picture.shape == (64, 128, 3) and np.ptp(picture[:, :64]) == 0 and np.ptp(picture[:, 64:]) > 20

@@ -176,12 +176,13 @@ def track(arguments: Namespace) -> None:
     """Extend a result by further timesteps."""
     import mifit
     from mifit.pipeline import choose
+    from mifit.result.ownership import finish, remember
 
+    finish(arguments.result)
     result = mifit.Reconstruction.load(arguments.result)
     capture = mifit.Capture.load(arguments.capture)
     use_variant(arguments)
     from mifit.output.sequence import write_moving_pictures
-    from mifit.result.ownership import remember
     from mifit.tracking import sequence_left, track_into
 
     for name in arguments.overlay or ():  # an unknown one is refused now, not after the work

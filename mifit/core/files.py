@@ -13,8 +13,8 @@ import stat
 import sys
 import unicodedata
 from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from contextlib import contextmanager, suppress
+from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 from mifit.core.limits import MAX_NAME_BYTES
@@ -128,6 +128,54 @@ def check_no_links(folder: str | Path, path: str | Path) -> None:
         inside = inside / part
         if inside.is_symlink():
             raise InputError(f"{inside}: found a symbolic link, expected a file or folder of its own; remove the link")
+
+
+@contextmanager
+def at_place(folder: str | Path, name: str, make: bool = False) -> Iterator[tuple[str | Path, int | None]]:
+    """Yield the last part of ``name`` and a descriptor of the folder that it is in, for functions with ``dir_fd``.
+
+    The folders between are below ``folder`` and no links, also if somebody changes them meanwhile.
+
+    Parameters
+    ----------
+    folder : path
+        Where the user said to write; it may be a link itself.
+    name : str
+        A path below it, with ``/``.
+    make : bool
+        Make folders that are missing.
+
+    Raises
+    ------
+    FileNotFoundError
+        A folder is missing.
+    InputError
+        A link or a file in place of a folder.
+    """
+    *parents, last = PurePosixPath(name).parts
+    if os.open not in os.supports_dir_fd:  # Windows, where links need an administrator
+        check_no_links(folder, Path(folder, name))
+        if make:
+            Path(folder, *parents).mkdir(parents=True, exist_ok=True)
+        yield Path(folder, name), None
+        return
+    at = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        for part in parents:
+            if make:
+                with suppress(FileExistsError):
+                    os.mkdir(part, dir_fd=at)
+            try:
+                inner = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=at)
+            except OSError as error:
+                if error.errno not in (errno.ENOTDIR, errno.ELOOP):
+                    raise
+                raise InputError(f"{folder}: found a link or a file as a folder in {name}; remove it") from None
+            os.close(at)
+            at = inner
+        yield last, at
+    finally:
+        os.close(at)
 
 
 @contextmanager

@@ -2,6 +2,9 @@
 
 The folder ``.mifit`` marks one of ours. In it are ``files.json`` (every file that we wrote, with a digest of its
 content), the lock of the process that writes, checkpoints, and, while files are being replaced, the new ones.
+
+A result may come from a stranger. Who reads one changes nothing in it; who writes holds the lock, follows no link in
+it, and touches nothing outside.
 """
 
 from __future__ import annotations
@@ -10,17 +13,20 @@ import hashlib
 import json
 import os
 import shutil
+import stat
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+from contextlib import contextmanager, suppress
+from pathlib import Path, PurePosixPath
 
-from mifit.core.files import write_text
+from mifit.core.files import at_place, check_no_links, read_text, write_text
+from mifit.core.limits import MAX_DOCUMENT_BYTES
 from mifit.errors import InputError
 
 MARK = ".mifit"
 CHECKPOINTS = f"{MARK}/checkpoints"
 _FILES, _LOCK, _NEW, _COMMIT = "files.json", "lock", "new", "commit.json"
+_FOLDERS = (MARK, "geometry", "refined", "maps", "masks")
+"""Folders of a result: ours, never links."""
 
 
 def check_ours(folder: Path, force: bool = False) -> None:
@@ -29,12 +35,18 @@ def check_ours(folder: Path, force: bool = False) -> None:
     Raises
     ------
     InputError
-        A file, or without ``force`` a folder that isn't empty and has neither the mark nor a result in it.
+        A file; a link where a result has a folder, or in ``.mifit``; or without ``force`` a folder that isn't empty and
+        has neither the mark nor a result in it.
     """
     if not os.path.lexists(folder):
         return
     if not folder.is_dir():
         raise InputError(f"{folder}: found a file, expected a folder or nothing")
+    for place in (*(folder / name for name in _FOLDERS), *(folder / MARK).rglob("*")):
+        check_no_links(folder, place)
+    for place in filter(os.path.lexists, (folder / name for name in _FOLDERS)):
+        if not place.is_dir():
+            raise InputError(f"{place}: found a file, expected a folder or nothing; move it away")
     inside = sorted(p.name for p in folder.iterdir())
     if force or not inside or (folder / MARK).is_dir() or _holds_a_result(folder):
         return
@@ -54,7 +66,9 @@ def claim(folder: Path, force: bool = False) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from writing into a claimed folder.
+    """Keep others from writing into a claimed folder, and finish what an interrupted write left in it.
+
+    Who holds the lock may take it again.
 
     Raises
     ------
@@ -63,7 +77,7 @@ def locked(folder: Path) -> Iterator[None]:
     """
     from filelock import FileLock, Timeout
 
-    lock = FileLock(folder / MARK / _LOCK)
+    lock = FileLock(folder.resolve() / MARK / _LOCK, is_singleton=True)
     try:
         lock.acquire(timeout=0)
     except Timeout:
@@ -71,16 +85,57 @@ def locked(folder: Path) -> Iterator[None]:
             f"{folder}: another mifit is writing into it; wait until it has ended, or name another folder"
         ) from None
     try:
+        _finish(folder)
         yield
     finally:
         lock.release()
 
 
+def finish(folder: Path) -> None:
+    """Finish an interrupted write into a result; called by what is about to read it and then to write into it.
+
+    Raises
+    ------
+    InputError
+        The folder isn't ours, or another process writes into it.
+    """
+    if _interrupted(folder):
+        check_ours(folder)
+        with locked(folder):
+            pass
+
+
+@contextmanager
+def unchanging(folder: Path) -> Iterator[None]:
+    """Read a result in the block as one write has left it; nothing is written.
+
+    Raises
+    ------
+    InputError
+        A write was interrupted, or another process writes meanwhile.
+    """
+
+    def state() -> dict[str, str]:
+        if _interrupted(folder):
+            raise InputError(
+                f"{folder}: files are being written into it, or that was interrupted; wait for the mifit that writes, "
+                "or run the `mifit fit` or `mifit track` that wrote again, with --resume: it finishes that"
+            )
+        return written(folder)
+
+    before = state()
+    try:
+        yield
+    finally:
+        if state() != before:
+            raise InputError(f"{folder}: another mifit has written into it meanwhile; try again")
+
+
 def written(folder: Path) -> dict[str, str]:
     """Files that mifit wrote, relative to the folder, with the digests of what it wrote."""
     try:
-        known = json.loads((folder / MARK / _FILES).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        known = json.loads(read_text(folder / MARK / _FILES, MAX_DOCUMENT_BYTES))
+    except (InputError, ValueError, RecursionError):
         return {}
     return {str(k): str(v) for k, v in known.items()} if isinstance(known, dict) else {}
 
@@ -101,16 +156,15 @@ def remember(folder: Path, names: Iterable[str]) -> None:
 def remove_written(folder: Path, names: Iterable[str]) -> None:
     """Delete those of the named files that are as mifit wrote them, and folders that are empty then."""
     known = written(folder)
-    for name in filter(lambda name: _inside(folder, name), names):
-        path = folder / name
-        if name in known and path.is_file() and not path.is_symlink() and _digest(path) == known[name]:
-            path.unlink()
-            for parent in Path(name).parents:
-                try:
-                    if parent != Path():
-                        (folder / parent).rmdir()
-                except OSError:  # not empty
-                    break
+    for name in sorted(set(names) & set(known)):
+        if not _inside(name) or _digest_inside(folder, name) != known[name]:
+            continue
+        for place in (name, *map(str, PurePosixPath(name).parents[:-1])):
+            try:
+                with at_place(folder, place) as (last, at):
+                    os.unlink(last, dir_fd=at) if place == name else os.rmdir(last, dir_fd=at)
+            except OSError:  # not empty
+                break
 
 
 def clear(folder: Path) -> None:
@@ -141,8 +195,8 @@ def clear(folder: Path) -> None:
 def replacing_files(folder: Path, only: bool = False) -> Iterator[Path]:
     """Yield a folder for new files that take the places of the old ones when the block ends well, all of them.
 
-    When the block raises, everything stays as it was. When the process is killed the next one that reads or writes the
-    folder either drops the new files or, if all were there, moves the rest to their places (`finish`).
+    When the block raises, everything stays as it was. When the process is killed the next one that writes into the
+    folder either drops the new files or, if all were there, moves the rest to their places.
 
     Parameters
     ----------
@@ -152,58 +206,85 @@ def replacing_files(folder: Path, only: bool = False) -> Iterator[Path]:
         Files that mifit wrote earlier and that aren't among the new ones go; what the user has changed or added stays
         in any case.
     """
-    finish(folder)
+    with locked(folder):
+        new = folder / MARK / _NEW
+        _remove_new(folder)  # what an unfinished process left
+        new.mkdir()
+        try:
+            yield new
+            made = {p.relative_to(new).as_posix(): _digest(p) for p in sorted(new.rglob("*")) if p.is_file()}
+            stale = [name for name in written(folder) if only and name not in made]
+            write_text(folder / MARK / _COMMIT, json.dumps({"made": made, "stale": stale}))
+        except BaseException:
+            _remove_new(folder)
+            raise
+        _finish(folder)
+
+
+def _interrupted(folder: Path) -> bool:
+    return os.path.lexists(folder / MARK / _COMMIT)
+
+
+def _remove_new(folder: Path) -> None:
     new = folder / MARK / _NEW
-    shutil.rmtree(new, ignore_errors=True)  # what an unfinished process left
-    new.mkdir(parents=True)
-    try:
-        yield new
-        made = {str(p.relative_to(new).as_posix()): _digest(p) for p in sorted(new.rglob("*")) if p.is_file()}
-        stale = [name for name in written(folder) if only and name not in made]
-        write_text(folder / MARK / _COMMIT, json.dumps({"made": made, "stale": stale}))
-    except BaseException:
-        shutil.rmtree(new, ignore_errors=True)
-        raise
-    finish(folder)
+    if new.is_dir():
+        shutil.rmtree(new, ignore_errors=True)  # follows no link
+    else:
+        new.unlink(missing_ok=True)
 
 
-def finish(folder: Path) -> None:
-    """Move new files to their places where a process got as far as having them all; harmless otherwise."""
-    path, new = folder / MARK / _COMMIT, folder / MARK / _NEW
-    try:
-        commit: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        made, stale = dict(commit["made"]), list(commit["stale"])
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+def _finish(folder: Path) -> None:
+    """Move new files to their places where a process got as far as having them all; of a locked folder."""
+    if not _interrupted(folder):
         return
-    made = {str(name): str(digest) for name, digest in made.items() if _inside(folder, name)}
+    for place in (folder / MARK / _NEW, folder / MARK / _COMMIT, folder / MARK / _FILES):
+        check_no_links(folder, place)
+    try:
+        commit = json.loads(read_text(folder / MARK / _COMMIT, MAX_DOCUMENT_BYTES))
+        made = {str(name): str(digest) for name, digest in commit["made"].items() if _inside(name)}
+        stale = [str(name) for name in commit["stale"]]
+    except (InputError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        made, stale = {}, []
     for name in sorted(made, key=lambda name: name == "result.json"):  # which names the others: last
-        if (new / name).is_file():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            os.replace(new / name, folder / name)
+        with suppress(FileNotFoundError), at_place(folder, f"{MARK}/{_NEW}/{name}") as (source, source_at):
+            if stat.S_ISREG(os.stat(source, dir_fd=source_at, follow_symlinks=False).st_mode):
+                with at_place(folder, name, make=True) as (target, target_at):
+                    os.replace(source, target, src_dir_fd=source_at, dst_dir_fd=target_at)
     remove_written(folder, stale)
     known = {k: v for k, v in written(folder).items() if k not in stale} | made
     write_text(folder / MARK / _FILES, json.dumps(known, indent=1, sort_keys=True) + "\n")
-    path.unlink(missing_ok=True)
-    shutil.rmtree(new, ignore_errors=True)
+    _remove_new(folder)
+    (folder / MARK / _COMMIT).unlink()
 
 
-def _inside(folder: Path, name: str) -> bool:
-    """Whether a name that a file gives stays in the folder, links followed."""
-    parent = (folder / name).parent.resolve()
-    root = folder.resolve()
-    return not Path(name).is_absolute() and ".." not in Path(name).parts and (parent == root or root in parent.parents)
+def _inside(name: str) -> bool:
+    """Whether a name that a file gives is one of a file of a result: below its folder, and not in ``.mifit``."""
+    path = PurePosixPath(name)
+    inside = bool(path.parts) and not path.is_absolute() and ".." not in path.parts and "\0" not in name
+    return inside and path.parts[0] != MARK
+
+
+def _digest_inside(folder: Path, name: str) -> str | None:
+    """Digest of a regular file below a folder, no links followed; None where there is none."""
+    try:
+        with at_place(folder, name) as (last, at):
+            if not stat.S_ISREG(os.stat(last, dir_fd=at, follow_symlinks=False).st_mode):
+                return None
+            return _digest(os.open(last, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0), dir_fd=at))
+    except (OSError, InputError):
+        return None
 
 
 def _holds_a_result(folder: Path) -> bool:
     """Whether ``result.json`` is one that mifit wrote, before it marked folders."""
     try:
-        document = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        document = json.loads(read_text(folder / "result.json", MAX_DOCUMENT_BYTES))
+    except (InputError, ValueError, RecursionError):
         return False
     return isinstance(document, dict) and "mifit_version" in document
 
 
-def _digest(path: Path) -> str:
+def _digest(path: Path | int) -> str:
     with open(path, "rb") as stream:
         state = hashlib.blake2b(digest_size=16)
         while block := stream.read(1 << 20):

@@ -35,13 +35,18 @@ from mifit.core.subdivision import split_faces
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import lacks_eyes, with_eyes
-from mifit.result.ownership import finish
+from mifit.result.ownership import unchanging
 from mifit.result.record import R
 from mifit.result.writing import FORMAT_VERSION, label_file
 
 
 def load(cls: type[R], folder: Path, model: MorphableModel | None = None) -> R:
     """Read a result folder as a `Result` or a class made from it; see `Reconstruction.load`."""
+    with unchanging(folder):
+        return _load(cls, folder, model)
+
+
+def _load(cls: type[R], folder: Path, model: MorphableModel | None) -> R:
     path = folder / "result.json"
     document = read_document(folder)
     try:
@@ -86,7 +91,6 @@ def load(cls: type[R], folder: Path, model: MorphableModel | None = None) -> R:
 
 def read_document(folder: Path) -> dict[str, Any]:
     """Parse ``result.json`` and check that it is one, of this version; InputError otherwise."""
-    finish(folder)
     path = folder / "result.json"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a result that `mifit fit` wrote")

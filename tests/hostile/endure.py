@@ -304,7 +304,7 @@ def endure(scenario: Scenario, root: Path, kills: int, fulls: int, chance: rando
             continue
         done += 1
         if (output / ".mifit").is_dir():
-            finish_writing(output)  # as whoever reads or writes the folder next does first
+            finish_writing(output)  # as whoever writes into the folder next does first
         if output.exists() or old:
             judge(old, content(output) if output.exists() else {}, new, scenario)
         if done % 4 == 0 or done == kills:

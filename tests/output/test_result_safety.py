@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mifit.cli import main
 from mifit.core.image import write_image
 from mifit.errors import InputError
 from mifit.reconstruction import Reconstruction
@@ -96,7 +97,7 @@ def test_a_save_that_fails_leaves_the_old_result(ball, other, tmp_path, monkeypa
 
 
 def test_killed_while_files_change_places(ball, other, tmp_path):
-    """Killed after any number of them: the next that reads has all of the new result, never a mix."""
+    """Killed after any number of them: none reads a mix, and the next that writes has all of the new result."""
     ball.save(tmp_path / "start")
     other.save(tmp_path / "end")
     expected = tree(tmp_path / "end")
@@ -110,12 +111,12 @@ def test_killed_while_files_change_places(ball, other, tmp_path):
         folder = shutil.copytree(tmp_path / "start", tmp_path / f"run{limit}")
         moves[0] = 0
 
-        def dying(a, b, limit=limit):
-            if ownership.MARK + os.sep + "new" in str(a) and ".part" not in Path(a).name:
+        def dying(a, b, limit=limit, **at):
+            if at:
                 if moves[0] == limit:
                     raise Killed
                 moves[0] += 1
-            replace(a, b)
+            replace(a, b, **at)
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(os, "replace", dying)
@@ -123,29 +124,117 @@ def test_killed_while_files_change_places(ball, other, tmp_path):
                 other.save(folder)
                 ended = True
             except Killed:
-                pass
+                before = {name: (folder / name).stat() for name in tree(folder)}
+                with pytest.raises(InputError, match="`mifit fit` or `mifit track`"):
+                    Reconstruction.load(folder, ball.model)
+                assert {name: (folder / name).stat() for name in tree(folder)} == before
+        ownership.finish(folder)
         assert Reconstruction.load(folder, ball.model).timesteps == (0,)
         assert tree(folder) == expected
         limit += 1
     assert limit > 10
 
 
-def test_names_in_a_foreign_result_stay_inside(ball, tmp_path):
-    folder, outside = tmp_path / "result", tmp_path / "outside"
-    ball.save(folder)
-    outside.mkdir()
-    (outside / "victim").write_text("mine")
-    (folder / "link").symlink_to(outside)
-    digest = ownership._digest(outside / "victim")
-    names = ["../outside/victim", str(outside / "victim"), "link/victim"]
-    mark = folder / ownership.MARK
-    (mark / "files.json").write_text(json.dumps(dict.fromkeys(names, digest)))
-    (mark / "new" / "link").mkdir(parents=True)
-    (mark / "new" / "link" / "victim").write_text("theirs")
+def everything(folder: Path) -> dict[str, tuple]:
+    """All below a folder, links followed nowhere, with what tells that it was moved or changed."""
+    found = {}
+    for path in folder.rglob("*"):
+        status = path.lstat()
+        content = path.read_bytes() if path.is_file() and not path.is_symlink() else b""
+        found[str(path.relative_to(folder))] = status.st_mode, status.st_ino, status.st_mtime_ns, content
+    return found
+
+
+def plant(result: Reconstruction, tmp_path: Path, new: str) -> Path:
+    """A result folder from a stranger whose notes say that files of the user's home were about to become its own."""
+    folder, home = tmp_path / "result", tmp_path / "home"
+    (home / ".ssh").mkdir(parents=True)
+    (home / ".ssh" / "id_rsa").write_text("mine")
+    (home / "victim").write_text("mine")
+    result.model.save(tmp_path / "ball.npz")
+    dataclasses.replace(result, model_source=str(tmp_path / "ball.npz")).save(folder)
+    (folder / "link").symlink_to(home)
+    mark, digest = folder / ownership.MARK, ownership._digest(home / "victim")
+    names = [".ssh/id_rsa", "victim", "../home/victim", str(home / "victim"), "link/victim", "id_rsa"]
+    known = json.loads((mark / "files.json").read_text())
+    (mark / "files.json").write_text(json.dumps(known | dict.fromkeys(names, digest)))
+    if new == "link":
+        (mark / "new").symlink_to(home)
+    elif new == "link inside":
+        (mark / "new").mkdir()
+        (mark / "new" / ".ssh").symlink_to(home / ".ssh")
+        (mark / "new" / "id_rsa").symlink_to(home / ".ssh" / "id_rsa")
+    else:
+        (mark / "new" / "link").mkdir(parents=True)
+        (mark / "new" / "link" / "victim").write_text("theirs")
     (mark / "commit.json").write_text(json.dumps({"made": dict.fromkeys(names, ""), "stale": names}))
-    Reconstruction.load(folder, ball.model)
-    assert (outside / "victim").read_text() == "mine"
-    assert not (mark / "commit.json").exists()
+    return folder
+
+
+@pytest.mark.parametrize("new", ["link", "link inside", "folder"])
+def test_reading_moves_nothing(ball, tmp_path, monkeypatch, capsys, new):
+    folder = plant(ball, tmp_path, new)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    before = everything(tmp_path)
+    with pytest.raises(InputError, match="finishes"):
+        Reconstruction.load(folder)
+    for arguments in (
+        ("export", "--format", "obj", "--out", str(tmp_path / "x.obj")),
+        ("render", "--out", str(tmp_path / "x.png")),
+        ("evaluate", "--capture", str(tmp_path / "capture"), "--camera", "third"),
+        ("view", "--port", "0"),
+        ("turntable", "--out", str(tmp_path / "x")),
+        ("relight", "--env", str(tmp_path / "x.hdr"), "--out", str(tmp_path / "x")),
+    ):
+        assert main([arguments[0], str(folder), *arguments[1:]]) == 2
+        assert "finishes" in capsys.readouterr().err
+        assert everything(tmp_path) == before
+
+
+@pytest.mark.parametrize("new", ["link", "link inside", "folder"])
+def test_writing_moves_nothing_from_or_to_elsewhere(ball, tmp_path, new):
+    folder = plant(ball, tmp_path, new)
+    before = everything(tmp_path / "home")
+    if new == "folder":
+        with pytest.raises(InputError, match="found a link or a file as a folder in link/victim"):
+            ball.save(folder, force=True)
+        (folder / "link").unlink()
+        ball.save(folder)
+        assert Reconstruction.load(folder, ball.model).timesteps == ball.timesteps
+    else:
+        with pytest.raises(InputError, match="found a symbolic link"):
+            ball.save(folder, force=True)
+    assert everything(tmp_path / "home") == before
+
+
+@pytest.mark.parametrize("place", [".mifit", "maps", "geometry", ".mifit/new", ".mifit/checkpoints", ".mifit/lock"])
+def test_a_link_in_place_of_a_folder_of_ours_is_refused(ball, tmp_path, place):
+    folder, outside = tmp_path / "result", tmp_path / "outside"
+    for name in ("new", "checkpoints", "maps"):
+        (outside / name).mkdir(parents=True)
+        (outside / name / "victim").write_text("mine")
+    (folder / place).parent.mkdir(parents=True)
+    (folder / place).symlink_to(outside)
+    before = everything(tmp_path)
+    with pytest.raises(InputError, match="found a symbolic link"):
+        ball.save(folder, force=True)
+    assert everything(tmp_path) == before
+
+
+def test_a_result_that_changes_while_it_is_read_is_refused(ball, other, tmp_path, monkeypatch):
+    from mifit.result import reading
+
+    ball.save(tmp_path)
+    read = reading.read_image
+
+    def slow(path):
+        if path.name == "specular.exr":
+            other.save(tmp_path)
+        return read(path)
+
+    monkeypatch.setattr(reading, "read_image", slow)
+    with pytest.raises(InputError, match="another mifit has written into it meanwhile; try again"):
+        Reconstruction.load(tmp_path, ball.model)
 
 
 def test_one_process_writes_at_a_time(tmp_path):
