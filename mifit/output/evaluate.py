@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -16,12 +15,11 @@ from mifit.core.camera import Camera
 from mifit.core.flip import flip
 from mifit.core.image import to_8_bit
 from mifit.core.metrics import mean_squared_error, psnr_from_rmse, ssim
-from mifit.core.npz import read_npz
 from mifit.errors import InputError
-from mifit.morphable.openings import leading_faces
 from mifit.output.deferred import shade_methods, trace_mesh, visible_surface
 from mifit.output.pose import pose_head
 from mifit.output.resect import needs_resection, resect
+from mifit.output.truth import true_mesh
 from mifit.progress import Progress, silent
 from mifit.render.image_based import image_based
 
@@ -209,7 +207,13 @@ def compare(
     if region == "model":
         area = face_area(vertices, model.faces, model.face_mask, view)
     elif region == "truth":
-        area = face_area(*_truth(capture, reconstruction, timestep), view)
+        truth = true_mesh(capture, timestep, reconstruction.model)
+        if truth is None:
+            raise InputError(
+                f"{capture.path}: has no true mesh of timestep {timestep} (truth/{timestep:04d}.npz); --region truth needs "
+                "the capture's ground truth, or use --region model"
+            )
+        area = face_area(truth.vertices, truth.faces, truth.face_mask, view)
     else:
         raise InputError(f"region: found {region!r}, expected 'model' or 'truth'")
     area &= frame.valid
@@ -259,39 +263,3 @@ def face_area(vertices: NDArray, faces: NDArray, face_mask: NDArray, camera: Cam
     side = 2 * EROSION + 1
     # The image's border is no border of the face.
     return binary_erosion(area.reshape(camera.height, camera.width), np.ones((side, side)), border_value=1)
-
-
-def _truth(capture: Capture, reconstruction: Result, timestep: int) -> tuple[NDArray, NDArray, NDArray[np.bool_]]:
-    """Vertices, faces and face area of the capture's ground-truth mesh.
-
-    The mesh's faces are those that the truth folder carries (``faces`` and ``face_mask`` in ``mesh.npz``), else
-    the fitted model's. Of a model that got eyes the truth may have the first vertices, those of the model's file.
-    """
-    folder = Path(capture.path) / "truth"
-    path = folder / f"{timestep:04d}.npz"
-    try:
-        if not path.exists():
-            raise InputError(f"{path}: missing; --region truth needs the capture's ground truth, or use --region model")
-        vertices = read_npz(path, ("vertices",))["vertices"]
-    except KeyError:
-        raise InputError(f"{path}: not a ground-truth file: has no array 'vertices'") from None
-    mesh = folder / "mesh.npz"
-    if mesh.exists():
-        data = read_npz(mesh, ("faces", "face_mask"))
-        if "faces" not in data:
-            raise InputError(f"{mesh}: has no array 'faces'")
-        faces = data["faces"]
-        if faces.ndim != 2 or faces.shape[1] != 3 or faces.min() < 0 or faces.max() >= len(vertices):
-            raise InputError(
-                f"{mesh}: faces has shape {faces.shape}, expected (F, 3) indices of {len(vertices)} vertices"
-            )
-        mask = data["face_mask"].astype(bool) if "face_mask" in data else np.ones(len(faces), dtype=bool)
-        return vertices, faces, mask
-    model = reconstruction.model
-    own = leading_faces(model, len(vertices))
-    if own is None:
-        raise InputError(
-            f"{path}: found {len(vertices)} vertices, but the fitted model {model.name!r} has {len(model.mean)}, "
-            f"so its faces don't fit; expected {mesh} with the truth's faces, or use --region model"
-        )
-    return vertices, model.faces[own], model.face_mask[own]

@@ -1,0 +1,195 @@
+"""Images compared over regions of a face: which pixels count, and errors that any program's images can be given.
+
+Regions follow the landmarks of the photograph alone, so that they are the same for every program:
+
+- ``face``: the hull of the 68 landmarks, a few pixels smaller;
+- ``skin``: the face without eyes and inner mouth;
+- ``relit``: the face without a wider surrounding of both, where relit views are compared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.camera import Camera
+from mifit.core.flip import flip
+from mifit.core.image import linear_to_srgb, srgb_to_linear
+from mifit.core.metrics import psnr_from_rmse, ssim
+from mifit.core.sh import LUMINANCE
+from mifit.errors import InputError
+
+SHRINK = 4
+"""Pixels by which the hull of the landmarks shrinks."""
+EYES, INNER_LIPS, BROWS = ((36, 42), (42, 48)), (60, 68), ((17, 22), (22, 27))
+"""iBUG landmarks of what is no skin, first and past the last."""
+BROW_WIDTH = 0.05
+"""Of the face's width: half of a brow's height."""
+SMOOTH = 3.0
+"""Pixels by which specular images are blurred before they are compared a second time."""
+
+Region = NDArray[np.bool_]
+
+
+def face_region(landmarks: NDArray, camera: Camera, shrink: int = SHRINK) -> Region:
+    """(H, W) hull of 68 landmarks (68, 2), eroded by ``shrink`` pixels."""
+    side = 2 * shrink + 1
+    return cv2.erode(_hull(landmarks, camera), np.ones((side, side), np.uint8)) > 0
+
+
+def skin_region(landmarks: NDArray, camera: Camera) -> Region:
+    """(H, W) face without eyes and inner mouth."""
+    holes = _openings(landmarks, camera, 1.6, 1.2)
+    side = 2 * int(0.012 * np.ptp(landmarks[:, 0])) + 1
+    return face_region(landmarks, camera) & (cv2.dilate(holes, np.ones((side, side), np.uint8)) == 0)
+
+
+def relit_region(landmarks: NDArray, camera: Camera) -> Region:
+    """(H, W) face without a wider surrounding of eyes and mouth."""
+    return face_region(landmarks, camera) & (_openings(landmarks, camera, 2.0, 2.0) == 0)
+
+
+def pass_region(landmarks: NDArray, camera: Camera) -> Region:
+    """(H, W) as `relit_region`, without brows and further from the hull: bare skin, for diffuse and specular images."""
+    hair = np.zeros((camera.height, camera.width), np.uint8)
+    for first, last in BROWS:
+        width = max(int(BROW_WIDTH * np.ptp(landmarks[:, 0])), 1)
+        cv2.polylines(hair, [landmarks[first:last].astype(np.int32)], False, 1, width)
+    inner = face_region(landmarks, camera, 7)
+    return inner & (_openings(landmarks, camera, 2.0, 2.0) == 0) & (hair == 0)
+
+
+def _hull(points: NDArray, camera: Camera) -> NDArray[np.uint8]:
+    area = np.zeros((camera.height, camera.width), np.uint8)
+    cv2.fillConvexPoly(area, cv2.convexHull(points.astype(np.float32)).astype(np.int32), 1)
+    return area
+
+
+def _openings(landmarks: NDArray, camera: Camera, eyes: float, mouth: float) -> NDArray[np.uint8]:
+    """Hulls of eyes and inner mouth, grown about their middles by factors."""
+    area = np.zeros((camera.height, camera.width), np.uint8)
+    for (first, last), factor in ((EYES[0], eyes), (EYES[1], eyes), (INNER_LIPS, mouth)):
+        middle = landmarks[first:last].mean(0)
+        area |= _hull(middle + factor * (landmarks[first:last] - middle), camera)
+    return area
+
+
+class Errors:
+    """Errors of some images of one method against photographs, pooled over the pixels of their regions."""
+
+    def __init__(self) -> None:
+        self.pixels = 0
+        self._sums = np.zeros(4)
+
+    def add(self, image: NDArray[np.uint8], photograph: NDArray[np.uint8], region: Region) -> None:
+        """Add the pixels of a region of 8-bit sRGB images (H, W, 3); an empty region adds nothing."""
+        count = int(region.sum())
+        if not count:
+            return
+        a, b = image[region].astype(np.float64), photograph[region].astype(np.float64)
+        means = ((a - b) ** 2).mean(), (matched_difference(a, b) ** 2).mean()
+        box = _around(region)
+        pair = image[box], photograph[box], region[box]
+        self._sums += count * np.array([*means, ssim(*pair), flip(*pair)])
+        self.pixels += count
+
+    def figures(self) -> dict[str, float]:
+        """PSNR (dB), PSNR after one factor per channel and image, RMSE (0..255), SSIM, FLIP and number of pixels."""
+        squared, matched, likeness, flipped = self._sums / max(self.pixels, 1)
+        return {
+            "psnr": psnr_from_rmse(math.sqrt(squared)),
+            "psnr_matched": psnr_from_rmse(math.sqrt(matched)),
+            "rmse": math.sqrt(squared),
+            "ssim": float(likeness),
+            "flip": float(flipped),
+            "pixels": self.pixels,
+        }
+
+
+def _around(region: Region, margin: int = 48) -> tuple[slice, slice]:
+    """The region's box with a margin wider than any window of a measure."""
+    sides = [np.flatnonzero(region.any(axis=axis)) for axis in (1, 0)]
+    low = [max(int(side[0]) - margin, 0) for side in sides]
+    return slice(low[0], int(sides[0][-1]) + margin + 1), slice(low[1], int(sides[1][-1]) + margin + 1)
+
+
+def matched_difference(codes: NDArray, photograph: NDArray) -> NDArray[np.float64]:
+    """(N, 3) difference of sRGB codes 0..255 once each channel's light is scaled to fit best.
+
+    A camera that no program reads may be exposed or balanced differently.
+    """
+    a, b = (srgb_to_linear(x / 255.0) for x in (codes, photograph))
+    return np.asarray(255.0 * linear_to_srgb(np.clip(_channel_scale(a, b) * a, 0.0, 1.0)) - photograph)
+
+
+def scaled_psnr(image: NDArray, truth: NDArray, region: Region) -> float:
+    """PSNR (dB) of the sRGB codes of linear images over a region, after the least-squares factor of each channel."""
+    a, b = image[region].astype(np.float64), truth[region].astype(np.float64)
+    codes = [255.0 * linear_to_srgb(np.clip(x, 0.0, 1.0)) for x in (_channel_scale(a, b) * a, b)]
+    return psnr_from_rmse(float(np.sqrt(np.mean((codes[0] - codes[1]) ** 2))))
+
+
+def _channel_scale(a: NDArray, b: NDArray) -> NDArray:
+    return (a * b).sum(0) / np.maximum((a * a).sum(0), 1e-9)
+
+
+def separation(
+    diffuse: NDArray, specular: NDArray, true_diffuse: NDArray, true_specular: NDArray, region: Region
+) -> dict[str, float]:
+    """How well diffuse and specular reflection are separated in one view.
+
+    Parameters
+    ----------
+    diffuse, specular, true_diffuse, true_specular : (H, W, 3)
+        Linear radiance; the true images in the same exposure as the photograph.
+    region : (H, W) bool
+        Skin, see `pass_region`.
+
+    Returns
+    -------
+    dict
+        ``correlation``: of the specular images' luminance (Pearson); ``error``: RMS error of it after the best factor,
+        over its RMS; both again ``_smooth``, after a blur of 3 pixels; ``error_flat``: that of an even specular image;
+        ``share``, ``share_truth``: mean specular over mean of both; ``diffuse_psnr``: PSNR in dB of the diffuse image
+        after one factor per channel; ``diffuse_psnr_unseparated``: that of the whole true image.
+    """
+    if not region.any():
+        raise InputError("separation: the region is empty, expected skin in the view")
+    weights = np.asarray(LUMINANCE, np.float64)
+
+    def blurred(image: NDArray) -> NDArray:
+        return cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTH)
+
+    def likeness(found: NDArray, true: NDArray) -> tuple[float, float]:
+        a, b = found[region] @ weights, true[region] @ weights
+        factor = (a @ b) / max(a @ a, 1e-12)
+        flat = np.ptp(a) == 0 or np.ptp(b) == 0
+        error = np.sqrt(((factor * a - b) ** 2).mean() / max((b**2).mean(), 1e-20))
+        return 0.0 if flat else float(np.corrcoef(a, b)[0, 1]), float(error)
+
+    def share(part: NDArray, rest: NDArray) -> float:
+        both = ((part + rest)[region] @ weights).mean()
+        return float((part[region] @ weights).mean() / max(both, 1e-12))
+
+    specular, true_specular = np.asarray(specular, np.float64), np.asarray(true_specular, np.float64)
+    raw, smooth = likeness(specular, true_specular), likeness(blurred(specular), blurred(true_specular))
+    return {
+        "correlation": raw[0],
+        "error": raw[1],
+        "correlation_smooth": smooth[0],
+        "error_smooth": smooth[1],
+        "error_flat": likeness(np.ones_like(true_specular), true_specular)[1],
+        "share": share(specular, np.asarray(diffuse, np.float64)),
+        "share_truth": share(true_specular, np.asarray(true_diffuse, np.float64)),
+        "diffuse_psnr": scaled_psnr(diffuse, true_diffuse, region),
+        "diffuse_psnr_unseparated": scaled_psnr(true_diffuse + true_specular, true_diffuse, region),
+    }
+
+
+def pooled(figures: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Mean of every figure over several views."""
+    return {key: float(np.mean([f[key] for f in figures])) for key in figures[0]} if figures else {}

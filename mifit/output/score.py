@@ -1,0 +1,297 @@
+"""Scores of any program's images and meshes, in plain files, against a capture's photographs and truth.
+
+Nothing of mifit's own results is needed. In the scored folder, with the capture's camera names and four-digit
+timesteps:
+
+=================================  =====================================================================================
+``CAMERA_TTTT.png``                a view, compared with that camera's photograph
+``diffuse_CAMERA.exr``             the first timestep's view without specular reflection
+``specular_CAMERA.exr``            its specular part; both are compared with the truth's passes
+``relit_ENV.exr``                  the truth's view under the environment ENV
+``TTTT.ply``                       the mesh of a timestep, world space
+=================================  =====================================================================================
+
+Images may be PNG or JPEG (sRGB) or EXR or HDR (linear), meshes PLY or OBJ. Views have the size of the camera's
+undistorted photographs. Relit views and passes are compared after one factor per channel, so their exposure is free.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.image import SUFFIXES, read_image, to_8_bit
+from mifit.errors import InputError
+from mifit.output.compare import (
+    Errors,
+    face_region,
+    pass_region,
+    relit_region,
+    scaled_psnr,
+    separation,
+    skin_region,
+)
+from mifit.output.truth import (
+    TrueMesh,
+    distance_figures,
+    landmarks_of,
+    nearest_points,
+    points_seen,
+    read_mesh,
+    relit_truths,
+    true_mesh,
+    true_passes,
+)
+from mifit.progress import Progress, silent
+from mifit.render.gbuffer import SurfaceScene
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+
+MESHES = (".ply", ".obj")
+REGIONS = ("skin", "face", "whole")
+
+
+def score(
+    capture: Capture,
+    folder: str | Path,
+    fitted: Sequence[str] | None = None,
+    model: MorphableModel | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Compare the files of a folder with a capture's photographs and truth.
+
+    Regions are those of the photograph's landmarks: ``face`` (their hull), ``skin`` (without eyes and inner mouth; where
+    the capture has a true mesh, what the fitted cameras see of it) and ``whole`` (all that the true mesh covers; without
+    one, every valid pixel).
+
+    Parameters
+    ----------
+    capture : Capture
+    folder : path
+        Named as the module says.
+    fitted : sequence of str, optional
+        Cameras that the program was given; default: the first two. Views of others count as held out.
+    model : MorphableModel, optional
+        Gives the triangles of a truth that has vertices alone.
+    progress : Progress
+
+    Returns
+    -------
+    dict
+        ``views``: per camera, and for ``held_out`` together, by region ``{"psnr", "psnr_matched", "rmse", "ssim",
+        "flip", "pixels"}`` (dB, dB after one factor per channel, 0..255, 0..1); ``relit``: PSNR per environment and
+        their mean; ``passes``: per camera what `output.compare.separation` gives; ``meshes``: distances (mm) from true
+        points that all fitted cameras see; ``ignored``: files without a meaning.
+
+    Raises
+    ------
+    InputError
+        No folder, nothing in it to score, an image of another size, or a truth that is missing.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; expected one with images to score, such as third_0000.png")
+    cameras = capture.cameras[:2] if fitted is None else tuple(fitted)
+    for name in cameras:
+        capture.camera(name)
+    found = _Files.of(folder, capture)
+    out: dict[str, Any] = {"capture": Path(capture.path).name, "fitted": list(cameras)}
+    jobs = len(found.views) + len(found.relit) + len(found.passes) + len(found.meshes)
+    if not jobs:
+        example = next((c for c in capture.cameras if c not in cameras), capture.cameras[-1])
+        raise InputError(
+            f"{folder}: found no file to score, expected names such as {example}_0000.png, relit_studio.exr, "
+            f"diffuse_{example}.exr, specular_{example}.exr or 0000.ply"
+        )
+    progress("Scoring", 0, jobs)
+    truth = _Truths(capture, cameras, model)
+    if found.views:
+        out["views"] = _views(found.views, truth)
+    if found.relit:
+        out["relit"] = _relit(found.relit, capture)
+    if found.passes:
+        out["passes"] = {camera: _passes(paths, camera, capture) for camera, paths in found.passes.items()}
+    if found.meshes:
+        out["meshes"] = _meshes(found.meshes, truth)
+    out["ignored"] = found.ignored
+    progress("Scoring", jobs, jobs)
+    return out
+
+
+class _Files:
+    """The files of a folder by what their names mean."""
+
+    def __init__(self) -> None:
+        self.views: dict[tuple[str, int], Path] = {}
+        self.relit: dict[str, Path] = {}
+        self.passes: dict[str, dict[str, Path]] = defaultdict(dict)
+        self.meshes: dict[int, Path] = {}
+        self.ignored: list[str] = []
+
+    @classmethod
+    def of(cls, folder: Path, capture: Capture) -> _Files:
+        """Read the names; two files of one meaning are an error."""
+        found = cls()
+        for path in sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")):
+            place = found._place(path, capture)
+            if place is None:
+                found.ignored.append(path.name)
+                continue
+            group, key = place
+            if key in group:
+                raise InputError(f"{path}: {group[key].name} means the same; expected one of the two")
+            group[key] = path
+        return found
+
+    def _place(self, path: Path, capture: Capture) -> tuple[dict[Any, Path], Any] | None:
+        stem, suffix = path.stem, path.suffix.lower()
+        if suffix in MESHES:
+            known = stem.isdigit() and int(stem) in capture.timesteps
+            return (self.meshes, int(stem)) if known else None
+        if suffix not in SUFFIXES:
+            return None
+        view = re.fullmatch(r"(.+)_(\d{4,})", stem)
+        if view and view[1] in capture.cameras and int(view[2]) in capture.timesteps:
+            return self.views, (view[1], int(view[2]))
+        kind, _, name = stem.partition("_")
+        if kind == "relit" and name:
+            return self.relit, name
+        if kind in ("diffuse", "specular") and name in capture.cameras:
+            return self.passes[name], kind
+        return None
+
+
+class _Truths:
+    """True meshes of a capture's timesteps, each read once, with what the fitted cameras see of them."""
+
+    def __init__(self, capture: Capture, fitted: Sequence[str], model: MorphableModel | None) -> None:
+        self.capture, self.fitted, self._model = capture, tuple(fitted), model
+        self._meshes: dict[int, tuple[TrueMesh, SurfaceScene] | None] = {}
+
+    def at(self, timestep: int) -> tuple[TrueMesh, SurfaceScene] | None:
+        """The mesh of a timestep, and what rays are sent at; None where there is none, or no triangles are known."""
+        if timestep not in self._meshes:
+            try:
+                mesh = true_mesh(self.capture, timestep, self._model)
+            except InputError:
+                if self._model is not None:
+                    raise
+                mesh = None
+            self._meshes[timestep] = None if mesh is None else (mesh, SurfaceScene(mesh.vertices, mesh.faces))
+        return self._meshes[timestep]
+
+    def regions(self, camera: str, timestep: int) -> dict[str, NDArray[np.bool_]]:
+        """Pixels of one photograph that count, by region."""
+        view, frame = self.capture.camera(camera), self.capture.frame(camera, timestep)
+        marks = landmarks_of(self.capture, camera, timestep)
+        skin, whole, found = skin_region(marks, view), frame.valid, self.at(timestep)
+        if found is not None:
+            from mifit.render.image_based import image_based
+
+            mesh, scene = found
+            cameras = [self.capture.camera(name) for name in self.fitted]
+            shown = image_based(self.capture, cameras, view, timestep, mesh.vertices, mesh.faces, scene=scene)
+            skin, whole = skin & shown.seen, whole & shown.hit
+        regions = {"skin": skin & frame.valid, "face": face_region(marks, view) & frame.valid, "whole": whole}
+        for name, region in regions.items():
+            if not region.any():
+                raise InputError(
+                    f"{self.capture.path}: camera {camera}, timestep {timestep}: no pixel of region {name} is visible, "
+                    "nothing to score"
+                )
+        return regions
+
+
+def _views(files: dict[tuple[str, int], Path], truth: _Truths) -> dict[str, Any]:
+    tallies: dict[str, dict[str, Errors]] = {}
+    for (camera, timestep), path in files.items():
+        frame = truth.capture.frame(camera, timestep)
+        image = to_8_bit(_read(path, frame.image.shape[:2]))
+        groups = [camera] if camera in truth.fitted else [camera, "held_out"]
+        for region, pixels in truth.regions(camera, timestep).items():
+            for group in groups:
+                tally = tallies.setdefault(group, {}).setdefault(region, Errors())
+                tally.add(image, to_8_bit(frame.image), pixels)
+    return {group: {region: e.figures() for region, e in found.items()} for group, found in tallies.items()}
+
+
+def _relit(files: dict[str, Path], capture: Capture) -> dict[str, float]:
+    truths = relit_truths(capture)
+    camera, timestep = capture.cameras[-1], capture.timesteps[0]
+    region = relit_region(landmarks_of(capture, camera, timestep), capture.camera(camera))
+    out = {}
+    for name, path in files.items():
+        if name not in truths:
+            known = ", ".join(truths) or "none"
+            raise InputError(f"{path}: the capture's truth has no view relit by {name!r}; it has {known}")
+        out[name] = scaled_psnr(_read(path, region.shape), truths[name].image, region)
+    return {**out, "mean": float(np.mean(list(out.values())))}
+
+
+def _passes(paths: dict[str, Path], camera: str, capture: Capture) -> dict[str, float]:
+    missing = next((kind for kind in ("diffuse", "specular") if kind not in paths), None)
+    if missing is not None:
+        there = next(iter(paths.values()))
+        raise InputError(f"{there}: found without {missing}_{camera}{there.suffix}, expected both passes")
+    truth = true_passes(capture, camera)
+    if truth is None:
+        raise InputError(f"{paths['diffuse']}: the capture's truth has no passes of camera {camera!r}")
+    view, marks = capture.camera(camera), landmarks_of(capture, camera, capture.timesteps[0])
+    region = pass_region(marks, view)
+    images = (_read(paths[kind], region.shape) for kind in ("diffuse", "specular"))
+    return separation(*images, truth.diffuse, truth.specular, region)
+
+
+def _meshes(files: dict[int, Path], truth: _Truths) -> dict[str, float]:
+    distances = []
+    for timestep, path in files.items():
+        found = truth.at(timestep)
+        if found is None:
+            raise InputError(
+                f"{path}: the capture's truth has no mesh of timestep {timestep}, or vertices without triangles; name "
+                "the model that it was made with"
+            )
+        points = points_seen(found[0], truth.capture, truth.fitted, timestep)
+        mesh = read_mesh(path)
+        distances.append(nearest_points(points.position, mesh.vertices, mesh.faces)[0])
+    return distance_figures(np.concatenate(distances) * truth.capture.unit_mm)
+
+
+def _read(path: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    image = read_image(path)
+    if image.shape[:2] != shape:
+        found, wanted = (f"{s[1]} x {s[0]}" for s in (image.shape, shape))
+        raise InputError(f"{path}: found {found} pixels, expected {wanted}, the size of the photograph")
+    return image
+
+
+def summary(found: dict[str, Any]) -> str:
+    """The scores as lines of text."""
+    lines = []
+    for group, regions in found.get("views", {}).items():
+        for region, f in regions.items():
+            lines.append(
+                f"{group}, {region}: {f['psnr']:.2f} dB ({f['psnr_matched']:.2f} after one factor per channel), "
+                f"SSIM {f['ssim']:.4f}, FLIP {f['flip']:.4f}"
+            )
+    lines += [f"relit by {name}: {value:.2f} dB" for name, value in found.get("relit", {}).items()]
+    for camera, f in found.get("passes", {}).items():
+        lines.append(
+            f"passes of {camera}: specular correlation {f['correlation']:.3f} ({f['correlation_smooth']:.3f} smoothed), "
+            f"error {f['error']:.3f}, share {f['share']:.3f} (truth {f['share_truth']:.3f}), diffuse "
+            f"{f['diffuse_psnr']:.2f} dB (no separation {f['diffuse_psnr_unseparated']:.2f})"
+        )
+    if "meshes" in found:
+        f = found["meshes"]
+        lines.append(
+            f"scan to mesh: median {f['median_mm']:.3f}, mean {f['mean_mm']:.3f}, 90 % {f['p90_mm']:.3f} mm"
+        )
+    return "\n".join(lines)
