@@ -85,8 +85,9 @@ def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> No
         watch=show,
     )
     remember(out, [path.name for path in first])  # after the fit, which clears away what a result before it left
-    judged = {"camera": "third", "timesteps": None, "region": "model", "baseline": True, "json": out / "third.json"}
-    judge(Namespace(quiet=arguments.quiet, result=out, capture=folder, **judged), result, capture)
+    judged = {"camera": "third", "timesteps": None, "region": "model", "baseline": True, "passes": False}
+    given = Namespace(quiet=arguments.quiet, result=out, capture=folder, json=out / "third.json", **judged)
+    judge(given, result, capture)
 
 
 def _first_picture(out: Path, result: Reconstruction, capture: Capture) -> Path:

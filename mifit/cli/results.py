@@ -43,6 +43,7 @@ def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> Non
         region=arguments.region,
         progress=console_progress(arguments.quiet),
         baseline=arguments.baseline,
+        passes=arguments.passes,
         watch=lambda one: shown.append(one) if len(shown) < SHOWN_TIMESTEPS else None,
     )
     if not fitted_to(result, capture):
@@ -66,6 +67,10 @@ def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> Non
     if "baseline" in found:
         print(f"image-based rendering on the same mesh, {found['baseline']['region_pixels']} pixels that it can fill")
         _print_measures(found["baseline"]["methods"])
+    if "passes" in found:
+        from mifit.output.score import summary
+
+        print(summary({"passes": {found["camera"]: found["passes"]}}))
     write_report(arguments.result, result, capture, found, shown)
 
 
@@ -73,6 +78,27 @@ def _print_measures(methods: dict[str, dict[str, float]]) -> None:
     print(f"{'method':<12}{'PSNR dB':>9}{'RMSE':>8}{'SSIM':>8}{'FLIP':>8}")
     for method, f in methods.items():
         print(f"{method:<12}{f['psnr']:>9.2f}{f['rmse']:>8.2f}{f['ssim']:>8.4f}{f['flip']:>8.4f}")
+
+
+def score(arguments: Namespace) -> None:
+    """Score any program's images and meshes, in plain files, against a capture's truth."""
+    import mifit
+
+    capture = mifit.Capture.load(arguments.capture)
+    model = None if arguments.model is None else mifit.MorphableModel.load(arguments.model)
+    use_variant(arguments)
+    from mifit.output.score import score as scored
+    from mifit.output.score import summary
+
+    found = scored(capture, arguments.images, arguments.cameras, model, console_progress(arguments.quiet))
+    for name in found["ignored"]:
+        print(
+            f"mifit: warning: {arguments.images / name}: its name says nothing that is scored; left out",
+            file=sys.stderr,
+        )
+    if arguments.json:
+        write_text(arguments.json, json.dumps(found, indent=2) + "\n")
+    print(summary(found))
 
 
 def render(arguments: Namespace) -> None:
@@ -188,7 +214,24 @@ def add_commands(add: types.Add) -> None:
         "--region", choices=["model", "truth"], default="model", help="whose face area counts (default: model)"
     )
     p.add_argument("--baseline", action="store_true", help="compare image-based rendering on the same mesh and pixels")
+    p.add_argument(
+        "--passes",
+        action="store_true",
+        help="compare diffuse and specular images of the capture's first timestep with the truth's",
+    )
     p.add_argument("--json", type=types.path, help="file to write the figures to")
+
+    p = add("score", score, "any program's images, relit views, passes or meshes against a capture's truth")
+    p.add_argument("capture", type=types.path, help="capture folder with truth, or its transforms.json")
+    p.add_argument(
+        "--images",
+        type=types.path,
+        required=True,
+        help="folder with CAMERA_TTTT.png, relit_ENV.exr, diffuse_CAMERA.exr, specular_CAMERA.exr, TTTT.ply",
+    )
+    p.add_argument("--cameras", type=types.listed, help="cameras that the program was given; default: the first two")
+    p.add_argument("--model", help="morphable model that the capture was made with, if its truth has no triangles")
+    p.add_argument("--json", type=types.path, help="file to write the scores to")
 
     p = add("render", render, "render a reconstruction from a camera of the capture, or from any side")
     p.add_argument("result", type=types.path, help="result folder of mifit fit")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -16,10 +16,11 @@ from mifit.core.flip import flip
 from mifit.core.image import to_8_bit
 from mifit.core.metrics import mean_squared_error, psnr_from_rmse, ssim
 from mifit.errors import InputError
+from mifit.output.compare import pass_region, separation
 from mifit.output.deferred import shade_methods, trace_mesh, visible_surface
 from mifit.output.pose import pose_head
 from mifit.output.resect import needs_resection, resect
-from mifit.output.truth import true_mesh
+from mifit.output.truth import landmarks_of, true_mesh, true_passes
 from mifit.progress import Progress, silent
 from mifit.render.image_based import image_based
 
@@ -69,6 +70,7 @@ def evaluate(
     progress: Progress = silent,
     baseline: bool = False,
     watch: Callable[[Comparison], None] | None = None,
+    passes: bool = False,
 ) -> dict[str, Any]:
     """Compare renders with photographs over the face area.
 
@@ -96,6 +98,8 @@ def evaluate(
         Compare image-based rendering on the fitted mesh as well (`render.image_based`).
     watch : callable, optional
         Given the comparison of each timestep.
+    passes : bool
+        Compare the model's diffuse and specular image of the capture's first timestep with the truth's.
 
     Returns
     -------
@@ -105,7 +109,8 @@ def evaluate(
         With ``baseline`` also ``"baseline": {"region_pixels", "methods"}``, over the pixels of the region that a
         fitted view sees, with ``"image_based"`` among the methods; for a camera that had to be placed,
         ``"resected": {"landmark_pixels", "focal_pixels"}``, and for timesteps that had no head
-        ``"posed": {timestep: {"landmark_pixels"}}``.
+        ``"posed": {timestep: {"landmark_pixels"}}``; with ``passes`` also ``"passes"``, what
+        `output.compare.separation` gives.
 
     Raises
     ------
@@ -117,6 +122,7 @@ def evaluate(
     placed = resect(reconstruction, capture, camera) if needs_resection(reconstruction, capture, camera) else None
     if placed is not None:
         capture = capture.with_estimate([*reconstruction.cameras, placed.camera])
+    separated = separation_of(reconstruction, capture, camera) if passes else None
     per_timestep, posed = [], {}
     whole, seen = _Sums(), _Sums()
     progress("Evaluating", 0, len(steps))
@@ -142,11 +148,38 @@ def evaluate(
     }
     if baseline:
         out["baseline"] = {"region_pixels": seen.pixels, "methods": seen.figures()}
+    if separated is not None:
+        out["passes"] = separated
     if posed:
         out["posed"] = posed
     if placed is not None:
         out["resected"] = {"landmark_pixels": placed.landmark_pixels, "focal_pixels": placed.camera.fx}
     return out
+
+
+def separation_of(reconstruction: Result, capture: Capture, camera: str) -> dict[str, float]:
+    """How well a result's diffuse and specular image of the first timestep agree with the truth's.
+
+    The result is rendered without its residual, which is neither. See `output.compare.separation`.
+
+    Raises
+    ------
+    InputError
+        No passes in the truth, a first timestep that wasn't fitted, or a fit without reflectance.
+    """
+    truth, timestep = true_passes(capture, camera), capture.timesteps[0]
+    if truth is None:
+        raise InputError(f"{capture.path}: --passes needs truth/diffuse_{camera}.exr, which is missing")
+    if timestep not in reconstruction.timesteps or "diffuse" not in reconstruction.methods:
+        raise InputError(f"--passes: needs reflectance and timestep {timestep}, of which the truth's passes are")
+    alone = replace(reconstruction, residual=None)
+    view = located(capture, reconstruction, camera).camera(camera)
+    surface = visible_surface(alone, view, timestep)
+    linear = shade_methods(alone, surface, timestep, ("full", "diffuse"))
+    full, diffuse = (as_photographed(alone, linear[method], camera) for method in ("full", "diffuse"))
+    region = pass_region(landmarks_of(capture, camera, timestep), view) & (full[..., 3] > 0)
+    parts = diffuse[..., :3], full[..., :3] - diffuse[..., :3]
+    return separation(*parts, truth.diffuse, truth.specular, region)
 
 
 class _Sums:
@@ -210,8 +243,8 @@ def compare(
         truth = true_mesh(capture, timestep, reconstruction.model)
         if truth is None:
             raise InputError(
-                f"{capture.path}: has no true mesh of timestep {timestep} (truth/{timestep:04d}.npz); --region truth needs "
-                "the capture's ground truth, or use --region model"
+                f"{capture.path}: has no true mesh of timestep {timestep} (truth/{timestep:04d}.npz); --region truth "
+                "needs the capture's ground truth, or use --region model"
             )
         area = face_area(truth.vertices, truth.faces, truth.face_mask, view)
     else:

@@ -68,9 +68,9 @@ def score(
 ) -> dict[str, Any]:
     """Compare the files of a folder with a capture's photographs and truth.
 
-    Regions are those of the photograph's landmarks: ``face`` (their hull), ``skin`` (without eyes and inner mouth; where
-    the capture has a true mesh, what the fitted cameras see of it) and ``whole`` (all that the true mesh covers; without
-    one, every valid pixel).
+    Regions are those of the photograph's landmarks: ``face`` (their hull), ``skin`` (without eyes and inner mouth;
+    where the capture has a true mesh, what the fitted cameras see of it) and ``whole`` (all that the true mesh covers;
+    without one, every valid pixel).
 
     Parameters
     ----------
@@ -285,13 +285,11 @@ def summary(found: dict[str, Any]) -> str:
     lines += [f"relit by {name}: {value:.2f} dB" for name, value in found.get("relit", {}).items()]
     for camera, f in found.get("passes", {}).items():
         lines.append(
-            f"passes of {camera}: specular correlation {f['correlation']:.3f} ({f['correlation_smooth']:.3f} smoothed), "
-            f"error {f['error']:.3f}, share {f['share']:.3f} (truth {f['share_truth']:.3f}), diffuse "
-            f"{f['diffuse_psnr']:.2f} dB (no separation {f['diffuse_psnr_unseparated']:.2f})"
+            f"passes of {camera}: specular correlation {f['correlation']:.3f} ({f['correlation_smooth']:.3f} "
+            f"smoothed), error {f['error']:.3f}, share {f['share']:.3f} (truth {f['share_truth']:.3f}), "
+            f"diffuse {f['diffuse_psnr']:.2f} dB (no separation {f['diffuse_psnr_unseparated']:.2f})"
         )
     if "meshes" in found:
         f = found["meshes"]
-        lines.append(
-            f"scan to mesh: median {f['median_mm']:.3f}, mean {f['mean_mm']:.3f}, 90 % {f['p90_mm']:.3f} mm"
-        )
+        lines.append(f"scan to mesh: median {f['median_mm']:.3f}, mean {f['mean_mm']:.3f}, 90 % {f['p90_mm']:.3f} mm")
     return "\n".join(lines)

@@ -72,6 +72,8 @@ class PathTracer:
         Longest path in segments; 4 is two bounces of light between skin and skin.
     lamps : sequence of dict
         Emitters beside the environment, as Mitsuba's dictionaries.
+    specular : bool
+        Whether the lobes reflect; without them the diffuse base alone is left.
     """
 
     def __init__(
@@ -80,10 +82,11 @@ class PathTracer:
         environment: NDArray,
         max_depth: int = 4,
         lamps: Sequence[dict[str, Any]] = (),
+        specular: bool = True,
     ) -> None:
         import mitsuba as mi
 
-        self._bsdfs = {name: mi.load_dict(_bsdf(material)) for name, material in materials.items()}
+        self._bsdfs = {name: mi.load_dict(_bsdf(material, float(specular))) for name, material in materials.items()}
         bitmap = mi.Bitmap(np.ascontiguousarray(environment, dtype=np.float32))
         self._emitter = mi.load_dict({"type": "envmap", "bitmap": bitmap})
         self._lamps = {f"lamp{i}": mi.load_dict(lamp) for i, lamp in enumerate(lamps)}
@@ -135,7 +138,7 @@ def _stratified_count(spp: int) -> int:
     return side * (side - 1) if side * (side - 1) >= spp else side * side
 
 
-def _bsdf(material: Material) -> dict[str, Any]:
+def _bsdf(material: Material, strength: float) -> dict[str, Any]:
     def lobe(specular: float, roughness: NDArray) -> dict[str, Any]:
         return {
             "type": "principled",
@@ -150,8 +153,8 @@ def _bsdf(material: Material) -> dict[str, Any]:
         "nested": {
             "type": "blendbsdf",
             "weight": _texture(material.gloss),
-            "dry": lobe(0.3, material.roughness),
-            "oily": lobe(0.7, 0.6 * material.roughness),
+            "dry": lobe(0.3 * strength, material.roughness),
+            "oily": lobe(0.7 * strength, 0.6 * material.roughness),
         },
     }
 

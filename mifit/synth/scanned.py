@@ -189,8 +189,9 @@ def synthesize_scan(
     """Render a capture of a scanned head, with truth beside it.
 
     ``truth/NNNN.ply`` is the mesh in world space (centimetres), ``truth/maps.npz`` albedo, specular and roughness,
-    ``truth/relit_NAME.exr`` the last camera's view of the first timestep under another environment, linear, and
-    ``truth/environment_NAME.exr`` that environment; ``truth/meta.json`` has the factor of each to the
+    ``truth/full_CAMERA.exr`` and ``truth/diffuse_CAMERA.exr`` the last camera's view of the first timestep with and
+    without specular reflection, ``truth/relit_NAME.exr`` the same view under another environment, and
+    ``truth/environment_NAME.exr`` that environment; all linear. ``truth/meta.json`` has the factor of each to the
     sensor's range. There are no landmarks: `mifit landmarks` finds them.
 
     Parameters
@@ -237,6 +238,13 @@ def synthesize_scan(
             shot = Shot(camera.name, t, out / "images" / camera.name / f"{t:04d}.png")
             write_image(shot.image, expose(image[..., :3] * exposure, np.random.default_rng([seed, t, c, 22])))
             shots.append(shot)
+        if not t:
+            last = cameras[-1]
+            bare = PathTracer({"head": material}, environment, specular=False)
+            write_image(out / "truth" / f"full_{last.name}.exr", images[-1][..., :3])
+            # The same seeds as the whole view's: their difference, the specular part, has less noise.
+            first = bare.render([placed], cameras, spp, seed=seed * 100_003)[-1]
+            write_image(out / "truth" / f"diffuse_{last.name}.exr", first[..., :3])
         grey = np.full_like(placed.vertices, 0.5)
         write_ply(out / "truth" / f"{t:04d}.ply", placed.vertices, head.faces, placed.normals, head.uv, grey)
         progress("Rendering", t + 1, total)
