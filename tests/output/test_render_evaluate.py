@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mifit.core import sh
-from mifit.core.image import srgb_to_linear
+from mifit.core.image import srgb_to_linear, write_image
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
@@ -214,3 +215,32 @@ def test_bad_requests_are_named(ball, stage_1_ball, variant):
     behind = replace(camera, name="behind", world_to_camera=pose)
     with pytest.raises(InputError, match="face area is not visible"):
         evaluate(ball, FakeCapture((behind,), lambda c, t: np.zeros((64, 64, 3))), "behind")
+
+
+class MarkedCapture(FakeCapture):
+    """With 68 landmarks about the middle of the picture: a wide hull, small eyes, brows and mouth."""
+
+    def landmarks(self, name, timestep):
+        angle = np.linspace(0, 2 * np.pi, 68)
+        points = 32 + 24 * np.stack([np.cos(angle), np.sin(angle)], 1)
+        for part, middle in ((slice(17, 27), (32, 12)), (slice(36, 42), (26, 26)), (slice(42, 48), (38, 26))):
+            points[part] = middle
+        points[60:68] = (32, 44)
+        return SimpleNamespace(points=points)
+
+
+def test_passes_of_a_result_are_compared_with_the_truths(ball, variant, tmp_path):
+    camera = ball_camera("third", 5.0)
+    full, diffuse = (ball.render(camera, 0, method)[..., :3] for method in ("full", "diffuse"))
+    capture = MarkedCapture((camera,), lambda c, t: full, tmp_path)
+    with pytest.raises(InputError, match=r"--passes needs truth/diffuse_third.exr, which is missing"):
+        evaluate(ball, capture, "third", (0,), passes=True)
+    write_image(tmp_path / "truth" / "diffuse_third.exr", diffuse)
+    write_image(tmp_path / "truth" / "full_third.exr", full)
+    found = evaluate(ball, capture, "third", (0,), passes=True)["passes"]
+    assert found["correlation"] > 0.999 and found["error"] < 0.01 and found["diffuse_psnr"] > 60
+    assert found["share"] == pytest.approx(found["share_truth"], rel=0.01) and found["share"] > 0.02
+    matt = replace(ball.reflectance, specular=np.zeros_like(ball.reflectance.specular))
+    none = evaluate(replace(ball, reflectance=matt), capture, "third", (0,), passes=True)["passes"]
+    assert none["share"] == 0 and none["correlation"] == 0 and none["error"] == pytest.approx(1.0)
+    assert "passes" not in evaluate(ball, capture, "third", (0,))

@@ -1,5 +1,6 @@
 """Captures of scanned heads, heads that talk and turn, and the public Digital Emily scenes."""
 
+import json
 import math
 from pathlib import Path
 
@@ -106,6 +107,12 @@ def test_a_scan_becomes_a_capture_with_truth(files, variant):
     relit = read_image(view) * exposure
     assert 0.5 < np.percentile(relit.max(axis=-1)[relit.sum(-1) > 0], 95) < 0.9
     assert light.name == "environment_other.exr"
+    full, diffuse = (read_image(out / "truth" / f"{name}_third.exr") for name in ("full", "diffuse"))
+    photograph = capture.frame("third", 0).image
+    exposure = json.loads((out / "truth" / "meta.json").read_text())["exposure"]
+    lit = photograph.sum(-1) > 0.2
+    assert np.median(np.abs(full * exposure - photograph)[lit]) < 0.02
+    assert 0.5 < diffuse[lit].sum() / full[lit].sum() < 0.97  # some of the light is specular reflection
     assert main([str(a) for a in arguments]) == 2  # the folder holds something
 
 
