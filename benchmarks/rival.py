@@ -299,8 +299,8 @@ def true_geometry_like(task: Task, head: Head) -> Any:
 def ours(task: Task, size: int) -> dict[str, Any]:
     """``mifit.fit``'s stages with their defaults on the same images; the clock starts when they have been read."""
     from mifit.config import FitConfig
+    from mifit.fitting import Source, run_steps, steps
     from mifit.reconstruction import Reconstruction
-    from mifit.steps import Source, run_steps, steps
 
     config = FitConfig()
     config = replace(config, reflectance=replace(config.reflectance, texture_size=size))

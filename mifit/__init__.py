@@ -32,7 +32,7 @@ _EXPORTS = {
     "set_variant": "mifit.render.variant",
     "register_plugins": "mifit.render.plugins",
     "load_scene": "mifit.render.scene",
-    "fit": "mifit.pipeline",
+    "fit": "mifit.fitting",
     "track": "mifit.stages.track",
     "refine": "mifit.extras.refine",
     "choose_frames": "mifit.capture.choose_frames",

@@ -1,28 +1,272 @@
-"""Fitting into a result folder: checkpoints, resuming, and nothing lost that an earlier run has made."""
+"""``mifit.fit``: capture and model -> geometry -> reflectance -> normals, mesh -> reconstruction.
+
+`steps` lists the steps in order, each with its inputs and settings. A step sees nothing but what it is given: the
+source (capture, model, cameras, timesteps, seed), the estimates that it names as inputs, and its settings. The key in
+the cache is made of exactly these, so that any change of one runs it anew, with all that depends on it, and a change of
+anything else doesn't.
+
+To add a step, write ``_name(source, inputs, progress, *settings)`` and put a `Step` into `steps`. A step whose
+``part`` an earlier one has made already replaces that estimate for all that come after it.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import shutil
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
+
+import numpy as np
 
 import mifit
+from mifit.cache import Cache, digest
 from mifit.capture.choose_frames import FrameChoice
-from mifit.config import FitConfig
+from mifit.config import (
+    FitConfig,
+    GeometryConfig,
+    MeshConfig,
+    NormalsConfig,
+    ReflectanceConfig,
+    ResidualConfig,
+    SurfaceConfig,
+)
+from mifit.core.estimate import (
+    GeometryEstimate,
+    MeshEstimate,
+    NormalsEstimate,
+    ReflectanceEstimate,
+    ResidualEstimate,
+)
+from mifit.core.threads import one_blas_thread
 from mifit.errors import InputError
-from mifit.pipeline import choose, choose_timesteps, fit, fitted_model
 from mifit.progress import Progress, silent
 from mifit.reconstruction import Reconstruction
 from mifit.result.ownership import CHECKPOINTS, check_ours, claim, locked
 from mifit.result.reading import read_document
-from mifit.steps import STAGES, Stage
+from mifit.stages.eyes import behind_lids
+from mifit.stages.falloff import find_falloff
+from mifit.stages.find_residual import find_residual
+from mifit.stages.find_surface import find_surface
+from mifit.stages.fit_geometry import fit_geometry
+from mifit.stages.infer_reflectance import infer_reflectance
+from mifit.stages.normals.mesh_refinement import refine_mesh
+from mifit.stages.normals.normal_refinement import refine_normals
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
+    from mifit.result import Result
+
+T = TypeVar("T")
+ESTIMATED_CAMERAS = "the capture is uncalibrated: focal length, camera poses and so the scale are estimates"
+BASELINE_DEGREES = 3.0
+"""Angle between the views below which a person is told that distance is not measured."""
+Stage = Literal["geometry", "reflectance", "normals"]
+STAGES: tuple[Stage, ...] = ("geometry", "reflectance", "normals")
+Part = Literal["geometry", "reflectance", "normals", "mesh", "residual"]
+PARTS: dict[Part, type] = {
+    "geometry": GeometryEstimate,
+    "reflectance": ReflectanceEstimate,
+    "normals": NormalsEstimate,
+    "mesh": MeshEstimate,
+    "residual": ResidualEstimate,
+}
+
+
+Inputs = Mapping[Part, Any]
+
+
+@dataclass(frozen=True)
+class Source:
+    """What every step starts from.
+
+    Attributes
+    ----------
+    capture : Capture
+        Calibrated, or with estimated cameras.
+    digest : str
+        Of the capture's files, for the chosen cameras and timesteps.
+    model : MorphableModel
+    cameras : tuple of str
+    timesteps : tuple of int
+    seed : int
+    """
+
+    capture: Capture
+    digest: str
+    model: MorphableModel
+    cameras: tuple[str, ...]
+    timesteps: tuple[int, ...]
+    seed: int
+
+    @property
+    def images(self) -> tuple[Capture, MorphableModel, tuple[str, ...]]:
+        """Capture, model and cameras."""
+        return self.capture, self.model, self.cameras
+
+    @property
+    def key(self) -> dict[str, Any]:
+        """All that a result depends on besides settings, as JSON values."""
+        return {
+            "version": mifit.__version__,
+            "capture": self.digest,
+            "model": self.model.digest,
+            "cameras": list(self.cameras),
+            "timesteps": list(self.timesteps),
+            "seed": self.seed,
+        }
+
+    def seen(self, inputs: Inputs) -> Source:
+        """The source without the exposures, falloff and contrast that its geometry has found."""
+        found = inputs.get("geometry")
+        if found is None or not found.corrects_images:
+            return self
+        capture = self.capture.with_exposures(found.exposed).with_lenses(found.falloff, found.contrast)
+        return replace(self, capture=capture)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a fit.
+
+    Attributes
+    ----------
+    name : str
+        Of its checkpoint; one of a kind in a list of steps.
+    part : str
+        What it makes: a key of `PARTS`.
+    inputs : tuple of str
+        Parts that it is given, each as the last step before it left it.
+    settings : tuple of dataclass
+        Settings that it is given.
+    run : callable
+        ``run(source, inputs, progress, *settings)`` -> estimate of the part; a function of the module, so that it can
+        read nothing else.
+    """
+
+    name: str
+    part: Part
+    inputs: tuple[Part, ...]
+    settings: tuple[Any, ...]
+    run: Callable[..., Any]
+
+
+@one_blas_thread()
+def fit(
+    capture: Capture,
+    model: MorphableModel,
+    cameras: Sequence[str] | None = None,
+    timesteps: Sequence[int] | FrameChoice | None = None,
+    config: FitConfig | None = None,
+    until: Stage = "normals",
+    seed: int = 0,
+    progress: Progress = silent,
+    checkpoints: str | Path | None = None,
+    shared: bool = False,
+    watch: Callable[[Reconstruction], None] | None = None,
+) -> Reconstruction:
+    """Recover geometry, reflectance, lighting and normals of a face from a capture.
+
+    Parameters
+    ----------
+    capture : Capture
+        Images with cameras and landmarks.
+    model : MorphableModel
+        The face model to fit. One whose eyes are holes gets simple ones, unless ``[geometry] eyes`` is false: the
+        result's ``model``, whose vertices begin with this one's.
+    cameras : sequence of str, optional
+        Cameras to use; no other camera's images are read. Default: the capture's first two.
+    timesteps : sequence of int or FrameChoice, optional
+        Timesteps to fit jointly, named in any order; default: the first four. A choice (`mifit.choose_frames`) is kept
+        with its reasons in ``geometry.report.details["frames"]``.
+    config : FitConfig, optional
+        Settings of the stages.
+    until : {"geometry", "reflectance", "normals"}
+        Last stage to run; the mesh update goes with the normals.
+    seed : int
+        Seed of everything random.
+    progress : Progress
+        Called as work advances.
+    checkpoints : path, optional
+        Folder for finished stages. A stage found there, computed from the same inputs, isn't run again.
+    shared : bool
+        Whether fits with other settings use that folder too: the stages that they have in common run once.
+    watch : callable, optional
+        Called after each step with the result so far.
+
+    Returns
+    -------
+    Reconstruction
+
+    Raises
+    ------
+    InputError
+        An unknown camera, timestep or stage, or inputs that a stage can't use.
+    ConvergenceError
+        A stage that ended without a usable result.
+
+    Notes
+    -----
+    The three stages of Song, Zheng, Cai, Cham, "Recovering Facial Reflectance and Geometry from Multi-view
+    Images", sections 4 to 6. A Mitsuba variant must be active (``mifit.set_variant``).
+    """
+    from mifit.render.variant import check_active_variant
+
+    check_active_variant()
+    config = config or FitConfig()
+    cameras = choose("camera", capture.cameras, cameras, 2)
+    choice = timesteps if isinstance(timesteps, FrameChoice) else None
+    timesteps = choose_timesteps(capture, timesteps)
+    if until not in STAGES:
+        raise InputError(f"until: found {until!r}, expected one of {', '.join(STAGES)}")
+    check_images(capture, cameras, timesteps)
+    capture_digest = capture.digest(cameras, timesteps)
+    given, model = model, fitted_model(model, config)
+    estimated: tuple[str, ...] = ()
+    if not capture.calibrated:
+        from mifit.extras.calibrate_densely import calibrate_capture
+
+        dense = calibrate_capture(capture, model, cameras, timesteps, progress)
+        capture, estimated = dense.capture, (ESTIMATED_CAMERAS, dense.note)
+    source = Source(capture, capture_digest, model, cameras, timesteps, seed)
+
+    def result(estimates: Mapping[Part, Any], seconds: float = 0.0) -> Reconstruction:
+        return Reconstruction(
+            model=model,
+            **cast(dict, estimates),
+            config={**dataclasses.asdict(config), "seed": seed},
+            cameras=tuple(capture.camera(name) for name in cameras),
+            capture_digest=capture_digest,
+            model_source=model.source,
+            units=capture.units,
+            unit_mm=capture.unit_mm,
+            warnings=(
+                *estimated,
+                *one_place(capture, cameras, estimates["geometry"]),
+                *eyes_note(given, model),
+            ),
+            seconds=seconds,
+            peak_memory=peak_memory(),
+        )
+
+    estimates, seconds = run_steps(
+        steps(config, until),
+        source,
+        progress,
+        Cache(None if checkpoints is None else Path(checkpoints), shared),
+        None if watch is None else lambda so_far: watch(result(so_far)),
+    )
+    if choice is not None:
+        geometry = estimates["geometry"]
+        details = {**geometry.report.details, "frames": choice.document()}
+        report = replace(geometry.report, details=details)
+        estimates["geometry"] = replace(geometry, report=report)
+    return result(estimates, seconds)
 
 
 def fit_into(
@@ -144,3 +388,204 @@ def _is_there(folder: Path, wanted: dict[str, Any], until: Stage) -> bool:
             "--force replaces the result, or name another folder"
         )
     return False
+
+
+def steps(config: FitConfig, until: Stage = "normals") -> list[Step]:
+    """The steps of a fit with these settings, in order."""
+    measured = replace(config.geometry, falloff=False, contrast=False)
+    found = [Step("geometry", "geometry", (), (measured,), _fit_geometry)]
+    if config.surface.enabled:
+        found.append(Step("surface", "geometry", ("geometry",), (config.surface, measured), _find_surface))
+    if config.geometry.falloff or config.geometry.contrast:
+        found.append(Step("falloff", "geometry", ("geometry",), (config.geometry,), _find_falloff))
+    if until == "geometry":
+        return found
+    found.append(Step("reflectance", "reflectance", ("geometry",), (config.reflectance,), _infer_reflectance))
+    if until == "reflectance":
+        return found
+    found += [
+        Step("normals", "normals", ("geometry", "reflectance"), (config.normals,), _refine_normals),
+        Step("mesh", "mesh", ("geometry", "normals"), (config.mesh,), _refine_mesh),
+    ]
+    if config.residual.enabled:
+        given: tuple[Part, ...] = ("geometry", "reflectance", "normals")
+        found.append(Step("residual", "residual", given, (config.residual,), _find_residual))
+    return found
+
+
+def keys(listed: Sequence[Step], source: Source) -> dict[str, str]:
+    """The key of each step's checkpoint, by its name: a digest of all that the step is given."""
+    found: dict[str, str] = {}
+    current: dict[Part, str] = {}
+    for step in listed:
+        given = {
+            "source": source.key,
+            "step": step.run.__name__,
+            "inputs": {part: current[part] for part in step.inputs},
+            "settings": [[type(s).__name__, dataclasses.asdict(s)] for s in step.settings],
+        }
+        found[step.name] = current[step.part] = digest(given)
+    return found
+
+
+def run_steps(
+    listed: Sequence[Step],
+    source: Source,
+    progress: Progress,
+    cache: Cache,
+    watch: Callable[[Mapping[Part, Any]], None] | None = None,
+) -> tuple[dict[Part, Any], float]:
+    """Estimates by part, as the last step of each left it, and the wall time of all steps, those kept included.
+
+    Parameters
+    ----------
+    listed : sequence of Step
+    source : Source
+    progress : Progress
+    cache : Cache
+        Where steps are kept.
+    watch : callable, optional
+        Called with the estimates after each step.
+    """
+    estimates: dict[Part, Any] = {}
+    before = 0.0
+    made = keys(listed, source)
+    for step in listed:
+        inputs = {part: estimates[part] for part in step.inputs}
+        run = functools.partial(step.run, source.seen(inputs), inputs, progress, *step.settings)
+        done = cache.get(step.name, PARTS[step.part], made[step.name], run)
+        if step.part in estimates and step.part not in step.inputs:
+            before += estimates[step.part].report.seconds  # one that goes on from another counts its time
+        estimates[step.part] = done
+        if watch:
+            watch(estimates)
+    return estimates, before + sum(estimate.report.seconds for estimate in estimates.values())
+
+
+def _fit_geometry(source: Source, inputs: Inputs, progress: Progress, config: GeometryConfig) -> GeometryEstimate:
+    capture, model, cameras = source.images
+    found = fit_geometry(capture, model, cameras, source.timesteps, config, seed=source.seed, progress=progress)
+    return behind_lids(model, found)
+
+
+def _find_surface(
+    source: Source, inputs: Inputs, progress: Progress, config: SurfaceConfig, geometry: GeometryConfig
+) -> GeometryEstimate:
+    capture, model, cameras = source.images
+    return behind_lids(model, find_surface(capture, model, inputs["geometry"], cameras, config, progress, geometry))
+
+
+def _find_falloff(source: Source, inputs: Inputs, progress: Progress, config: GeometryConfig) -> GeometryEstimate:
+    capture, model, cameras = source.images
+    return find_falloff(capture, model, inputs["geometry"], cameras, config, source.seed, progress)
+
+
+def _infer_reflectance(
+    source: Source, inputs: Inputs, progress: Progress, config: ReflectanceConfig
+) -> ReflectanceEstimate:
+    capture, model, cameras = source.images
+    return infer_reflectance(capture, model, inputs["geometry"], cameras, config, seed=source.seed, progress=progress)
+
+
+def _refine_normals(source: Source, inputs: Inputs, progress: Progress, config: NormalsConfig) -> NormalsEstimate:
+    capture, model, cameras = source.images
+    given = inputs["geometry"], inputs["reflectance"]
+    return refine_normals(capture, model, *given, cameras, config, seed=source.seed, progress=progress)
+
+
+def _refine_mesh(source: Source, inputs: Inputs, progress: Progress, config: MeshConfig) -> MeshEstimate:
+    return refine_mesh(source.model, inputs["geometry"], inputs["normals"], config, progress)
+
+
+def _find_residual(source: Source, inputs: Inputs, progress: Progress, config: ResidualConfig) -> ResidualEstimate:
+    capture, model, cameras = source.images
+    given = inputs["geometry"], inputs["reflectance"], inputs["normals"]
+    return find_residual(capture, model, *given, cameras, config, seed=source.seed, progress=progress)
+
+
+def check_images(capture: Capture, cameras: Sequence[str], timesteps: Sequence[int]) -> None:
+    """Raise InputError for an image that is black or clipped throughout: nothing of the face can be measured in it."""
+    for timestep in timesteps:
+        for name in cameras:
+            frame = capture.frame(name, timestep)
+            if not (frame.image[frame.valid & ~frame.clipped] > 0).any():
+                raise InputError(
+                    f"camera {name}, timestep {timestep}: every usable pixel is black or clipped, expected a photo; "
+                    "leave the camera or the timestep out, or check its mask"
+                )
+
+
+def fitted_model(model: MorphableModel, config: FitConfig) -> MorphableModel:
+    """The model that a fit uses: the given one, with simple eyes where its own are holes and the settings want them."""
+    from mifit.morphable.openings import lacks_eyes, with_eyes
+
+    return with_eyes(model) if config.geometry.eyes and lacks_eyes(model) else model
+
+
+def eyes_note(given: MorphableModel, fitted: MorphableModel) -> tuple[str, ...]:
+    """What to say of the eyes: that the fit put some into a model, or that renders will look through holes."""
+    from mifit.morphable.openings import STRIP, lacks_eyes
+
+    if fitted is not given:
+        return (
+            f"the eyes of model {given.name} are holes: the fit put simple eyes and the inside of a mouth there, and "
+            f"the layout of its maps lies {100 * STRIP:.0f} % higher than the model's own; [geometry] eyes = false "
+            "leaves the model as it is",
+        )
+    if not lacks_eyes(fitted):
+        return ()
+    return (f"the eyes of model {fitted.name} are holes; [geometry] eyes = true puts simple ones there",)
+
+
+def one_place(capture: Capture, cameras: Sequence[str], geometry: GeometryEstimate) -> tuple[str, ...]:
+    """A warning when the landmarks are seen from so nearly one place that the head's distance isn't measured."""
+    seen = [name for name in cameras if any(capture.frame(name, t).visible.any() for t in geometry.timesteps)]
+    towards = np.array([capture.camera(name).position for name in seen]) - geometry.vertices[0].mean(axis=0)
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    apart = float(np.degrees(np.arccos(np.clip((towards @ towards.T).min(), -1.0, 1.0))))
+    if apart >= BASELINE_DEGREES:
+        return ()
+    place = f"landmarks in camera {seen[0]} alone" if len(seen) == 1 else f"cameras {apart:.1f} degrees apart"
+    return (f"{place}: how far away and so how large the head is rests on the model's size more than on the images",)
+
+
+def choose(kind: str, known: Sequence[T], wanted: Sequence[T] | None, default: int) -> tuple[T, ...]:
+    """The wanted cameras or timesteps, checked, without repeats; the first ``default`` ones when none is named."""
+    if wanted is None:
+        return tuple(known[:default])
+    for item in wanted:
+        if item not in known:
+            raise InputError(f"{kind} {item!r}: not in the capture; it has {', '.join(map(str, known))}")
+    if not wanted:
+        raise InputError(f"no {kind} named; the capture has {', '.join(map(str, known))}")
+    return tuple(dict.fromkeys(wanted))
+
+
+def choose_timesteps(capture: Capture, wanted: Sequence[int] | FrameChoice | None) -> tuple[int, ...]:
+    """The timesteps of a fit, checked, in ascending order; the first four when none is named.
+
+    Sums over timesteps round differently in another order, and a search may then end a millimetre elsewhere where the
+    images hardly tell: the order in which a user names them must not matter.
+    """
+    named = wanted.timesteps if isinstance(wanted, FrameChoice) else wanted
+    return tuple(sorted(choose("timestep", capture.timesteps, named, 4)))
+
+
+def fitted_to(result: Result, capture: Capture) -> bool:
+    """Whether a result was fitted to this very capture: its calibration, images, masks and landmarks."""
+    names = [camera.name for camera in result.cameras]
+    tracked = [] if result.normals is None else result.normals.report.details.get("tracked", [])
+    timesteps = [t for t in result.timesteps if t not in tracked]
+    if not set(names) <= set(capture.cameras) or not set(timesteps) <= set(capture.timesteps):
+        return False
+    return capture.digest(names, timesteps) == result.capture_digest
+
+
+def peak_memory() -> int:
+    """Largest resident memory of this process so far, in bytes; 0 where the system doesn't tell."""
+    try:
+        import resource
+    except ModuleNotFoundError:  # Windows
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

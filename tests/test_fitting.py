@@ -13,10 +13,9 @@ import mifit
 from mifit.cli import fits
 from mifit.config import FitConfig, MeshConfig, ReflectanceConfig
 from mifit.errors import InputError
-from mifit.fitting import fit_into
+from mifit.fitting import fit_into, fitted_to
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs, with_eyes
-from mifit.pipeline import fitted_to
 from mifit.reconstruction import Reconstruction
 from mifit.result import ownership
 from mifit.result.ownership import CHECKPOINTS
@@ -98,7 +97,7 @@ def test_a_fit_that_gave_its_model_eyes_goes_on_with_the_model_as_it_was(monkeyp
     skin = MorphableModel.load(tmp_path / "skin.npz")
     stages, geometry = Stages(monkeypatch), mean_geometry(with_eyes(skin), (0, 3))
     for name in ("fit_geometry", "find_surface"):
-        monkeypatch.setattr(f"mifit.stages.{name}.{name}", stages.stand_in(name, geometry))
+        monkeypatch.setattr(f"mifit.fitting.{name}", stages.stand_in(name, geometry))
     out, options = tmp_path / "out", {"until": "geometry", "resume": True}
     first = fit_into(out, made_up_capture(), skin, **options)
     assert stages.ran == ALL[:3] and len(eyeballs(first.model)) == 2

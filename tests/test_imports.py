@@ -20,16 +20,15 @@ LAYERS = (
     {"optim", "solve"},
     {"morphable", "capture"},
     {"appearance"},
-    {"cache", "checkpoint"},
+    {"cache"},
     {"render"},
     {"sampling"},
     {"synth", "stages", "result"},
     {"output"},
     {"reconstruction"},
-    {"steps", "tracking"},
+    {"tracking"},
     {"extras"},
-    {"pipeline"},
-    {"fitting", "fit"},
+    {"fitting"},
     {"experiments"},
 )
 """Parts from the lowest to the highest: a part imports only those of lower rows."""
@@ -112,7 +111,7 @@ def test_mitsuba_and_drjit_are_imported_late_and_only_by_what_forms_images(name)
 def test_the_core_does_without_extras():
     """Commands load them when they are wanted, and `mifit.fit` for a capture without calibration."""
     users = {part_of(name) for name in FILES if any(m.startswith("mifit.extras") for m in imports_of(TREES[name]))}
-    assert users <= {"extras", "cli", "pipeline", "fit"}
+    assert users <= {"extras", "cli", "fitting"}
     for name, tree in TREES.items():
         top = [node for node in tree.body if isinstance(node, (ast.Import, ast.ImportFrom))]
         early = {found for node in top for found in imports_of(ast.Module([node], []))}

@@ -10,10 +10,9 @@ import mifit
 from mifit.config import FitConfig
 from mifit.core.estimate import GeometryEstimate, Report, ResidualEstimate
 from mifit.errors import InputError
+from mifit.fitting import PARTS, Source, check_images, choose_timesteps, eyes_note, keys, one_place, steps
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs, with_eyes
-from mifit.pipeline import check_images, choose_timesteps, eyes_note, one_place
-from mifit.steps import PARTS, Source, keys, steps
 from tests.output.conftest import ball_camera, ball_result
 
 
@@ -62,7 +61,7 @@ def without_eyes(model):
 def test_a_fit_gives_a_model_eyes_that_has_none(monkeypatch):
     """What runs sees the model with eyes, unless the settings say no; one that has eyes is left alone."""
     seen = []
-    monkeypatch.setattr("mifit.pipeline.run_steps", lambda steps, source, *_: seen.append(source.model) or 1 / 0)
+    monkeypatch.setattr("mifit.fitting.run_steps", lambda steps, source, *_: seen.append(source.model) or 1 / 0)
     model = MorphableModel.load("builtin:coarse").subset(identity=2, expression=2, albedo=2)
     skin = without_eyes(model)
     holes = FitConfig(geometry=mifit.GeometryConfig(eyes=False))
@@ -158,15 +157,13 @@ class Stages:
         self.ran, self.saw = [], []
         residual = ResidualEstimate((0,), np.zeros((1, 32, 32, 3), np.float32), Report("converged"))
         result = dataclasses.replace(ball_result(), residual=residual)
-        for module, name, part in (
-            ("fit_geometry", "fit_geometry", "geometry"), ("find_surface", "find_surface", "geometry"),
-            ("infer_reflectance", "infer_reflectance", "reflectance"),
-            ("normals.normal_refinement", "refine_normals", "normals"),
-            ("normals.mesh_refinement", "refine_mesh", "mesh"), ("find_residual", "find_residual", "residual"),
-        ):  # fmt: skip
-            monkeypatch.setattr(f"mifit.stages.{module}.{name}", self.stand_in(name, getattr(result, part)))
+        for name, part in {
+            "fit_geometry": "geometry", "find_surface": "geometry", "infer_reflectance": "reflectance",
+            "refine_normals": "normals", "refine_mesh": "mesh", "find_residual": "residual",
+        }.items():  # fmt: skip
+            monkeypatch.setattr(f"mifit.fitting.{name}", self.stand_in(name, getattr(result, part)))
         monkeypatch.setattr(
-            "mifit.stages.falloff.find_falloff",
+            "mifit.fitting.find_falloff",
             lambda capture, model, geometry, *_: self.stand_in("find_falloff", geometry)(capture),
         )
 

@@ -142,7 +142,7 @@ def _calibrate_from_heads(arguments: Namespace) -> None:
     import mifit
     from mifit.extras.calibrate_densely import calibrate_capture
     from mifit.extras.place import calibrate_others, write_cameras
-    from mifit.pipeline import choose, choose_timesteps
+    from mifit.fitting import choose, choose_timesteps
 
     capture = mifit.Capture.load(arguments.capture)
     if capture.calibrated != arguments.refine:

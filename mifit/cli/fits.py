@@ -163,7 +163,7 @@ def fit(arguments: Namespace) -> None:
 def _chosen(arguments: Namespace, capture: Capture, count: int) -> FrameChoice:
     """The frames that tell most, said on standard error."""
     from mifit.capture.choose_frames import choose_frames
-    from mifit.pipeline import choose
+    from mifit.fitting import choose
 
     found = choose_frames(capture, choose("camera", capture.cameras, arguments.cameras, 2), count)
     for timestep, why in found.why.items():
@@ -176,7 +176,7 @@ def _chosen(arguments: Namespace, capture: Capture, count: int) -> FrameChoice:
 def track(arguments: Namespace) -> None:
     """Extend a result by further timesteps."""
     import mifit
-    from mifit.pipeline import choose
+    from mifit.fitting import choose
     from mifit.result.ownership import finish, remember
 
     finish(arguments.result)

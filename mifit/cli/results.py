@@ -30,9 +30,9 @@ def evaluate(arguments: Namespace) -> None:
 
 def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> None:
     """`evaluate` of a result that has been read, or just been made and written into ``arguments.result``."""
+    from mifit.fitting import fitted_to
     from mifit.output.evaluate import Comparison, evaluate, held_out
     from mifit.output.report import SHOWN_TIMESTEPS, write_report
-    from mifit.pipeline import fitted_to
 
     shown: list[Comparison] = []
     found = evaluate(

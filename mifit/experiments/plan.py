@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import mifit
-from mifit import checkpoint
+from mifit import cache
 from mifit.config import FitConfig
 from mifit.core.files import check_file, file_digest, file_name
 from mifit.core.limits import MAX_IMAGE_BYTES, MAX_RUNS, MAX_SAMPLES, MAX_SEED, MAX_SETTINGS_BYTES
@@ -230,7 +230,7 @@ def load_plan(path: str | Path, overrides: Sequence[str] = (), seed: int = 0) ->
             inputs = {name: digest_of(*given) for name, given in _inputs(experiment).items()}
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
-        key = checkpoint.digest({"version": mifit.__version__, "settings": dataclasses.asdict(experiment), **inputs})
+        key = cache.digest({"version": mifit.__version__, "settings": dataclasses.asdict(experiment), **inputs})
         runs.append(Run(experiment, swept, key))
     if len({run.digest for run in runs}) != len(runs):
         raise InputError(f"{path}: sweep: two runs have the same settings; remove the repeated value")
@@ -365,7 +365,7 @@ def _digest(
         path = Path(name)
         stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.exists() else None
         return name if name in ("builtin", "builtin:coarse") else _model_digest(name, stamp)
-    from mifit.pipeline import choose, choose_timesteps
+    from mifit.fitting import choose, choose_timesteps
 
     capture = mifit.Capture.load(name)
     if cameras is None:

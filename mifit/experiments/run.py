@@ -15,13 +15,17 @@ import platform
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 import mifit
-from mifit import checkpoint
-from mifit.core.files import FULL, file_name, read_text, replacing, write_text
+from mifit import cache
+from mifit.core.files import FULL, file_name, read_text, write_text
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError, MifitError
 from mifit.experiments.plan import Experiment, Plan, Run, SynthRun, load_plan
@@ -142,7 +146,7 @@ def _execute_on_dask(arguments: Sequence[tuple], address: str) -> Iterator[tuple
 
 def _synthetic_capture(synth: SynthRun, folder: Path, variant: str) -> Path:
     """The synthetic capture of some settings, made once and shared by all runs that name it."""
-    path = folder / "captures" / checkpoint.digest(dataclasses.asdict(synth))[:10]
+    path = folder / "captures" / cache.digest(dataclasses.asdict(synth))[:10]
     if not (path / "transforms.json").exists():
         set_fitting_variant(variant)
         from mifit.synth import synthesize
@@ -224,10 +228,13 @@ def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: 
     return metrics
 
 
+@dataclass(frozen=True)
+class _Reference:
+    image: NDArray
+
+
 def _execute_render(e: Experiment, folder: Path, experiment_folder: Path, variant: str) -> dict[str, float]:
     """Render a scene and compare it with its reference; returns the figures of the table."""
-    import numpy as np
-
     from mifit.core.image import write_image
     from mifit.core.metrics import psnr, rmse
     from mifit.render.scene_image import render_scene
@@ -241,21 +248,20 @@ def _execute_render(e: Experiment, folder: Path, experiment_folder: Path, varian
     if e.outputs.images:
         write_image(folder / "image.exr", image)
         write_image(folder / "image.png", image)
-    if e.reference:
-        key = checkpoint.digest(
-            [run.scene, read_text(run.scene, MAX_SETTINGS_BYTES), run.parameters, dataclasses.asdict(e.reference)]
+    if (reference := e.reference) is not None:
+        key = cache.digest(
+            [run.scene, read_text(run.scene, MAX_SETTINGS_BYTES), run.parameters, dataclasses.asdict(reference)]
         )
-        cache = experiment_folder / "references" / f"{key[:10]}.npy"
-        if not cache.exists():
-            made = render_scene(
-                run.scene, {**run.parameters, **e.reference.parameters}, spp=e.reference.spp, seed=e.reference.seed
-            )
-            with replacing(cache) as temporary:
-                np.save(temporary, made)
-        reference = np.load(cache)
-        peak = float(np.quantile(reference[..., :3], 0.999))
-        metrics["rmse"] = rmse(image[..., :3], reference[..., :3])
-        metrics["psnr"] = psnr(image[..., :3], reference[..., :3], peak=peak)
+
+        def render() -> _Reference:
+            parameters = {**run.parameters, **reference.parameters}
+            return _Reference(render_scene(run.scene, parameters, spp=reference.spp, seed=reference.seed))
+
+        kept = cache.Cache(experiment_folder / "references", shared=True)
+        expected = kept.get("reference", _Reference, key, render).image
+        peak = float(np.quantile(expected[..., :3], 0.999))
+        metrics["rmse"] = rmse(image[..., :3], expected[..., :3])
+        metrics["psnr"] = psnr(image[..., :3], expected[..., :3], peak=peak)
     return metrics
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Generic
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit import checkpoint
+from mifit import cache
 from mifit.config import GeometryConfig, ReflectanceConfig, ResidualConfig, from_mapping
 from mifit.core.bend import bend, texel_neighbours
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report, ResidualEstimate
@@ -107,7 +107,7 @@ def refine(
     folder, key = None if checkpoints is None else Path(checkpoints), ""
     if folder is not None:
         names = [camera.name for camera in result.cameras]
-        key = checkpoint.digest([_digest(result), capture.digest(names, wanted), wanted, seed])
+        key = cache.digest([_digest(result), capture.digest(names, wanted), wanted, seed])
     seen = result.seen(capture)
     result = resurfaced(result, seen, fitted_jointly(result), wanted, seed, progress, folder, key)
     refinement = Refinement(result, capture, seed)
@@ -203,11 +203,11 @@ class Refinement(Generic[R]):
         pose = tuple(getattr(self._last, name) for name in POSE)
         rows = tuple((t, *astuple(fit), self.left_out.get(t, "")) for t, fit in self.fits.items())
         sums = tuple(getattr(self._information, f.name) for f in fields(self._information))
-        checkpoint.save(folder, "refine", _Kept(sums, rows, pose), key)
+        cache.save(folder, "refine", _Kept(sums, rows, pose), key)
 
     def restore(self, folder: Path, key: str) -> None:
         """Go on from the sums that `keep` wrote, where there are any of this key."""
-        kept = checkpoint.load(folder, "refine", _Kept, key)
+        kept = cache.load(folder, "refine", _Kept, key)
         if kept is None:
             return
         self._information = Information(*(np.array(part) for part in kept.sums))

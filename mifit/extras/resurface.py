@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit import checkpoint
+from mifit import cache
 from mifit.capture.choose_frames import choose_frames
 from mifit.config import GeometryConfig, SurfaceConfig, from_mapping
 from mifit.core.estimate import GeometryEstimate
@@ -89,7 +89,7 @@ def resurfaced(
     settings = from_mapping(SurfaceConfig, result.config.get("surface", {}), "result.json: config: surface")
     if result.geometry.displacement is None or not settings.enabled:
         return result
-    found = None if folder is None else checkpoint.load(folder, "surface", _Surface, key)
+    found = None if folder is None else cache.load(folder, "surface", _Surface, key)
     if found is None:
         count = (MOST - len(fitted)) * JUDGE // (JUDGE - 1)
         further = _chosen(capture, names, timesteps, fitted, count)
@@ -103,7 +103,7 @@ def resurfaced(
         parts = swept.displacement, swept.timesteps, swept.expression, swept.rotation, swept.translation
         found = _Surface(bool(details["kept"]), *parts, details)
         if folder is not None:
-            checkpoint.save(folder, "surface", found, key)
+            cache.save(folder, "surface", found, key)
     return _on(result, found)
 
 

@@ -14,8 +14,8 @@ from mifit.capture.landmark_files import Landmarks, write_landmarks
 from mifit.capture.transforms import Shot, View, write_transforms
 from mifit.core.image import write_image
 from mifit.extras.bundle import Bundle, Intrinsics, Sightings, adjust_bundle
+from mifit.fitting import calibrated
 from mifit.morphable import MorphableModel
-from mifit.pipeline import calibrated
 from tests.stages.memory_capture import make_capture
 
 BOTH = ("left", "right")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mifit import checkpoint
+from mifit import cache
 from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.core.estimate import NormalsEstimate, ReflectanceEstimate, Report
@@ -17,8 +17,8 @@ def estimate():
 
 
 def test_round_trip(tmp_path, estimate):
-    checkpoint.save(tmp_path, "normals", estimate, "key")
-    back = checkpoint.load(tmp_path, "normals", NormalsEstimate, "key")
+    cache.save(tmp_path, "normals", estimate, "key")
+    back = cache.load(tmp_path, "normals", NormalsEstimate, "key")
     assert back is not None
     assert back.timesteps == estimate.timesteps
     assert back.report == estimate.report
@@ -27,12 +27,12 @@ def test_round_trip(tmp_path, estimate):
 
 
 def test_other_key_missing_and_damaged(tmp_path, estimate):
-    assert checkpoint.load(tmp_path, "normals", NormalsEstimate, "key") is None
-    checkpoint.save(tmp_path, "normals", estimate, "key")
-    assert checkpoint.load(tmp_path, "normals", NormalsEstimate, "other") is None
+    assert cache.load(tmp_path, "normals", NormalsEstimate, "key") is None
+    cache.save(tmp_path, "normals", estimate, "key")
+    assert cache.load(tmp_path, "normals", NormalsEstimate, "other") is None
     path = tmp_path / "normals.npz"
     path.write_bytes(path.read_bytes()[:200])
-    assert checkpoint.load(tmp_path, "normals", NormalsEstimate, "key") is None
+    assert cache.load(tmp_path, "normals", NormalsEstimate, "key") is None
 
 
 def test_lighting_and_lobe_round_trip(tmp_path):
@@ -43,8 +43,8 @@ def test_lighting_and_lobe_round_trip(tmp_path):
         lobe = Lobe(exponent, 3.0, True)
         light = Illumination(rng.standard_normal((9, 3)), lights, 0.1)
         estimate = ReflectanceEstimate(*maps, light, lobe, "shadowed", Report("converged", details={"tried": [[1, 2]]}))
-        checkpoint.save(tmp_path, "reflectance", estimate, "key")
-        back = checkpoint.load(tmp_path, "reflectance", ReflectanceEstimate, "key")
+        cache.save(tmp_path, "reflectance", estimate, "key")
+        back = cache.load(tmp_path, "reflectance", ReflectanceEstimate, "key")
         assert back is not None and back.report == estimate.report and back.shading_model == "shadowed"
         np.testing.assert_array_equal(back.diffuse, estimate.diffuse)
         np.testing.assert_array_equal(back.illumination.unknowns, light.unknowns)
@@ -55,7 +55,7 @@ def test_lighting_and_lobe_round_trip(tmp_path):
 
 @pytest.mark.parametrize("damage", ["nan", "shape", "scalar"])
 def test_changed_content_is_not_used(tmp_path, estimate, damage):
-    checkpoint.save(tmp_path, "normals", estimate, "key")
+    cache.save(tmp_path, "normals", estimate, "key")
     path = tmp_path / "normals.npz"
     with np.load(path) as data:
         arrays = dict(data)
@@ -66,12 +66,12 @@ def test_changed_content_is_not_used(tmp_path, estimate, damage):
     else:
         arrays["_meta"] = np.frombuffer(bytes(arrays["_meta"]).replace(b"[0, 2]", b"[0, 7]"), np.uint8)
     np.savez(path, **arrays)
-    assert checkpoint.load(tmp_path, "normals", NormalsEstimate, "key") is None
+    assert cache.load(tmp_path, "normals", NormalsEstimate, "key") is None
 
 
 def test_digest_follows_every_value():
-    assert checkpoint.digest({"a": 1, "b": [1, 2]}) == checkpoint.digest({"b": [1, 2], "a": 1})
-    assert checkpoint.digest({"a": 1}) != checkpoint.digest({"a": 2})
+    assert cache.digest({"a": 1, "b": [1, 2]}) == cache.digest({"b": [1, 2], "a": 1})
+    assert cache.digest({"a": 1}) != cache.digest({"a": 2})
 
 
 def test_lighting_and_lobe_come_back_to_the_last_bit(tmp_path):
@@ -86,8 +86,8 @@ def test_lighting_and_lobe_come_back_to_the_last_bit(tmp_path):
         shading_model="shadowed",
         report=Report("converged"),
     )
-    checkpoint.save(tmp_path, "reflectance", estimate, "key")
-    back = checkpoint.load(tmp_path, "reflectance", ReflectanceEstimate, "key")
+    cache.save(tmp_path, "reflectance", estimate, "key")
+    back = cache.load(tmp_path, "reflectance", ReflectanceEstimate, "key")
     np.testing.assert_array_equal(back.illumination.unknowns, estimate.illumination.unknowns)
     np.testing.assert_array_equal(back.illumination.lights[0].direction, light.direction)
     assert back.illumination.lights[0].radius == light.radius and back.illumination.ambient == 0.1

@@ -1,19 +1,24 @@
-"""Stage results kept beside a result folder, so that a killed run goes on where it stopped.
+"""What steps have computed, kept in files under a key of all that it was computed from.
 
-One ``.npz`` per stage in ``RESULT/.mifit/checkpoints``: the arrays of an estimate, its scalars as JSON, a digest of
-both and the key of all that it was computed from. A file whose key differs, or whose content isn't what was written,
-is not used. Written beside and renamed; loading one never runs code.
+One ``.npz`` for each estimate: its arrays, its scalars as JSON, a digest of both and its key. A file whose key differs,
+or whose content isn't what was written, is not used. Written beside and renamed; loading one never runs code.
+
+A fit keeps its steps in ``RESULT/.mifit/checkpoints``, so that a killed run goes on where it stopped; the fits of a
+sweep share one folder.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+import filelock
 import numpy as np
 
 from mifit.appearance.illumination import Illumination, light_from
@@ -33,6 +38,42 @@ def digest(value: Any) -> str:
     record = dataclasses.is_dataclass(value) and not isinstance(value, type)
     plain = dataclasses.asdict(value) if record else value
     return hashlib.sha256(json.dumps(plain, sort_keys=True, default=str).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Cache:
+    """A folder of estimates, or none.
+
+    Attributes
+    ----------
+    folder : path, optional
+        Without one nothing is kept.
+    shared : bool
+        Whether processes with other settings use the folder too, at the same time perhaps: files are then named after
+        their keys, and who needs what another is busy with waits for it.
+    """
+
+    folder: Path | None = None
+    shared: bool = False
+
+    def get(self, name: str, cls: type[T], key: str, make: Callable[[], T]) -> T:
+        """The estimate of this name and key as it is kept, or what ``make`` returns, which is kept then."""
+        if self.folder is None:
+            return make()
+        name = f"{name}_{key[:16]}" if self.shared else name
+        with self._alone(name):
+            found = load(self.folder, name, cls, key)
+            if found is None:
+                found = make()
+                save(self.folder, name, found, key)
+        return found
+
+    def _alone(self, name: str) -> contextlib.AbstractContextManager:
+        """A lock between processes, which the system takes back from one that is killed."""
+        if self.folder is None or not self.shared:
+            return contextlib.nullcontext()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        return filelock.FileLock(self.folder / f"{name}.lock")
 
 
 def save(folder: Path, stage: str, estimate: Any, key: str) -> None:
