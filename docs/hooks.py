@@ -25,8 +25,7 @@ def settings_tables(text: str) -> str:
 
 def settings_table(cls: type, prefix: str, skip: bool = False) -> str:
     """A Markdown table of all settings below a class; ``skip``: without those of the stages."""
-    from mifit.config import FitConfig
-    from mifit.schema import list_settings
+    from mifit.config import FitConfig, list_settings
 
     stages = {f"fit.{key}" for key, *_ in list_settings(FitConfig)} if skip else set()
     lines = ["| key | default | expected | meaning |", "| --- | --- | --- | --- |"]

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from mifit.config import FitConfig, MeshConfig, ReflectanceConfig
+from mifit.config import FitConfig, MeshConfig, ReflectanceConfig, from_mapping, list_settings
 from mifit.errors import InputError
 from mifit.experiments import load_plan
 from mifit.experiments.plan import (
@@ -19,7 +19,6 @@ from mifit.experiments.plan import (
     RenderRun,
     SynthRun,
 )
-from mifit.schema import from_mapping, list_settings
 
 
 def test_defaults_are_the_papers():

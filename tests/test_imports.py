@@ -14,7 +14,6 @@ import mifit
 PACKAGE = Path(mifit.__file__).parent
 LAYERS = (
     {"errors", "progress"},
-    {"schema"},
     {"config"},
     {"core"},
     {"optim", "solve"},

@@ -15,11 +15,8 @@ from typing import Any, Literal
 
 import mifit
 from mifit import cache
-from mifit.config import FitConfig
-from mifit.core.files import check_file, file_digest, file_name
-from mifit.core.limits import MAX_IMAGE_BYTES, MAX_RUNS, MAX_SAMPLES, MAX_SEED, MAX_SETTINGS_BYTES
-from mifit.errors import InputError
-from mifit.schema import (
+from mifit.config import (
+    FitConfig,
     Index,
     Name,
     flag,
@@ -28,13 +25,14 @@ from mifit.schema import (
     one_of,
     parse_toml,
     part,
-    part_or_none,
     read_toml,
     settings,
     several,
-    table,
     text,
 )
+from mifit.core.files import check_file, file_digest, file_name
+from mifit.core.limits import MAX_IMAGE_BYTES, MAX_RUNS, MAX_SAMPLES, MAX_SEED, MAX_SETTINGS_BYTES
+from mifit.errors import InputError
 
 
 @settings
@@ -55,7 +53,7 @@ class FitRun(FitConfig):
     """Fit a capture; the settings of ``mifit fit``, those of its stages among them."""
 
     capture: str | None = text(None, "capture folder")
-    synth: SynthRun | None = part_or_none("a capture made for the experiment, instead of a folder")
+    synth: SynthRun | None = part(None, "a capture made for the experiment, instead of a folder")
     model: str = text("builtin", "morphable model: a path or builtin")
     cameras: tuple[Name, ...] = several(("left", "right"), "cameras to use")
     timesteps: tuple[Index, ...] | None = several(None, "timesteps to use; none: the first four")
@@ -88,7 +86,7 @@ class RelightRun:
     env: str = text(..., "lat-long environment, .hdr or .exr")
     rotate: float = number(0.0, "turn of the environment about the vertical", "degrees", least=-3600, most=3600)
     capture: str | None = text(None, "capture folder")
-    synth: SynthRun | None = part_or_none("a capture made for the experiment, instead of a folder")
+    synth: SynthRun | None = part(None, "a capture made for the experiment, instead of a folder")
     camera: str = text("third", "camera of that capture")
 
 
@@ -97,7 +95,7 @@ class RenderRun:
     """Render a Mitsuba scene; its ``<default>`` names take values from ``parameters``."""
 
     scene: str = text(..., "scene file")
-    parameters: dict[str, bool | int | float | str] = table("values of the scene's <default> names")
+    parameters: dict[str, bool | int | float | str] = part(dict, "values of the scene's <default> names")
     spp: int = number(64, "samples per pixel", least=1, most=MAX_SAMPLES)
     seed: int = number(0, "seed of the samples", least=0, most=MAX_SEED)
 
@@ -106,7 +104,7 @@ class RenderRun:
 class ReferenceRun:
     """The render of the same scene that a `RenderRun` is compared with."""
 
-    parameters: dict[str, bool | int | float | str] = table("values of the scene's <default> names")
+    parameters: dict[str, bool | int | float | str] = part(dict, "values of the scene's <default> names")
     spp: int = number(1024, "samples per pixel", least=1, most=MAX_SAMPLES)
     seed: int = number(1, "seed of the samples", least=0, most=MAX_SEED)
 
@@ -132,11 +130,11 @@ class Experiment:
     """One run: either ``fit`` with ``evaluate`` and ``relight``, or ``render`` with ``reference``."""
 
     name: str = text(..., "names the folder of the runs", pattern=r"^[^\x00-\x1f/\\\\.][^\x00-\x1f/\\\\]{0,99}$")
-    fit: FitRun | None = part_or_none()
-    evaluate: EvaluateRun | None = part_or_none()
-    relight: RelightRun | None = part_or_none()
-    render: RenderRun | None = part_or_none()
-    reference: ReferenceRun | None = part_or_none()
+    fit: FitRun | None = part()
+    evaluate: EvaluateRun | None = part()
+    relight: RelightRun | None = part()
+    render: RenderRun | None = part()
+    reference: ReferenceRun | None = part()
     outputs: Outputs = part(Outputs)
 
 

@@ -17,11 +17,11 @@ from mifit.capture import Capture
 from mifit.capture.colmap import write_colmap
 from mifit.capture.stereo import write_stereo
 from mifit.cli import build_parser, main
+from mifit.config import read_toml
 from mifit.core.image import to_8_bit
 from mifit.experiments import load_plan
 from mifit.extras.boards import Board
 from mifit.output.sequence import write_video
-from mifit.schema import read_toml
 from tests.capture import photogrammetry
 from tests.extras.board_video import Studio, pair, poses
 

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from mifit.config import FitConfig
+from mifit.config import FitConfig, list_settings
 from mifit.experiments.plan import Experiment
-from mifit.schema import list_settings
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
