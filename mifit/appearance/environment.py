@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -43,6 +44,8 @@ LOOKS = 16
 """Directions of the lobe."""
 ROWS = 128
 """Rows of the environment that the lobe looks at."""
+IRRADIANCE_ROWS = 32
+"""Rows of the table of what normals receive."""
 OFFSET = 1e-3
 """Distance by which rays start off the surface, relative to the mesh's diagonal."""
 
@@ -103,6 +106,55 @@ def _halfway(along: NDArray) -> int:
     return int(np.clip(np.abs(along - target).argmin(), 1, len(along) - 2))
 
 
+class _Parts:
+    """What no rotation changes of an environment, in the axes of its image."""
+
+    def __init__(self, image: NDArray[np.float32]) -> None:
+        self.image = image
+
+    @cached_property
+    def soft(self) -> NDArray[np.float32]:
+        """(H, W, 3) the image without what is bright."""
+        height, width = self.image.shape[:2]
+        luminance = self.image @ LUMINANCE
+        mean = float((luminance.mean(1) * np.ravel(latlong_solid_angles(height, width))).sum()) * width / (4.0 * np.pi)
+        share = np.minimum(1.0, BRIGHT * mean / np.maximum(luminance, 1e-30))[..., None]
+        return (self.image * share).astype(np.float32)
+
+    @cached_property
+    def lamps(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Directions and powers that stand for the rest; none where nothing is bright."""
+        bright = self.image - self.soft
+        return cut(bright, LAMPS) if bright.any() else (np.zeros((0, 3)), np.zeros((0, 3)))
+
+    @cached_property
+    def sky(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Directions and powers of the soft part."""
+        return self._sampled(SKY_ROWS)
+
+    @cached_property
+    def irradiance(self) -> NDArray[np.float32]:
+        """(H, W, 3) of a surface in each direction to which all of the soft part is open."""
+        toward, power = self._sampled(IRRADIANCE_ROWS)
+        table = np.maximum(toward @ toward.T, 0.0) @ power
+        return table.reshape(IRRADIANCE_ROWS, 2 * IRRADIANCE_ROWS, 3).astype(np.float32)
+
+    def _sampled(self, rows: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        small = cv2.resize(self.soft, (2 * rows, rows), interpolation=cv2.INTER_AREA).astype(np.float64)
+        angles = np.reshape(latlong_solid_angles(rows, 2 * rows), (rows, -1))
+        return latlong_directions(rows, 2 * rows).reshape(-1, 3), (small * angles[..., None]).reshape(-1, 3)
+
+
+_last: list[_Parts] = []
+
+
+def _parts(image: NDArray[np.float32]) -> _Parts:
+    """Those of an image; kept until another one is asked for, since lights are turned one after the other."""
+    if not _last or _last[0].image is not image:
+        _last[:] = [_Parts(image)]
+    return _last[0]
+
+
 @dataclass(frozen=True)
 class EnvironmentLight:
     """A lat-long environment turned by a rotation: what came from d comes from R d.
@@ -116,15 +168,6 @@ class EnvironmentLight:
 
     image: NDArray[np.float32]
     rotation: NDArray[np.float64]
-
-    def parts(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The soft and the bright part of the image; they add up to it."""
-        height, width = self.image.shape[:2]
-        luminance = self.image @ LUMINANCE
-        mean = float((luminance.mean(1) * np.ravel(latlong_solid_angles(height, width))).sum()) * width / (4.0 * np.pi)
-        share = np.minimum(1.0, BRIGHT * mean / np.maximum(luminance, 1e-30))[..., None]
-        soft = (self.image * share).astype(np.float32)
-        return soft, self.image - soft
 
     def at_vertices(self, scene: SurfaceScene, albedo: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(V, 3) irradiance at a mesh's vertices with its own shadows and what it throws on itself.
@@ -141,7 +184,7 @@ class EnvironmentLight:
             Without and with what comes from the bright part directly.
         """
         mesh = reception(scene)
-        toward, power = self._soft(SKY_ROWS)
+        toward, power = _parts(self.image).sky
         shaded = mesh.from_sky(toward @ self.rotation.T, power)
         direct = shaded + self._from_lamps(scene, mesh.normals)
         bounced = np.zeros_like(direct)
@@ -149,29 +192,18 @@ class EnvironmentLight:
             bounced = mesh.from_mesh((direct + bounced) * albedo / np.float32(np.pi))
         return shaded + bounced, direct + bounced
 
-    def _soft(self, rows: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Directions (M, 3) in the image's own axes, and power (M, 3), of the soft part at so many rows."""
-        small = cv2.resize(self.parts()[0], (2 * rows, rows), interpolation=cv2.INTER_AREA).astype(np.float64)
-        angles = np.reshape(latlong_solid_angles(rows, 2 * rows), (rows, -1))
-        return latlong_directions(rows, 2 * rows).reshape(-1, 3), (small * angles[..., None]).reshape(-1, 3)
-
     def _from_lamps(self, scene: SurfaceScene, normals: NDArray) -> NDArray[np.float32]:
         """(V, 3) irradiance of the vertices by the bright part, with its shadows."""
-        points = np.asarray(scene.vertices, dtype=np.float64)
-        directions, power = self._lights(self.parts()[1], LAMPS)
-        out = np.zeros((len(points), 3), np.float32)
-        for start in range(0, len(directions), 32):
-            part = directions[start : start + 32]
-            bits = scene.open_towards(points, normals, part)
-            seen = (bits[:, None] >> np.arange(len(part), dtype=np.uint32)) & 1
-            out += ((np.maximum(normals @ part.T, 0.0) * seen) @ power[start : start + 32]).astype(np.float32)
-        return out
+        directions, power = self._lights()
+        if not len(directions):
+            return np.zeros((len(normals), 3), np.float32)
+        bits = scene.open_towards(np.asarray(scene.vertices, dtype=np.float64), normals, directions)
+        seen = (bits[:, None] >> np.arange(len(directions), dtype=np.uint32)) & 1
+        return np.asarray((np.maximum(normals @ directions.T, 0.0) * seen) @ power, dtype=np.float32)
 
-    def _lights(self, image: NDArray, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """World directions and powers that stand for a part of the image; none for a black one."""
-        if not image.any():
-            return np.zeros((0, 3)), np.zeros((0, 3))
-        directions, power = cut(image, count)
+    def _lights(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """World directions and powers that stand for the bright part."""
+        directions, power = _parts(self.image).lamps
         return directions @ self.rotation.T, power
 
     def lamps(
@@ -181,7 +213,7 @@ class EnvironmentLight:
         import drjit as dr
         import mitsuba as mi
 
-        directions, power = self._lights(self.parts()[1], LAMPS)
+        directions, power = self._lights()
         count = len(normals)
         if not len(directions) or not count:
             return np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
@@ -201,11 +233,11 @@ class EnvironmentLight:
 
     def bend(self, normals: NDArray, base: NDArray) -> NDArray[np.float32]:
         """(N, 3) irradiance at normals (N, 3) over that at others, where all of the soft part is seen."""
-        rows = 32
-        toward, power = self._soft(rows)
-        table = (np.maximum(toward @ toward.T, 0.0) @ power).reshape(rows, 2 * rows, 3)  # normals on the same grid
-        bent, flat = (_look(table.astype(np.float32), n @ self.rotation) for n in (normals, base))
-        return bent / np.maximum(flat, 1e-12)
+        import mitsuba as mi
+
+        sky = _Sky(_parts(self.image).irradiance, self.rotation)
+        bent, flat = (sky.eval(on_device(mi.Vector3f, n), True) for n in (normals, base))
+        return stored([a / (b + 1e-12) for a, b in zip(bent, flat, strict=True)], len(normals))
 
     def specular(
         self,
@@ -216,6 +248,7 @@ class EnvironmentLight:
         view: NDArray,
         lobe: Lobe,
         radiosity: NDArray,
+        group: tuple[NDArray, int] | None = None,
     ) -> NDArray[np.float32]:
         """(N, 3) specular radiance at unit specular albedo from a part of the environment.
 
@@ -231,6 +264,8 @@ class EnvironmentLight:
             With a Fresnel factor: the lobe about the mirror direction.
         radiosity : (V, 3)
             Radiance that the mesh's vertices reflect, seen where it blocks the environment.
+        group : (N,) int and int, optional
+            Number of each point among so many neighbours that are averaged later: they share the looks of one.
         """
         import drjit as dr
         import mitsuba as mi
@@ -239,16 +274,11 @@ class EnvironmentLight:
         if not count:
             return np.zeros((0, 3), np.float32)
         spacing = 8.0 * np.pi / ((lobe.typical + 2.0) * LOOKS)  # solid angle of a look at the lobe's peak
-        table = mi.Texture2f(
-            mi.TensorXf(blurred(image, spacing)),
-            wrap_mode=dr.WrapMode.Repeat,
-            filter_mode=dr.FilterMode.Linear,
-        )
+        sky = _Sky(blurred(image, spacing), self.rotation)
         n, v, base = (on_device(mi.Vector3f, x) for x in (normals, view, points.normal))
         exponent = mi.Float(aligned(np.broadcast_to(np.asarray(lobe.exponent, np.float32), (count,))))
         # Opaque: the kernel is compiled once, not once for every mesh and every turn of the light.
         offset = dr.opaque(mi.Float, OFFSET * _diagonal(scene))
-        back = [[dr.opaque(mi.Float, float(x)) for x in row] for row in self.rotation.T]
         origin = on_device(mi.Point3f, points.position) + offset * base
         cosine = dr.dot(n, v)
         mirror = dr.normalize(2.0 * cosine * n - v)
@@ -256,20 +286,22 @@ class EnvironmentLight:
         peak = normalization(exponent) if lobe.normalized else mi.Float(1.0 / np.pi)
         colours, indices = mi.Float(aligned(radiosity).ravel()), mi.UInt(aligned(scene.faces, np.uint32).ravel())
         total = mi.Color3f(0.0)
-        for k in range(LOOKS):
+        number, sharing = (mi.Float(0.0), 1) if group is None else (mi.Float(aligned(group[0])), min(group[1], LOOKS))
+        number -= sharing * dr.floor(number / sharing)
+        looks = LOOKS // sharing
+        for k in range(looks):
             # The density ((1 + c) / 2)^(m / 2) about the mirror direction, inverted; a golden spiral around it.
-            c = 2.0 * dr.power((k + 0.5) / LOOKS, 2.0 / (exponent + 2.0)) - 1.0
-            turn = k * float(np.pi * (3.0 - np.sqrt(5.0)))
+            look = number + k * sharing
+            c = 2.0 * dr.power((look + 0.5) / LOOKS, 2.0 / (exponent + 2.0)) - 1.0
+            around_sine, around = dr.sincos(look * float(np.pi * (3.0 - np.sqrt(5.0))))
             sine = dr.safe_sqrt(1.0 - c * c)
-            d = frame.to_world(mi.Vector3f(sine * float(np.cos(turn)), sine * float(np.sin(turn)), c))
+            d = frame.to_world(mi.Vector3f(sine * around, sine * around_sine, c))
             above = (dr.dot(d, base) > 0.0) & (c > 0.0)
             hit = scene.rays.ray_intersect_preliminary(mi.Ray3f(origin, d), active=above)
             blocked = above & hit.is_valid()
-            local = mi.Vector3f(*(row[0] * d.x + row[1] * d.y + row[2] * d.z for row in back))
-            sky = mi.Color3f(table.eval(_coordinates(local), above)[:3])
-            seen = dr.select(blocked, _interpolated(hit, indices, colours, blocked), sky)
+            seen = dr.select(blocked, _interpolated(hit, indices, colours, blocked), sky.eval(d, above))
             total += dr.select(above, seen * dr.maximum(c, 0.0), 0.0)
-        scale = peak * (8.0 * np.pi) / ((exponent + 2.0) * LOOKS)
+        scale = peak * (8.0 * np.pi) / ((exponent + 2.0) * looks)
         if lobe.fresnel is not None:
             scale = scale * fresnel_factor(cosine, lobe.fresnel)
         total *= scale
@@ -284,16 +316,17 @@ class EnvironmentLight:
         lobe: Lobe,
         albedo: NDArray,
         eye: NDArray[np.bool_] | None = None,
+        group: tuple[NDArray, int] | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Diffuse and specular radiance (N, 3) of points at unit albedo; ``albedo`` (V, 3) is that of the vertices.
 
         Shadows belong to the mesh; bent normals change what an open surface would receive. Where ``eye`` (N,) says so
-        the lobe is the cornea's.
+        the lobe is the cornea's. ``group`` as in `specular`.
         """
         soft, whole = self.at_vertices(scene, albedo)
         diffuse = interpolate(soft, scene.faces, points.face, points.barycentric) / np.float32(np.pi)
         radiosity = whole * albedo / np.float32(np.pi)
-        specular = self.specular(self.parts()[0], scene, points, normals, view, lobe, radiosity)
+        specular = self.specular(_parts(self.image).soft, scene, points, normals, view, lobe, radiosity, group)
         matt, glossy = self.lamps(scene, points, normals, view, lobe)
         specular += glossy
         rows = np.flatnonzero(eye) if eye is not None else []
@@ -327,26 +360,31 @@ def blurred(image: NDArray, solid_angle: float) -> NDArray[np.float32]:
     return np.maximum((top / np.maximum(bottom, 1e-12))[rows : 2 * rows], 0.0).astype(np.float32)
 
 
-def _coordinates(d: Any) -> Any:
-    """Texture coordinates of directions: axes of ``core.sh.latlong_directions``."""
-    import drjit as dr
-    import mitsuba as mi
+class _Sky:
+    """A lat-long table (H, W, 3) on the device, turned by a rotation."""
 
-    across = dr.atan2(d.x, -d.z) * float(0.5 / np.pi)
-    return mi.Point2f(across - dr.floor(across), dr.safe_acos(d.y) * float(1.0 / np.pi))
+    def __init__(self, table: NDArray, rotation: NDArray) -> None:
+        import drjit as dr
+        import mitsuba as mi
 
+        # The poles' rows are doubled: what wraps around the image's sides must not wrap over its top.
+        padded = np.concatenate([table[:1], table, table[-1:]])
+        self._share = float(len(table) / len(padded))
+        self._texture = mi.Texture2f(
+            mi.TensorXf(padded), wrap_mode=dr.WrapMode.Repeat, filter_mode=dr.FilterMode.Linear
+        )
+        # Opaque: the kernel is compiled once, not once for every turn of the light.
+        self._back = [[dr.opaque(mi.Float, float(x)) for x in row] for row in rotation.T]
 
-def _look(table: NDArray, directions: NDArray) -> NDArray[np.float32]:
-    """A lat-long table at directions (N, 3), bilinear."""
-    rows, columns = table.shape[:2]
-    across = np.arctan2(directions[:, 0], -directions[:, 2]) / (2.0 * np.pi) % 1.0
-    down = np.arccos(np.clip(directions[:, 1], -1.0, 1.0)) / np.pi
-    x, y = across * columns - 0.5, np.clip(down * rows - 0.5, 0.0, rows - 1.0)
-    x0, y0 = np.floor(x).astype(int), np.minimum(np.floor(y).astype(int), rows - 2)
-    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
-    left, right = x0 % columns, (x0 + 1) % columns
-    top = table[y0, left] * (1 - fx) + table[y0, right] * fx
-    return (top * (1 - fy) + (table[y0 + 1, left] * (1 - fx) + table[y0 + 1, right] * fx) * fy).astype(np.float32)
+    def eval(self, d: Any, active: Any) -> Any:
+        """Colours in world directions; axes of ``core.sh.latlong_directions``."""
+        import drjit as dr
+        import mitsuba as mi
+
+        x, y, z = (row[0] * d.x + row[1] * d.y + row[2] * d.z for row in self._back)
+        across = dr.atan2(x, -z) * float(0.5 / np.pi)
+        down = (dr.safe_acos(y) * float(1.0 / np.pi) - 0.5) * self._share + 0.5
+        return mi.Color3f(self._texture.eval(mi.Point2f(across - dr.floor(across), down), active)[:3])
 
 
 def _diagonal(scene: SurfaceScene) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from mifit.appearance.arrays import on_device
+from mifit.appearance.arrays import aligned, on_device, stored
 from mifit.core.mesh import normalize, vertex_normals
 from mifit.core.sh import LUMINANCE
 
@@ -60,10 +60,23 @@ class Reception:
         def summed(values: NDArray) -> NDArray[np.float64]:
             return np.stack([np.bincount(nearest, column, minlength=len(self.directions)) for column in values.T], 1)
 
+        import drjit as dr
+        import mitsuba as mi
+
         middle = normalize(summed(toward * (power @ LUMINANCE)[:, None]) + 1e-12 * self.directions)
-        seen = np.unpackbits(self.open_sky.view(np.uint8), axis=1, bitorder="little")
-        cosine = np.maximum(self.normals @ middle.T, 0.0).astype(np.float32)
-        return np.asarray((cosine * seen) @ summed(power).astype(np.float32))
+        n, words = on_device(mi.Vector3f, self.normals), self.open_sky.shape[1]
+        bits, vertex = mi.UInt(aligned(self.open_sky, np.uint32).ravel()), dr.arange(mi.UInt, len(self.normals))
+        lights = mi.Float(aligned(np.concatenate([middle, summed(power)], axis=1)).ravel())
+
+        def body(i: Any, total: Any) -> tuple[Any, Any]:
+            x, y, z, *colour = (dr.gather(mi.Float, lights, 6 * i + k) for k in range(6))
+            open_bit = (dr.gather(mi.UInt, bits, vertex * words + i // 32) >> (i % 32)) & 1
+            return i + 1, total + dr.maximum(n.x * x + n.y * y + n.z * z, 0.0) * open_bit * mi.Color3f(*colour)
+
+        start = (mi.UInt(0), dr.zeros(mi.Color3f, len(self.normals)))
+        count = dr.opaque(mi.UInt, len(self.directions))
+        _, total = dr.while_loop(state=start, cond=lambda i, total: i < count, body=body)
+        return stored([total.x, total.y, total.z], len(self.normals))
 
     def from_mesh(self, radiance: NDArray) -> NDArray[np.float32]:
         """(V, 3) irradiance from the mesh, whose vertices reflect a radiance (V, 3)."""

@@ -54,6 +54,12 @@ class VisibleSurface:
     points: NDArray[np.float32]
     view: NDArray[np.float32]
 
+    @property
+    def group(self) -> tuple[NDArray[np.int64], int]:
+        """Number of each sample in its pixel, and how many samples a pixel has."""
+        k, width = self.oversampling, self.shape[1]
+        return self.index // (width * k) % k * k + self.index % k, k * k
+
     def image(self, colour: NDArray) -> NDArray[np.float32]:
         """Average sample colours (N, 3) into pixels: (H, W, 4), colour not premultiplied, alpha = coverage."""
         height, width = self.shape
@@ -110,26 +116,31 @@ def trace_mesh(vertices: NDArray, faces: NDArray, camera: Camera, oversampling: 
 
 @dataclass(frozen=True)
 class SampledMaterial:
-    """Surface properties under every sample of a `VisibleSurface`.
+    """Surface properties under every sample of a `VisibleSurface`: what no light changes.
 
     Attributes
     ----------
-    normal : (N, 3) float32
-        Unit, world space.
+    normal, base : (N, 3) float32
+        Unit, world space: the refined ones and the mesh's.
     diffuse : (N, 3), specular : (N,) float32
         Albedo, 0..1.
+    eye : (N,) bool
+        On an eyeball under its film of tears.
     """
 
     normal: NDArray[np.float32]
+    base: NDArray[np.float32]
     diffuse: NDArray[np.float32]
     specular: NDArray[np.float32]
+    eye: NDArray[np.bool_]
 
 
 def surface_material(reconstruction: Result, surface: VisibleSurface, timestep: int) -> SampledMaterial:
     """Look up maps where there are maps, and vertex albedo that continues them and the mesh's normals elsewhere."""
     model, geometry = reconstruction.model, reconstruction.geometry
     rotation = geometry.rotation[reconstruction.index(timestep)]
-    normal = _mesh_normals(reconstruction, surface, timestep)
+    base = _mesh_normals(reconstruction, surface, timestep).astype(np.float32)
+    normal = base.copy()
     inside = mapped_faces(reconstruction)[surface.face]
     diffuse = np.zeros((len(inside), 3), dtype=np.float32)
     specular = np.zeros(len(inside), dtype=np.float32)
@@ -142,9 +153,10 @@ def surface_material(reconstruction: Result, surface: VisibleSurface, timestep: 
     uv = interpolate(model.uv, model.faces_uv, surface.face[inside], surface.weights[inside])
     diffuse[inside] = sample_map(maps.diffuse, uv)
     specular[inside] = sample_map(maps.specular, uv)
-    specular[eye_faces(reconstruction)[surface.face]] = REFLECTANCE
+    eye = eye_faces(reconstruction)[surface.face]
+    specular[eye] = REFLECTANCE
     normal[inside] = normalize(sample_map(maps.normal, uv)) @ rotation.T
-    return SampledMaterial(normal.astype(np.float32), diffuse.astype(np.float32), specular)
+    return SampledMaterial(normal, base, diffuse, specular, eye)
 
 
 def render_local(
@@ -156,11 +168,16 @@ def render_local(
 
 
 def shade_methods(
-    reconstruction: Result, surface: VisibleSurface, timestep: int, methods: tuple[Method, ...]
+    reconstruction: Result,
+    surface: VisibleSurface,
+    timestep: int,
+    methods: tuple[Method, ...],
+    material: SampledMaterial | None = None,
 ) -> dict[Method, NDArray[np.float32]]:
     """Images (H, W, 4) of one visible surface by several methods.
 
-    Shadows, where the model has them, are traced at the vertices and interpolated, as in the fit.
+    Shadows, where the model has them, are traced at the vertices and interpolated, as in the fit. ``material`` is what
+    `surface_material` has found before, for the same face under another light.
     """
     out: dict[Method, NDArray[np.float32]] = {}
     if "pca" in methods:
@@ -170,16 +187,16 @@ def shade_methods(
         reflectance = reconstruction.reflectance
         assert reflectance is not None
         model, vertices = reconstruction.model, reconstruction.geometry.vertices[reconstruction.index(timestep)]
-        material = surface_material(reconstruction, surface, timestep)
-        base = _mesh_normals(reconstruction, surface, timestep)
+        material = material or surface_material(reconstruction, surface, timestep)
+        base, eye = material.base, material.eye
         appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: _look_up(model, surface, m)))
         points = MeshPoints(surface.points, base, surface.face, surface.weights)
-        mesh, eye = occluding_mesh(vertices, model.faces), eye_faces(reconstruction)[surface.face]
+        mesh = occluding_mesh(vertices, model.faces)
         if reconstruction.environment is not None and appearance.lobe.fresnel is not None:
             turn = reconstruction.environment_rotation
             light = EnvironmentLight(reconstruction.environment, np.eye(3) if turn is None else turn)
-            albedo = _vertex_albedo(reconstruction)
-            shaded = light.shade(mesh.scene, points, material.normal, surface.view, appearance.lobe, albedo, eye)
+            albedo, lobe, view = _vertex_albedo(reconstruction), appearance.lobe, surface.view
+            shaded = light.shade(mesh.scene, points, material.normal, view, lobe, albedo, eye, surface.group)
         else:
             occlusion = appearance.trace(mesh, points)
             shaded = shade_eyes(appearance, eye, material.normal, base, surface.view, occlusion, surface.points)
