@@ -15,7 +15,7 @@ from mifit.morphable import MorphableModel
 from mifit.result import METHODS, Method, Result
 
 if TYPE_CHECKING:
-    from mifit.output.relight import Lighting
+    from mifit.output.relight import Exposure, Lighting
     from mifit.output.scene import Skin
 
 
@@ -180,23 +180,23 @@ class Reconstruction(Result):
         InputError
             A result without cameras, or a distance that isn't positive.
         """
-        from mifit.output.turntable import orbit_camera
+        from mifit.output.views import orbit_camera
 
         return orbit_camera(self, self.timesteps[0] if timestep is None else timestep, yaw, pitch, distance)
 
     @overload
     def relight(
-        self, lighting: Lighting, rotate: float | NDArray = 0.0, exposure: float | None = None
+        self, lighting: Lighting, rotate: float | NDArray = 0.0, exposure: Exposure = 1.0
     ) -> Reconstruction: ...
     @overload
     def relight(
-        self, lighting: Lighting, *, exposure: float | None = None, rotations: Sequence[float | NDArray]
+        self, lighting: Lighting, *, exposure: Exposure = 1.0, rotations: Sequence[float | NDArray]
     ) -> list[Reconstruction]: ...
     def relight(
         self,
         lighting: Lighting,
         rotate: float | NDArray = 0.0,
-        exposure: float | None = None,
+        exposure: Exposure = 1.0,
         rotations: Sequence[float | NDArray] | None = None,
     ) -> Reconstruction | list[Reconstruction]:
         """Put the face under another light.
@@ -209,9 +209,9 @@ class Reconstruction(Result):
             `Illumination` all of it, ambient term included.
         rotate : float or (3, 3)
             Turns the light about the vertical (+y) by degrees, or by a rotation R: what came from d comes from R d.
-        exposure : float, optional
-            Factor on the radiance. A capture doesn't tell how its exposure relates to that of an environment file; for
-            those the mean radiance by default stays that of the recovered lighting. The others are taken as they are.
+        exposure : float or "auto"
+            Factor on the radiance; by default the lighting is taken as it is. A capture doesn't tell how its exposure
+            relates to that of an environment file: ``"auto"`` keeps the mean luminance of the recovered lighting.
         rotations : sequence, optional
             Several values of ``rotate``, for which the environment is read and projected once.
 
@@ -227,9 +227,9 @@ class Reconstruction(Result):
         InputError
             No environment map, no rotation, or a fit that ended before stage 2.
         """
-        from mifit.output.relight import relit_many
+        from mifit.output.relight import relit
 
-        lit = relit_many(self, lighting, [rotate] if rotations is None else rotations, exposure)
+        lit = relit(self, lighting, [rotate] if rotations is None else rotations, exposure)
         return lit[0] if rotations is None else lit
 
     def _check(self, method: Method) -> None:

@@ -154,3 +154,8 @@ def rate(text: str) -> float:
     if value <= 0:
         raise argparse.ArgumentTypeError(f"found {text!r}, expected a number above 0")
     return value
+
+
+def exposure(text: str) -> float | str:
+    """``auto``, or a number above 0."""
+    return text if text == "auto" else rate(text)

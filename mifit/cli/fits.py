@@ -183,7 +183,7 @@ def track(arguments: Namespace) -> None:
     result = mifit.Reconstruction.load(arguments.result)
     capture = mifit.Capture.load(arguments.capture)
     use_variant(arguments)
-    from mifit.output.sequence import write_moving_pictures
+    from mifit.output.views import write_moving_pictures
     from mifit.tracking import sequence_left, track_into
 
     for name in arguments.overlay or ():  # an unknown one is refused now, not after the work

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from argparse import Namespace
@@ -11,6 +12,7 @@ from mifit.cli import arguments as types
 from mifit.cli.arguments import say, use_variant
 from mifit.cli.console import console_progress
 from mifit.core.files import write_text
+from mifit.core.limits import MAX_RENDERED_PIXELS
 from mifit.errors import InputError
 
 if TYPE_CHECKING:
@@ -136,9 +138,12 @@ def _result_and_variant(arguments: Namespace) -> Reconstruction:
 def turntable(arguments: Namespace) -> None:
     """Write novel views about the vertical axis."""
     result = _result_and_variant(arguments)
-    from mifit.output.sequence import write_sequence
-    from mifit.output.turntable import write_turntable
+    from mifit.output.views import write_sequence, write_turntable
 
+    if arguments.env:
+        result = result.relight(arguments.env, arguments.rotate, arguments.exposure)
+    elif arguments.rotate or arguments.exposure != 1.0:
+        raise InputError("--rotate and --exposure: found without --env, the light that they are of")
     progress = console_progress(arguments.quiet)
     if arguments.sequence:
         path, methods = arguments.out / "sequence.mp4", result.methods[:0:-1] or result.methods
@@ -162,24 +167,46 @@ def view(arguments: Namespace) -> None:
 
 def relight(arguments: Namespace) -> None:
     """Write views under another environment."""
+    if arguments.camera and arguments.yaw is not None:
+        raise InputError(f"--camera {arguments.camera}: found --yaw beside it, expected one of both")
+    if arguments.video and not arguments.turn:
+        raise InputError(f"--video {arguments.video}: found without --turn, the number of rotations that it shows")
     result = _result_and_variant(arguments)
     from mifit.output.relight import AGREEMENT, write_relit
-    from mifit.output.sequence import write_sequence
 
-    progress = console_progress(arguments.quiet)
+    cameras = list(result.cameras)
+    if arguments.camera:
+        cameras = [result.camera(arguments.camera)]
+    elif arguments.yaw is not None or arguments.turn:
+        cameras = [result.orbit(arguments.yaw or 0.0)]
+    if arguments.size:
+        cameras = [camera.resized(arguments.size / camera.width) for camera in cameras]
+    turns = arguments.turn or 1
     found = write_relit(
-        result, arguments.env, arguments.out, rotate=arguments.rotate, seed=arguments.seed, progress=progress
+        result,
+        arguments.env,
+        arguments.out,
+        cameras,
+        [arguments.rotate + 360.0 * k / turns for k in range(turns)],
+        arguments.exposure,
+        arguments.video,
+        arguments.fps,
+        arguments.integrator,
+        check=arguments.check,
+        seed=arguments.seed,
+        progress=console_progress(arguments.quiet),
     )
-    print(f"Fast against path-traced views: {found['psnr']:.1f} dB")
-    if found["psnr"] < AGREEMENT:
-        print(
-            f"mifit: warning: fast and path-traced views agree to less than {AGREEMENT:g} dB; use the latter",
-            file=sys.stderr,
-        )
-    if arguments.sequence:
-        lit = result.relight(arguments.env, rotate=arguments.rotate)
-        write_sequence(lit, arguments.out / "sequence.mp4", fps=arguments.fps, progress=progress)
-    print(f"Views: {arguments.out}")
+    say(
+        arguments,
+        f"Exposure: {found['exposure']:.3g} times the file's own radiance; "
+        f"the capture's level is {found['capture_exposure']:.3g} (--exposure auto)",
+    )
+    if arguments.check:
+        agreement = found["check"]["psnr"]
+        print(f"Fast view against path tracing: {agreement:.1f} dB")
+        if agreement < AGREEMENT:
+            print(f"mifit: warning: they agree to less than {AGREEMENT:g} dB; use --integrator path", file=sys.stderr)
+    print(f"Views: {arguments.video or arguments.out}")
 
 
 def export(arguments: Namespace) -> None:
@@ -265,6 +292,7 @@ def add_commands(add: types.Add) -> None:
         action="store_true",
         help="play the timesteps while the camera turns: sequence.mp4, one frame per timestep in place of --steps",
     )
+    _add_light(p, False)
     types.add_rate(p)
 
     p = add("view", view, "a live view in the browser: turn the head and the light, switch parts, load an environment")
@@ -273,15 +301,15 @@ def add_commands(add: types.Add) -> None:
 
     p = add("relight", relight, "relit views under a measured environment")
     p.add_argument("result", type=types.path, help="result folder of mifit fit")
-    p.add_argument("--env", type=types.path, required=True, help="lat-long environment, .hdr or .exr")
     p.add_argument("--out", type=types.path, required=True, help="folder to write")
-    p.add_argument(
-        "--rotate",
-        type=types.real,
-        default=0.0,
-        help="turn the environment about the vertical, degrees (default: 0)",
-    )
-    p.add_argument("--sequence", action="store_true", help="also play the timesteps from the front: sequence.mp4")
+    _add_light(p, True)
+    p.add_argument("--turn", type=types.at_least(1), help="number of rotations of the light about the vertical")
+    p.add_argument("--video", type=types.path, help="of --turn: .mp4 or .webp to write in place of images")
+    p.add_argument("--camera", help="a fitted camera; default: all of them, with --turn the front")
+    p.add_argument("--yaw", type=types.real, help="a view of the face from so many degrees about the vertical")
+    p.add_argument("--size", type=types.whole(16, MAX_RENDERED_PIXELS // 16), help="width in pixels")
+    p.add_argument("--integrator", choices=["local", "path"], default="local", help="fast (default) or path tracing")
+    p.add_argument("--check", action="store_true", help="compare both integrators in one small view")
     types.add_rate(p)
 
     p = add("export", export, "geometry with its maps for other programs")
@@ -296,4 +324,16 @@ def add_commands(add: types.Add) -> None:
         choices=["fitted", "refined"],
         default="fitted",
         help="refined: with the refined normals as shape, and its displacement map (default: fitted)",
+    )
+
+
+def _add_light(p: argparse.ArgumentParser, required: bool) -> None:
+    """Add the options of an environment."""
+    p.add_argument("--env", type=types.path, required=required, help="lat-long environment, .hdr or .exr")
+    p.add_argument("--rotate", type=types.real, default=0.0, help="of --env: degrees about the vertical (default: 0)")
+    p.add_argument(
+        "--exposure",
+        type=types.exposure,
+        default=1.0,
+        help="of --env: factor on the file's radiance (default: 1), or auto: the capture's level",
     )

@@ -212,8 +212,16 @@ def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: 
         for method, figures in evaluation["methods"].items():
             metrics |= {f"psnr_{method}": figures["psnr"], f"rmse_{method}": figures["rmse"]}
     if e.relight:
-        found = write_relit(result, e.relight.env, folder / "relit", rotate=e.relight.rotate, seed=fit.seed)
-        metrics["relight_fast_vs_path_psnr"] = found["psnr"]
+        found = write_relit(
+            result,
+            e.relight.env,
+            folder / "relit",
+            rotations=[e.relight.rotate],
+            exposure="auto",
+            check=True,
+            seed=fit.seed,
+        )
+        metrics["relight_fast_vs_path_psnr"] = found["check"]["psnr"]
         lit_capture = e.relight.capture
         if e.relight.synth:
             lit_capture = str(_synthetic_capture(e.relight.synth, experiment_folder, variant))

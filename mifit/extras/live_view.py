@@ -28,7 +28,7 @@ from mifit.core.mesh import normalize
 from mifit.errors import InputError, MifitError
 from mifit.output.deferred import render_local
 from mifit.output.relight import relit
-from mifit.output.turntable import on_backdrop, orbit_camera
+from mifit.output.views import on_backdrop, orbit_camera
 from mifit.progress import Progress
 from mifit.result import METHODS, Method, Result
 
@@ -83,7 +83,7 @@ class Picture:
 def under(result: Result, turn: float, environment: Path | None) -> Result:
     """A result under its own light or an environment, turned about the vertical by degrees."""
     if environment is not None:
-        return relit(result, environment, rotate=turn)
+        return relit(result, environment, [turn], "auto")[0]
     if turn == 0.0 or result.reflectance is None:
         return result
     rotation = Rotation.from_rotvec(np.radians(turn) * vertical(result)).as_matrix()

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.illumination import Illumination
-from mifit.core.files import file_name, replacing, write_text
-from mifit.core.image import encode_png, read_image, to_8_bit, write_image
+from mifit.core.files import file_name, write_text
+from mifit.core.image import read_image, to_8_bit, write_image
 from mifit.core.metrics import psnr, rmse
 from mifit.core.sh import LUMINANCE, SHLighting
 from mifit.errors import InputError
+from mifit.output.deferred import SampledMaterial, VisibleSurface, shade_methods, surface_material, visible_surface
 from mifit.output.evaluate import face_area
-from mifit.output.figures import HEAT_LIMIT, heat_map
-from mifit.output.turntable import sheet
+from mifit.output.views import check_moving, sheet, write_moving
 from mifit.progress import Progress, silent
 from mifit.result.record import R
 
@@ -38,39 +38,32 @@ MAP_ROWS = 512
 
 Lighting = str | Path | NDArray | SHLighting | Illumination
 """What a face can be put under: an environment file or image, spherical harmonics, or everything that lights it."""
+Exposure = float | Literal["auto"]
+"""Factor on a lighting's radiance; ``auto`` gives it the mean luminance of the capture's."""
 
 
-def relit(reconstruction: R, lighting: Lighting, rotate: float | NDArray = 0.0, exposure: float | None = None) -> R:
-    """Replace the lighting of a reconstruction; see `Reconstruction.relight`."""
-    return relit_many(reconstruction, lighting, [rotate], exposure)[0]
-
-
-def relit_many(
-    reconstruction: R, lighting: Lighting, rotations: Sequence[float | NDArray], exposure: float | None = None
+def relit(
+    reconstruction: R, lighting: Lighting, rotations: Sequence[float | NDArray] = (0.0,), exposure: Exposure = 1.0
 ) -> list[R]:
-    """Replace the lighting by one that is turned in several ways; an environment is read and projected once."""
+    """The face under a lighting that is turned in several ways; see `Reconstruction.relight`."""
     reflectance = reconstruction.reflectance
     if reflectance is None:
         raise InputError("relighting needs reflectance, but this fit ended after the geometry stage; fit it further")
-    if exposure is not None and not (np.isfinite(exposure) and exposure > 0):
-        raise InputError(f"exposure: found {exposure!r}, expected a positive number")
+    if exposure != "auto" and not (isinstance(exposure, (int, float)) and np.isfinite(exposure) and exposure > 0):
+        raise InputError(f"exposure: found {exposure!r}, expected a positive number or 'auto'")
     turns = [_rotation(rotation) for rotation in rotations]
     if isinstance(lighting, Illumination):
-        lit = lighting if exposure is None else lighting.scaled(exposure)
-        middle = reconstruction.geometry.middle
+        if exposure == "auto":
+            raise InputError("exposure: found 'auto', expected a number: this lighting has a level of its own")
+        lit, middle = lighting.scaled(exposure), reconstruction.geometry.middle
         return [reconstruction.with_illumination(lit.rotated(turn, middle)) for turn in turns]
-    before = float(reconstruction.lighting.coefficients[0] @ LUMINANCE)
     image = None if isinstance(lighting, SHLighting) else _environment(lighting)
     smooth = SHLighting.from_envmap(image, reconstruction.lighting.order) if image is not None else lighting
-    after = float(smooth.coefficients[0] @ LUMINANCE)
-    if not after > 0:
-        raise InputError(f"lighting: found a mean luminance of {after:g}, expected one above 0")
-    if exposure is None:
-        exposure = before / after if image is not None else 1.0
+    level = _level(reconstruction.lighting) / _level(smooth)
+    factor = level if exposure == "auto" else float(exposure)
     # The ambient term stands for light that the model leaves out, such as interreflection: it grows with the light.
-    ambient = reflectance.illumination.ambient * exposure * after / before
-    lit = Illumination(exposure * smooth.coefficients, ambient=ambient)
-    shown = None if image is None else (exposure * image).astype(np.float32)
+    lit = Illumination(factor * smooth.coefficients, ambient=reflectance.illumination.ambient * factor / level)
+    shown = None if image is None else (factor * image).astype(np.float32)
     return [
         replace(
             reconstruction.with_illumination(lit.rotated(turn)),
@@ -79,6 +72,14 @@ def relit_many(
         )
         for turn in turns
     ]
+
+
+def _level(lighting: SHLighting) -> float:
+    """Mean luminance over all directions."""
+    level = float(lighting.coefficients[0] @ LUMINANCE) / float(np.sqrt(4 * np.pi))
+    if not level > 0:
+        raise InputError(f"lighting: found a mean luminance of {level:g}, expected one above 0")
+    return level
 
 
 def _environment(source: str | Path | NDArray) -> NDArray[np.float32]:
@@ -112,57 +113,116 @@ def write_relit(
     reconstruction: Result,
     environment: str | Path,
     folder: str | Path,
-    rotate: float = 0.0,
-    exposure: float | None = None,
-    samples: int = 128,
+    cameras: Sequence[Camera] = (),
+    rotations: Sequence[float] = (0.0,),
+    exposure: Exposure = 1.0,
+    video: str | Path | None = None,
+    fps: float = 12.0,
+    integrator: Literal["local", "path"] = "local",
+    samples: int = 144,
+    check: bool = False,
     seed: int = 0,
     progress: Progress = silent,
-) -> dict[str, float]:
-    """Write views under a measured environment: the fast path, the path-traced one, and their difference.
+) -> dict[str, Any]:
+    """Write views of the first timestep under a measured environment.
 
-    The first timestep is shown from every fitted camera. ``NAME_fast.png`` shades the visible surface under the
-    environment without tracing paths (``appearance.environment``); ``NAME_path.png``
-    traces paths under the whole environment, with shadows and
-    interreflection; ``NAME_difference.png`` is the error between them; ``relight.png`` shows all in rows, and
-    ``relight.json`` holds exposure and figures.
+    ``NAME.png`` (RGBA) is a camera's view, or ``NAME_NNN.png`` where the light is turned several times;
+    ``relight.png`` shows several cameras side by side; ``relight.json`` holds what is returned.
+
+    Parameters
+    ----------
+    reconstruction : Result
+    environment : path
+    folder : path
+        Made when it is missing.
+    cameras : sequence of Camera
+        Default: the fitted ones.
+    rotations : sequence of float
+        Degrees by which the environment is turned about the vertical. What no light changes is computed once.
+    exposure : float or "auto"
+        As in `Reconstruction.relight`.
+    video : path, optional
+        ``.mp4`` or ``.webp`` to write the turning light to, in place of images; cameras are side by side.
+    fps : float
+        Rotations per second of the video.
+    integrator, samples, seed
+        ``local`` traces no paths; ``path`` traces so many per pixel. See `Reconstruction.render`.
+    check : bool
+        Compare both integrators in one small view: the first camera's at a quarter of the size.
+    progress : Progress
 
     Returns
     -------
     dict
-        ``exposure``, and ``psnr`` (dB) and ``rmse`` (0..255) between fast path and path tracing in 8-bit sRGB, over
-        the pixels that the head covers in all views.
+        ``exposure``; ``capture_exposure``, the one that gives the capture's mean luminance; ``mean_radiance``,
+        ``rotations``, ``integrator``, ``files``; with ``check`` PSNR (dB) and RMSE (0..255) of the fast view against
+        the path-traced one in 8-bit sRGB, over the pixels that the head covers.
     """
     folder = Path(folder)
-    lit = relit(reconstruction, environment, rotate, exposure)
-    timestep = lit.timesteps[0]
-    rows, pairs = [], []
-    total = 2 * len(lit.cameras)
-    progress("Relighting", 0, total)
-    for k, camera in enumerate(lit.cameras):
-        fast = lit.render(camera, timestep)
-        progress("Relighting", 2 * k + 1, total)
-        path = lit.render(camera, timestep, integrator="path", samples=samples, seed=seed)
-        progress("Relighting", 2 * k + 2, total)
-        name = file_name(camera.name)
-        write_image(folder / f"{name}_fast.png", fast)
-        write_image(folder / f"{name}_path.png", path)
-        covered = (fast[..., 3] == 1) & (path[..., 3] > 0.99)
-        a, b = to_8_bit(fast[..., :3]), to_8_bit(path[..., :3])
-        with replacing(folder / f"{name}_difference.png") as temporary:
-            temporary.write_bytes(encode_png(heat_map(b, a, covered)))
-        rows.append([fast, path])
-        pairs.append((a[covered], b[covered]))
-    fast_codes, path_codes = (np.concatenate([p[j] for p in pairs])[None] for j in (0, 1))
-    used = float(lit.illumination.radiance[0] @ LUMINANCE)
-    figures = {
-        "psnr": psnr(fast_codes, path_codes),
-        "rmse": rmse(fast_codes, path_codes),
-        "mean_radiance": used / np.sqrt(4 * np.pi),
-        "difference_limit": HEAT_LIMIT,
+    if video is not None:
+        check_moving(video)
+    image = _environment(environment)
+    lits = relit(reconstruction, image, rotations, exposure)
+    timestep, views = lits[0].timesteps[0], list(cameras) or list(reconstruction.cameras)
+    if not views:
+        raise InputError("this result has no cameras to show it from; give one")
+    level = _level(SHLighting.from_envmap(image, reconstruction.lighting.order))
+    capture_exposure = _level(reconstruction.lighting) / level
+    used = capture_exposure if exposure == "auto" else float(exposure)
+    shared: list[tuple[VisibleSurface, SampledMaterial]] = []
+    if integrator == "local":
+        surfaces = [visible_surface(lits[0], camera, timestep) for camera in views]
+        shared = [(surface, surface_material(lits[0], surface, timestep)) for surface in surfaces]
+    total, written = len(lits) * len(views), []
+
+    def shown(k: int) -> list[NDArray]:
+        """Views of the k-th rotation; each is written as soon as it is there, unless for a video."""
+        images = []
+        for c, camera in enumerate(views):
+            progress("Relighting", k * len(views) + c, total)
+            if shared:
+                surface, material = shared[c]
+                image = shade_methods(lits[k], surface, timestep, ("full",), material)["full"]
+            else:
+                image = lits[k].render(camera, timestep, integrator=integrator, samples=samples, seed=seed)
+            images.append(image)
+            if video is None:
+                number = f"_{k:03d}" if len(lits) > 1 else ""
+                written.append(f"{file_name(camera.name)}{number}.png")
+                write_image(folder / written[-1], image)
+        return images
+
+    if video is not None:
+        write_moving(video, (np.concatenate(shown(k), axis=1) for k in range(len(lits))), fps)
+        written.append(str(video))
+    else:
+        first, *_ = [shown(k) for k in range(len(lits))]
+        if len({image.shape for image in first}) == 1 < len(first):
+            write_image(folder / "relight.png", sheet([first]))
+            written.append("relight.png")
+    progress("Relighting", total, total)
+    figures: dict[str, Any] = {
+        "environment": Path(environment).name,
+        "exposure": used,
+        "capture_exposure": capture_exposure,
+        "mean_radiance": used * level,
+        "rotations": list(rotations),
+        "integrator": integrator,
+        "files": written,
     }
-    write_image(folder / "relight.png", sheet(rows))
-    write_text(folder / "relight.json", json.dumps({"rotate": rotate, **figures}, indent=1) + "\n")
+    if check:
+        figures["check"] = _check(lits[0], views[0].resized(0.25), timestep, samples, seed)
+    write_text(folder / "relight.json", json.dumps(figures, indent=1) + "\n")
     return figures
+
+
+def _check(lit: Result, camera: Camera, timestep: int, samples: int, seed: int) -> dict[str, float]:
+    """Error of a fast view against the path-traced one, over the pixels that the head covers."""
+    fast = lit.render(camera, timestep)
+    path = lit.render(camera, timestep, integrator="path", samples=samples, seed=seed)
+    covered = (fast[..., 3] == 1) & (path[..., 3] > 0.99)
+    a, b = to_8_bit(fast[..., :3])[covered][None], to_8_bit(path[..., :3])[covered][None]
+    return {"psnr": psnr(a, b), "rmse": rmse(a, b)}
 
 
 def evaluate_relit(
@@ -206,7 +266,7 @@ def evaluate_relit(
     """
     if camera in [c.name for c in reconstruction.cameras]:
         raise InputError(f"camera {camera}: was fitted; expected another one to judge by")
-    lit = relit(reconstruction, environment, rotate)
+    lit = relit(reconstruction, environment, [rotate])[0]
     capture = capture.with_fitted(reconstruction.cameras)
     steps = [t for t in lit.timesteps if t in capture.timesteps]
     if not steps:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from mifit.core.image import write_image
 from mifit.errors import InputError
 from mifit.extras.live_view import FitView, LiveView, Picture, Shown, browser_camera, under, vertical
-from mifit.output.turntable import orbit_camera
+from mifit.output.views import orbit_camera
 from tests.output import browser
 from tests.output.conftest import ball_result
 

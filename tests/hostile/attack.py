@@ -54,7 +54,7 @@ def preload() -> None:
     import mifit.output.export
     import mifit.output.relight
     import mifit.output.report
-    import mifit.output.sequence
+    import mifit.output.views
     import mifit.synth
 
     for name in mifit.__all__:

@@ -161,7 +161,7 @@ VIDEO = """
 import numpy as np
 from pathlib import Path
 try:
-    from mifit.output.sequence import write_video
+    from mifit.output.views import write_video
 except ImportError:
     from mifit.output.video import write_video
 frames = (np.random.default_rng(i).integers(0, 255, (64, 96, 3)).astype(np.uint8) for i in range(40))

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import mifit
@@ -15,8 +16,9 @@ from mifit.appearance.illumination import Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.core.camera import Camera
 from mifit.core.estimate import NormalsEstimate
-from mifit.core.image import to_8_bit, write_image
+from mifit.core.image import read_image, to_8_bit, write_image
 from mifit.core.metrics import psnr
+from mifit.core.sh import LUMINANCE
 from mifit.errors import InputError
 from mifit.output.export import export
 from mifit.output.relight import write_relit
@@ -119,13 +121,37 @@ def test_relit_scene_is_lit_by_the_environment(flat, variant, tmp_path):
     assert 'type="envmap"' in (tmp_path / "lit.xml").read_text()
 
 
-def test_relit_views_are_written_fast_and_path_traced(flat, variant, tmp_path):
+def test_relit_views_are_fast_and_can_be_checked_by_path_tracing(flat, variant, tmp_path):
     write_image(tmp_path / "studio.hdr", smooth_environment())
-    figures = write_relit(flat, tmp_path / "studio.hdr", tmp_path / "out", rotate=20, samples=64)
-    names = {f"{c}_{kind}.png" for c in ("left", "right") for kind in ("fast", "path", "difference")}
-    assert {p.name for p in (tmp_path / "out").iterdir()} == names | {"relight.png", "relight.json"}
-    assert json.loads((tmp_path / "out" / "relight.json").read_text()) == {"rotate": 20, **figures}
-    assert 25 < figures["psnr"] < 60
+    out = tmp_path / "out"
+    found = write_relit(flat, tmp_path / "studio.hdr", out, rotations=[20.0], exposure="auto", check=True)
+    assert {p.name for p in out.iterdir()} == {"left.png", "right.png", "relight.png", "relight.json"}
+    assert json.loads((out / "relight.json").read_text()) == found
+    assert 25 < found["check"]["psnr"] < 60
+    assert found["exposure"] == pytest.approx(found["capture_exposure"])
+    assert found["mean_radiance"] == pytest.approx(flat.lighting.coefficients[0] @ LUMINANCE / np.sqrt(4 * np.pi))
+    path = flat.relight(smooth_environment(), 20.0).render(flat.cameras[0], 0, integrator="path", samples=64)
+    found = write_relit(flat, tmp_path / "studio.hdr", out, flat.cameras[:1], [20.0], integrator="path", samples=64)
+    assert found["exposure"] == 1.0 and "check" not in found
+    covered = path[..., 3] == 1
+    shown = read_image(out / "left.png")[..., :3][covered]
+    assert np.abs(to_8_bit(shown).astype(float) - to_8_bit(path[..., :3])[covered]).mean() < 2.0
+
+
+def test_a_turning_light_is_a_view_after_another(flat, variant, tmp_path):
+    write_image(tmp_path / "studio.hdr", smooth_environment())
+    env, camera = tmp_path / "studio.hdr", flat.cameras[0].resized(0.5)
+    write_relit(flat, env, tmp_path / "out", [camera], [0.0, 120.0, 240.0])
+    names = {f"left_{k:03d}.png" for k in range(3)}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == names | {"relight.json"}
+    single = to_8_bit(flat.relight(env, 240.0).render(camera, 0)[..., :3]).astype(float)
+    turned = to_8_bit(read_image(tmp_path / "out" / "left_002.png")[..., :3]).astype(float)
+    np.testing.assert_allclose(turned, single, atol=1.0)
+    found = write_relit(flat, env, tmp_path / "video", [camera], [0.0, 120.0], video=tmp_path / "light.webp")
+    assert {p.name for p in (tmp_path / "video").iterdir()} == {"relight.json"}
+    assert found["files"] == [str(tmp_path / "light.webp")]
+    with Image.open(tmp_path / "light.webp") as animation:
+        assert animation.n_frames == 2 and animation.size == (32, 32)
 
 
 def test_saved_result_has_a_scene_that_load_scene_renders(ball, variant, tmp_path):

@@ -17,8 +17,14 @@ from mifit.errors import InputError
 from mifit.output.evaluate import rgba_8_bit
 from mifit.output.export import export
 from mifit.output.figures import overlay
-from mifit.output.sequence import write_moving_pictures, write_overlay, write_sequence, write_video
-from mifit.output.turntable import on_backdrop, orbit_camera
+from mifit.output.views import (
+    on_backdrop,
+    orbit_camera,
+    write_moving_pictures,
+    write_overlay,
+    write_sequence,
+    write_video,
+)
 from mifit.result.ownership import claim, remember
 from tests.output.test_export import read_glb
 from tests.output.test_render_evaluate import FakeCapture

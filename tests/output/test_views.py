@@ -12,7 +12,7 @@ from mifit.core.image import write_image
 from mifit.core.sh import SHLighting, latlong_directions
 from mifit.errors import InputError
 from mifit.output.relight import evaluate_relit
-from mifit.output.turntable import orbit_camera, write_turntable
+from mifit.output.views import orbit_camera, write_turntable
 from tests.output.conftest import ball_camera
 from tests.output.test_render_evaluate import FakeCapture
 
@@ -51,16 +51,16 @@ def smooth_environment(height=64):
     return (np.exp(3 * (d @ np.array([0.6, 0.48, 0.64]) - 1))[..., None] * (1.0, 0.8, 0.6)).astype(np.float32)
 
 
-def test_relighting_projects_the_environment_and_keeps_the_mean(ball):
+def test_relighting_projects_the_environment_at_its_own_or_the_captures_level(ball):
     environment = smooth_environment()
-    lit = ball.relight(environment)
+    lit = ball.relight(environment, exposure="auto")
     expected = SHLighting.from_envmap(environment, 3).coefficients
     ratio = lit.lighting.coefficients / expected
     np.testing.assert_allclose(ratio, ratio[0, 0], rtol=1e-3)
     luminance = np.array([0.2126, 0.7152, 0.0722])
     assert lit.lighting.coefficients[0] @ luminance == pytest.approx(ball.lighting.coefficients[0] @ luminance)
     assert lit.illumination.ambient == pytest.approx(ball.illumination.ambient)
-    plain = ball.relight(environment, exposure=1.0)
+    plain = ball.relight(environment)
     np.testing.assert_allclose(plain.lighting.coefficients, expected, rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(plain.environment, environment)
     # The ambient term goes with the mean radiance.

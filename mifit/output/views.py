@@ -1,31 +1,109 @@
-"""Timesteps as moving pictures: renders of a sequence, and renders over the input."""
+"""Novel views of a result, still and moving: turntables, sequences of timesteps, renders over the input."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.camera import Camera
 from mifit.core.files import file_name, replacing
-from mifit.core.image import to_8_bit
+from mifit.core.image import to_8_bit, write_image
+from mifit.core.mesh import normalize
 from mifit.core.quiet import decoding
 from mifit.errors import InputError, MifitError
 from mifit.output.deferred import shade_methods, visible_surface
 from mifit.output.evaluate import as_photographed, rgba_8_bit
 from mifit.output.figures import overlay
 from mifit.output.gltf import write_glb
-from mifit.output.turntable import on_backdrop, orbit_camera, write_animation
 from mifit.progress import Progress, silent
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.result import Method, Result
 
+BACKDROP = 0.35
+"""Linear grey behind the head on sheets and in animations."""
 CODECS = ("vp09", "mp4v")
 """Video codecs by preference: browsers play VP9; every OpenCV can write MPEG-4."""
+
+
+def orbit_camera(
+    reconstruction: Result, timestep: int, degrees: float, pitch: float = 0.0, distance: float | None = None
+) -> Camera:
+    """A camera that looks at the face from an angle about the vertical; 0 is straight from the front.
+
+    Image size, focal length and distance are those of the fitted cameras; positive angles move the camera to
+    its right, so that it sees the head's left side, and a positive ``pitch`` upwards. The vertical is the fitted
+    cameras' mean up axis.
+
+    Raises
+    ------
+    InputError
+        The result has no cameras, or ``distance`` isn't positive.
+    """
+    if not reconstruction.cameras:
+        raise InputError("this result has no cameras, so there is no image size to render at; give one to render()")
+    model, i = reconstruction.model, reconstruction.index(timestep)
+    first = reconstruction.cameras[0]
+    vertices = reconstruction.geometry.vertices[i][np.unique(model.faces[model.face_mask])]
+    centre = 0.5 * (vertices.min(0) + vertices.max(0)).astype(np.float64)
+    up = normalize(-np.mean([c.rotation[1] for c in reconstruction.cameras], axis=0))
+    front = reconstruction.geometry.rotation[i][:, 2]
+    front = normalize(front - (front @ up) * up)
+    reach = float(np.mean([np.linalg.norm(c.position - centre) for c in reconstruction.cameras]))
+    facing = Camera.look_at(centre + reach * front, centre, up)
+    cx, cy = first.width / 2, first.height / 2
+    camera = replace(first, world_to_camera=facing.world_to_camera, distortion=(), cx=cx, cy=cy)
+    name = f"orbit{degrees:+g}" + (f"{pitch:+g}" if pitch else "")
+    return camera.orbit(degrees, pitch, centre, up, distance, name)
+
+
+def write_turntable(
+    reconstruction: Result,
+    folder: str | Path,
+    start: float = -35.0,
+    stop: float = 35.0,
+    steps: int = 7,
+    timestep: int | None = None,
+    progress: Progress = silent,
+) -> None:
+    """Write views about the vertical axis with and without specular, as in the paper's figure of novel views.
+
+    Writes ``full_NN.png`` and ``diffuse_NN.png`` (RGBA) per step, ``turntable.png`` with one row per method, and
+    ``turntable.webp``, an animation. A result of stage 1 alone gives ``pca_NN.png``.
+
+    Parameters
+    ----------
+    reconstruction : Result
+    folder : path
+        Made when it is missing.
+    start, stop : float
+        First and last angle in degrees.
+    steps : int
+        Number of views.
+    timestep : int, optional
+        Default: the first that was fitted.
+    progress : Progress
+    """
+    folder = Path(folder)
+    timestep = reconstruction.timesteps[0] if timestep is None else timestep
+    methods: tuple[Method, ...] = ("full", "diffuse") if reconstruction.reflectance is not None else ("pca",)
+    rows: dict[Method, list[NDArray]] = {m: [] for m in methods}
+    angles = np.linspace(start, stop, steps)
+    progress("Turntable", 0, steps)
+    for k, angle in enumerate(angles):
+        surface = visible_surface(reconstruction, orbit_camera(reconstruction, timestep, float(angle)), timestep)
+        for method, image in shade_methods(reconstruction, surface, timestep, methods).items():
+            write_image(folder / f"{method}_{k:02d}.png", image)
+            rows[method].append(image)
+        progress("Turntable", k + 1, steps)
+    write_image(folder / "turntable.png", sheet([rows[m] for m in methods]))
+    write_moving(folder / "turntable.webp", rows[methods[0]] + rows[methods[0]][-2:0:-1], 12)
 
 
 def write_sequence(
@@ -61,9 +139,7 @@ def write_sequence(
     InputError
         A timestep or method that the result lacks, another suffix, or no cameras.
     """
-    path = Path(path)
-    if path.suffix.lower() not in (".mp4", ".webp"):
-        raise InputError(f"{path}: found suffix {path.suffix!r}, expected '.mp4' or '.webp'")
+    check_moving(path)
     steps = sorted(reconstruction.timesteps) if timesteps is None else timesteps
     shown = tuple(reconstruction.methods[-1:] if methods is None else methods)
     for method in shown:
@@ -80,10 +156,7 @@ def write_sequence(
             yield np.concatenate([images[m] for m in shown], axis=1)
         progress("sequence", len(steps), len(steps))
 
-    if path.suffix.lower() == ".webp":
-        write_animation(path, list(frames()), fps)
-    else:
-        write_video(path, (to_8_bit(on_backdrop(frame)) for frame in frames()), fps)
+    write_moving(path, frames(), fps)
 
 
 def write_overlay(
@@ -148,6 +221,42 @@ def write_moving_pictures(
         write_overlay(reconstruction, capture, name, path, fps, progress)
     write_glb(reconstruction, folder / "sequence.glb", animate=sorted(reconstruction.timesteps), fps=fps)
     return [*overlays, folder / "sequence.glb"]
+
+
+def on_backdrop(image: NDArray) -> NDArray:
+    """Lay a linear image with coverage on grey."""
+    return image[..., :3] * image[..., 3:] + BACKDROP * (1 - image[..., 3:])
+
+
+def sheet(rows: Sequence[Sequence[NDArray]]) -> NDArray:
+    """Images with coverage in rows, cropped to what any of them covers, on grey."""
+    covered = np.any([image[..., 3] > 0 for row in rows for image in row], axis=0)
+    used_rows, used_columns = np.flatnonzero(covered.any(1)), np.flatnonzero(covered.any(0))
+    if not len(used_rows):
+        raise InputError("no view shows the head; choose angles or a camera from which it is visible")
+    box = slice(used_rows[0], used_rows[-1] + 1), slice(used_columns[0], used_columns[-1] + 1)
+    return np.concatenate([np.concatenate([on_backdrop(image[box]) for image in row], axis=1) for row in rows])
+
+
+def check_moving(path: str | Path) -> None:
+    """InputError for the name of a moving picture that is neither ``.mp4`` nor ``.webp``."""
+    if Path(path).suffix.lower() not in (".mp4", ".webp"):
+        raise InputError(f"{path}: found suffix {Path(path).suffix!r}, expected '.mp4' or '.webp'")
+
+
+def write_moving(path: str | Path, frames: Iterable[NDArray], fps: float) -> None:
+    """Write linear images with coverage, on grey, as ``.mp4``, or as an animated ``.webp`` that loops."""
+    check_moving(path)
+    codes = (to_8_bit(on_backdrop(frame)) for frame in frames)
+    if Path(path).suffix.lower() == ".mp4":
+        write_video(path, codes, fps)
+        return
+    from PIL import Image
+
+    first, *others = (Image.fromarray(frame) for frame in codes)
+    with replacing(path) as temporary:
+        duration = round(1000 / fps)
+        first.save(temporary, "WEBP", save_all=True, append_images=others, duration=duration, loop=0, quality=85)
 
 
 def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> None:
