@@ -296,15 +296,6 @@ TIME = [
 
 VIDEO = [
     M("a bias told in pixels alone", STAGES, r"SCATTER_OF_FACE \* float\(", "0.0 * float(", "tests/stages/test_find_surface.py -k bias"),
-    M("a surface swept again is always kept", EXTRAS, r"kept = between\[1\] < between\[0\]", "kept = True",
-      "tests/extras/test_sweep_again.py"),
-    M("what judges is swept too", EXTRAS, r"swept = \[t for t in geometry\.timesteps if t not in judged\]",
-      "swept = list(geometry.timesteps)", "tests/extras/test_sweep_again.py"),
-    M("more timesteps are more certain", EXTRAS, r"found\.precision \* min\(1\.0, self\._count_as / len\(posed\)\)",
-      "found.precision", "tests/extras/test_sweep_again.py"),
-    M("frames that disagree are swept", ANY, r"if apart\(one\) < DISAGREES \* usual:", "if True:", "tests/extras/test_resurfacing.py"),
-    M("timesteps that aren't swept stay on the old surface", ANY, r"on_surface\(model, posed\.at\(\(timestep,\)\), found\.displacement\)",
-      "on_surface(model, posed.at((timestep,)), geometry.displacement)", "tests/extras/test_resurfacing.py"),
 ]  # fmt: skip
 
 GLOSS = [

@@ -183,15 +183,17 @@ def track(arguments: Namespace) -> None:
     result = mifit.Reconstruction.load(arguments.result)
     capture = mifit.Capture.load(arguments.capture)
     use_variant(arguments)
+    from mifit.output.report import write_report
     from mifit.output.views import write_moving_pictures
     from mifit.tracking import sequence_left, track_into
 
     for name in arguments.overlay or ():  # an unknown one is refused now, not after the work
         capture.with_fitted(result.cameras).camera(name)
-    timesteps = sequence_left(result, capture, arguments.resume)
-    if arguments.timesteps:
-        timesteps = choose("timestep", capture.timesteps, arguments.timesteps, 0)
     progress = console_progress(arguments.quiet)
+    wanted = choose("timestep", capture.timesteps, arguments.timesteps, 0) if arguments.timesteps else ()
+    if arguments.refine:
+        result, wanted = _with_refined(arguments, result, capture, wanted, progress)
+    timesteps = wanted or sequence_left(result, capture, arguments.resume)
     result = track_into(
         arguments.result,
         result,
@@ -202,27 +204,26 @@ def track(arguments: Namespace) -> None:
         resume=arguments.resume,
         progress=progress,
     )
-    if arguments.refine:
-        result = _with_refined(arguments, result, capture, progress)
+    write_report(arguments.result, result, capture)
     written = write_moving_pictures(arguments.result, result, capture, arguments.overlay, arguments.fps, progress)
     remember(arguments.result, [path.name for path in written])
     print(f"Result: {arguments.result}")
 
 
-def _with_refined(arguments: Namespace, result: Reconstruction, capture: Capture, progress: Progress) -> Reconstruction:
-    """The result with all of its frames absorbed into its maps and normals, written into its folder."""
+def _with_refined(
+    arguments: Namespace, result: Reconstruction, capture: Capture, wanted: tuple[int, ...], progress: Progress
+) -> tuple[Reconstruction, tuple[int, ...]]:
+    """The result with maps, lighting and normals from further frames too, in its folder, and what is to be tracked."""
     from mifit.extras.refine import refine
-    from mifit.output.report import write_report
-    from mifit.result.ownership import CHECKPOINTS, locked
+    from mifit.result.ownership import locked
 
-    folder: Path = arguments.result
-    with locked(folder):
-        checkpoints = folder / CHECKPOINTS / "refine"
-        found = refine(result, capture, result.timesteps, arguments.seed, progress, checkpoints)
-        found.save(folder)
-        shutil.rmtree(checkpoints, ignore_errors=True)
-    write_report(folder, found, capture)
-    return found
+    if result.reflectance is not None and "refined" in result.reflectance.report.details:
+        return result, wanted  # by a run before, which goes on here
+    found = refine(result, capture, sorted({*result.timesteps, *wanted}) if wanted else None, arguments.seed, progress)
+    with locked(arguments.result):
+        found.save(arguments.result)
+    again = {t for t in result.timesteps if t not in found.timesteps}
+    return found, tuple(sorted({*wanted, *again})) if wanted else ()
 
 
 def run(arguments: Namespace) -> None:
@@ -279,7 +280,7 @@ def add_commands(add: types.Add) -> None:
     p.add_argument("--timesteps", type=types.timesteps, help="default: all that aren't in the result yet")
     p.add_argument("--resume", action="store_true", help="keep the frames that an earlier run has written")
     p.add_argument(
-        "--refine", action="store_true", help="also add what the frames show to the maps and normals of the result"
+        "--refine", action="store_true", help="first find maps, lighting and normals anew, from frames of the video too"
     )
     p.add_argument("--overlay", type=types.listed, help="cameras to write overlay videos of; default: the fitted ones")
     types.add_rate(p)

@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from mifit.appearance.illumination import Illumination
     from mifit.appearance.lobe import Lobe
 
-FURTHER_FRAMES = "surface of further frames"
-"""Phase in a geometry's report: a surface that was swept again with frames of a video."""
-
 
 @dataclass(frozen=True)
 class Report:
@@ -166,8 +163,6 @@ class ReflectanceEstimate:
         What each image of the fit shows (`core.labels.Label`); empty where that wasn't looked for.
     labelled : tuple of (camera, timestep)
         Of which image each of ``labels`` is.
-    frames : (S, S) float32 or None
-        Number of timesteps that showed each texel, where a video was absorbed (`mifit.refine`).
     relief : (S, S) float32 or None
         Factor of the diffuse light of the capture that mesh and lighting don't explain: relief finer than the mesh,
         edges of shadows. None where nothing was parted from the albedo, and under any other light.
@@ -189,7 +184,6 @@ class ReflectanceEstimate:
     report: Report
     labels: tuple[NDArray, ...] = ()
     labelled: tuple[tuple[str, int], ...] = ()
-    frames: NDArray | None = None
     relief: NDArray | None = None
     specular_confidence: NDArray | None = None
     lit_eyes: NDArray | None = None

@@ -23,7 +23,7 @@ from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.core.files import file_name, write_bytes, write_text
 from mifit.core.image import encode_png
 from mifit.errors import InputError
-from mifit.extras.board_adjustment import LEAST_NOISE, adjust
+from mifit.extras.board_adjustment import adjust
 from mifit.extras.board_camera import (
     BAD_ERROR,
     CONTRADICTS,
@@ -205,29 +205,8 @@ def _together(
 
     A board that moves while the cameras aren't quite in step fits each camera by itself.
     """
-    watched = list(watched)
     while True:
-        every = np.array([error for seen in watched for error in seen.errors.values()])
-        found = adjust(
-            board.points,
-            [seen.used for seen in watched],
-            [seen.matrix for seen in watched],
-            [seen.distortion for seen in watched],
-            poses,
-            [seen.size for seen in watched],
-            max(float(np.median(every)) / np.sqrt(2.0), LEAST_NOISE),
-        )
-        poses = found.poses
-        watched = [
-            dataclasses.replace(
-                seen,
-                matrix=found.matrices[c],
-                distortion=found.distortions[c],
-                focal_deviation=found.focal_deviations[c] / float(found.matrices[c][0, 0]),
-                errors=found.errors[c],
-            )
-            for c, seen in enumerate(watched)
-        ]
+        watched, poses = adjust(watched, poses, board)
         kept = [_consistent(seen) for seen in watched]
         shared = [len(_shared(a, b)) for k, b in enumerate(kept) for a in kept[:k]]
         few = any(len(seen.used) < LEAST_FRAMES for seen in kept) or min(shared, default=LEAST_SHARED) < LEAST_SHARED

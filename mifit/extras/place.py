@@ -10,25 +10,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from mifit.capture.capture import Capture
 from mifit.capture.landmark_files import COUNT, MIN_VISIBLE
+from mifit.capture.resection import landmark_weights, resect_camera
 from mifit.capture.transforms import update_frames
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.errors import InputError
-
-JAW = 17
-"""The first landmarks lie on the jaw's outline, which slides over the head as it turns: they count less."""
-JAW_WEIGHT = 0.3
-NOISE = 0.004
-"""Standard deviation of a landmark as a part of the image's longer side."""
-FOCAL_DEVIATION = 0.02, 0.5
-"""Deviation of the logarithm of an unknown focal length from the others', for images of their size and not."""
 
 
 def landmark_places(
@@ -72,7 +62,7 @@ def place_camera(
     places : dict
         From `landmark_places`.
     focal : float
-        Expected focal length in multiples of the image's longer side, where the capture gives none.
+        Expected focal length in pixels, where the capture gives none.
     same : bool
         Whether its images have the size of those that ``focal`` is from.
 
@@ -81,8 +71,6 @@ def place_camera(
     InputError
         Too few of its landmarks are visible.
     """
-    view = capture.views[name]
-    side = max(view.width, view.height)
     points, pixels, weights = [], [], []
     for timestep, (seen, world) in places.items():
         marks = capture.landmarks(name, timestep)
@@ -90,35 +78,13 @@ def place_camera(
             both = marks.visible[seen]
             points.append(world[both])
             pixels.append(marks.points[seen[both]])
-            weights.append(np.where(seen[both] < JAW, JAW_WEIGHT, 1.0))
+            weights.append(landmark_weights(seen[both]))
     if sum(map(len, points)) < MIN_VISIBLE:
         raise InputError(
             f"camera {name!r}: found fewer than {MIN_VISIBLE} landmarks that the others see too, expected enough to "
             "place it; run mifit landmarks, or leave the camera uncalibrated with --cameras"
         )
-    world, where, weight = np.concatenate(points), np.concatenate(pixels), np.concatenate(weights)
-    fx, fy, cx, cy = view.intrinsics or (focal * side, focal * side, view.width / 2, view.height / 2)
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    found, turn, shift = cv2.solvePnP(world, where, matrix, np.zeros(4), flags=cv2.SOLVEPNP_SQPNP)
-    if not found:
-        raise InputError(f"camera {name!r}: no place explains its landmarks; check their order (iBUG-68)")
-
-    def project(x: NDArray) -> NDArray:
-        p = world @ Rotation.from_rotvec(x[:3]).as_matrix().T + x[3:6]
-        zoom = np.exp(x[6]) if view.intrinsics is None else 1.0
-        return zoom * np.array((fx, fy)) * p[:, :2] / np.maximum(p[:, 2:], 1e-6) + (cx, cy)
-
-    def residuals(x: NDArray) -> NDArray:
-        error = (project(x) - where) * (weight / (NOISE * side))[:, None]
-        return np.append(error.ravel(), x[6] / FOCAL_DEVIATION[not same])
-
-    start = np.concatenate([turn.ravel(), shift.ravel(), [0.0]])
-    x = least_squares(residuals, start, loss="soft_l1", x_scale="jac", max_nfev=200).x
-    zoom = float(np.exp(x[6])) if view.intrinsics is None else 1.0
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(x[:3]).as_matrix(), x[3:6]
-    error = float(np.sqrt(np.mean(np.sum((project(x) - where)[weight == 1.0] ** 2, axis=1))))
-    return Camera(name, view.width, view.height, zoom * fx, zoom * fy, cx, cy, pose), error
+    return resect_camera(capture.views[name], *map(np.concatenate, (points, pixels, weights)), focal, same)
 
 
 def calibrate_others(
@@ -138,13 +104,12 @@ def calibrate_others(
             f"{capture.path}: {', '.join(decided)} give no landmark a place in space; expected two cameras"
         )
     sides = {name: max(capture.views[name].width, capture.views[name].height) for name in capture.cameras}
-    focal = float(np.median([capture.camera(name).fx / sides[name] for name in decided]))
+    focal = float(np.median([capture.camera(name).fx / sides[name] for name in decided]))  # in longer sides
     sizes = {(capture.views[name].width, capture.views[name].height) for name in decided}
     found: dict[str, tuple[Camera, float]] = {}
     for name in capture.cameras:
-        camera, error = place_camera(
-            capture, name, places, focal, (capture.views[name].width, capture.views[name].height) in sizes
-        )
+        same = (capture.views[name].width, capture.views[name].height) in sizes
+        camera, error = place_camera(capture, name, places, focal * sides[name], same)
         found[name] = (capture.camera(name) if name in decided else camera), error
     return found
 

@@ -36,10 +36,6 @@ def picture_maps(result: Result, timestep: int) -> str:
                 1.0,
             )
         )
-    if reflectance.frames is not None:
-        figures.append(
-            _grey("Frames that showed each texel", reflectance.frames, float(reflectance.frames.max()) or 1.0)
-        )
     refined = result.refined_normal(timestep)
     if refined is not None:
         colours = np.where(np.any(refined != 0, axis=-1, keepdims=True), 127.5 * (refined + 1), 0)

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from mifit.capture.resection import JAW, NOISE, landmark_weights
 from mifit.core.camera import Camera
 from mifit.core.estimate import NormalsEstimate
 from mifit.errors import InputError
-from mifit.output.resect import JAW, JAW_WEIGHT, LEAST_VISIBLE, NOISE
+from mifit.output.resect import LEAST_VISIBLE
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -94,7 +95,7 @@ def _marks(capture: Capture, camera: Camera, timestep: int) -> _Marks:
     if marks is None:
         return _Marks(camera, np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros(0))
     index = np.flatnonzero(marks.visible)
-    weight = np.where(index < JAW, JAW_WEIGHT, 1.0) / (NOISE * max(camera.width, camera.height))
+    weight = landmark_weights(index) / (NOISE * max(camera.width, camera.height))
     return _Marks(camera, index, marks.points[index], weight)
 
 

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import mifit
-from mifit.core.estimate import FURTHER_FRAMES
 from mifit.core.files import write_text
 from mifit.core.image import to_8_bit
 from mifit.output.evaluate import Comparison, as_photographed, compare, held_out, rgba_8_bit
@@ -278,20 +277,13 @@ def _inputs(result: Result, capture: Capture, timesteps: tuple[int, ...]) -> str
 def _frames(result: Result) -> str:
     """Frames that were chosen, added or left out, and why; nothing where all was as asked for."""
     chosen = result.geometry.report.details.get("frames", {})
-    refined = {} if result.normals is None else result.normals.report.details.get("refined", {})
+    refined = {} if result.reflectance is None else result.reflectance.report.details.get("refined", {})
     lines = [f"Timestep {t} was fitted: {why}." for t, why in chosen.get("why", {}).items()]
     lines += [f"Timestep {t} was not to be chosen: {why}." for t, why in chosen.get("left_out", {}).items()]
     for camera, offset in chosen.get("camera_offsets_frames", {}).items():
         lines.append(f"Camera {camera} is {offset:+.2f} frames later than the first one, by its epipolar lines.")
-    for swept in (p for p in result.geometry.report.details.get("phases", []) if p["name"] == FURTHER_FRAMES):
-        old, new = swept["between_views"]
-        end = "kept" if swept["kept"] else "dropped"
-        lines.append(
-            f"The surface was swept with {len(swept['timesteps'])} timesteps and {end}: "
-            f"in {len(swept['judged'])} others the views predict one another to {new:.4f} instead of {old:.4f}."
-        )
     if refined:
-        lines.append(f"{len(refined['timesteps'])} frames were added to maps and normals.")
+        lines.append(f"Maps and lighting are from {len(refined['timesteps'])} frames.")
         lines += [f"Timestep {t} was left out of them: {why}." for t, why in refined["left_out"].items()]
     return f"<ul>{''.join(f'<li>{html.escape(line)}</li>' for line in lines)}</ul>" if lines else ""
 

@@ -279,7 +279,6 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
         report=_report(document, "reflectance"),
         labels=tuple(labels.values()),
         labelled=tuple(labels),
-        frames=optional("frames"),
         relief=optional("relief"),
         specular_confidence=optional("specular_confidence"),
         lit_eyes=optional("lit_eyes", 3),

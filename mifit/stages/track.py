@@ -149,8 +149,6 @@ class Follower:
     ----------
     capture, model, geometry, cameras, geometry_config, fitted, seed
         As in `track`.
-    last : GeometryEstimate, optional
-        Of one timestep, from which the next one starts; default: the last of ``geometry``.
     """
 
     def __init__(
@@ -162,7 +160,6 @@ class Follower:
         geometry_config: GeometryConfig,
         fitted: Sequence[int] | None = None,
         seed: int = 0,
-        last: GeometryEstimate | None = None,
     ) -> None:
         self._capture, self._model, self._cameras = capture, model, tuple(cameras)
         self._config, self._seed = geometry_config, seed
@@ -171,7 +168,7 @@ class Follower:
         # Landmarks without a bias place a face better than skin does, whose shading turns with the light.
         biased = landmarks_are_biased(self._home)
         self._texture = KeptTexture(capture, model, self._home, cameras) if biased else None
-        self._last = geometry.at(geometry.timesteps[-1:]) if last is None else last
+        self._last = geometry.at(geometry.timesteps[-1:])
 
     @one_blas_thread()
     def next(self, timestep: int) -> tuple[GeometryEstimate, bool, list[str]]:

@@ -58,9 +58,7 @@ def seen() -> Seen:
 def test_a_lens_stays_plain_where_the_board_was_not_seen(seen: Seen) -> None:
     watched = seen.watched
     assert max(abs(w.distortion[4]) for w in watched) > 1.0  # what it is when nothing holds it
-    lenses = [w.matrix for w in watched], [w.distortion for w in watched]
-    used, sizes = [w.used for w in watched], [w.size for w in watched]
-    found = adjust(BOARD.points, used, *lenses, seen.poses, sizes, NOISE)
+    found, _ = adjust(watched, seen.poses, BOARD)
     corner = np.array([[[0.0, 0.0]], [[639.0, 479.0]], [[0.0, 479.0]]])
 
     def off(matrix: np.ndarray, lens: tuple[float, ...], camera) -> float:
@@ -71,9 +69,9 @@ def test_a_lens_stays_plain_where_the_board_was_not_seen(seen: Seen) -> None:
         return float(np.linalg.norm(seen_at, axis=-1).max())
 
     before = [off(w.matrix, w.distortion, c) for w, c in zip(watched, pair(), strict=True)]
-    after = [off(m, d, c) for m, d, c in zip(found.matrices, found.distortions, pair(), strict=True)]
+    after = [off(w.matrix, w.distortion, c) for w, c in zip(found, pair(), strict=True)]
     assert max(after) < 0.5 * max(before)
-    assert max(abs(lens[4]) for lens in found.distortions) < 0.5
+    assert max(abs(lens[4]) for lens in (w.distortion for w in found)) < 0.5
 
 
 def test_frames_in_which_the_cameras_are_out_of_step_are_left_out_by_name(seen: Seen) -> None:
@@ -82,13 +80,12 @@ def test_frames_in_which_the_cameras_are_out_of_step_are_left_out_by_name(seen: 
         i: BoardPoints(p.ids, p.pixels + np.array([6.0, 2.0])) if i in (4, 9) else p for i, p in watched[1].used.items()
     }
     watched[1] = Watched(**{**vars(watched[1]), "used": late})
-    lenses = [w.matrix for w in watched], [w.distortion for w in watched]
-    every = adjust(BOARD.points, [w.used for w in watched], *lenses, seen.poses, [w.size for w in watched], NOISE)
+    _, every = adjust(watched, seen.poses, BOARD)
     found, relative = _together(watched, seen.poses, BOARD)
     out = [reason for w in found for i, reason in w.left_out.items() if i in (4, 9)]
     assert len(out) >= 2 and all("contradicts the others" in reason for reason in out)
     assert all(i in (4, 9) for w in found for i in w.left_out)
     assert max(w.error for w in found) < 2.0 * NOISE
     truth = pair()[1].world_to_camera[:3, :3]
-    turns = [np.degrees(np.arccos(0.5 * (np.trace(p[1][:3, :3] @ truth.T) - 1.0))) for p in (every.poses, relative)]
+    turns = [np.degrees(np.arccos(0.5 * (np.trace(p[1][:3, :3] @ truth.T) - 1.0))) for p in (every, relative)]
     assert turns[1] < 0.5 * turns[0] and turns[1] < 0.4, turns

@@ -321,9 +321,8 @@ def test_frames_whose_images_changed_are_tracked_anew(scene, fit_truth, saved):
 
 
 def test_memory_does_not_grow_with_tracked_frames(scene, fit_truth, saved, tmp_path, monkeypatch):
-    """Tracked, then refined: what frames leave behind in memory is their pose, not their maps and meshes."""
+    """What frames leave behind in memory is their pose, not their maps and meshes."""
     from mifit.core import rows
-    from mifit.extras.refine import refine
     from mifit.tracking import track_into
 
     monkeypatch.setattr(rows, "IN_MEMORY", 0)  # as for a long video
@@ -332,17 +331,12 @@ def test_memory_does_not_grow_with_tracked_frames(scene, fit_truth, saved, tmp_p
         folder = shutil.copytree(saved, tmp_path / str(k))
         tracemalloc.start()
         tracked = track_into(folder, reload(folder), scene, steps, CONFIG)
-        refined = refine(tracked, scene, tracked.timesteps)
-        refined.save(folder)
         gc.collect()
         left.append(tracemalloc.get_traced_memory()[0])
         tracemalloc.stop()
-        assert refined.timesteps == tracked.timesteps == (0, *steps)
-    frame = sum(
-        array[0].nbytes
-        for result in (tracked, refined)
-        for array in (result.normals.normal_object, result.mesh.vertices, result.mesh.displacement)
-    )
+        assert tracked.timesteps == (0, *steps)
+    arrays = (tracked.normals.normal_object, tracked.mesh.vertices, tracked.mesh.displacement)
+    frame = sum(array[0].nbytes for array in arrays)
     assert (left[2] - left[1]) / 2 < 0.05 * frame, (left, frame)
 
 

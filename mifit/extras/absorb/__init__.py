@@ -1,1 +1,0 @@
-"""What frames of a video say, absorbed into sums of a fixed size per texel."""
