@@ -29,7 +29,8 @@ def run_capture(name: str, work: Path) -> dict[str, Any]:
     capture, out = SHARED / "captures" / name, work / name
     mifit("fit", capture, "--model", MODEL, "--cameras", "left,right",
           "--timesteps", ",".join(map(str, TIMESTEPS)), "--out", out, "--force")  # fmt: skip
-    mifit("evaluate", out, "--capture", capture, "--camera", "third", "--region", "truth", "--json", out / "third.json")
+    mifit("evaluate", out, "--capture", capture, "--camera", "third", "--region", "truth", "--json", out / "third.json",
+          "--force")  # fmt: skip
     found = json.loads((out / "third.json").read_text())
     result = Reconstruction.load(out)
     return {

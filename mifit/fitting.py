@@ -46,7 +46,7 @@ from mifit.core.threads import one_blas_thread
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
 from mifit.reconstruction import Reconstruction
-from mifit.result.ownership import CHECKPOINTS, check_ours, claim, locked
+from mifit.result.ownership import CHECKPOINTS, check_ours, locked
 from mifit.result.reading import read_document
 from mifit.stages.eyes import behind_lids
 from mifit.stages.falloff import find_falloff
@@ -315,8 +315,7 @@ def fit_into(
     wanted = _identity(capture, model, choose("camera", capture.cameras, cameras, 2), timesteps, config, seed)
     if until not in STAGES:
         raise InputError(f"until: found {until!r}, expected one of {', '.join(STAGES)}")
-    claim(folder, force)
-    with locked(folder):
+    with locked(folder, force):
         if force:
             shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
         elif (folder / "result.json").exists() and _is_there(folder, wanted, until):

@@ -15,7 +15,7 @@ from mifit.core.estimate import NormalsEstimate, Report
 from mifit.core.rows import Rows
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
-from mifit.result.ownership import claim, locked
+from mifit.result.ownership import locked
 from mifit.result.record import R
 from mifit.result.writing import add_timestep, write_remarks
 from mifit.stages.normals.mesh_refinement import MeshRefiner
@@ -79,7 +79,6 @@ def track_into(
         timesteps = _not_yet(result, timesteps, digests)
     result = _without(result, [t for t in tracked if t in timesteps])
     folder = Path(folder)
-    claim(folder)
     refiner = None if result.mesh is None else mesh_refiner(result)
     with locked(folder):
         result, room = _with_room(result, len(timesteps))

@@ -18,7 +18,7 @@ from mifit.capture.landmark_files import COUNT, Landmarks, read_landmarks
 from mifit.capture.lens import Undistortion, undistort_points
 from mifit.capture.transforms import UNITS_MM, Shot, Transforms, View, read_transforms, write_transforms
 from mifit.core.camera import Camera
-from mifit.core.files import file_digest
+from mifit.core.files import file_digest, note_read
 from mifit.core.image import load_image
 from mifit.core.limits import MAX_IMAGE_BYTES
 from mifit.errors import InputError
@@ -162,6 +162,7 @@ class Capture:
     @classmethod
     def of(cls, path: Path, transforms: Transforms, cache_bytes: int = CACHE_BYTES) -> Capture:
         """Make a capture of checked content."""
+        note_read(file for shot in transforms.shots for file in (shot.image, shot.landmarks, shot.mask) if file)
         return cls(
             path,
             {view.name: view for view in transforms.views},

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import sys
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
+from mifit.core.files import check_overwriting, overwriting
 from mifit.core.limits import MAX_SEED, MAX_TIMESTEPS
+from mifit.errors import InputError
 
 LONGEST = 1000
 """Characters of a message; one that quotes more of an input says nothing."""
@@ -50,6 +53,36 @@ def common_options() -> Parser:
 def add_rate(p: argparse.ArgumentParser) -> None:
     """Add ``--fps``."""
     p.add_argument("--fps", type=rate, default=12.0, help="timesteps per second of what moves (default: 12)")
+
+
+def writes(*options: str) -> Callable[[Command], Command]:
+    """Make a command refuse to write over files: without ``--force`` all, with it those that it reads.
+
+    ``options`` name what its user says to write; a file, or a folder with something in it, is refused before any work.
+    """
+
+    def decorate(command: Command) -> Command:
+        @functools.wraps(command)
+        def run(arguments: Namespace) -> int | None:
+            with overwriting(arguments.force):
+                for out in filter(None, (getattr(arguments, option, None) for option in options)):
+                    check_empty(out, arguments.force) if out.is_dir() else check_overwriting(out)
+                return command(arguments)
+
+        return run
+
+    return decorate
+
+
+def check_empty(folder: Path, force: bool = False) -> None:
+    """Refuse to write into a folder with something in it, or a file in its place, unless ``force``."""
+    if folder.exists() and not force and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: is there already and not empty; --force writes into it, or name another folder")
+
+
+def add_force(p: argparse.ArgumentParser) -> None:
+    """Add ``--force`` of a command that `writes`."""
+    p.add_argument("--force", action="store_true", help="replace files that are there, but never what is read")
 
 
 def add_address(p: argparse.ArgumentParser) -> None:

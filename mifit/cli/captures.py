@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 def synth(arguments: Namespace) -> None:
     """Write path-traced captures."""
     out: Path = arguments.out
-    if out.exists() and not arguments.force and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"--out {out}: is there already and not empty; --force writes into it, or name another folder")
+    types.check_empty(out, arguments.force)
     if arguments.head is not None:
         _synth_scan(arguments)
         return
@@ -123,8 +122,7 @@ def calibrate(arguments: Namespace) -> None:
     board = Board.parse(arguments.board)
     if out is None:
         raise InputError("--board needs --out, the folder to write")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"--out {out}: is there already and not empty; name another folder")
+    types.check_empty(out, arguments.force)
     if not arguments.video and not arguments.images:
         for path in board.write(out):
             print(f"Board: {path}")
@@ -303,6 +301,7 @@ def add_commands(add: types.Add) -> None:
         "agree better then; the calibration as it was is kept beside it",
     )
     p.add_argument("--out", type=types.path, help="of a board: folder to write")
+    p.add_argument("--force", action="store_true", help="of a board: write into a folder that holds something already")
 
     p = add("landmarks", landmarks, "detect 68 landmarks in every image and write them into the capture")
     p.add_argument("capture", type=types.path, help="capture folder, or its transforms.json")

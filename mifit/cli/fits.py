@@ -111,7 +111,7 @@ def _first_picture(out: Path, result: Reconstruction, capture: Capture) -> Path:
 def fit(arguments: Namespace) -> None:
     """Run the stages and write the result folder."""
     import mifit
-    from mifit.result.ownership import check_ours
+    from mifit.result.ownership import check_ours, replacing_files
 
     out: Path = arguments.out
     check_ours(out, arguments.force)
@@ -150,7 +150,8 @@ def fit(arguments: Namespace) -> None:
         force=arguments.force,
         watch=view.watch if view else None,
     )
-    write_report(out, result, capture)
+    with replacing_files(out, force=arguments.force) as new:
+        write_report(new, result, capture)
     print(f"Result: {out}", flush=True)
     if view:
         from mifit.extras.live_view import serve
@@ -177,7 +178,7 @@ def track(arguments: Namespace) -> None:
     """Extend a result by further timesteps."""
     import mifit
     from mifit.fitting import choose
-    from mifit.result.ownership import finish, remember
+    from mifit.result.ownership import finish, replacing_files
 
     finish(arguments.result)
     result = mifit.Reconstruction.load(arguments.result)
@@ -204,9 +205,9 @@ def track(arguments: Namespace) -> None:
         resume=arguments.resume,
         progress=progress,
     )
-    write_report(arguments.result, result, capture)
-    written = write_moving_pictures(arguments.result, result, capture, arguments.overlay, arguments.fps, progress)
-    remember(arguments.result, [path.name for path in written])
+    with replacing_files(arguments.result) as new:
+        write_report(new, result, capture)
+        write_moving_pictures(new, result, capture, arguments.overlay, arguments.fps, progress)
     print(f"Result: {arguments.result}")
 
 

@@ -9,7 +9,7 @@ from argparse import Namespace
 from typing import TYPE_CHECKING
 
 from mifit.cli import arguments as types
-from mifit.cli.arguments import say, use_variant
+from mifit.cli.arguments import add_force, say, use_variant, writes
 from mifit.cli.console import console_progress
 from mifit.core.files import write_text
 from mifit.core.limits import MAX_RENDERED_PIXELS
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mifit.reconstruction import Reconstruction
 
 
+@writes("json")
 def evaluate(arguments: Namespace) -> None:
     """Error on a held-out view: a table on stdout, JSON on request, the report renewed."""
     import mifit
@@ -35,6 +36,7 @@ def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> Non
     from mifit.fitting import fitted_to
     from mifit.output.evaluate import Comparison, evaluate, held_out
     from mifit.output.report import SHOWN_TIMESTEPS, write_report
+    from mifit.result.ownership import replacing_files
 
     shown: list[Comparison] = []
     found = evaluate(
@@ -73,7 +75,8 @@ def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> Non
         from mifit.output.score import summary
 
         print(summary({"passes": {found["camera"]: found["passes"]}}))
-    write_report(arguments.result, result, capture, found, shown)
+    with replacing_files(arguments.result) as new:
+        write_report(new, result, capture, found, shown)
 
 
 def _print_measures(methods: dict[str, dict[str, float]]) -> None:
@@ -82,6 +85,7 @@ def _print_measures(methods: dict[str, dict[str, float]]) -> None:
         print(f"{method:<12}{f['psnr']:>9.2f}{f['rmse']:>8.2f}{f['ssim']:>8.4f}{f['flip']:>8.4f}")
 
 
+@writes("json")
 def score(arguments: Namespace) -> None:
     """Score any program's images and meshes, in plain files, against a capture's truth."""
     import mifit
@@ -103,6 +107,7 @@ def score(arguments: Namespace) -> None:
     print(summary(found))
 
 
+@writes("out")
 def render(arguments: Namespace) -> None:
     """Render one timestep from a camera of the capture."""
     import mifit
@@ -135,6 +140,7 @@ def _result_and_variant(arguments: Namespace) -> Reconstruction:
     return result
 
 
+@writes("out")
 def turntable(arguments: Namespace) -> None:
     """Write novel views about the vertical axis."""
     result = _result_and_variant(arguments)
@@ -165,6 +171,7 @@ def view(arguments: Namespace) -> None:
     serve(live)
 
 
+@writes("out", "video")
 def relight(arguments: Namespace) -> None:
     """Write views under another environment."""
     if arguments.camera and arguments.yaw is not None:
@@ -209,6 +216,7 @@ def relight(arguments: Namespace) -> None:
     print(f"Views: {arguments.video or arguments.out}")
 
 
+@writes("out")
 def export(arguments: Namespace) -> None:
     """Write geometry and maps for another program."""
     result = _result_and_variant(arguments)
@@ -247,6 +255,7 @@ def add_commands(add: types.Add) -> None:
         help="compare diffuse and specular images of the capture's first timestep with the truth's",
     )
     p.add_argument("--json", type=types.path, help="file to write the figures to")
+    add_force(p)
 
     p = add("score", score, "any program's images, relit views, passes or meshes against a capture's truth")
     p.add_argument("capture", type=types.path, help="capture folder with truth, or its transforms.json")
@@ -259,6 +268,7 @@ def add_commands(add: types.Add) -> None:
     p.add_argument("--cameras", type=types.listed, help="cameras that the program was given; default: the first two")
     p.add_argument("--model", help="morphable model that the capture was made with, if its truth has no triangles")
     p.add_argument("--json", type=types.path, help="file to write the scores to")
+    add_force(p)
 
     p = add("render", render, "render a reconstruction from a camera of the capture, or from any side")
     p.add_argument("result", type=types.path, help="result folder of mifit fit")
@@ -271,6 +281,7 @@ def add_commands(add: types.Add) -> None:
     )
     p.add_argument("--timestep", type=types.at_least(0), help="default: the first of the result")
     p.add_argument("--out", type=types.path, required=True, help="image to write: .png (8-bit sRGB) or .exr (linear)")
+    add_force(p)
     p.add_argument(
         "--method",
         choices=["full", "diffuse", "pca"],
@@ -284,6 +295,7 @@ def add_commands(add: types.Add) -> None:
     p = add("turntable", turntable, "novel views about the vertical axis, with and without specular")
     p.add_argument("result", type=types.path, help="result folder of mifit fit")
     p.add_argument("--out", type=types.path, required=True, help="folder to write")
+    add_force(p)
     p.add_argument("--from", dest="start", type=types.real, default=-35.0, help="first angle in degrees (default: -35)")
     p.add_argument("--to", dest="stop", type=types.real, default=35.0, help="last angle in degrees (default: 35)")
     p.add_argument("--steps", type=types.at_least(1), default=7, help="number of views (default: 7)")
@@ -302,6 +314,7 @@ def add_commands(add: types.Add) -> None:
     p = add("relight", relight, "relit views under a measured environment")
     p.add_argument("result", type=types.path, help="result folder of mifit fit")
     p.add_argument("--out", type=types.path, required=True, help="folder to write")
+    add_force(p)
     _add_light(p, True)
     p.add_argument("--turn", type=types.at_least(1), help="number of rotations of the light about the vertical")
     p.add_argument("--video", type=types.path, help="of --turn: .mp4 or .webp to write in place of images")
@@ -316,6 +329,7 @@ def add_commands(add: types.Add) -> None:
     p.add_argument("result", type=types.path, help="result folder of mifit fit")
     p.add_argument("--format", choices=["glb", "obj", "ply", "mitsuba"], required=True, help="kind of file")
     p.add_argument("--out", type=types.path, required=True, help="file to write")
+    add_force(p)
     p.add_argument("--timestep", type=types.at_least(0), help="default: the first of the result")
     p.add_argument("--animate", action="store_true", help="glb: play all timesteps, from --timestep's maps")
     types.add_rate(p)

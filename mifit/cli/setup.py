@@ -31,6 +31,7 @@ def doctor(arguments: Namespace) -> int:
     return 0 if all(check["ok"] for check in checks if check["required"]) else 1
 
 
+@types.writes("preview", "out")
 def model(arguments: Namespace) -> None:
     """Inspect or convert a morphable model."""
     import mifit
@@ -62,8 +63,10 @@ def add_commands(add: types.Add) -> None:
     q = actions.add_parser("info", help="print a table", parents=[common])
     q.add_argument("model", help="a path or builtin")
     q.add_argument("--preview", type=types.path, help="also write a sheet of the mean and the first modes")
+    types.add_force(q)
     q = actions.add_parser("convert", help="write a model in mifit's own format", parents=[common])
     q.add_argument("source", type=types.path, help="file of a model, of any known kind")
     q.add_argument("out", type=types.path, help="file to write, .npz")
+    types.add_force(q)
     q.add_argument("--kind", help="format of SOURCE; default: recognised by content")
     q.add_argument("--eyes", action="store_true", help="put simple eyes and a mouth's inside where the model has holes")

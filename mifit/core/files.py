@@ -12,7 +12,7 @@ import shutil
 import stat
 import sys
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
@@ -26,6 +26,52 @@ FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
 _BLOCK = 2**20
 _MACHINE = re.sub(r"[^A-Za-z0-9-]", "-", platform.node()) or "here"
 _PART = re.compile(r"\..+\." + re.escape(_MACHINE) + r"-(\d+)\.part(\.[^.]+)?")
+
+
+_read: set[str] = set()
+_overwriting: bool | None = None
+
+
+@contextmanager
+def overwriting(force: bool | None) -> Iterator[None]:
+    """Say what `replacing` may do in the block to a file that is there: by default, and with None, replace it.
+
+    With False it is refused, and with True it is replaced unless the block has read it (`opened`, `note_read`) or it is
+    no regular file. A command that writes where its user says runs in such a block.
+    """
+    global _overwriting
+    before = _overwriting
+    if before is None:
+        _read.clear()
+    _overwriting = force
+    try:
+        yield
+    finally:
+        _overwriting = before
+
+
+def note_read(paths: Iterable[str | Path]) -> None:
+    """Count files as read before they are; see `overwriting`."""
+    _read.update(os.path.abspath(path) for path in paths)
+
+
+def check_overwriting(path: str | Path) -> None:
+    """Refuse a file that may not be written, see `overwriting`; InputError names it and the remedy."""
+    if _overwriting is None or not os.path.lexists(path):
+        return
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise InputError(f"{path}: found {'a folder' if os.path.isdir(path) else 'a device'}, expected a file to write")
+    if any(_is_same(path, read) for read in _read):
+        raise InputError(f"{path}: this command reads it, so it can't be written; name another file")
+    if not _overwriting:
+        raise InputError(f"{path}: is there already; --force replaces it, or name another file")
+
+
+def _is_same(path: str | Path, other: str) -> bool:
+    try:
+        return os.path.samefile(path, other)
+    except OSError:
+        return False
 
 
 @contextmanager
@@ -45,6 +91,7 @@ def opened(path: str | Path, limit: int, what: str = "file") -> Iterator[tuple[B
         raise InputError(f"{path}: no such {what}") from None
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
         raise InputError(f"{path}: can't be read: {getattr(error, 'strerror', None) or error}") from None
+    note_read([path])
     found = os.fstat(descriptor)
     problem = None
     if not stat.S_ISREG(found.st_mode):
@@ -188,9 +235,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
     Raises
     ------
     InputError
-        The disk is full or the place can't be written; the message names ``path``.
+        The disk is full, the place can't be written, or `overwriting` forbids it; the message names ``path``.
     """
     path = Path(path)
+    check_overwriting(path)
     temporary = _part(path)
     with _room(path, temporary):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -62,7 +62,7 @@ def write_report(
     evaluation: dict[str, Any] | None = None,
     comparisons: Sequence[Comparison] = (),
 ) -> Path:
-    """Write ``report.html`` into a result folder, whole or not at all.
+    """Write ``report.html`` into a folder, whole or not at all.
 
     Parameters
     ----------

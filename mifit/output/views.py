@@ -209,18 +209,15 @@ def write_moving_pictures(
     cameras: Sequence[str] | None = None,
     fps: float = 12.0,
     progress: Progress = silent,
-) -> list[Path]:
+) -> None:
     """Write what shows a tracked sequence: ``overlay_CAMERA.mp4`` per camera and ``sequence.glb``.
 
-    Cameras are those of the fit by default. Parameters as in `write_overlay`. Returns the files.
+    Cameras are those of the fit by default. Parameters as in `write_overlay`.
     """
     folder = Path(folder)
-    names = [camera.name for camera in reconstruction.cameras] if cameras is None else cameras
-    overlays = [folder / f"overlay_{file_name(name)}.mp4" for name in names]
-    for name, path in zip(names, overlays, strict=True):
-        write_overlay(reconstruction, capture, name, path, fps, progress)
+    for name in [camera.name for camera in reconstruction.cameras] if cameras is None else cameras:
+        write_overlay(reconstruction, capture, name, folder / f"overlay_{file_name(name)}.mp4", fps, progress)
     write_glb(reconstruction, folder / "sequence.glb", animate=sorted(reconstruction.timesteps), fps=fps)
-    return [*overlays, folder / "sequence.glb"]
 
 
 def on_backdrop(image: NDArray) -> NDArray:

@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
-from mifit.core.files import at_place, check_no_links, read_text, write_text
+from mifit.core.files import at_place, check_no_links, overwriting, read_text, write_text
 from mifit.core.limits import MAX_DOCUMENT_BYTES
 from mifit.errors import InputError
 
@@ -65,18 +65,19 @@ def claim(folder: Path, force: bool = False) -> None:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keep others from writing into a claimed folder, and finish what an interrupted write left in it.
+def locked(folder: Path, force: bool = False) -> Iterator[None]:
+    """Claim a folder, keep others from writing into it, and finish what an interrupted write left in it.
 
     Who holds the lock may take it again.
 
     Raises
     ------
     InputError
-        Another one does.
+        Another one writes into it, or as `claim`.
     """
     from filelock import FileLock, Timeout
 
+    claim(folder, force)
     lock = FileLock(folder.resolve() / MARK / _LOCK, is_singleton=True)
     try:
         lock.acquire(timeout=0)
@@ -85,8 +86,9 @@ def locked(folder: Path) -> Iterator[None]:
             f"{folder}: another mifit is writing into it; wait until it has ended, or name another folder"
         ) from None
     try:
-        _finish(folder)
-        yield
+        with overwriting(None):  # these rules hold here
+            _finish(folder)
+            yield
     finally:
         lock.release()
 
@@ -100,7 +102,6 @@ def finish(folder: Path) -> None:
         The folder isn't ours, or another process writes into it.
     """
     if _interrupted(folder):
-        check_ours(folder)
         with locked(folder):
             pass
 
@@ -192,7 +193,7 @@ def clear(folder: Path) -> None:
 
 
 @contextmanager
-def replacing_files(folder: Path, only: bool = False) -> Iterator[Path]:
+def replacing_files(folder: Path, only: bool = False, force: bool = False) -> Iterator[Path]:
     """Yield a folder for new files that take the places of the old ones when the block ends well, all of them.
 
     When the block raises, everything stays as it was. When the process is killed the next one that writes into the
@@ -201,12 +202,14 @@ def replacing_files(folder: Path, only: bool = False) -> Iterator[Path]:
     Parameters
     ----------
     folder : path
-        A claimed folder.
+        Claimed and locked meanwhile.
     only : bool
         Files that mifit wrote earlier and that aren't among the new ones go; what the user has changed or added stays
         in any case.
+    force : bool
+        As in `claim`.
     """
-    with locked(folder):
+    with locked(folder, force):
         new = folder / MARK / _NEW
         _remove_new(folder)  # what an unfinished process left
         new.mkdir()

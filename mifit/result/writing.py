@@ -23,7 +23,7 @@ from mifit.core.ply import write_ply
 from mifit.core.split_mesh import SplitMesh, split_at_seams, tangent_space_map
 from mifit.core.subdivision import split_faces
 from mifit.core.threads import on_all_cores
-from mifit.result.ownership import claim, replacing_files
+from mifit.result.ownership import replacing_files
 from mifit.result.record import Result
 
 FORMAT_VERSION = 1
@@ -40,8 +40,7 @@ def save(result: Result, folder: Path, write_scene: Callable[[Path], None], forc
     All files are written beside the old ones first, so that one that fails leaves the old result whole.
     ``write_scene`` writes the scene file that it is given, and those beside it.
     """
-    claim(folder, force)
-    with replacing_files(folder, only=True) as new:
+    with replacing_files(folder, only=True, force=force) as new:
         surfaces = _surfaces(result)
         files = [partial(_write_timestep, result, new, timestep, surfaces) for timestep in result.timesteps]
         if result.reflectance is not None:
@@ -61,7 +60,6 @@ def save(result: Result, folder: Path, write_scene: Callable[[Path], None], forc
 
 def add_timestep(result: Result, folder: Path, timestep: int) -> None:
     """Write the files of one timestep of a result into its folder, and ``result.json`` anew, all or none."""
-    claim(folder)
     with replacing_files(folder) as new:
         _write_timestep(result, new, timestep, _surfaces(result))
         _write_document(result, new)
@@ -69,7 +67,6 @@ def add_timestep(result: Result, folder: Path, timestep: int) -> None:
 
 def write_remarks(result: Result, folder: Path) -> None:
     """Write ``result.json`` anew, whose reports say more than before; all else of the result is in its folder."""
-    claim(folder)
     with replacing_files(folder) as new:
         _write_document(result, new)
 

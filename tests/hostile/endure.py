@@ -34,7 +34,6 @@ from tests.hostile.child import run_command
 
 CHANGES = {"os.remove", "os.rename", "os.mkdir", "os.rmdir", "shutil.rmtree"}
 FIT = ("fit", "capture", "--model", "builtin:coarse", "--timesteps", "0", "--config", "fit.toml", "--quiet")
-SCENE = ("--format", "mitsuba")
 CONFIG = """
 [geometry]
 rounds = 1
@@ -191,15 +190,19 @@ def scenarios(base: Path) -> list[Scenario]:
 
         return prepare
 
+    def exported(name: str, kind: str, suffix: str) -> Scenario:
+        command = ("export", "result", "--format", kind, "--out", f"x/f.{suffix}")
+        return Scenario(f"export {name}", command, "x", 8, 4, copy("result"), (*command, "--force"))
+
     given = ("capture", "fit.toml")
     track = ("track", "capture", "--result", "result", "--timesteps", "1", "--quiet")
     return [
         Scenario("fit", (*FIT, "--out", "out"), "out", 22, 10, copy(*given), (*FIT, "--out", "out", "--resume")),
         Scenario("fit over", (*FIT, "--out", "out", "--force"), "out", 14, 8, over(*given), whole=True),
         Scenario("track", track, "result", 22, 10, copy("capture", "result"), (*track, "--resume")),
-        Scenario("export glb", ("export", "result", "--format", "glb", "--out", "x/f.glb"), "x", 8, 4, copy("result")),
-        Scenario("export obj", ("export", "result", "--format", "obj", "--out", "x/f.obj"), "x", 8, 4, copy("result")),
-        Scenario("export scene", ("export", "result", *SCENE, "--out", "x/f.xml"), "x", 8, 4, copy("result")),
+        exported("glb", "glb", "glb"),
+        exported("obj", "obj", "obj"),
+        exported("scene", "mitsuba", "xml"),
         Scenario(
             "import", ("import", "--transforms", "capture/transforms.json", "--out", "out", "--quiet"), "out", 12, 6,
             copy("capture"), whole=True,

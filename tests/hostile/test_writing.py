@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -155,6 +156,71 @@ def test_synth_keeps_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixture
     assert files_below(tmp_path) == {"out/transforms.json": b"mine"}
 
 
+# -- files that are there -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture, a result of it and an environment."""
+    from tests.hostile.cases import make_base
+
+    return make_base(tmp_path_factory.mktemp("base") / "work")
+
+
+OUTPUTS = {
+    "render": ("render", "result", "--capture", "capture", "--camera", "left", "--timestep", "0", "--out"),
+    "evaluate": ("evaluate", "result", "--capture", "capture", "--camera", "left", "--timesteps", "0", "--json"),
+    "export": ("export", "result", "--format", "ply", "--out"),
+    "convert": ("model", "convert", "ball.npz"),
+    "preview": ("model", "info", "ball.npz", "--preview"),
+    "turntable": ("turntable", "result", "--steps", "1", "--out"),
+    "relight": ("relight", "result", "--env", "env.hdr", "--out"),
+}
+MINE = {
+    "render": "x.png", "evaluate": "x.json", "export": "x.ply", "convert": "x.npz", "preview": "x.png",
+    "turntable": "x/turntable.png", "relight": "x/left.png",
+}  # fmt: skip
+READ = {
+    "render": ("capture/images/left/0000.png", "capture/images/right/0001.png"),
+    "evaluate": ("capture/transforms.json", "result/result.json"),
+    "export": ("result/geometry/0000.ply", "ball.npz"),
+    "convert": ("ball.npz",),
+    "preview": ("ball.npz",),
+}
+
+
+@pytest.mark.parametrize("command", OUTPUTS)
+def test_files_that_are_there_stay(variant: str, work: Path, tmp_path: Path, monkeypatch, capfd, command: str) -> None:
+    """Without --force all of them, with it those that the command reads."""
+    home = shutil.copytree(work, tmp_path / "home")
+    document = json.loads((home / "result" / "result.json").read_text())
+    document["model"]["source"] = str(home / "ball.npz")
+    (home / "result" / "result.json").write_text(json.dumps(document))
+    monkeypatch.chdir(home)
+    mine = home / MINE[command]
+    out = mine if mine.parent == home else mine.parent
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("mine")
+    before = files_below(home)
+    options = ("--quiet", "--variant", variant)
+    if command in ("convert", "preview"):
+        options = ()
+    assert main([*OUTPUTS[command], str(out), *options]) == 2
+    assert f"{out}: is there already" in capfd.readouterr().err
+    for name in READ.get(command, ()):
+        for path in (home / name, tmp_path / "link"):
+            if path.name == "link":
+                path.symlink_to(home / name)
+            assert main([*OUTPUTS[command], str(path), "--force", *options]) == 2
+            error = capfd.readouterr().err
+            assert "this command reads it" in error or "found suffix" in error or "expected" in error, error
+        path.unlink()
+    assert files_below(home) == before
+    if command != "evaluate":  # which judges a camera that isn't held out
+        assert main([*OUTPUTS[command], str(out), "--force", *options]) == 0
+        assert mine.read_bytes() != b"mine"
+
+
 # -- no room --------------------------------------------------------------------------------------------------------
 
 VIDEO = """
@@ -192,7 +258,8 @@ def test_a_video_is_whole_or_not_there(tmp_path: Path) -> None:
 
 
 def test_no_room_is_one_line_and_bad_input(tmp_path: Path) -> None:
-    convert = "import sys; from mifit.cli import main; sys.exit(main(['model', 'convert', 'builtin:coarse', 'm.npz']))"
+    arguments = ["model", "convert", "builtin:coarse", "m.npz", "--force"]
+    convert = f"import sys; from mifit.cli import main; sys.exit(main({arguments}))"
     (tmp_path / "m.npz").write_bytes(b"old")
     for size in (0, 1000, 300_000):
         done = with_room_for(size, convert, tmp_path)

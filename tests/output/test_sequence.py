@@ -25,7 +25,7 @@ from mifit.output.views import (
     write_sequence,
     write_video,
 )
-from mifit.result.ownership import claim, remember
+from mifit.result.ownership import replacing_files
 from tests.output.test_export import read_glb
 from tests.output.test_render_evaluate import FakeCapture
 
@@ -87,10 +87,9 @@ def test_overlay_shows_input_and_render_in_order_of_time(backwards, capture, var
 
 def test_tracking_leaves_an_overlay_per_camera_and_an_animation(ball, capture, variant, tmp_path):
     names = {"overlay_left.mp4", "overlay_right.mp4", "sequence.glb"}
-    assert {p.name for p in write_moving_pictures(tmp_path, ball, capture)} == names
-    assert {p.name for p in tmp_path.iterdir()} == names
-    claim(tmp_path, force=True)
-    remember(tmp_path, names)
+    with replacing_files(tmp_path) as new:
+        write_moving_pictures(new, ball, capture)
+    assert {p.name for p in tmp_path.iterdir()} == {".mifit", *names}
     ball.save(tmp_path)  # a new fit in the folder: pictures of the old one go
     assert not names & {p.name for p in tmp_path.iterdir()}
 
