@@ -171,7 +171,7 @@ def outcome(result: Reconstruction) -> dict[str, Any]:
         if "reflectance" in reports
         else None,
         "exponent": result.reflectance.lobe.typical if result.reflectance else None,
-        "warnings": [*result.warnings, *(w for report in reports.values() for w in report.warnings)],
+        "warnings": [one.text for one in result.diagnostics],
     }
 
 

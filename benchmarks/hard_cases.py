@@ -193,7 +193,7 @@ def run_case(case: Case, work: Path, reference: NDArray | None) -> tuple[dict[st
             "finite": is_finite(result),
             "mesh_mm": mesh_error(result, folder)["mesh_mm"],
             "third_db": third_view(result, capture),
-            "warnings": [*result.warnings, *(w for report in result.reports.values() for w in report.warnings)],
+            "warnings": [one.text for one in result.diagnostics],
         }
         if case.same and reference is not None:
             row["difference_mm"] = float(np.abs(vertices - reference).max()) * result.unit_mm

@@ -59,10 +59,7 @@ def judge(folder: Path, found: dict[str, tuple[Reconstruction, Capture]]) -> dic
             for name, (result, _) in found.items()
         },
         "seconds": {name: round(result.seconds, 1) for name, (result, _) in found.items()},
-        "warnings": {
-            name: [*result.warnings, *(w for report in result.reports.values() for w in report.warnings)]
-            for name, (result, _) in found.items()
-        },
+        "warnings": {name: [one.text for one in result.diagnostics] for name, (result, _) in found.items()},
         "commit": machine()["commit"],
     }
 

@@ -23,12 +23,13 @@ import numpy as np
 
 from mifit.appearance.illumination import Illumination, light_from
 from mifit.appearance.lobe import Lobe
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import Report
 from mifit.core.files import replacing
 from mifit.core.npz import read_npz
 
 T = TypeVar("T")
-RECORDS: dict[str, type] = {cls.__name__: cls for cls in (Report, Illumination, Lobe)}
+RECORDS: dict[str, type] = {cls.__name__: cls for cls in (Report, Diagnostic, Illumination, Lobe)}
 """Dataclasses that an estimate may hold."""
 ARRAY, RECORD, LIGHT = "$array", "$record", "$light"
 

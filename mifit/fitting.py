@@ -35,6 +35,7 @@ from mifit.config import (
     ResidualConfig,
     SurfaceConfig,
 )
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import (
     GeometryEstimate,
     MeshEstimate,
@@ -63,7 +64,9 @@ if TYPE_CHECKING:
     from mifit.result import Result
 
 T = TypeVar("T")
-ESTIMATED_CAMERAS = "the capture is uncalibrated: focal length, camera poses and so the scale are estimates"
+ESTIMATED_CAMERAS = Diagnostic(
+    "uncalibrated", "the capture is uncalibrated: focal length, camera poses and so the scale are estimates"
+)
 BASELINE_DEGREES = 3.0
 """Angle between the views below which a person is told that distance is not measured."""
 Stage = Literal["geometry", "reflectance", "normals"]
@@ -227,12 +230,13 @@ def fit(
     check_images(capture, cameras, timesteps)
     capture_digest = capture.digest(cameras, timesteps)
     given, model = model, fitted_model(model, config)
-    estimated: tuple[str, ...] = ()
+    estimated: tuple[Diagnostic, ...] = ()
     if not capture.calibrated:
         from mifit.extras.calibrate_densely import calibrate_capture
 
         dense = calibrate_capture(capture, model, cameras, timesteps, progress)
-        capture, estimated = dense.capture, (ESTIMATED_CAMERAS, dense.note)
+        note = Diagnostic("calibration-estimated", dense.note, "note")
+        capture, estimated = dense.capture, (ESTIMATED_CAMERAS, note)
     source = Source(capture, capture_digest, model, cameras, timesteps, seed)
 
     def result(estimates: Mapping[Part, Any], seconds: float = 0.0) -> Reconstruction:
@@ -521,22 +525,24 @@ def fitted_model(model: MorphableModel, config: FitConfig) -> MorphableModel:
     return with_eyes(model) if config.geometry.eyes and lacks_eyes(model) else model
 
 
-def eyes_note(given: MorphableModel, fitted: MorphableModel) -> tuple[str, ...]:
+def eyes_note(given: MorphableModel, fitted: MorphableModel) -> tuple[Diagnostic, ...]:
     """What to say of the eyes: that the fit put some into a model, or that renders will look through holes."""
     from mifit.morphable.openings import STRIP, lacks_eyes
 
     if fitted is not given:
-        return (
+        text = (
             f"the eyes of model {given.name} are holes: the fit put simple eyes and the inside of a mouth there, and "
             f"the layout of its maps lies {100 * STRIP:.0f} % higher than the model's own; [geometry] eyes = false "
-            "leaves the model as it is",
+            "leaves the model as it is"
         )
+        return (Diagnostic("eyes-added", text, "note"),)
     if not lacks_eyes(fitted):
         return ()
-    return (f"the eyes of model {fitted.name} are holes; [geometry] eyes = true puts simple ones there",)
+    text = f"the eyes of model {fitted.name} are holes; [geometry] eyes = true puts simple ones there"
+    return (Diagnostic("eyes-are-holes", text, "note"),)
 
 
-def one_place(capture: Capture, cameras: Sequence[str], geometry: GeometryEstimate) -> tuple[str, ...]:
+def one_place(capture: Capture, cameras: Sequence[str], geometry: GeometryEstimate) -> tuple[Diagnostic, ...]:
     """A warning when the landmarks are seen from so nearly one place that the head's distance isn't measured."""
     seen = [name for name in cameras if any(capture.frame(name, t).visible.any() for t in geometry.timesteps)]
     towards = np.array([capture.camera(name).position for name in seen]) - geometry.vertices[0].mean(axis=0)
@@ -545,7 +551,8 @@ def one_place(capture: Capture, cameras: Sequence[str], geometry: GeometryEstima
     if apart >= BASELINE_DEGREES:
         return ()
     place = f"landmarks in camera {seen[0]} alone" if len(seen) == 1 else f"cameras {apart:.1f} degrees apart"
-    return (f"{place}: how far away and so how large the head is rests on the model's size more than on the images",)
+    text = f"{place}: how far away and so how large the head is rests on the model's size more than on the images"
+    return (Diagnostic("distance-unmeasured", text),)
 
 
 def choose(kind: str, known: Sequence[T], wanted: Sequence[T] | None, default: int) -> tuple[T, ...]:

@@ -113,7 +113,7 @@ def with_frame_offsets(result: R, capture: Capture) -> R:
     found = frame_offsets(seen, result.model, result.geometry, names)
     report = result.normals.report
     details = {**report.details, "frame_offsets": {name: asdict(offset) for name, offset in found.items()}}
-    before = tuple(line for line in report.warnings if OUT_OF_STEP not in line)
+    before = tuple(one for one in report.warnings if one.code != OUT_OF_STEP)
     warnings = (*before, *frame_offset_warnings(found, names[0]))
     return replace(result, normals=replace(result.normals, report=replace(report, details=details, warnings=warnings)))
 

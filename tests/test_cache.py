@@ -6,13 +6,15 @@ import pytest
 from mifit import cache
 from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.lobe import Lobe
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import NormalsEstimate, ReflectanceEstimate, Report
 
 
 @pytest.fixture
 def estimate():
     rng = np.random.default_rng(0)
-    report = Report("converged", {"data": [2.0, 1.0]}, 1.5, ("a warning",), {"figure": 3})
+    warning = Diagnostic("code", "a warning", camera="left")
+    report = Report("converged", {"data": [2.0, 1.0]}, 1.5, (warning,), {"figure": 3})
     return NormalsEstimate((0, 2), rng.random((2, 4, 4, 3), dtype=np.float32), report)
 
 

@@ -4,12 +4,15 @@ import argparse
 import json
 import math
 import shutil
+from argparse import Namespace
 
 import cv2
 import numpy as np
 import pytest
 
 from mifit.cli import build_parser, main
+from mifit.cli.arguments import tell
+from mifit.core.diagnostics import Diagnostic
 
 COMMANDS = (
     "doctor demo synth import landmarks fit track evaluate render turntable view relight export run model".split()
@@ -170,7 +173,7 @@ def test_an_uncalibrated_capture_is_fitted_and_reported(capsys, capture, tmp_pat
         "--timesteps", 0, "--until", "geometry", "--quiet",
     )  # fmt: skip
     assert code == 0, err
-    assert "uncalibrated" in json.loads((out / "result.json").read_text())["warnings"][0]
+    assert "uncalibrated" in json.loads((out / "result.json").read_text())["warnings"][0]["text"]
     assert "uncalibrated" in (out / "report.html").read_text()
     code, _, err = run(
         capsys,
@@ -192,6 +195,20 @@ def test_an_uncalibrated_capture_is_fitted_and_reported(capsys, capture, tmp_pat
     code, table, err = run(capsys, "evaluate", out, "--capture", capture, "--camera", "third", "--quiet")
     assert code == 0, err
     assert "third" in table and "landmarks" in table  # placed by its landmarks, and said so
+
+
+def test_warnings_are_lines_on_stderr_the_worst_first(capsys):
+    found = [Diagnostic("a", "one"), Diagnostic("b", "two"), Diagnostic("c", "three", "fault", "left")]
+    notes = [Diagnostic("d", "four", "note")]
+    assert tell(Namespace(quiet=True, strict=False), [*notes, *found, found[0]]) == 0
+    assert capsys.readouterr().err.splitlines() == [
+        "mifit: fault: three",
+        "mifit: warning: one",
+        "mifit: warning: two",
+    ]
+    assert tell(Namespace(quiet=False, strict=True), notes) == 0
+    assert capsys.readouterr().err == "mifit: note: four\n"
+    assert tell(Namespace(quiet=True, strict=True), found) == 3
 
 
 def options(parser, name=""):

@@ -104,7 +104,7 @@ def test_a_fit_that_gave_its_model_eyes_goes_on_with_the_model_as_it_was(monkeyp
     before = tree(out)
     again = fit_into(out, made_up_capture(), skin, **options)
     assert stages.ran == ALL[:3] and tree(out) == before and again.model.digest == first.model.digest
-    assert any("[geometry] eyes = false" in text for text in again.warnings)
+    assert any("[geometry] eyes = false" in one.text for one in again.warnings)
     shutil.rmtree(out / CHECKPOINTS)  # the result alone says that all is there
     fit_into(out, made_up_capture(), skin, **options)
     assert stages.ran == ALL[:3]

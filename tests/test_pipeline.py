@@ -46,9 +46,9 @@ def test_a_model_whose_eyes_are_holes_brings_a_note():
     model = MorphableModel.load("builtin:coarse").subset(identity=2, expression=2, albedo=2)
     skin = without_eyes(model)
     assert eyes_note(model, model) == ()
-    assert "[geometry] eyes = true puts simple ones there" in eyes_note(skin, skin)[0]
+    assert "[geometry] eyes = true puts simple ones there" in eyes_note(skin, skin)[0].text
     (given,) = eyes_note(skin, with_eyes(skin))
-    assert "maps lies 9 % higher" in given and "[geometry] eyes = false leaves" in given
+    assert "maps lies 9 % higher" in given.text and "[geometry] eyes = false leaves" in given.text
 
 
 def without_eyes(model):
@@ -108,9 +108,9 @@ def test_views_from_one_place_bring_a_warning():
         camera=cameras.get, frame=lambda name, t: SimpleNamespace(visible=np.full(68, name != "blind"))
     )
     geometry = ball_result().geometry
-    assert one_place(capture, ["a"], geometry)[0].startswith("landmarks in camera a alone: how far away")
-    assert one_place(capture, ["a", "b"], geometry)[0].startswith("cameras 1.0 degrees apart")
-    assert one_place(capture, ["blind", "c"], geometry)[0].startswith("landmarks in camera c alone")
+    assert one_place(capture, ["a"], geometry)[0].text.startswith("landmarks in camera a alone: how far away")
+    assert one_place(capture, ["a", "b"], geometry)[0].text.startswith("cameras 1.0 degrees apart")
+    assert one_place(capture, ["blind", "c"], geometry)[0].text.startswith("landmarks in camera c alone")
     assert one_place(capture, ["a", "b", "c"], geometry) == ()
 
 

@@ -1,6 +1,7 @@
 """The ``mifit`` command: parsing and exit codes; one module for each kind of command.
 
-Exit codes: 0 success, 2 bad usage or bad input (one line on stderr), 1 a failure of mifit's own, 130 interrupted.
+Exit codes: 0 success, 2 bad usage or bad input (one line on stderr), 3 a named fault of the capture (with
+``--strict``), 1 a failure of mifit's own, 130 interrupted.
 """
 
 from __future__ import annotations

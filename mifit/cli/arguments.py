@@ -6,14 +6,17 @@ import argparse
 import functools
 import sys
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NoReturn
 
+from mifit.core.diagnostics import Diagnostic, worst_first
 from mifit.core.files import check_overwriting, overwriting
 from mifit.core.limits import MAX_SEED, MAX_TIMESTEPS
 from mifit.errors import InputError
 
+STRICT = 3
+"""Exit code of a command that named a fault of its capture, with ``--strict``."""
 LONGEST = 1000
 """Characters of a message; one that quotes more of an input says nothing."""
 Command = Callable[[Namespace], "int | None"]
@@ -40,7 +43,7 @@ def one_line(text: str) -> str:
 def common_options() -> Parser:
     """Options that every command has."""
     p = Parser(add_help=False)
-    p.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    p.add_argument("--quiet", action="store_true", help="no progress on stderr, warnings alone")
     p.add_argument("--debug", action="store_true", help="show the traceback of an error")
     p.add_argument(
         "--variant", default="auto", help="Mitsuba variant; auto: CUDA where it works, else LLVM (default: auto)"
@@ -91,11 +94,31 @@ def add_address(p: argparse.ArgumentParser) -> None:
     p.add_argument("--port", type=whole(0, 65535), default=8080, help="of the view (default: 8080); 0: a free one")
 
 
+def add_strict(p: argparse.ArgumentParser) -> None:
+    """Add ``--strict``."""
+    p.add_argument("--strict", action="store_true", help="exit with 3 where a fault of the capture is named")
+
+
 def use_variant(arguments: Namespace) -> str:
     """Activate the variant that ``--variant`` names; returns its name. VariantError where it can't fit."""
     from mifit.render.variant import set_fitting_variant
 
     return set_fitting_variant(arguments.variant)
+
+
+def tell(arguments: Namespace, found: Iterable[Diagnostic]) -> int:
+    """Print diagnostics on standard error, a line each, the worst first; notes not with ``--quiet``.
+
+    Returns
+    -------
+    int
+        Exit code of the command: 3 with ``--strict`` where one of them is a named fault, else 0.
+    """
+    found = worst_first(found)
+    for one in found:
+        if one.severity != "note" or not arguments.quiet:
+            print(f"mifit: {one.severity}: {one_line(one.text)}", file=sys.stderr, flush=True)
+    return STRICT if arguments.strict and any(one.severity == "fault" for one in found) else 0
 
 
 def say(arguments: Namespace, text: str) -> None:

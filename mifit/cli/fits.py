@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mifit.cli import arguments as types
-from mifit.cli.arguments import say, use_variant
+from mifit.cli.arguments import say, tell, use_variant
 from mifit.cli.console import console_progress
 from mifit.cli.results import judge
 from mifit.config import PRESETS, FitConfig, NormalsConfig, ReflectanceConfig, from_mapping
@@ -86,7 +86,9 @@ def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> No
     )
     remember(out, [path.name for path in first])  # after the fit, which clears away what a result before it left
     judged = {"camera": "third", "timesteps": None, "region": "model", "baseline": True, "passes": False}
-    given = Namespace(quiet=arguments.quiet, result=out, capture=folder, json=out / "third.json", **judged)
+    given = Namespace(
+        quiet=arguments.quiet, strict=False, result=out, capture=folder, json=out / "third.json", **judged
+    )
     judge(given, result, capture)
 
 
@@ -108,7 +110,7 @@ def _first_picture(out: Path, result: Reconstruction, capture: Capture) -> Path:
     return path
 
 
-def fit(arguments: Namespace) -> None:
+def fit(arguments: Namespace) -> int:
     """Run the stages and write the result folder."""
     import mifit
     from mifit.result.ownership import check_ours, replacing_files
@@ -152,6 +154,7 @@ def fit(arguments: Namespace) -> None:
     )
     with replacing_files(out, force=arguments.force) as new:
         write_report(new, result, capture)
+    code = tell(arguments, result.diagnostics)
     print(f"Result: {out}", flush=True)
     if view:
         from mifit.extras.live_view import serve
@@ -159,6 +162,7 @@ def fit(arguments: Namespace) -> None:
         view.watch(result)  # where nothing had to be fitted it is the first
         assert view.live is not None
         serve(view.live)
+    return code
 
 
 def _chosen(arguments: Namespace, capture: Capture, count: int) -> FrameChoice:
@@ -174,7 +178,7 @@ def _chosen(arguments: Namespace, capture: Capture, count: int) -> FrameChoice:
     return found
 
 
-def track(arguments: Namespace) -> None:
+def track(arguments: Namespace) -> int:
     """Extend a result by further timesteps."""
     import mifit
     from mifit.fitting import choose
@@ -208,7 +212,9 @@ def track(arguments: Namespace) -> None:
     with replacing_files(arguments.result) as new:
         write_report(new, result, capture)
         write_moving_pictures(new, result, capture, arguments.overlay, arguments.fps, progress)
+    code = tell(arguments, result.diagnostics)
     print(f"Result: {arguments.result}")
+    return code
 
 
 def _with_refined(
@@ -273,6 +279,7 @@ def add_commands(add: types.Add) -> None:
     p.add_argument(
         "--view", action="store_true", help="show the fit in the browser while it is being fitted, and after"
     )
+    types.add_strict(p)
     types.add_address(p)
 
     p = add("track", track, "geometry and normals of further timesteps, reflectance and lighting fixed")
@@ -284,6 +291,7 @@ def add_commands(add: types.Add) -> None:
         "--refine", action="store_true", help="first find maps, lighting and normals anew, from frames of the video too"
     )
     p.add_argument("--overlay", type=types.listed, help="cameras to write overlay videos of; default: the fitted ones")
+    types.add_strict(p)
     types.add_rate(p)
 
     p = add("run", run, "a scene-file driven experiment or a sweep of them")

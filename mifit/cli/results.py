@@ -9,8 +9,9 @@ from argparse import Namespace
 from typing import TYPE_CHECKING
 
 from mifit.cli import arguments as types
-from mifit.cli.arguments import add_force, say, use_variant, writes
+from mifit.cli.arguments import add_force, say, tell, use_variant, writes
 from mifit.cli.console import console_progress
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.files import write_text
 from mifit.core.limits import MAX_RENDERED_PIXELS
 from mifit.errors import InputError
@@ -21,17 +22,17 @@ if TYPE_CHECKING:
 
 
 @writes("json")
-def evaluate(arguments: Namespace) -> None:
+def evaluate(arguments: Namespace) -> int:
     """Error on a held-out view: a table on stdout, JSON on request, the report renewed."""
     import mifit
 
     result = mifit.Reconstruction.load(arguments.result)
     capture = mifit.Capture.load(arguments.capture)
     use_variant(arguments)
-    judge(arguments, result, capture)
+    return judge(arguments, result, capture)
 
 
-def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> None:
+def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> int:
     """`evaluate` of a result that has been read, or just been made and written into ``arguments.result``."""
     from mifit.fitting import fitted_to
     from mifit.output.evaluate import Comparison, evaluate, held_out
@@ -50,10 +51,14 @@ def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> Non
         passes=arguments.passes,
         watch=lambda one: shown.append(one) if len(shown) < SHOWN_TIMESTEPS else None,
     )
+    said = list(result.diagnostics)
     if not fitted_to(result, capture):
-        say(arguments, f"mifit: warning: {arguments.capture}: isn't the capture that was fitted, or has changed since")
+        text = f"{arguments.capture}: isn't the capture that was fitted, or has changed since"
+        said.append(Diagnostic("capture-changed", text))
     if not held_out(result, found):
-        say(arguments, f"mifit: warning: camera {arguments.camera!r} was fitted, so this is no held-out error")
+        text = f"camera {arguments.camera!r} was fitted, so this is no held-out error"
+        said.append(Diagnostic("not-held-out", text, camera=arguments.camera))
+    code = tell(arguments, said)
     if arguments.json:
         write_text(arguments.json, json.dumps(found, indent=2) + "\n")
     print(f"camera {found['camera']}, timesteps {found['timesteps']}, {found['region_pixels']} pixels")
@@ -77,6 +82,7 @@ def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> Non
         print(summary({"passes": {found["camera"]: found["passes"]}}))
     with replacing_files(arguments.result) as new:
         write_report(new, result, capture, found, shown)
+    return code
 
 
 def _print_measures(methods: dict[str, dict[str, float]]) -> None:
@@ -256,6 +262,7 @@ def add_commands(add: types.Add) -> None:
     )
     p.add_argument("--json", type=types.path, help="file to write the figures to")
     add_force(p)
+    types.add_strict(p)
 
     p = add("score", score, "any program's images, relit views, passes or meshes against a capture's truth")
     p.add_argument("capture", type=types.path, help="capture folder with truth, or its transforms.json")

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.diagnostics import Diagnostic
+
 if TYPE_CHECKING:
     from mifit.appearance.illumination import Illumination
     from mifit.appearance.lobe import Lobe
@@ -30,8 +32,8 @@ class Report:
         Energy per term over the iterations (same length each).
     seconds : float
         Wall time of the stage.
-    warnings : tuple of str
-        Things a person should know, in words.
+    warnings : tuple of Diagnostic
+        Things a person should know.
     details : dict
         Further figures of the stage; JSON values only.
     """
@@ -39,7 +41,7 @@ class Report:
     outcome: str
     energies: dict[str, list[float]] = field(default_factory=dict)
     seconds: float = 0.0
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Diagnostic, ...] = ()
     details: dict = field(default_factory=dict)
 
 

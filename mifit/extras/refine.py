@@ -14,6 +14,7 @@ import numpy as np
 
 from mifit.capture.choose_frames import choose_frames
 from mifit.config import FitConfig, from_mapping
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.threads import one_blas_thread
 from mifit.errors import ConvergenceError, InputError
@@ -87,7 +88,9 @@ def refine(
         "timesteps": list(geometry.timesteps),
         "left_out": {str(t): why for t, why in (left_out | failed).items()},
     }
-    lines = tuple(f"timestep {t}: left out of the refinement, {why}" for t, why in failed.items())
+    lines = tuple(
+        Diagnostic("timestep-left-out", f"timestep {t}: left out of the refinement, {why}") for t, why in failed.items()
+    )
     report = replace(
         reflectance.report,
         warnings=(*reflectance.report.warnings, *lines),

@@ -150,22 +150,11 @@ def _summary(result: Result, evaluation: dict[str, Any] | None) -> str:
         )
     else:
         parts.append("<p>No held-out view was evaluated; <code>mifit evaluate</code> adds one to this page.</p>")
-    warnings = all_warnings(result)
-    parts += [f'<p class="warning">{html.escape(text)}</p>' for text in warnings]
-    if not warnings:
+    found = result.diagnostics
+    parts += [f'<p class="warning">{one.severity.capitalize()}: {html.escape(one.text)}</p>' for one in found]
+    if not found:
         parts.append('<p class="soft">No warnings.</p>')
     return "".join(parts)
-
-
-def all_warnings(result: Result) -> list[str]:
-    """Warnings of the fit and its stages, in words; a stage that did not converge counts as one."""
-    out = list(result.warnings)
-    for name, report in result.reports.items():
-        out += [f"{STAGES[name]}: {text}" for text in report.warnings]
-        if report.outcome != "converged":
-            words = report.outcome.replace("_", " ")
-            out.append(f"{STAGES[name]}: ended without convergence ({words}); see the curves below.")
-    return out
 
 
 def _view3d(result: Result, timestep: int) -> str:

@@ -16,6 +16,7 @@ from mifit.appearance.illumination import Illumination, light_from
 from mifit.appearance.lobe import Lobe
 from mifit.config import MeshConfig
 from mifit.core.camera import Camera
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import (
     GeometryEstimate,
     MeshEstimate,
@@ -79,7 +80,7 @@ def _load(cls: type[R], folder: Path, model: MorphableModel | None) -> R:
             unit_mm=float(capture["unit_mm"]),
             seconds=float(document["seconds"]),
             peak_memory=int(document["peak_memory"]),
-            warnings=tuple(document["warnings"]),
+            warnings=_diagnostics(document["warnings"]),
         )
     except InputError:
         raise
@@ -139,7 +140,11 @@ def _camera(entry: dict[str, Any]) -> Camera:
 def _report(document: dict[str, Any], stage: str) -> Report:
     entry = document["stages"][stage]
     energies = {k: [math.nan if x is None else float(x) for x in v] for k, v in entry["energies"].items()}
-    return Report(entry["status"], energies, float(entry["seconds"]), tuple(entry["warnings"]), entry["details"])
+    return Report(entry["status"], energies, float(entry["seconds"]), _diagnostics(entry["warnings"]), entry["details"])
+
+
+def _diagnostics(entries: Any) -> tuple[Diagnostic, ...]:
+    return tuple(Diagnostic.of(entry) for entry in entries)
 
 
 def _array(value: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float64]:

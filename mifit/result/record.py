@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mifit.appearance.illumination import Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.core.camera import Camera
+from mifit.core.diagnostics import Diagnostic, worst_first
 from mifit.core.estimate import (
     GeometryEstimate,
     MeshEstimate,
@@ -69,8 +70,8 @@ class Result:
     model_source : str
         Path of the model's file, or ``"builtin"``: what `load` reads the model from again. Empty when it is not
         known; then `load` wants the model given.
-    warnings : tuple of str
-        Things a person should know about the whole fit, in words.
+    warnings : tuple of Diagnostic
+        Things a person should know about the capture and the whole fit.
     environment : (H, W, 3) float32, optional
         Lat-long radiance that `relight` put in place of the recovered lighting; path tracing uses it whole. Not saved.
     environment_rotation : (3, 3), optional
@@ -89,7 +90,7 @@ class Result:
     seconds: float = 0.0
     peak_memory: int = 0
     model_source: str = ""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Diagnostic, ...] = ()
     environment: NDArray[np.float32] | None = field(default=None, repr=False)
     mesh: MeshEstimate | None = field(default=None, repr=False)
     residual: ResidualEstimate | None = field(default=None, repr=False)
@@ -185,6 +186,18 @@ class Result:
     def methods(self) -> tuple[Method, ...]:
         """Methods that `render` can show: all three, or ``pca`` alone when only stage 1 ran."""
         return METHODS if self.reflectance is not None else ("pca",)
+
+    @property
+    def diagnostics(self) -> list[Diagnostic]:
+        """What a person should know of capture and fit, the worst first; a stage that did not converge counts."""
+        found = list(self.warnings)
+        for name, report in self.reports.items():
+            found += report.warnings
+            said = any(one.code == "not-converged" for one in report.warnings)
+            if report.outcome != "converged" and not said:
+                words = report.outcome.replace("_", " ")
+                found.append(Diagnostic("not-converged", f"stage {name} ended without convergence ({words})"))
+        return worst_first(found)
 
     @property
     def reports(self) -> dict[str, Report]:

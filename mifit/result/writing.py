@@ -192,7 +192,7 @@ def _document(result: Result) -> dict[str, Any]:
             "stages": {name: _report_document(report) for name, report in result.reports.items()},
             "seconds": result.seconds,
             "peak_memory": int(result.peak_memory),
-            "warnings": list(result.warnings),
+            "warnings": [found.document() for found in result.warnings],
         }
     )
 
@@ -213,7 +213,7 @@ def _report_document(report: Report) -> dict[str, Any]:
         "status": report.outcome,
         "seconds": report.seconds,
         "energies": report.energies,
-        "warnings": list(report.warnings),
+        "warnings": [found.document() for found in report.warnings],
         "details": report.details,
     }
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mifit.config import GeometryConfig, SurfaceConfig
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, Report
 from mifit.core.threads import one_blas_thread
 from mifit.progress import Progress, silent
@@ -159,24 +160,28 @@ def find_surface(
     return replace(found, report=_extended(geometry.report, seconds, phase, epipolar_warnings(residuals)))
 
 
-def _unchanged(geometry: GeometryEstimate, warning: str, began: float) -> GeometryEstimate:
+def _unchanged(geometry: GeometryEstimate, text: str, began: float) -> GeometryEstimate:
     """The input with a warning."""
     report = _extended(geometry.report, time.perf_counter() - began, {"name": "surface", "outcome": "left out"})
+    warning = Diagnostic("surface-in-span", text)
     return replace(geometry, report=replace(report, warnings=(*report.warnings, warning)))
 
 
-def _extended(report: Report, seconds: float, phase: dict, warnings: Sequence[str] = ()) -> Report:
+def _extended(report: Report, seconds: float, phase: dict, warnings: Sequence[Diagnostic] = ()) -> Report:
     """A report with one more phase."""
     details = {**report.details, "phases": [*report.details.get("phases", []), phase]}
     warnings = (*report.warnings, *warnings)
     return replace(report, seconds=report.seconds + seconds, details=details, warnings=warnings)
 
 
-def epipolar_warnings(residuals: Mapping[str, float | None]) -> list[str]:
+def epipolar_warnings(residuals: Mapping[str, float | None]) -> list[Diagnostic]:
     """What to say of views, such as ``"left, right"``, that show points off one another's epipolar lines."""
     return [
-        f"cameras {names}: what they show lies {pixels:.1f} pixels off one another's epipolar lines; the calibration "
-        "is off, or the cameras aren't in step"
+        Diagnostic(
+            "views-disagree",
+            f"cameras {names}: what they show lies {pixels:.1f} pixels off one another's epipolar lines, expected at "
+            f"most {OFF_PIXELS:g}; the calibration is off, or the cameras aren't in step",
+        )
         for names, pixels in residuals.items()
         if pixels is not None and pixels > OFF_PIXELS
     ]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mifit.capture import Capture
 from mifit.config import GeometryConfig
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.threads import one_blas_thread
 from mifit.errors import ConvergenceError, InputError
@@ -121,7 +122,8 @@ def fit_geometry(
         return found
     for name in cameras:
         if name not in gains:
-            journal.warn(f"camera {name}: shares too little of the face with {cameras[0]} to tell its gain; taken as 1")
+            text = f"camera {name}: shares too little of the face with {cameras[0]} to tell its gain; taken as 1"
+            journal.warn(Diagnostic("gain-unknown", text, camera=name))
     return refine(capture, gains, found.exposures)
 
 
@@ -178,7 +180,8 @@ def fit_pose_expression(
         state, views, config = start.state, start.views, replace(config, landmark_noise=start.noise)
     else:
         state = warm
-        journal.warn(f"timestep {timestep}: too few landmarks; started from timestep {geometry.timesteps[-1]} alone")
+        text = f"timestep {timestep}: too few landmarks; started from timestep {geometry.timesteps[-1]} alone"
+        journal.warn(Diagnostic("few-landmarks", text))
     found = _refine_and_pack(
         capture, baked, cameras, (timestep,), config, seed, journal, state, views, reference, geometry, geometry.gains
     )

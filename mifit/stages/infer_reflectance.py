@@ -10,6 +10,7 @@ import numpy as np
 
 from mifit.appearance.cornea import reflects
 from mifit.config import ReflectanceConfig
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
 from mifit.core.labels import hidden
 from mifit.core.mesh import interpolate
@@ -100,7 +101,8 @@ def infer_reflectance(
     quality = surface.quality()
     filled = blend_unseen(model, surface.texels, albedo, fitted.maps, quality, fitted.told, mirrored)
     if fitted.outcome is Outcome.MAX_ITERATIONS:
-        warnings = (*warnings, "the lighting had not converged when the iterations ran out; raise max_iterations")
+        text = "the lighting had not converged when the iterations ran out; raise max_iterations"
+        warnings = (*warnings, Diagnostic("not-converged", text))
     details: dict = {
         "shading": choice,
         "gauge": GAUGE,

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mifit.config import GeometryConfig, NormalsConfig
 from mifit.core.bend import bend, tangent_plane, unbend
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
 from mifit.core.threads import one_blas_thread
 from mifit.core.uv import TexelMap, rasterize_uv
@@ -54,7 +55,7 @@ class TrackedFrame:
     seconds : float
     refound : bool
         The last pose led nowhere and landmarks found the face again.
-    warnings : tuple of str
+    warnings : tuple of Diagnostic
     """
 
     timestep: int
@@ -62,7 +63,7 @@ class TrackedFrame:
     normal_object: NDArray[np.float32]
     seconds: float
     refound: bool
-    warnings: tuple[str, ...]
+    warnings: tuple[Diagnostic, ...]
 
 
 def track(
@@ -129,7 +130,8 @@ def track(
         prior = memory.offsets(found)
         frame = refine_frame(capture, model, found, reflectance, cameras, config, texels, prior, seed)
         if frame.measured == 0.0:
-            warnings.append(f"timestep {timestep}: no camera measures the face; normals are those of the frames before")
+            text = f"timestep {timestep}: no camera measures the face; normals are those of the frames before"
+            warnings.append(Diagnostic("face-unseen", text))
         memory.add(found, frame.normal_object)
         progress("track", done + 1, len(timesteps))
         yield TrackedFrame(
@@ -171,7 +173,7 @@ class Follower:
         self._last = geometry.at(geometry.timesteps[-1:])
 
     @one_blas_thread()
-    def next(self, timestep: int) -> tuple[GeometryEstimate, bool, list[str]]:
+    def next(self, timestep: int) -> tuple[GeometryEstimate, bool, list[Diagnostic]]:
         """Geometry of a timestep, whether landmarks had to find the lost face again, and warnings.
 
         Raises
@@ -199,7 +201,8 @@ class Follower:
         found = found if self._texture is None else self._texture.aligned(found)
         warnings = list(found.report.warnings)
         if refound:
-            warnings.append(f"timestep {timestep}: lost the face and found it again by its landmarks")
+            text = f"timestep {timestep}: lost the face and found it again by its landmarks"
+            warnings.append(Diagnostic("face-lost", text, "note"))
         self._last = found
         return found, refound, warnings
 

@@ -105,7 +105,7 @@ def test_a_frame_in_other_light_is_left_out_by_name(scene, result):
     changed = replace(scene, frames=frames)
     found, without = refine(result, changed), refine(result, scene, (0, 1, 2, 3, 5))
     assert entered(found)["timesteps"] == [0, 1, 2, 3, 5] and list(entered(found)["left_out"]) == ["4"]
-    assert "timestep 4: left out of the refinement, it differs" in found.reflectance.report.warnings[-1]
+    assert "timestep 4: left out of the refinement, it differs" in found.reflectance.report.warnings[-1].text
     assert_array_equal(found.reflectance.diffuse, without.reflectance.diffuse)
 
 

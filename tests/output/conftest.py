@@ -12,6 +12,7 @@ from mifit.appearance.illumination import Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.config import MeshConfig
 from mifit.core.camera import Camera
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import rasterize_uv
@@ -100,7 +101,8 @@ def ball_result(size: int = 32, shading_model: str = "prefiltered") -> Reconstru
     radiance[1] = -0.5
     shading = radiance * np.repeat([1.0, 2 / 3, 1 / 4], [1, 3, 5])[:, None]
     curve = {"data": [3.0, 1.0, 0.5], "prior": [0.1, 0.2, 0.2]}
-    report = Report("converged", curve, 1.5, ("one landmark is hidden",), {"points": 68})
+    hidden = Diagnostic("landmark-hidden", "one landmark is hidden", camera="left")
+    report = Report("converged", curve, 1.5, (hidden,), {"points": 68})
     geometry = GeometryEstimate(
         (0, 3), identity, albedo, expression, rotation, translation, scale, vertices.astype(np.float32),
         model.albedo(albedo), shading, 0.01, report,

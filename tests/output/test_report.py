@@ -12,6 +12,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.image import to_8_bit
 from mifit.core.sh import SHLighting
 from mifit.output.evaluate import evaluate
@@ -93,8 +94,8 @@ def test_report_is_whole_and_self_contained(ball, capture, variant, tmp_path):
     assert path.stat().st_size < 6e6 and list(tmp_path.iterdir()) == [path]
     words = " ".join(page.text)
     assert f"{evaluation['methods']['full']['psnr']:.2f}" in words and "held out, never fitted" in words
-    assert "1 Geometry: one landmark is hidden" in words
-    assert "2 Reflectance: ended without convergence (max iterations)" in words
+    assert "Warning: one landmark is hidden" in words
+    assert "stage reflectance ended without convergence (max iterations)" in words
     assert words.count("Timestep 3") == 2
     assert re.search(r"left: 0\.0% clipped, \d+\.\d% unexplained", words)
     assert float(re.search(r"right: (\d+\.\d)% clipped", words)[1]) == pytest.approx(50, abs=15)
@@ -107,7 +108,9 @@ def test_report_without_evaluation_and_of_stage_1(stage_1_ball, capture, variant
 
 
 def test_text_from_outside_is_escaped(ball, capture, variant, tmp_path):
-    harmful = replace(ball, config={"x": "</pre><script>alert(1)</script>"}, warnings=("<b>bold</b>",))
+    harmful = replace(
+        ball, config={"x": "</pre><script>alert(1)</script>"}, warnings=(Diagnostic("bold", "<b>bold</b>"),)
+    )
     _, text = parsed(write_report(tmp_path, harmful, capture))
     assert "<script>alert" not in text and "<b>bold" not in text
 

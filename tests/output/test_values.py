@@ -10,6 +10,7 @@ import pytest
 from mifit import cli
 from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.core.camera import Camera
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.image import read_image
 from mifit.core.sh import SHLighting
 from mifit.errors import InputError
@@ -57,7 +58,7 @@ def test_equality_and_text(ball, stage_1_ball):
     assert ball == replace(ball) and ball != stage_1_ball and ball != 3
     assert ball == replace(ball, model=replace(ball.model, name="renamed"))
     assert ball != replace(ball, model=replace(ball.model, mean=1.1 * ball.model.mean))
-    assert ball != replace(ball, warnings=("one",))
+    assert ball != replace(ball, warnings=(Diagnostic("one", "text"),))
     assert repr(ball) == (
         "Reconstruction(model ball; timesteps 0, 3; cameras left, right; 32 x 32 maps; prefiltered shading, 3 bands)"
     )

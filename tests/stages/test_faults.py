@@ -76,7 +76,7 @@ def test_every_mistake_is_named(model, mistake):
     assert inverses, "each correction is undone by one of the others"
     wrong = miscalibrated(right, inverses[0])
     assert named(model, wrong) == mistake
-    assert any(mistake in text for text in calibration_warnings(wrong, model, 1.0, 200.0))
+    assert any(mistake in one.text for one in calibration_warnings(wrong, model, 1.0, 200.0))
 
 
 def test_mistakes_that_look_alike_are_all_named(model):
@@ -104,7 +104,7 @@ def test_landmarks_that_no_face_has_name_nothing(model):
 def test_a_late_camera_is_named(model, lag):
     views = seen(model, lag, steps=8)
     assert delayed_camera(views) == ("right", lag)
-    assert any("right looks" in text for text in calibration_warnings(views, model, 1.0, 1.0))
+    assert any("right looks" in one.text for one in calibration_warnings(views, model, 1.0, 1.0))
 
 
 def test_cameras_in_step_are_not_called_late(model):
@@ -113,6 +113,6 @@ def test_cameras_in_step_are_not_called_late(model):
 
 def test_a_camera_that_never_shows_the_face_is_named_with_what_to_look_at():
     blind = {("left", 0), ("right", 0), ("right", 1)}
-    (message,) = unseen_warnings(blind, ("left", "right"), 2, 1000.0)
-    assert message.startswith("camera right ") and "1000 mm" in message and "left taken for right" in message
+    (found,) = unseen_warnings(blind, ("left", "right"), 2, 1000.0)
+    assert found.camera == "right" and "1000 mm" in found.text and "left taken for right" in found.text
     assert unseen_warnings({("left", 0)}, ("left", "right"), 2, 1000.0) == []

@@ -204,7 +204,7 @@ def test_hard_cases_converge(model, capture, change, limit_mm, limit_degrees, co
     for k in range(2):
         assert rotation_angle(estimate.rotation[k], capture.rotation[k]) < limit_degrees
     if change is black:
-        assert any("camera left" in warning for warning in estimate.report.warnings)
+        assert any("camera left" in warning.text for warning in estimate.report.warnings)
 
 
 def test_identical_views_are_one_view(model):
@@ -261,7 +261,7 @@ def test_tracking_keeps_identity_and_follows_the_head(model):
     assert rotation_angle(turned, truly) < 0.6
     blind = capture.changed(lambda n, t, f: replace(f, landmarks=None, visible=np.zeros(68, bool)))
     warm = fit_pose_expression(blind, model, tracked, BOTH, 2, QUICK, reference=reference)
-    assert any("too few landmarks" in warning for warning in warm.report.warnings)
+    assert any("too few landmarks" in warning.text for warning in warm.report.warnings)
     assert errors_mm(model, capture, warm)[0] < 1.0
 
 

@@ -70,7 +70,7 @@ def test_half_a_frame_is_told_with_its_sign(model, film):
     assert found["right"].frames == pytest.approx(0.5, abs=0.08)
     assert found["right"].deviation < 0.1
     (warning,) = frame_offset_warnings(found, "left")
-    assert "camera right" in warning and "later" in warning
+    assert warning.camera == "right" and "later" in warning.text
 
 
 def test_a_calibration_that_is_off_is_no_offset_in_time(model, film):
@@ -97,4 +97,4 @@ def test_single_timesteps_tell_nothing(model, film):
 
 def test_what_is_uncertain_is_no_warning():
     assert frame_offset_warnings({"right": FrameOffset(0.4, 0.2)}, "left") == []
-    assert "earlier" in frame_offset_warnings({"right": FrameOffset(-0.4, 0.05)}, "left")[0]
+    assert "earlier" in frame_offset_warnings({"right": FrameOffset(-0.4, 0.05)}, "left")[0].text

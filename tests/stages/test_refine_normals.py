@@ -196,7 +196,7 @@ def test_without_measurements_the_model_is_kept_and_said(scene):
     texels, base = base_map(scene)
     result = refine(replace(scene, frames=blind))
     assert angles(result.normal_object[0], base)[texels.mask].max() < 0.1
-    assert "timestep 0" in result.report.warnings[0]
+    assert "timestep 0" in result.report.warnings[0].text
 
 
 def test_clipped_pixels_and_nan_pixels_count_nothing(scene):

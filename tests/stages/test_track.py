@@ -102,7 +102,7 @@ def test_where_nothing_is_measured_the_last_detail_stays(scene, fit_truth):
     hidden.timesteps = scene.timesteps
     seen, unseen = run(hidden, timesteps=(1, 2))
     assert_allclose(unseen.normal_object, seen.normal_object, atol=1e-4)
-    assert "no camera measures the face" in unseen.warnings[-1]
+    assert "no camera measures the face" in unseen.warnings[-1].text
 
 
 def test_only_named_cameras_are_read(scene, fit_truth):
@@ -231,7 +231,7 @@ def test_cameras_out_of_step_are_named_once(scene, fit_truth, saved, monkeypatch
     report = reload(saved).normals.report
     assert asked == [(0, 1), (0, 1, 2)]
     assert report.details["frame_offsets"] == {"right": {"frames": 0.4, "deviation": 0.02}}
-    assert sum("0.40 of a frame later than those of left" in line for line in report.warnings) == 1
+    assert sum("0.40 of a frame later than those of left" in one.text for one in report.warnings) == 1
 
 
 def test_meshes_of_tracked_frames_are_refined_as_those_of_the_fit(scene, fit_truth, saved):

@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.diagnostics import Diagnostic
 from mifit.morphable import MorphableModel
 from mifit.stages.geometry.initial import pose_candidates, reprojection, triangulate
 from mifit.stages.geometry.landmarks import LandmarkView
@@ -85,21 +86,24 @@ MISTAKES: dict[str, Callable[[Matrix], Matrix]] = {
 """What may be wrong, and what turns the world-to-camera matrix (4, 4) into the right one."""
 
 
-def calibration_warnings(views: Sequence[LandmarkView], model: MorphableModel, scale: float, noise: float) -> list[str]:
+def calibration_warnings(
+    views: Sequence[LandmarkView], model: MorphableModel, scale: float, noise: float
+) -> list[Diagnostic]:
     """What is probably wrong with the cameras of a fit by landmarks that scatter by ``noise`` pixels about it."""
     found = []
     width = min((view.camera.width for view in views), default=0)
     if noise > SCATTER_OF_WIDTH * width:
         mistake = calibration_fault(views, model.mean[model.landmarks].astype(np.float64), scale)
         if mistake is not None:
-            found.append(f"the calibration looks wrong: {mistake}")
+            found.append(Diagnostic("calibration-wrong", f"the calibration looks wrong: {mistake}", "fault"))
     late = delayed_camera(views)
     if late is not None:
         name, steps = late
-        found.append(
+        text = (
             f"camera {name} looks {abs(steps)} timesteps {'late' if steps > 0 else 'early'}: its landmarks agree with "
             "the other cameras' when moved by that; synchronise the videos"
         )
+        found.append(Diagnostic("camera-delayed", text, "fault", name))
     return found
 
 
@@ -198,7 +202,7 @@ def _all_landmarks(view: LandmarkView) -> NDArray[np.float64]:
 
 def unseen_warnings(
     blind: Collection[tuple[str, int]], cameras: Sequence[str], steps: int, unit_mm: float
-) -> list[str]:
+) -> list[Diagnostic]:
     """What to say of cameras that show nothing of the fitted face in any of the timesteps.
 
     Parameters
@@ -211,9 +215,13 @@ def unseen_warnings(
         The capture's unit of length in millimetres.
     """
     return [
-        f"camera {name} shows the front of the fitted face at no timestep. If its images do show the face: is the unit "
-        f"of length right (found one of {unit_mm:g} mm), is the order of the landmarks (left taken for right turns a "
-        "head around), are the cameras' poses?"
+        Diagnostic(
+            "face-unseen",
+            f"camera {name} shows the front of the fitted face at no timestep. If its images do show the face: is the "
+            f"unit of length right (found one of {unit_mm:g} mm), is the order of the landmarks (left taken for right "
+            "turns a head around), are the cameras' poses?",
+            camera=name,
+        )
         for name in cameras
         if all((name, step) in blind for step in range(steps))
     ]

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, Report
 from mifit.morphable import MorphableModel
 from mifit.progress import Progress
@@ -25,12 +26,12 @@ class Journal:
         self.began = time.perf_counter()
         self.phases: list[dict] = []
         self.energies: dict[str, list[float]] = {}
-        self.warnings: list[str] = []
+        self.warnings: list[Diagnostic] = []
         self.last: Solution | None = None
         self._label, self._total, self._progress = label, total, progress
         progress(label, 0, total)
 
-    def warn(self, message: str) -> None:
+    def warn(self, message: Diagnostic) -> None:
         """Note something that a person should know."""
         if message not in self.warnings:
             self.warnings.append(message)
@@ -49,7 +50,8 @@ class Journal:
             }
         )
         if solution.outcome is Outcome.MAX_ITERATIONS:
-            self.warn(f"the fit of {name} was stopped after {solution.iterations} iterations before it converged")
+            text = f"the fit of {name} was stopped after {solution.iterations} iterations before it converged"
+            self.warn(Diagnostic("not-converged", text))
         if geometric:
             self.last = solution
             self._extend(solution.energies)
@@ -103,15 +105,15 @@ def pack(
     width = min((view.camera.width for view in views), default=np.inf)
     scatter = coordinate_deviation(state, views) if views else 0.0
     if scatter > SCATTER_OF_WIDTH * width:
-        journal.warn(
-            f"landmarks scatter by {scatter:.1f} pixels about the fitted face: check the detector and the calibration"
-        )
+        text = f"landmarks scatter by {scatter:.1f} pixels about the fitted face: check detector and calibration"
+        journal.warn(Diagnostic("landmarks-scatter", text))
     identity = x[layout.at("identity")].copy() if fixed is None else fixed.identity
     if len(identity) and np.abs(identity).max() > 5.0:
-        journal.warn(
+        text = (
             f"an identity coefficient is {np.abs(identity).max():.1f} standard deviations from the mean: the model "
             "may not span this face, or the calibration is off"
         )
+        journal.warn(Diagnostic("identity-far", text))
     return GeometryEstimate(
         timesteps=timesteps,
         identity=identity,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mifit.capture import Capture
 from mifit.core.camera import Camera
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.threads import on_all_cores
 from mifit.morphable import MorphableModel
@@ -71,7 +72,7 @@ class Visibility:
         self.cameras: list[Camera] = [capture.camera(name) for name in cameras]
         self.timesteps = tuple(timesteps)
         self._shown: dict[int, NDArray] = {}  # vertices that the buffers show
-        self.warnings: list[str] = []
+        self.warnings: list[Diagnostic] = []
         self.blind: set[tuple[str, int]] = set()  # images (camera, step) that showed nothing of the face once
         self._buffers: dict[tuple[int, str], GBuffer] = {}
         self._measured: dict[tuple[int, str], NDArray[np.bool_]] = {}
@@ -118,10 +119,11 @@ class Visibility:
 
     def _warn_unusable(self, camera: Camera, step: int) -> None:
         self.blind.add((camera.name, step))
-        self.warnings.append(
+        text = (
             f"camera {camera.name}, timestep {self.timesteps[step]}: no pixel of the face can be used (out of view, "
             "masked, clipped or black); only landmarks count there"
         )
+        self.warnings.append(Diagnostic("no-usable-pixels", text, camera=camera.name))
 
     def textures(self, state: State, points: SurfacePoints, sigma: float, window: float) -> tuple[TextureView, ...]:
         """Log-texture of every image and the points it sees."""

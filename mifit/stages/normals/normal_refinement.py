@@ -22,6 +22,7 @@ from mifit.appearance.formation import Appearance
 from mifit.appearance.occlusion import MeshPoints
 from mifit.config import NormalsConfig
 from mifit.core.bend import bend, tangent_plane, texel_neighbours
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.mesh import normalize
 from mifit.core.threads import one_blas_thread
@@ -92,7 +93,8 @@ def refine_normals(
         frame = refine_frame(capture, model, geometry.at((timestep,)), reflectance, cameras, config, texels, seed=seed)
         normals.append(texels.to_map(frame.normal_object))
         if frame.measured == 0.0:
-            warnings.append(f"timestep {timestep}: no camera measures the face; normals are the model's")
+            text = f"timestep {timestep}: no camera measures the face; normals are the model's"
+            warnings.append(Diagnostic("face-unseen", text))
         outcomes.append(frame.outcome)
         seconds.append(frame.seconds)
         for name, values in frame.energies.items():

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mifit.appearance.formation import Appearance, form_image
 from mifit.config import ReflectanceConfig
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.sh import LUMINANCE
 from mifit.core.threads import on_all_cores
 from mifit.progress import Progress
@@ -225,7 +226,7 @@ def fit_als(
     config: ReflectanceConfig,
     seed: int,
     progress: Progress,
-) -> tuple[Fitted, dict, tuple[str, ...]]:
+) -> tuple[Fitted, dict, tuple[Diagnostic, ...]]:
     """Choose the shading model, find the lighting on a subset of the texels, then all maps.
 
     Returns

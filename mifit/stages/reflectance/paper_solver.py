@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mifit.appearance import models
 from mifit.appearance.lobe import Lobe
 from mifit.config import ReflectanceConfig
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.sh import radiance_of_shading
 from mifit.progress import Progress
 from mifit.solve import Outcome
@@ -32,7 +33,7 @@ def fit_adam(
     config: ReflectanceConfig,
     seed: int,
     progress: Progress,
-) -> tuple[Fitted, dict, tuple[str, ...]]:
+) -> tuple[Fitted, dict, tuple[Diagnostic, ...]]:
     """Minimise the paper's objective by Adam; ``shading = auto`` means the paper's model.
 
     Without robust weights lighting and ambient start from stage 1's, as in the paper; with them from a Lambertian

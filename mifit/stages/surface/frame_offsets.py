@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, normalize
 from mifit.core.threads import one_blas_thread
@@ -41,7 +42,7 @@ WINDOW = 11
 FEWEST_TEXELS = 200
 LEAST_PIXELS = 0.3
 """Movement across the planes in a frame, root mean square over the frames, below which nothing is told."""
-OUT_OF_STEP = ": its frames come"
+OUT_OF_STEP = "camera-out-of-step"
 WORTH_A_WARNING, CERTAIN = 0.15, 3.0
 """Part of a frame, and number of deviations, beyond which cameras count as out of step."""
 
@@ -125,11 +126,16 @@ def frame_offsets(
     return found
 
 
-def frame_offset_warnings(offsets: Mapping[str, FrameOffset], first: str) -> list[str]:
+def frame_offset_warnings(offsets: Mapping[str, FrameOffset], first: str) -> list[Diagnostic]:
     """What to say of cameras whose frames are certainly out of step with those of the first."""
     return [
-        f"camera {name}{OUT_OF_STEP} {abs(o.frames):.2f} of a frame {'later' if o.frames > 0 else 'earlier'} than "
-        f"those of {first} (+- {o.deviation:.2f}): where the face moves the views don't agree"
+        Diagnostic(
+            OUT_OF_STEP,
+            f"camera {name}: its frames come {abs(o.frames):.2f} of a frame "
+            f"{'later' if o.frames > 0 else 'earlier'} than those of {first} (+- {o.deviation:.2f}): where the face "
+            "moves the views don't agree",
+            camera=name,
+        )
         for name, o in offsets.items()
         if abs(o.frames) > max(WORTH_A_WARNING, CERTAIN * o.deviation)
     ]
