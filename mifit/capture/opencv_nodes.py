@@ -7,12 +7,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from mifit.capture.xml_text import parse_xml
 from mifit.core.files import read_text
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
@@ -107,6 +107,32 @@ def _number(text: str) -> float | None:
         return float(word)
     except ValueError:
         return None
+
+
+def parse_xml(text: str, where: str) -> ElementTree.Element:
+    """The root element of a document.
+
+    A document type is refused: it is what entities are declared in, which expand without bound or name other files.
+    None of the programs that are read here writes one.
+
+    Parameters
+    ----------
+    text : str
+        The document; its size is bounded where it was read.
+    where : str
+        For messages: what was read, and what it should be.
+
+    Raises
+    ------
+    InputError
+        A document type, or no well-formed XML.
+    """
+    if "<!DOCTYPE" in text:
+        raise InputError(f"{where} (a document type, which is refused)")
+    try:
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"{where} ({' '.join(str(error).split())[-80:]})") from None
 
 
 def _unreadable(path: Path, reason: str) -> InputError:

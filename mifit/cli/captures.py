@@ -78,32 +78,30 @@ def _synth_scan(arguments: Namespace) -> None:
 
 def import_(arguments: Namespace) -> None:
     """Make a capture from other files."""
-    if arguments.digital_emily is not None:
-        from mifit.capture.digital_emily import import_digital_emily
+    from mifit.capture import import_capture
+    from mifit.extras.importers import KINDS, REGISTRATIONS, import_from
+
+    sources = {name: getattr(arguments, name) for name in ("calibration", "transforms", *KINDS, "digital_emily")}
+    given = [name for name, path in sources.items() if path is not None]
+    if len(given) > 1:
+        raise InputError(f"found more than one of {', '.join(given)}, expected one")
+    kind = given[0] if given else None
+    if arguments.photos is not None and kind not in REGISTRATIONS:
+        raise InputError(f"photos: found without a model to go with, expected one of {', '.join(REGISTRATIONS)}")
+    if kind == "digital_emily":
+        from mifit.extras.digital_emily import import_digital_emily
 
         import_digital_emily(arguments.digital_emily, arguments.out)
         print(f"Capture: {arguments.out}; it has no landmarks yet: mifit landmarks {arguments.out}")
         return
-    from mifit.capture import import_capture
-
-    import_capture(
-        arguments.out,
-        videos=arguments.video,
-        calibration=arguments.calibration,
-        images=arguments.images,
-        colmap=arguments.colmap,
-        transforms=arguments.transforms,
-        metashape=arguments.metashape,
-        realitycapture=arguments.realitycapture,
-        vhap=arguments.vhap,
-        nersemble=arguments.nersemble,
-        photos=arguments.photos,
-        every=arguments.every,
-        start=arguments.start,
-        count=arguments.count,
-        units=arguments.units,
-        progress=console_progress(arguments.quiet),
-    )
+    options = {name: getattr(arguments, name) for name in ("images", "every", "start", "count", "units")} | {
+        "videos": arguments.video,
+        "progress": console_progress(arguments.quiet),
+    }
+    if kind in KINDS:
+        import_from(kind, sources[kind], arguments.out, photos=arguments.photos, **options)
+    else:
+        import_capture(arguments.out, calibration=arguments.calibration, transforms=arguments.transforms, **options)
     print(f"Capture: {arguments.out}")
 
 

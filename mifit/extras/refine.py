@@ -1,7 +1,7 @@
-"""``mifit.refine``: maps, lighting and normals anew, from more frames of a video than were fitted jointly.
+"""``mifit.refine``: surface, maps, lighting and normals anew, from more frames of a video than were fitted jointly.
 
 Frames that lie far apart in pose are chosen, the face is followed into them, those that contradict the fit are left out
-by name, and stages 2 and 3 run again with all of them. At most `MOST` frames enter, however long the video is.
+by name, and all stages after the model's fit run again with them. At most `MOST` frames enter, however long the video.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from mifit.core.estimate import GeometryEstimate
 from mifit.core.threads import one_blas_thread
 from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
+from mifit.stages.eyes import behind_lids
 from mifit.stages.find_residual import find_residual
+from mifit.stages.find_surface import find_surface
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.normals.mesh_refinement import refine_mesh
 from mifit.stages.normals.normal_refinement import refine_normals
@@ -43,7 +45,7 @@ def refine(
     seed: int = 0,
     progress: Progress = silent,
 ) -> Reconstruction:
-    """Find maps, lighting and normals of a result anew, from further frames too.
+    """Find surface, maps, lighting and normals of a result anew, from further frames too.
 
     Parameters
     ----------
@@ -60,9 +62,9 @@ def refine(
     Returns
     -------
     Reconstruction
-        With the timesteps that were fitted jointly; tracked ones, whose normals belong to the old maps, are to be
-        tracked again. ``reflectance.report.details["refined"]`` says which frames entered and which were left out, and
-        why.
+        With the timesteps that were fitted jointly; tracked ones, which belong to the old surface and maps, are to be
+        tracked again. A fit in the model's span stays there. ``reflectance.report.details["refined"]`` says which
+        frames entered and which were left out, and why.
 
     Raises
     ------
@@ -83,6 +85,9 @@ def refine(
     chosen = choose_frames(capture, names, MOST - len(fitted), further, fitted) if further else None
     left_out = {} if chosen is None else {t: why for t, why in chosen.left_out.items() if t in further}
     geometry, failed = _followed(result, capture, () if chosen is None else chosen.timesteps, config, seed, progress)
+    if geometry.displacement is not None:
+        found = find_surface(capture, model, geometry, names, config.surface, progress, config.geometry)
+        geometry = behind_lids(model, found)
     reflectance = infer_reflectance(capture, model, geometry, names, config.reflectance, seed, progress)
     refined = {
         "timesteps": list(geometry.timesteps),
@@ -97,7 +102,7 @@ def refine(
         details={**reflectance.report.details, "refined": refined},
     )
     reflectance = replace(reflectance, report=report)
-    home = result.geometry.at(fitted)
+    home = geometry.at(fitted)
     normals = refine_normals(capture, model, home, reflectance, names, config.normals, seed=seed, progress=progress)
     mesh = refine_mesh(model, home, normals, config.mesh, progress) if result.mesh is not None else None
     residual = None

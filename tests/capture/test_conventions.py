@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mifit.capture.colmap import read_colmap, write_colmap
 from mifit.capture.lens import Undistortion, project_distorted, undistort_points
 from mifit.capture.stereo import read_stereo, write_stereo
 from mifit.capture.transforms import Shot, View, read_transforms, write_transforms
 from mifit.core.camera import Camera
 from mifit.errors import InputError
+from mifit.extras.colmap import read_colmap
+from tests.extras.photogrammetry import write_colmap
 
 POINTS = np.random.default_rng(1).uniform(-9, 9, (60, 3))
 LENSES = [

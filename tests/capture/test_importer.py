@@ -11,10 +11,11 @@ import pytest
 from PIL import Image as Pillow
 
 from mifit.capture import Capture, import_capture
-from mifit.capture.colmap import write_colmap
 from mifit.capture.stereo import write_stereo
 from mifit.core.image import read_image
 from mifit.errors import InputError
+from mifit.extras.importers import import_from
+from tests.extras.photogrammetry import write_colmap
 
 
 def write_video(path: Path, frames: int = 6, size: tuple[int, int] = (64, 48), rate: float = 25.0) -> Path:
@@ -123,16 +124,15 @@ def test_numbers_in_names_give_the_order(tmp_path: Path) -> None:
 def test_colmap_model_with_its_images(tmp_path: Path, folder: Path) -> None:
     original = Capture.load(folder)
     write_colmap(folder / "sparse" / "0", [(original.camera(n), f"{n}/0000.png") for n in original.cameras])
-    capture = Capture.load(import_capture(tmp_path / "out", colmap=folder / "sparse" / "0"))
+    capture = Capture.load(import_from("colmap", folder / "sparse" / "0", tmp_path / "out"))
     assert (capture.cameras, capture.timesteps) == (("left", "right"), (0,))
     points = np.random.default_rng(0).normal(size=(20, 3)) * 5
     for name in original.cameras:
         np.testing.assert_allclose(
             capture.camera(name).project(points), original.camera(name).project(points), atol=1e-3
         )
-    both = import_capture(
-        tmp_path / "b", images=[folder / "images/left", folder / "images/right"], colmap=folder / "sparse" / "0"
-    )
+    images = [folder / "images/left", folder / "images/right"]
+    both = import_from("colmap", folder / "sparse" / "0", tmp_path / "b", images=images)
     assert Capture.load(both).timesteps == (0, 1)
 
 
@@ -156,20 +156,17 @@ def test_bad_imports(tmp_path: Path, folder: Path, pair: list[Path]) -> None:
     out = tmp_path / "out"
     (tmp_path / "empty").mkdir()
     original = Capture.load(folder)
-    write_colmap(tmp_path / "model", [(original.camera("left"), "left/0000.png")])
     write_stereo(tmp_path / "pair.yml", original.camera("left"), original.camera("right"))
     for options, message in (
         ({}, "nothing to import"),
         ({"videos": pair, "images": [left]}, "found videos and folders of images"),
-        ({"images": [left], "calibration": "a.yml", "colmap": "b"}, "found more than one of calibration"),
+        ({"images": [left], "calibration": "a.yml", "transforms": "b"}, "found more than one of calibration"),
         ({"images": [left], "calibration": tmp_path / "pair.yml"}, "describes two cameras, but 1 are given"),
         ({"images": [left, right], "calibration": tmp_path / "none.yml"}, "none.yml: no such calibration file"),
         (
             {"videos": pair, "calibration": tmp_path / "pair.yml"},
             "calibrated for 48 x 32 pixels, but the im",
         ),
-        ({"images": [left, right], "colmap": tmp_path / "model"}, "has cameras left, expected one called 'right'"),
-        ({"colmap": tmp_path / "model"}, "left.0000.png: no such image"),
         ({"images": [tmp_path / "empty"]}, "empty: found no image"),
         ({"images": [tmp_path / "none"]}, "none: no such folder"),
         ({"images": [left], "start": 2}, "start: found 2, expected less than the 2 frames"),
@@ -178,6 +175,12 @@ def test_bad_imports(tmp_path: Path, folder: Path, pair: list[Path]) -> None:
     ):
         with pytest.raises(InputError, match=message):
             import_capture(out, **options)
+        assert not out.exists()
+    write_colmap(tmp_path / "model", [(original.camera("left"), "left/0000.png")])
+    other, gone = "has cameras left, expected one called 'right'", "left.0000.png: no such image"
+    for images, message in (([left, right], other), ([], gone)):
+        with pytest.raises(InputError, match=message):
+            import_from("colmap", tmp_path / "model", out, images=images)
         assert not out.exists()
     with pytest.raises(InputError, match="is there already and not empty"):
         import_capture(folder, images=[left])

@@ -14,7 +14,6 @@ import cv2
 import pytest
 
 from mifit.capture import Capture
-from mifit.capture.colmap import write_colmap
 from mifit.capture.stereo import write_stereo
 from mifit.cli import build_parser, main
 from mifit.config import read_toml
@@ -24,6 +23,7 @@ from mifit.extras.boards import Board
 from mifit.output.views import write_video
 from tests.capture import photogrammetry
 from tests.extras.board_video import Studio, pair, poses
+from tests.extras.photogrammetry import write_colmap
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

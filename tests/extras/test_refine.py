@@ -134,6 +134,19 @@ def test_a_frame_without_a_face_is_left_out_by_name(scene, result, quick, monkey
     assert quick["reflectance"].timesteps == (0, 1, 2, 4, 5) and quick["normals"].timesteps == (0, 1)
 
 
+def test_the_surface_is_found_from_all_frames_where_the_fit_has_one(scene, result, quick, monkeypatch):
+    def find(capture, model, geometry, names, config, progress, geometry_config):
+        assert geometry.timesteps == tuple(range(FRAMES)) and tuple(names) == CAMERAS
+        return replace(geometry, displacement=geometry.displacement + np.float32(0.1))
+
+    monkeypatch.setattr(module, "find_surface", find)
+    assert refine(result, scene).geometry.displacement is None
+    beyond = replace(result.geometry, displacement=np.zeros_like(scene.model.mean))
+    found = refine(replace(result, geometry=beyond), scene)
+    assert (found.geometry.displacement == np.float32(0.1)).all() and found.timesteps == (0, 1)
+    assert quick["reflectance"].displacement is quick["normals"].displacement is found.geometry.displacement
+
+
 def test_the_choice_is_of_what_is_asked_for_and_says_what_it_left_out(scene, result, quick, asked, monkeypatch):
     monkeypatch.setattr(scene, "timesteps", tuple(range(9)))
     found = refine(result, scene, (7, 5, 2))

@@ -13,11 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mifit.capture import Capture
-from mifit.capture.colmap import read_colmap, write_colmap
 from mifit.capture.landmark_files import read_landmarks
 from mifit.capture.stereo import read_stereo, write_stereo
 from mifit.core.camera import Camera
 from mifit.core.image import MAX_PIXELS, encode_png, image_size, load_image, write_image
+from mifit.extras.colmap import read_colmap
+from tests.extras.photogrammetry import write_colmap
 from tests.fuzz.conftest import NASTY, as_json, bounded, read_or_refuse, spoilt_bytes, spoilt_documents
 
 POSE = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 60.0], [0, 0, 0, 1]]

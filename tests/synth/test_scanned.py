@@ -11,10 +11,10 @@ import trimesh
 
 from benchmarks import scan
 from mifit.capture import Capture
-from mifit.capture.digital_emily import import_digital_emily, read_camera
 from mifit.cli import main
 from mifit.core.image import read_image, write_image
 from mifit.errors import InputError
+from mifit.extras.digital_emily import import_digital_emily, read_camera
 from mifit.morphable import MorphableModel
 from mifit.synth import head as heads
 from mifit.synth.scanned import ScannedHead, rigid_motion

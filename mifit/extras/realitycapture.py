@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mifit.capture.photos import Photo, local, opencv_lens, parse_numbers, view_name
+from mifit.capture.opencv_nodes import parse_xml
 from mifit.capture.transforms import View, invert_pose, nearest_rotation
-from mifit.capture.xml_text import parse_xml
 from mifit.core.camera import OPENGL_FROM_OPENCV
 from mifit.core.files import read_text
 from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_SETTINGS_BYTES
 from mifit.errors import InputError
+from mifit.extras.photos import Photo, local, opencv_lens, parse_numbers, view_name
 
 FILM = 36.0
 """Millimetres that focal lengths refer to."""

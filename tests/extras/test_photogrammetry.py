@@ -13,18 +13,33 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mifit.capture import Capture, import_capture
-from mifit.capture.colmap import read_colmap
-from mifit.capture.metashape import read_metashape
-from mifit.capture.nersemble import read_nersemble
-from mifit.capture.realitycapture import read_realitycapture
+from mifit.capture import Capture
 from mifit.cli import main
 from mifit.core.camera import Camera
 from mifit.errors import InputError
-from tests.capture import photogrammetry as write
+from mifit.extras.colmap import read_colmap
+from mifit.extras.importers import KINDS, import_from
+from mifit.extras.metashape import read_metashape
+from mifit.extras.nersemble import read_nersemble
+from mifit.extras.realitycapture import read_realitycapture
+from tests.capture.conftest import write_capture
+from tests.extras import photogrammetry as write
 from tests.refused import refused
 
 SIZE = (64, 48)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_capture(tmp_path / "capture")
+
+
+def imported(out: Path, **options) -> Path:
+    """`import_from` with its source as an option called after its kind."""
+    (kind,) = (name for name in options if name in KINDS)
+    return import_from(kind, options.pop(kind), out, **options)
+
+
 LENSES = [(), (-0.21, 0.08, 0.001, -0.002), (-0.21, 0.08, 0.001, -0.002, 0.03)]
 
 
@@ -80,7 +95,7 @@ def test_a_known_capture_comes_back(tmp_path: Path, program: str, lens: tuple[fl
         options = {"realitycapture": write.write_csv(tmp_path / "a.csv", photos), "photos": tmp_path / "in"}
     else:
         options = {"colmap": write.write_colmap_binary(tmp_path / "in" / "sparse" / "0", photos)}
-    capture = Capture.load(import_capture(tmp_path / "out", **options))
+    capture = Capture.load(imported(tmp_path / "out", **options))
     assert_same_cameras(stored(capture), cameras)
     assert capture.units == ("cm" if program == "colmap" else "m")
     assert capture.timesteps == (0,)
@@ -125,14 +140,14 @@ def test_a_moving_camera_is_many_cameras_and_a_fixed_one_keeps_its_timesteps(tmp
     for chosen, names, steps in ((moving, ("a", "b"), (0,)), (fixed, ("left",), (0, 1))):
         model = write.write_colmap_binary(tmp_path / "sparse", chosen)
         out = tmp_path / "-".join(names)
-        capture = Capture.load(import_capture(out, colmap=model))
+        capture = Capture.load(imported(out, colmap=model))
         assert (capture.cameras, capture.timesteps) == (names, steps)
     assert_same_cameras(stored(capture), [Camera("left", *SIZE, 141.25, 139.5, 31.3, 25.9, cameras[2].world_to_camera)])
 
 
 def test_vhap(tmp_path: Path, folder: Path) -> None:
     original = Capture.load(folder)
-    capture = Capture.load(import_capture(tmp_path / "out", vhap=write.write_vhap(tmp_path / "v", folder)))
+    capture = Capture.load(imported(tmp_path / "out", vhap=write.write_vhap(tmp_path / "v", folder)))
     assert (capture.units, capture.cameras, capture.timesteps) == ("m", original.cameras, original.timesteps)
     assert_same_cameras(stored(capture), stored(original))
     ours, theirs = capture.frame("right", 1), original.frame("right", 1)
@@ -168,7 +183,7 @@ def test_nersemble(tmp_path: Path, layout: str) -> None:
             for _ in range(2):
                 writer.write(np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
             writer.release()
-    capture = Capture.load(import_capture(tmp_path / "out", nersemble=sequence))
+    capture = Capture.load(imported(tmp_path / "out", nersemble=sequence))
     assert (capture.units, capture.timesteps) == ("m", (0, 1))
     assert_same_cameras(stored(capture), cameras)
     if layout == "vhap":
@@ -181,7 +196,7 @@ def test_videos_with_a_photogrammetric_calibration(tmp_path: Path) -> None:
     for camera in cameras:
         make_photos(tmp_path / camera.name, [Camera(str(t), *SIZE, 1, 1, 0, 0, np.eye(4)) for t in range(3)])
     model = write.write_metashape(tmp_path / "c.xml", [(camera, f"{camera.name}.png") for camera in cameras])
-    out = import_capture(
+    out = imported(
         tmp_path / "out", images=[tmp_path / camera.name for camera in cameras], metashape=model, units="cm"
     )
     capture = Capture.load(out)
@@ -369,10 +384,9 @@ def test_bad_data_sets(tmp_path: Path, folder: Path) -> None:
     for options, message in (
         ({"vhap": vhap, "images": [vhap / "images"]}, "vhap: brings its own images"),
         ({"vhap": vhap, "photos": vhap}, "photos: found without a model"),
-        ({"vhap": vhap, "nersemble": vhap}, "found more than one of vhap, nersemble"),
     ):
         with pytest.raises(InputError, match=message):
-            import_capture(out, **options)
+            imported(out, **options)
         assert not out.exists()
 
 
@@ -380,16 +394,16 @@ def test_photographs_that_are_missing_or_alike(tmp_path: Path) -> None:
     cameras = make_cameras()
     model = write.write_colmap_binary(tmp_path / "m", [(c, f"{c.name}.png") for c in cameras])
     with pytest.raises(InputError, match=r"c0\.png: no such image; expected it there or in 'images'"):
-        import_capture(tmp_path / "out", colmap=model, photos=tmp_path / "none")
+        imported(tmp_path / "out", colmap=model, photos=tmp_path / "none")
     for folder in ("a", "b"):
         make_photos(tmp_path / "m" / folder, cameras)
     names = ("a/c0.png", "a/c1.png", "b/c0.png", "b/c1.png")
     write.write_colmap_binary(model, zip([*cameras, cameras[0]], names, strict=True))
     with pytest.raises(InputError, match="another one is called 'c0' too"):
-        import_capture(tmp_path / "out", colmap=model)
+        imported(tmp_path / "out", colmap=model)
     shutil.rmtree(tmp_path / "m" / "b")
     write.write_colmap_binary(model, [(cameras[0], "../../etc/a/c0.png"), (cameras[1], "/etc/c1.png")])
     Image.new("RGB", SIZE).save(tmp_path / "m" / "c0.png")
     Image.new("RGB", SIZE).save(tmp_path / "m" / "c1.png")
-    capture = Capture.load(import_capture(tmp_path / "out", colmap=model))  # found by name, never outside the folders
+    capture = Capture.load(imported(tmp_path / "out", colmap=model))  # found by name, never outside the folders
     assert set(capture.cameras) == {"a", "etc"}

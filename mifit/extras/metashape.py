@@ -14,12 +14,12 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.capture.photos import Photo, local, opencv_lens, parse_numbers, view_name
+from mifit.capture.opencv_nodes import parse_xml
 from mifit.capture.transforms import View, invert_pose
-from mifit.capture.xml_text import parse_xml
 from mifit.core.files import read_text
 from mifit.core.limits import MAX_PIXELS, MAX_XML_BYTES
 from mifit.errors import InputError
+from mifit.extras.photos import Photo, local, opencv_lens, parse_numbers, view_name
 
 COEFFICIENTS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 
