@@ -27,7 +27,7 @@ from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import vertex_sum_matrix
 from mifit.morphable import MorphableModel
 from mifit.morphable.register import distance_to_surface
-from mifit.solve import minimize
+from mifit.optim import minimize
 from mifit.stages.fit_geometry import fit_geometry
 from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.normal import NormalEquations, prior_energy
@@ -316,7 +316,7 @@ def value_and_gradient(problem: Any, x: np.ndarray) -> tuple[float, np.ndarray]:
 
 def shares(profile: cProfile.Profile) -> dict[str, float]:
     """Time by kind: linear algebra, shading (residuals and their derivatives), all else."""
-    algebra = ("solve/systems", "geometry/normal", "scipy/linalg", "scipy/sparse", "_sparsetools", "numpy/linalg")
+    algebra = ("optim/systems", "geometry/normal", "scipy/linalg", "scipy/sparse", "_sparsetools", "numpy/linalg")
     shading = (
         "geometry/rendering",
         "geometry/images",

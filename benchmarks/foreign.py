@@ -35,7 +35,7 @@ from benchmarks.record import RESULTS, SHARED, record
 from mifit import Capture, FitConfig, MorphableModel, Reconstruction
 from mifit.core.files import write_text
 from mifit.core.image import write_image
-from mifit.core.threads import set_threads, threads
+from mifit.core.process import set_threads, threads
 from mifit.errors import MifitError
 from mifit.render.image_based import image_based
 

@@ -21,8 +21,8 @@ import mifit
 from benchmarks.foreign import ICT
 from benchmarks.record import SHARED
 from mifit import Capture, MorphableModel, Reconstruction
+from mifit.core.estimate import hidden
 from mifit.core.image import srgb_to_linear, to_8_bit, write_image
-from mifit.core.labels import hidden
 from mifit.stages.observations import Surface
 
 CAMERAS, TIMESTEPS = ("left", "right"), (0, 1, 2, 3)

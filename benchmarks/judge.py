@@ -14,10 +14,9 @@ from benchmarks import scan
 from benchmarks.truth import angle
 from mifit import Capture, Reconstruction
 from mifit.core.camera import Camera
-from mifit.core.flip import flip
 from mifit.core.image import srgb_to_linear, to_8_bit
 from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.metrics import psnr_from_rmse, ssim
+from mifit.core.metrics import flip, psnr_from_rmse, ssim
 from mifit.core.uv import sample_map
 from mifit.render.image_based import image_based
 

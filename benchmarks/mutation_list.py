@@ -8,7 +8,7 @@ from benchmarks.mutations import Mutation as M
 CORE = "mifit/core/*.py"
 CAPTURE = "mifit/capture/*.py"
 STAGES = "mifit/stages/**/*.py"
-SOLVE = "mifit/solve/*.py"
+SOLVE = "mifit/optim/*.py"
 OUTPUT = "mifit/output/*.py"
 RENDER = "mifit/render/*.py"
 EXTRAS = "mifit/extras/**/*.py"
@@ -143,15 +143,15 @@ GEOMETRY = [
     M("the elimination of point colours left out", STAGES, r"system\.dense\(\) - rows\.T @ rows", "system.dense()",
       "tests/stages/test_geometry_terms.py"),
     M("Geman and McClure's weight not squared", SOLVE, r"return squared \* q, q \* q", "return squared * q, q",
-      "tests/solve/test_solve.py"),
+      "tests/optim/test_solve.py"),
     M("Huber's weight 1 everywhere", SOLVE, r"np\.where\(beyond, scale / np\.where\(beyond, r, 1\.0\), 1\.0\)",
-      "np.ones_like(r)", "tests/solve/test_solve.py"),
+      "np.ones_like(r)", "tests/optim/test_solve.py"),
     M("a step that raises the energy is taken", SOLVE, r"if ratio >= self\.minimum_ratio:.*", "if ratio >= -10.0:",
-      "tests/solve/test_solve.py"),
+      "tests/optim/test_solve.py"),
     M("the damping grows with good steps", SOLVE, r"1\.0 - \(2\.0 \* ratio - 1\.0\) \*\* 3", "1.0 + (2.0 * ratio - 1.0) ** 3",
-      "tests/solve/test_solve.py"),
+      "tests/optim/test_solve.py"),
     M("running out of iterations called converged", SOLVE, r"system, outcome = acceptance\.initial_size, None, Outcome\.MAX_ITERATIONS",
-      "system, outcome = acceptance.initial_size, None, Outcome.CONVERGED", "tests/solve/test_solve.py"),
+      "system, outcome = acceptance.initial_size, None, Outcome.CONVERGED", "tests/optim/test_solve.py"),
     M("the resume key without stage 2", "mifit/steps.py", r'"settings": \[\[type\(s\)\.__name__, dataclasses\.asdict\(s\)\] for s in step\.settings\],',
       '"settings": [] if step.part == "reflectance" else [dataclasses.asdict(s) for s in step.settings],',
       "tests/test_pipeline.py"),

@@ -22,9 +22,8 @@ from benchmarks.record import RESULTS, SHARED, record
 from benchmarks.truth import angle, bumped_normals
 from mifit import Capture, Reconstruction, set_variant
 from mifit.config import MeshConfig, NormalsConfig
-from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
-from mifit.core.mesh_update import interior_vertices
-from mifit.core.subdivision import split_faces
+from mifit.core.mesh import face_cross, interpolate, normalize, split_faces, vertex_normals
+from mifit.core.mesh_solve import interior_vertices
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.output.evaluate import evaluate
 from mifit.stages.normals.mesh_refinement import refine_mesh

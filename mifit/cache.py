@@ -23,10 +23,10 @@ import numpy as np
 
 from mifit.appearance.illumination import Illumination, light_from
 from mifit.appearance.lobe import Lobe
+from mifit.core.arrays import read_npz
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import Report
 from mifit.core.files import replacing
-from mifit.core.npz import read_npz
 
 T = TypeVar("T")
 RECORDS: dict[str, type] = {cls.__name__: cls for cls in (Report, Diagnostic, Illumination, Lobe)}

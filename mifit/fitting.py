@@ -43,7 +43,7 @@ from mifit.core.estimate import (
     ReflectanceEstimate,
     ResidualEstimate,
 )
-from mifit.core.threads import one_blas_thread
+from mifit.core.process import one_blas_thread
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
 from mifit.reconstruction import Reconstruction

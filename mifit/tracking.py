@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, from_mapping
+from mifit.core.arrays import Rows
 from mifit.core.estimate import NormalsEstimate, Report
-from mifit.core.rows import Rows
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
 from mifit.result.ownership import locked
@@ -67,7 +67,7 @@ def track_into(
     The files of a frame are written before ``result.json`` names it, and ``result.json`` is replaced as a whole, so
     a run that is killed leaves a folder with the frames finished so far. Frames depend on those before alone:
     going on later gives what an uninterrupted run gives. Meshes and normals of a long sequence lie in a file that is
-    mapped (`core.rows`), so that memory doesn't grow with the frames.
+    mapped (`core.arrays`), so that memory doesn't grow with the frames.
     """
     if result.reflectance is None:
         raise InputError(f"{folder}: found a result without reflectance, expected one of 'mifit fit' with all stages")

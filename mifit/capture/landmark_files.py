@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.arrays import read_npy
 from mifit.core.files import read_bytes, read_text, write_text
 from mifit.core.limits import MAX_SETTINGS_BYTES
-from mifit.core.npz import read_npy
 from mifit.errors import InputError
 
 COUNT = 68

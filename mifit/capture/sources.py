@@ -16,7 +16,7 @@ import numpy as np
 from mifit.core.files import check_file, read_bytes
 from mifit.core.image import SUFFIXES, decode_image, encode_png, image_kind, load_image
 from mifit.core.limits import MAX_IMAGE_BYTES, MAX_PIXELS, MAX_VIDEO_BYTES, MAX_VIDEO_FRAMES
-from mifit.core.quiet import decoding
+from mifit.core.process import decoding
 from mifit.errors import InputError
 
 

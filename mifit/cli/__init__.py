@@ -15,8 +15,8 @@ import mifit
 from mifit.cli import captures, fits, results, setup
 from mifit.cli.arguments import Command, Parser, common_options, one_line
 from mifit.cli.console import drop_chatter
-from mifit.core.allocator import keep_freed_memory
 from mifit.core.files import FULL
+from mifit.core.process import keep_freed_memory
 from mifit.errors import InputError, MifitError
 
 
@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             drop_chatter()
     try:
         if arguments.threads:
-            from mifit.core.threads import set_threads
+            from mifit.core.process import set_threads
 
             set_threads(arguments.threads)
         code = arguments.run(arguments) or 0

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from typing import TextIO
 
-from mifit.core.quiet import set_decoding_context
+from mifit.core.process import set_decoding_context
 from mifit.progress import Progress, silent
 
 LINE_SECONDS = 5.0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,7 +28,7 @@ class Report:
     Attributes
     ----------
     outcome : str
-        ``"converged"``, ``"max_iterations"``, ``"diverged"`` or another value of ``solve.Outcome``.
+        ``"converged"``, ``"max_iterations"``, ``"diverged"`` or another value of ``optim.Outcome``.
     energies : dict of str to list of float
         Energy per term over the iterations (same length each).
     seconds : float
@@ -162,7 +163,7 @@ class ReflectanceEstimate:
     shading_model : str
         How maps and lighting make an image: a name of ``appearance.models``.
     labels : tuple of (H, W) uint8
-        What each image of the fit shows (`core.labels.Label`); empty where that wasn't looked for.
+        What each image of the fit shows (`core.estimate.Label`); empty where that wasn't looked for.
     labelled : tuple of (camera, timestep)
         Of which image each of ``labels`` is.
     relief : (S, S) float32 or None
@@ -265,3 +266,24 @@ class MeshEstimate:
     def subdivisions(self) -> int:
         """Times that every face of the model was split into four."""
         return int(self.report.details["subdivisions"])
+
+
+class Label(IntEnum):
+    """Grey value of each kind of pixel in a mask's file; those above mid-grey are used, as in ``mask_path``."""
+
+    BACKGROUND = 0
+    OCCLUDER = 32
+    CLOTH = 64
+    HAIR = 96
+    MOUTH = 160
+    EYES = 208
+    SKIN = 255
+
+
+HIDDEN = (Label.OCCLUDER, Label.CLOTH, Label.HAIR)
+"""What hides the face."""
+
+
+def hidden(labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Pixels (H, W) at which something hides the face."""
+    return np.isin(labels, HIDDEN)

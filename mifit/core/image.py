@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mifit.core.files import read_bytes, write_bytes
 from mifit.core.limits import MAX_DECODED_BYTES, MAX_IMAGE_BYTES, MAX_PIXELS
-from mifit.core.quiet import decoding
+from mifit.core.process import decoding
 from mifit.errors import InputError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".hdr")

@@ -1,4 +1,11 @@
-"""Image error measures over a region of pixels."""
+"""Image error measures over a region of pixels: RMSE, PSNR, SSIM and FLIP.
+
+FLIP: FLIP: how different two images look when one flips between them (Andersson et al. 2020).
+
+The measure for images of standard range: colours are blurred by the eye's contrast sensitivity and compared where
+they are perceptually even, and edges and points are compared beside them, because they draw the eye. It needs no
+trained weights. Constants are the paper's.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +13,9 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import correlate1d, gaussian_filter
 
+from mifit.core.image import srgb_to_linear
 from mifit.errors import InputError
 
 
@@ -85,3 +93,146 @@ def checked_pair(image: NDArray, reference: NDArray, mask: NDArray | None) -> tu
     if not region.any():
         raise InputError("image metric: the region is empty, expected at least one pixel")
     return a, b, region
+
+
+PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
+"""The paper's viewing conditions: a screen 0.7 m wide with 3840 pixels across, seen from 0.7 m."""
+
+# Contrast sensitivity of the channels Y, Cx, Cz as sums of Gaussians in degrees: pairs (a, b) of
+# a sqrt(pi / b) exp(-pi^2 x^2 / b).
+SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
+FEATURE_DEGREES = 0.082
+COLOUR_EXPONENT, FEATURE_EXPONENT = 0.7, 0.5
+KNEE, KNEE_ERROR = 0.4, 0.95
+"""Colour differences up to 0.4 of the largest are spread over errors up to 0.95."""
+
+XYZ_FROM_RGB = np.array(
+    [
+        [0.4123907992659595, 0.357584339383878, 0.1804807884018343],
+        [0.2126390058715103, 0.715168678767756, 0.0721923153607337],
+        [0.0193308187155918, 0.119194779794626, 0.9505321522496607],
+    ]
+)
+RGB_FROM_XYZ = np.linalg.inv(XYZ_FROM_RGB)
+WHITE = XYZ_FROM_RGB.sum(axis=1)
+
+
+def flip(
+    image: NDArray,
+    reference: NDArray,
+    mask: NDArray | None = None,
+    peak: float = 255.0,
+    pixels_per_degree: float = PIXELS_PER_DEGREE,
+) -> float:
+    """Mean FLIP error over a region: 0 for equal images, at most 1.
+
+    Parameters
+    ----------
+    image, reference : (H, W, 3) or (H, W)
+        sRGB codes, 0..peak.
+    mask : (H, W) bool, optional
+        Region; the whole image by default. As the eye's blur does, a pixel's error depends on its neighbours, also
+        on those outside the region.
+    peak : float
+        Code of white.
+    pixels_per_degree : float
+        Pixels that a degree of the field of view holds.
+
+    Raises
+    ------
+    InputError
+        Shapes differ, or the region is empty.
+    """
+    a, b, region = checked_pair(image, reference, mask)
+    margin = len(_sensitivity_support(pixels_per_degree)) // 2  # no filter reaches further
+    box = tuple(
+        slice(max(inside[0] - margin, 0), inside[-1] + margin + 1)
+        for inside in (np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0)))
+    )
+    return float(flip_map(a[box] / peak, b[box] / peak, pixels_per_degree)[region[box]].mean())
+
+
+def flip_map(image: NDArray, reference: NDArray, pixels_per_degree: float = PIXELS_PER_DEGREE) -> NDArray[np.float64]:
+    """(H, W) FLIP error of every pixel, 0..1, of two sRGB images with values 0..1; see `flip`."""
+    a, b = (_opponent(x) for x in (image, reference))
+    return _colour_error(a, b, pixels_per_degree) ** (1.0 - _feature_error(a[..., 0], b[..., 0], pixels_per_degree))
+
+
+def _opponent(srgb: NDArray) -> NDArray[np.float64]:
+    """SRGB 0..1 -> YCxCz, linear opponent colours."""
+    rgb = srgb if srgb.ndim == 3 else np.repeat(srgb[..., None], 3, axis=-1)
+    x, y, z = np.moveaxis(srgb_to_linear(np.clip(rgb, 0.0, 1.0)) @ (XYZ_FROM_RGB / WHITE[:, None]).T, -1, 0)
+    return np.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], axis=-1)
+
+
+def _blurred(opponent: NDArray, pixels_per_degree: float) -> NDArray[np.float64]:
+    """YCxCz after the eye's contrast sensitivity -> linear RGB within the display's range."""
+    x = _sensitivity_support(pixels_per_degree) / pixels_per_degree
+    out = np.zeros_like(opponent)
+    for c, channel in enumerate(SENSITIVITY):
+        total = 0.0
+        for a, b in channel:
+            kernel = np.exp(-((math.pi * x) ** 2) / b)
+            weight = a * math.sqrt(math.pi / b)
+            out[..., c] += weight * _separable(opponent[..., c], kernel, kernel)
+            total += weight * kernel.sum() ** 2
+        out[..., c] /= total
+    y = (out[..., 0] + 16.0) / 116.0
+    xyz = np.stack([y + out[..., 1] / 500.0, y, y - out[..., 2] / 200.0], axis=-1) * WHITE
+    return np.clip(xyz @ RGB_FROM_XYZ.T, 0.0, 1.0)
+
+
+def _hunt_lab(linear: NDArray) -> NDArray[np.float64]:
+    """Linear RGB -> CIELAB whose colourfulness grows with lightness, as the eye's does (Hunt)."""
+    t = linear @ (XYZ_FROM_RGB / WHITE[:, None]).T
+    d = 6.0 / 29.0
+    fx, fy, fz = np.moveaxis(np.where(t > d**3, np.cbrt(t), t / (3.0 * d**2) + 4.0 / 29.0), -1, 0)
+    lightness = 116.0 * fy - 16.0
+    return np.stack([lightness, 5.0 * lightness * (fx - fy), 2.0 * lightness * (fy - fz)], axis=-1)
+
+
+def _hyab(a: NDArray, b: NDArray) -> NDArray[np.float64]:
+    """Distance of colours that stays meaningful when they are far apart."""
+    d = a - b
+    return np.abs(d[..., 0]) + np.hypot(d[..., 1], d[..., 2])
+
+
+def _colour_error(a: NDArray, b: NDArray, pixels_per_degree: float) -> NDArray[np.float64]:
+    found = _hyab(*(_hunt_lab(_blurred(x, pixels_per_degree)) for x in (a, b))) ** COLOUR_EXPONENT
+    largest = float(_hyab(_hunt_lab(np.array([0.0, 1.0, 0.0])), _hunt_lab(np.array([0.0, 0.0, 1.0]))))
+    largest **= COLOUR_EXPONENT
+    knee = KNEE * largest
+    above = KNEE_ERROR + (found - knee) / (largest - knee) * (1.0 - KNEE_ERROR)
+    return np.clip(np.where(found < knee, found * KNEE_ERROR / knee, above), 0.0, 1.0)
+
+
+def _feature_error(a: NDArray, b: NDArray, pixels_per_degree: float) -> NDArray[np.float64]:
+    """Difference in edges and points of lightness."""
+    sigma = 0.5 * FEATURE_DEGREES * pixels_per_degree
+    x = _support(3.0 * sigma)
+    blur = np.exp(-(x**2) / (2.0 * sigma**2))
+    difference = np.zeros(a.shape)
+    for profile in (-x * blur, (x**2 / sigma**2 - 1.0) * blur):
+        balanced = np.where(profile > 0, profile / profile[profile > 0].sum(), -profile / profile[profile < 0].sum())
+        strength = []
+        for image in (a, b):
+            y = (image + 16.0) / 116.0
+            smooth = blur / blur.sum()
+            strength.append(np.hypot(_separable(y, smooth, balanced), _separable(y, balanced, smooth)))
+        difference = np.maximum(difference, np.abs(strength[0] - strength[1]))
+    return np.clip(difference / math.sqrt(2.0), 0.0, 1.0) ** FEATURE_EXPONENT
+
+
+def _sensitivity_support(pixels_per_degree: float) -> NDArray[np.float64]:
+    widest = max(b for channel in SENSITIVITY for _, b in channel)
+    return _support(3.0 * math.sqrt(widest / (2.0 * math.pi**2)) * pixels_per_degree)
+
+
+def _support(radius: float) -> NDArray[np.float64]:
+    """Pixel offsets of a kernel that reaches ``radius`` pixels."""
+    r = math.ceil(radius)
+    return np.arange(-r, r + 1, dtype=np.float64)
+
+
+def _separable(image: NDArray, rows: NDArray, columns: NDArray) -> NDArray[np.float64]:
+    return correlate1d(correlate1d(image, rows, axis=0, mode="nearest"), columns, axis=1, mode="nearest")

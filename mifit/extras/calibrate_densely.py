@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.core.mesh import interpolate
-from mifit.core.threads import one_blas_thread
+from mifit.core.process import one_blas_thread
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.extras.bundle import AdjustedBundle, Bundle, Intrinsics, Sightings, adjust_bundle
 from mifit.extras.calibrate_heads import FOCAL_PRIOR, HeadCalibration, calibrate_heads

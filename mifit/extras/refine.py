@@ -16,7 +16,7 @@ from mifit.capture.choose_frames import choose_frames
 from mifit.config import FitConfig, from_mapping
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
-from mifit.core.threads import one_blas_thread
+from mifit.core.process import one_blas_thread
 from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
 from mifit.stages.eyes import behind_lids

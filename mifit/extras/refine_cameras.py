@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate
-from mifit.core.threads import one_blas_thread
+from mifit.core.process import one_blas_thread
 from mifit.core.uv import rasterize_uv
 from mifit.extras.bundle import (
     AdjustedBundle,

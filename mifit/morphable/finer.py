@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.subdivision import split_faces
+from mifit.core.mesh import split_faces
 
 if TYPE_CHECKING:
     from mifit.morphable.model import MorphableModel

@@ -8,9 +8,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from mifit.core.arrays import npz_keys
 from mifit.core.files import check_file
 from mifit.core.limits import MAX_MODEL_BYTES
-from mifit.core.npz import npz_keys
 from mifit.errors import InputError
 from mifit.morphable.builtin import builtin_model
 from mifit.morphable.formats import bfm2009, deep3d, threeddfa

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
-from mifit.core.flip import flip
 from mifit.core.image import linear_to_srgb, srgb_to_linear
-from mifit.core.metrics import psnr_from_rmse, ssim
+from mifit.core.metrics import flip, psnr_from_rmse, ssim
 from mifit.core.sh import LUMINANCE
 from mifit.errors import InputError
 

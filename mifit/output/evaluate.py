@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from mifit.core.camera import Camera
-from mifit.core.flip import flip
 from mifit.core.image import to_8_bit
-from mifit.core.metrics import mean_squared_error, psnr_from_rmse, ssim
+from mifit.core.metrics import flip, mean_squared_error, psnr_from_rmse, ssim
 from mifit.errors import InputError
 from mifit.output.compare import pass_region, separation
 from mifit.output.deferred import shade_methods, trace_mesh, visible_surface

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from mifit.appearance.cornea import CORNEA, REFLECTANCE
+from mifit.core.arrays import write_ply
 from mifit.core.files import replacing, write_text
 from mifit.core.image import encode_png, linear_to_srgb, to_8_bit, write_image
-from mifit.core.mesh import vertex_normals
-from mifit.core.ply import write_ply
-from mifit.core.split_mesh import part_of, split_at_seams, tangent_space_map
+from mifit.core.mesh import part_of, split_at_seams, tangent_space_map, vertex_normals
 from mifit.errors import InputError
 from mifit.output.gltf import write_glb
 from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
+from mifit.core.estimate import Label
 from mifit.core.image import encode_png, to_8_bit
-from mifit.core.labels import Label
 from mifit.core.sh import SHLighting
 
 HEAT_LIMIT = 40.0

@@ -17,8 +17,7 @@ import mifit
 from mifit.appearance.cornea import REFLECTANCE
 from mifit.core.files import replacing
 from mifit.core.image import encode_png, to_8_bit
-from mifit.core.mesh import vertex_normals
-from mifit.core.split_mesh import SplitMesh, part_of, split_at_seams, tangent_space_map, tangents
+from mifit.core.mesh import SplitMesh, part_of, split_at_seams, tangent_space_map, tangents, vertex_normals
 from mifit.morphable.openings import eyeball_faces
 from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 

@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 
 from mifit.appearance.cornea import CORNEA, REFLECTANCE
 from mifit.appearance.lobe import Lobe
+from mifit.core.arrays import write_ply
 from mifit.core.camera import Camera
 from mifit.core.files import write_text
 from mifit.core.image import write_image
-from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.ply import write_ply
+from mifit.core.mesh import SplitMesh, interpolate, normalize, part_of, split_at_seams, vertex_normals
 from mifit.core.sh import SHLighting
-from mifit.core.split_mesh import SplitMesh, part_of, split_at_seams
 from mifit.core.uv import rasterize_uv
 from mifit.output.deferred import visible_surface
 from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from mifit.appearance.cornea import reflects
-from mifit.core.membrane import factored_membrane
 from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.mesh_solve import factored_membrane
 from mifit.core.uv import TexelMap, rasterize_uv, sample_map
 from mifit.morphable.openings import eyeball_faces
 

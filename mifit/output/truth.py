@@ -25,11 +25,11 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mifit.core.arrays import read_npz
 from mifit.core.files import read_bytes
 from mifit.core.image import read_image
 from mifit.core.limits import MAX_MODEL_BYTES
 from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.npz import read_npz
 from mifit.errors import InputError
 from mifit.morphable.openings import leading_faces
 from mifit.output.compare import face_region

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from mifit.appearance.cornea import CORNEA, REFLECTANCE
 from mifit.core.image import to_8_bit
-from mifit.core.mesh import vertex_normals
+from mifit.core.mesh import part_of, split_at_seams, vertex_normals
 from mifit.core.sh import SHLighting, bands, cosine_coefficients
-from mifit.core.split_mesh import part_of, split_at_seams
 from mifit.output.figures import jpeg_uri, png_uri
 from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials
 

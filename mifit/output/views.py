@@ -14,7 +14,7 @@ from mifit.core.camera import Camera
 from mifit.core.files import file_name, replacing
 from mifit.core.image import to_8_bit, write_image
 from mifit.core.mesh import normalize
-from mifit.core.quiet import decoding
+from mifit.core.process import decoding
 from mifit.errors import InputError, MifitError
 from mifit.output.deferred import shade_methods, visible_surface
 from mifit.output.evaluate import as_photographed, rgba_8_bit

@@ -17,7 +17,7 @@ import sys
 from dataclasses import dataclass
 from importlib import metadata
 
-from mifit.core.threads import OURS, threads
+from mifit.core.process import OURS, threads
 from mifit.errors import UnknownVariantError, VariantError
 
 LLVM_SUPPORTED = 19

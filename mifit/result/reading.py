@@ -15,6 +15,7 @@ from mifit.appearance import models
 from mifit.appearance.illumination import Illumination, light_from
 from mifit.appearance.lobe import Lobe
 from mifit.config import MeshConfig
+from mifit.core.arrays import Rows, read_npz, read_ply
 from mifit.core.camera import Camera
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import (
@@ -28,11 +29,7 @@ from mifit.core.estimate import (
 from mifit.core.files import read_text
 from mifit.core.image import read_image, to_8_bit
 from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_PIXELS
-from mifit.core.npz import read_npz
-from mifit.core.ply import read_ply
-from mifit.core.rows import Rows
-from mifit.core.split_mesh import SplitMesh, split_at_seams
-from mifit.core.subdivision import split_faces
+from mifit.core.mesh import SplitMesh, split_at_seams, split_faces
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import lacks_eyes, with_eyes

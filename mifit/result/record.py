@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mifit.appearance.illumination import Illumination
 from mifit.appearance.lobe import Lobe
+from mifit.core.arrays import same
 from mifit.core.camera import Camera
 from mifit.core.diagnostics import Diagnostic, worst_first
 from mifit.core.estimate import (
@@ -20,9 +21,8 @@ from mifit.core.estimate import (
     Report,
     ResidualEstimate,
 )
+from mifit.core.mesh import split_faces
 from mifit.core.sh import SHLighting, radiance_of_shading
-from mifit.core.subdivision import split_faces
-from mifit.core.values import same
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.finer import finer_model

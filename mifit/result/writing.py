@@ -14,15 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mifit
+from mifit.core.arrays import write_ply
 from mifit.core.camera import Camera
 from mifit.core.estimate import Report
 from mifit.core.files import file_name, replacing, write_bytes, write_text
 from mifit.core.image import encode_png, write_image
-from mifit.core.mesh import vertex_normals
-from mifit.core.ply import write_ply
-from mifit.core.split_mesh import SplitMesh, split_at_seams, tangent_space_map
-from mifit.core.subdivision import split_faces
-from mifit.core.threads import on_all_cores
+from mifit.core.mesh import SplitMesh, split_at_seams, split_faces, tangent_space_map, vertex_normals
+from mifit.core.process import on_all_cores
 from mifit.result.ownership import replacing_files
 from mifit.result.record import Result
 
@@ -30,7 +28,7 @@ FORMAT_VERSION = 1
 
 
 def label_file(camera: str, timestep: int) -> Path:
-    """Where a result keeps what an image shows, relative to its folder: grey values of `core.labels.Label`."""
+    """Where a result keeps what an image shows, relative to its folder: grey values of `core.estimate.Label`."""
     return Path("masks") / f"{file_name(camera)}_{timestep:04d}.png"
 
 

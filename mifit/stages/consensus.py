@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.process import on_all_cores
 from mifit.core.sh import basis
-from mifit.core.threads import on_all_cores
 from mifit.stages.trust import DARKEST
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import vertex_normals
-from mifit.core.threads import on_all_cores
+from mifit.core.process import on_all_cores
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs, leading_faces
 

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from mifit.appearance.formation import Appearance, form_image
 from mifit.appearance.occlusion import MeshPoints
 from mifit.config import ResidualConfig
-from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report, ResidualEstimate
-from mifit.core.labels import hidden
+from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report, ResidualEstimate, hidden
 from mifit.core.mesh import normalize
-from mifit.core.threads import one_blas_thread
+from mifit.core.process import one_blas_thread
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
 from mifit.stages.observations import Surface

@@ -13,9 +13,9 @@ import numpy as np
 from mifit.config import GeometryConfig, SurfaceConfig
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, Report
-from mifit.core.threads import one_blas_thread
+from mifit.core.process import one_blas_thread
+from mifit.optim import Outcome
 from mifit.progress import Progress, silent
-from mifit.solve import Outcome
 from mifit.stages.eyes import behind_lids
 from mifit.stages.surface.close_openings import LIDS, LIPS, close_again, close_openings
 from mifit.stages.surface.coarse_to_fine import Reached, Search, sweeps

@@ -12,11 +12,11 @@ from mifit.capture import Capture
 from mifit.config import GeometryConfig
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
-from mifit.core.threads import one_blas_thread
+from mifit.core.process import one_blas_thread
 from mifit.errors import ConvergenceError, InputError
 from mifit.morphable import MorphableModel
+from mifit.optim import Solution
 from mifit.progress import Progress, silent
-from mifit.solve import Solution
 from mifit.stages.exposures import estimate_exposures
 from mifit.stages.gains import estimate_gains
 from mifit.stages.geometry.appearance import fit_appearance, gather

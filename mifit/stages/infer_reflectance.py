@@ -11,14 +11,13 @@ import numpy as np
 from mifit.appearance.cornea import reflects
 from mifit.config import ReflectanceConfig
 from mifit.core.diagnostics import Diagnostic
-from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
-from mifit.core.labels import hidden
+from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report, hidden
 from mifit.core.mesh import interpolate
-from mifit.core.threads import one_blas_thread
+from mifit.core.process import one_blas_thread
 from mifit.errors import ConvergenceError
 from mifit.morphable.openings import eyeball_faces
+from mifit.optim import Outcome
 from mifit.progress import Progress, silent
-from mifit.solve import Outcome
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.als import fit_als
 from mifit.stages.reflectance.beneath_film import beneath_the_film

@@ -20,7 +20,7 @@ from mifit.appearance.occlusion import OccludingMesh
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.threads import on_all_cores
+from mifit.core.process import on_all_cores
 from mifit.core.uv import TexelMap, bilinear, rasterize_uv
 from mifit.errors import InputError
 from mifit.stages.shown import face_pixels, footprint, texel_area

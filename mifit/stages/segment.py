@@ -18,11 +18,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.estimate import Label
 from mifit.core.image import to_8_bit
-from mifit.core.labels import Label
 from mifit.core.mesh import interpolate, normalize
+from mifit.core.process import on_all_cores
 from mifit.core.sh import basis
-from mifit.core.threads import on_all_cores
 from mifit.stages.consensus import OPPONENT, Consensus, agreed_colour, consensus, no_skin
 from mifit.stages.trust import DARKEST
 

@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.config import GeometryConfig, NormalsConfig
-from mifit.core.bend import bend, tangent_plane, unbend
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
-from mifit.core.threads import one_blas_thread
-from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.core.process import one_blas_thread
+from mifit.core.uv import TexelMap, bend, rasterize_uv, tangent_plane, unbend
 from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
 from mifit.stages.fit_geometry import fit_pose_expression

@@ -26,8 +26,7 @@ from mifit.core.limits import (
     MAX_TIMESTEPS,
     check_range,
 )
-from mifit.core.mesh import vertex_normals
-from mifit.core.split_mesh import MeshPart, SplitMesh, split_at_seams
+from mifit.core.mesh import MeshPart, SplitMesh, split_at_seams, vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel

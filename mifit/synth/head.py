@@ -11,8 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from mifit.core.mesh import edges, vertex_normals
-from mifit.core.split_mesh import SplitMesh
+from mifit.core.mesh import SplitMesh, edges, vertex_normals
 from mifit.morphable import MorphableModel
 from mifit.synth.noise import smooth_noise
 

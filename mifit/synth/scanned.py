@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mifit.capture.transforms import Shot, View, write_transforms
+from mifit.core.arrays import write_ply
 from mifit.core.camera import Camera
 from mifit.core.files import replacing, write_text
 from mifit.core.image import read_image, write_image
 from mifit.core.mesh import vertex_normals
-from mifit.core.ply import write_ply
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
 from mifit.render.pathtrace import Material, PathTracer, Surface

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from mifit.core.bend import bend, tangent_plane, texel_neighbours, transport, unbend
-from mifit.core.uv import TexelMap
+from mifit.core.uv import TexelMap, bend, tangent_plane, texel_neighbours, transport, unbend
 
 
 def directions(n=500, seed=0):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mifit.core.flip import flip, flip_map
+from mifit.core.metrics import flip, flip_map
 from mifit.errors import InputError
 
 

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image as Pillow
 
 from mifit.cli import console
-from mifit.core import quiet
+from mifit.core import process as quiet
 from mifit.core.image import (
     image_size,
     linear_to_srgb,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 
-from mifit.core.membrane import membrane
+from mifit.core.mesh_solve import membrane
 
 
 def strip(n: int = 21) -> tuple[np.ndarray, np.ndarray]:

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from mifit.core.mesh import face_cross, normalize, vertex_normals
-from mifit.core.mesh_update import (
+from mifit.core.mesh import face_cross, normalize, subdivide, vertex_normals
+from mifit.core.mesh_solve import (
     MeshUpdater,
     displacement,
     interior_vertices,
     rotate_between,
-    subdivide,
     wanted_face_normals,
 )
 from mifit.core.uv import rasterize_uv

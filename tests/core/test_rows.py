@@ -8,8 +8,8 @@ import os
 import numpy as np
 import pytest
 
-from mifit.core import rows
-from mifit.core.rows import Rows
+from mifit.core import arrays as rows
+from mifit.core.arrays import Rows
 from mifit.errors import InputError
 
 

@@ -13,12 +13,12 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import mifit
-from mifit.core.threads import VARIABLES, on_all_cores, one_blas_thread, set_threads
+from mifit.core.process import VARIABLES, on_all_cores, one_blas_thread, set_threads
 from mifit.errors import InputError
 
 ASK = """
 import sys
-from mifit.core.threads import set_threads, threads
+from mifit.core.process import set_threads, threads
 if sys.argv[1] == "before":
     set_threads(1)
 import cv2, drjit, numpy, scipy.linalg

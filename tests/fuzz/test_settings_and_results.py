@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mifit.config import FitConfig
-from mifit.core.ply import read_ply
+from mifit.core.arrays import read_ply
 from mifit.errors import InputError
 from mifit.experiments import load_plan
 from mifit.morphable import MorphableModel

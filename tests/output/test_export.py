@@ -13,8 +13,7 @@ import pytest
 import trimesh
 
 from mifit.core.image import read_image
-from mifit.core.mesh import vertex_normals
-from mifit.core.split_mesh import part_of, split_at_seams
+from mifit.core.mesh import part_of, split_at_seams, vertex_normals
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mifit.core.mesh import vertex_normals
-from mifit.core.split_mesh import split_at_seams, tangents
+from mifit.core.mesh import split_at_seams, tangents, vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.output.map_figures import picture_maps

@@ -12,7 +12,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mifit.core.image import to_8_bit
-from mifit.core.split_mesh import part_of, split_at_seams
+from mifit.core.mesh import part_of, split_at_seams
 from mifit.errors import InputError
 from mifit.output.evaluate import rgba_8_bit
 from mifit.output.export import export

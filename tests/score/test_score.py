@@ -13,9 +13,9 @@ import trimesh
 
 from mifit.capture import Capture
 from mifit.cli import main
+from mifit.core.arrays import write_ply
 from mifit.core.image import read_image, write_image
 from mifit.core.mesh import vertex_normals
-from mifit.core.ply import write_ply
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.output.compare import Errors, pass_region, separation

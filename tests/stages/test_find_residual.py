@@ -11,8 +11,7 @@ from stages.reflectance_scene import EXPONENT, SIZE, render, turning_dome
 from mifit.appearance.illumination import Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.config import ResidualConfig
-from mifit.core.estimate import NormalsEstimate, ReflectanceEstimate, Report
-from mifit.core.labels import Label
+from mifit.core.estimate import Label, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.stages.find_residual import find_residual

@@ -10,7 +10,7 @@ from stages.reflectance_scene import EXPONENT, SIZE, render, turning_dome
 
 from mifit.config import ReflectanceConfig
 from mifit.errors import InputError
-from mifit.solve import Outcome
+from mifit.optim import Outcome
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.lighting_equations import SPECULAR_LIMIT, expected_specular, specular_pull

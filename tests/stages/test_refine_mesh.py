@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from mifit.config import MeshConfig
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, Report
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
-from mifit.core.mesh_update import interior_vertices
+from mifit.core.mesh_solve import interior_vertices
 from mifit.core.uv import rasterize_uv
 from mifit.stages.normals.mesh_refinement import refine_mesh
 

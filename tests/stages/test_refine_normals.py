@@ -10,11 +10,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mifit.config import NormalsConfig
 from mifit.core import sh
-from mifit.core.bend import bend, tangent_plane, texel_neighbours
 from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.core.uv import TexelMap, bend, rasterize_uv, tangent_plane, texel_neighbours
 from mifit.errors import InputError
-from mifit.solve import Outcome
+from mifit.optim import Outcome
 from mifit.stages.normals.solvers import adam_steps, gauss_newton
 
 CAMERAS = ("left", "right")

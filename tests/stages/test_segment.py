@@ -10,9 +10,8 @@ import pytest
 from stages.memory_capture import make_capture
 
 from mifit.config import ReflectanceConfig
-from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report
+from mifit.core.estimate import GeometryEstimate, Label, ReflectanceEstimate, Report, hidden
 from mifit.core.image import linear_to_srgb, srgb_to_linear
-from mifit.core.labels import Label, hidden
 from mifit.morphable import MorphableModel
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface

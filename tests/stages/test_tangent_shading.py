@@ -12,7 +12,7 @@ def test_stock_normalmap_shows_the_refined_normals(variant):
     import mitsuba as mi
     from normal_scene import build
 
-    from mifit.core.split_mesh import split_at_seams, tangent_space_map
+    from mifit.core.mesh import split_at_seams, tangent_space_map
     from mifit.render.gbuffer import SurfaceScene, make_mesh
 
     scene = build(tilt=0.3)

@@ -322,7 +322,7 @@ def test_frames_whose_images_changed_are_tracked_anew(scene, fit_truth, saved):
 
 def test_memory_does_not_grow_with_tracked_frames(scene, fit_truth, saved, tmp_path, monkeypatch):
     """What frames leave behind in memory is their pose, not their maps and meshes."""
-    from mifit.core import rows
+    from mifit.core import arrays as rows
     from mifit.tracking import track_into
 
     monkeypatch.setattr(rows, "IN_MEMORY", 0)  # as for a long video

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mifit.capture import Capture
-from mifit.core.split_mesh import MeshPart, split_at_seams
+from mifit.core.mesh import MeshPart, split_at_seams
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.synth.compose import FULL_WELL, READ_NOISE, expose, place_cameras

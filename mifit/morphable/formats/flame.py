@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.npz import read_npz
+from mifit.core.arrays import read_npz
 from mifit.core.uv import sample_map
 from mifit.errors import InputError
 from mifit.morphable.assemble import complete, single, srgb_albedo

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.arrays import read_npz
 from mifit.core.files import read_bytes, read_text
 from mifit.core.limits import MAX_SETTINGS_BYTES, MAX_TEXT_MODEL_BYTES
-from mifit.core.npz import read_npz
 from mifit.errors import InputError
 from mifit.morphable.assemble import N_ALBEDO, check_mesh, fingerprint
 from mifit.morphable.model import MorphableModel

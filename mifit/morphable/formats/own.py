@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mifit.core.arrays import read_npz
 from mifit.core.files import replacing
-from mifit.core.npz import read_npz
 from mifit.errors import InputError
 from mifit.morphable.model import MorphableModel, provides
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.sh import basis
 from mifit.morphable import MorphableModel
-from mifit.solve import DenseSystem, Solution, geman_mcclure, minimize
+from mifit.optim import DenseSystem, Solution, geman_mcclure, minimize
 from mifit.stages.geometry.points import corner_matrix
 from mifit.stages.geometry.rendering import AMBIENT_PRIOR, WHITE, PixelView
 

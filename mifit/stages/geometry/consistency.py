@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
-from mifit.core.threads import on_all_cores
-from mifit.solve import geman_mcclure
-from mifit.solve.systems import DenseSystem
+from mifit.core.process import on_all_cores
+from mifit.optim import geman_mcclure
+from mifit.optim.systems import DenseSystem
 from mifit.stages.geometry.images import SmoothImage
 from mifit.stages.geometry.landmarks import LandmarkTerm
 from mifit.stages.geometry.normal import NormalEquations, prior_energy, square

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross
 from mifit.morphable import MorphableModel
-from mifit.solve import geman_mcclure
-from mifit.solve.systems import System
+from mifit.optim import geman_mcclure
+from mifit.optim.systems import System
 from mifit.stages.geometry.normal import NormalEquations, prior_energy
 from mifit.stages.geometry.parameters import Frames, Layout, Pose
 from mifit.stages.geometry.points import PointBasis, geometry_columns, project

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.solve import ArrowSystem
+from mifit.optim import ArrowSystem
 from mifit.stages.geometry.parameters import LOCAL, Layout
 
 

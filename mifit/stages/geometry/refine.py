@@ -12,7 +12,7 @@ from mifit.capture import Capture
 from mifit.config import GeometryConfig
 from mifit.core.estimate import GeometryEstimate
 from mifit.morphable import MorphableModel
-from mifit.solve import Solution, minimize
+from mifit.optim import Solution, minimize
 from mifit.stages.geometry.consistency import ConsistencyProblem
 from mifit.stages.geometry.displaced import displaced
 from mifit.stages.geometry.landmarks import LandmarkTerm, LandmarkView

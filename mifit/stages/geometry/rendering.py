@@ -22,8 +22,8 @@ from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross
 from mifit.core.sh import basis_gradient
 from mifit.morphable import MorphableModel
-from mifit.solve import geman_mcclure
-from mifit.solve.systems import ArrowSystem
+from mifit.optim import geman_mcclure
+from mifit.optim.systems import ArrowSystem
 from mifit.stages.geometry.images import SmoothImage
 from mifit.stages.geometry.landmarks import LandmarkTerm
 from mifit.stages.geometry.normal import NormalEquations, prior_energy

@@ -12,7 +12,7 @@ from mifit.capture import Capture
 from mifit.core.camera import Camera
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
-from mifit.solve import Solution, TrustRatio, minimize
+from mifit.optim import Solution, TrustRatio, minimize
 from mifit.stages.geometry.initial import pose_candidates, reprojection
 from mifit.stages.geometry.landmarks import LandmarkProblem, LandmarkTerm, LandmarkView, slide_contour
 from mifit.stages.geometry.parameters import Frames, Layout

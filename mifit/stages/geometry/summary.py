@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, Report
 from mifit.morphable import MorphableModel
+from mifit.optim import Outcome, Solution
 from mifit.progress import Progress
-from mifit.solve import Outcome, Solution
 from mifit.stages.geometry.landmarks import LandmarkTerm, LandmarkView
 from mifit.stages.geometry.start import State, coordinate_deviation
 

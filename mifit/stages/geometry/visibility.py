@@ -13,7 +13,7 @@ from mifit.capture import Capture
 from mifit.core.camera import Camera
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
-from mifit.core.threads import on_all_cores
+from mifit.core.process import on_all_cores
 from mifit.morphable import MorphableModel
 from mifit.render.gbuffer import GBuffer, SurfaceScene
 from mifit.stages.geometry.consistency import TextureView

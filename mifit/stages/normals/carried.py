@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.bend import tangent_plane, transport
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.uv import TexelMap
+from mifit.core.uv import TexelMap, tangent_plane, transport
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel

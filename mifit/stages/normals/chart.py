@@ -7,7 +7,7 @@ from typing import Any
 
 
 def bent_normal(frame: tuple[Any, Any, Any], a: Any, b: Any) -> Any:
-    """The chart of `core.bend.bend`."""
+    """The chart of `core.uv.bend`."""
     n, t1, t2 = frame
     p, q = 0.5 * a, 0.5 * b
     square = p * p + q * q

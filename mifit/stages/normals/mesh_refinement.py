@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from mifit.config import MeshConfig
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, Report
-from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.mesh_update import MeshUpdater, displacement, interior_vertices, wanted_face_normals
-from mifit.core.subdivision import split_faces
-from mifit.core.threads import on_all_cores
+from mifit.core.mesh import interpolate, normalize, split_faces, vertex_normals
+from mifit.core.mesh_solve import MeshUpdater, displacement, interior_vertices, wanted_face_normals
+from mifit.core.process import on_all_cores
 from mifit.core.uv import rasterize_uv
+from mifit.optim import Outcome
 from mifit.progress import Progress, silent
-from mifit.solve import Outcome
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
@@ -49,7 +48,7 @@ def refine_mesh(
 
     Notes
     -----
-    Nehab et al. 2005, see `core.mesh_update`. The system is factorised once for all timesteps.
+    Nehab et al. 2005, see `core.mesh_solve`. The system is factorised once for all timesteps.
     """
     began = time.perf_counter()
     refiner = MeshRefiner(model, normals.normal_object.shape[1], config or MeshConfig())

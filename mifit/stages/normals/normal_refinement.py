@@ -21,15 +21,14 @@ from numpy.typing import NDArray
 from mifit.appearance.formation import Appearance
 from mifit.appearance.occlusion import MeshPoints
 from mifit.config import NormalsConfig
-from mifit.core.bend import bend, tangent_plane, texel_neighbours
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.mesh import normalize
-from mifit.core.threads import one_blas_thread
-from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.core.process import one_blas_thread
+from mifit.core.uv import TexelMap, bend, rasterize_uv, tangent_plane, texel_neighbours
 from mifit.errors import InputError
+from mifit.optim import Outcome, Solution
 from mifit.progress import Progress, silent
-from mifit.solve import Outcome, Solution
 from mifit.stages.normals.solvers import adam_steps, gauss_newton
 from mifit.stages.observations import Surface
 
@@ -153,7 +152,7 @@ def refine_frame(
 ) -> FrameNormals:
     """Refine the normals of a geometry of one timestep; parameters as in `refine_normals`.
 
-    ``prior`` (N, 2) are offsets in the base normal's tangent plane (`core.bend`) that the correction is drawn
+    ``prior`` (N, 2) are offsets in the base normal's tangent plane (`core.uv`) that the correction is drawn
     to instead of to zero, and from which it starts.
     """
     problem, rows, base = frame_problem(capture, model, geometry, reflectance, cameras, config, texels, prior, seed)

@@ -2,7 +2,7 @@
 
     E(x) = sum_images sum_texels w rho(|I - L(n(x))|) + w1 |Laplacian (n(x) - n0)|_1 + w2 |n(x) - n0 - prior|^2
 
-over the tangent-plane offsets x of `core.bend`, with its linearisation. Shading is that of `appearance`; derivatives
+over the tangent-plane offsets x of `core.uv`, with its linearisation. Shading is that of `appearance`; derivatives
 are Dr.Jit's: forward mode for the two unknowns of a texel, reverse mode for Adam. All arrays stay with Dr.Jit.
 """
 
@@ -88,7 +88,7 @@ class NormalProblem:
     normals : (N, 3), tangents : (N, 2, 3)
         Base normals and tangents in which corrections are smoothed and measured.
     neighbours : (N, 4)
-        `core.bend.texel_neighbours`.
+        `core.uv.texel_neighbours`.
     views : sequence of NormalView
     shade : callable
         Shading of the texels' material.

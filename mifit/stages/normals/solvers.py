@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.optim import Outcome, Solution
 from mifit.progress import Progress, silent
-from mifit.solve import Outcome, Solution
 from mifit.stages.normals.problem import NormalProblem, stored_offsets, term_totals
 
 

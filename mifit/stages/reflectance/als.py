@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from mifit.appearance.formation import Appearance, form_image
 from mifit.config import ReflectanceConfig
 from mifit.core.diagnostics import Diagnostic
+from mifit.core.process import on_all_cores
 from mifit.core.sh import LUMINANCE
-from mifit.core.threads import on_all_cores
+from mifit.optim import Outcome
 from mifit.progress import Progress
-from mifit.solve import Outcome
 from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.choice import choose_lighting
 from mifit.stages.reflectance.forward import Forward

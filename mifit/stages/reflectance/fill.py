@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.membrane import membrane
 from mifit.core.mesh import interpolate
+from mifit.core.mesh_solve import membrane
 from mifit.core.uv import TexelMap, sample_map
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
@@ -48,7 +48,7 @@ def blend_unseen(
 ) -> Filled:
     """Replace texels that were hardly seen by the model's albedo plus an offset that continues the seen ones.
 
-    The offset is a membrane over the mesh (`core.membrane`), so that it crosses the atlas's seams.
+    The offset is a membrane over the mesh (`core.mesh_solve`), so that it crosses the atlas's seams.
 
     Parameters
     ----------

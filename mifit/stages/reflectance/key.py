@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mifit.appearance.formation import form_image
 from mifit.appearance.illumination import DistantLight, Light
 from mifit.appearance.reception import fibonacci_sphere
-from mifit.core.threads import on_all_cores
+from mifit.core.process import on_all_cores
 from mifit.stages.observations import Observations
 from mifit.stages.reflectance.forward import Forward, LightColumns
 from mifit.stages.reflectance.lighting import LightingSolution, bounded_weight, linearize

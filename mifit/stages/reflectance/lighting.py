@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from mifit.appearance.formation import form_image
 from mifit.appearance.reception import fibonacci_sphere
+from mifit.core.process import on_all_cores
 from mifit.core.sh import bands, basis
-from mifit.core.threads import on_all_cores
-from mifit.solve import Outcome
+from mifit.optim import Outcome
 from mifit.stages.reflectance.lighting_equations import (
     PRIORS,
     LightingEquations,

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from mifit.core.threads import on_all_cores
+from mifit.core.process import on_all_cores
 
 SPECULAR_SPREAD = 0.15
 """Standard deviation of the specular albedo over a face, relative to its median."""

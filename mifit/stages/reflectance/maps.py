@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 
-from mifit.core.threads import threads
-from mifit.solve import Outcome
+from mifit.core.process import threads
+from mifit.optim import Outcome
 
 SPLIT = 0.5
 """Weight of ADMM's splits relative to the median curvature of the blocks."""

@@ -12,8 +12,8 @@ from mifit.appearance.lobe import Lobe
 from mifit.config import ReflectanceConfig
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.sh import radiance_of_shading
+from mifit.optim import Outcome
 from mifit.progress import Progress
-from mifit.solve import Outcome
 from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.adam import HISTORY, Samples, minimize_by_adam
 from mifit.stages.reflectance.als import Fitted

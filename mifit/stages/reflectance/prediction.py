@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.formation import form_image
-from mifit.core.threads import on_all_cores
+from mifit.core.process import on_all_cores
 from mifit.stages.observations import Observations
 from mifit.stages.reflectance.lighting import bounded_weight, solve_lighting
 from mifit.stages.reflectance.lighting_equations import LightingProblem

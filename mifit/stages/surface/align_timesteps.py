@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate
-from mifit.core.threads import threads
+from mifit.core.process import threads
 from mifit.core.uv import TexelMap
 from mifit.morphable import MorphableModel
 from mifit.stages.geometry.parameters import exponential

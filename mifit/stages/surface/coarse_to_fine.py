@@ -14,8 +14,8 @@ from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.morphable.openings import leading_faces, skin_weights
+from mifit.optim import Outcome
 from mifit.progress import Progress
-from mifit.solve import Outcome
 from mifit.stages.geometry.points import corner_matrix
 from mifit.stages.geometry.scenes import Scenes
 from mifit.stages.surface.align_timesteps import align_timesteps

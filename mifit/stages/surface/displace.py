@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mifit.core.mesh import face_cross, normalize, vertex_normals
-from mifit.core.mesh_update import cotangent_laplacian
+from mifit.core.mesh_solve import cotangent_laplacian
 
 CONTACT_WEIGHT = 30.0
 """Of vertices that nearly touch, times the squared distance at which they do."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, normalize
-from mifit.core.threads import one_blas_thread
+from mifit.core.process import one_blas_thread
 from mifit.core.uv import TexelMap
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.surface.sweep import sweep

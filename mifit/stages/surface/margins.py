@@ -15,7 +15,7 @@ from scipy.optimize import lsq_linear
 from scipy.spatial import cKDTree
 
 from mifit.core.mesh import edges, face_cross, vertex_normals
-from mifit.core.mesh_update import cotangent_laplacian
+from mifit.core.mesh_solve import cotangent_laplacian
 from mifit.morphable.openings import closed_borders
 
 if TYPE_CHECKING:

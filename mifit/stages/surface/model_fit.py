@@ -23,8 +23,8 @@ from mifit.config import GeometryConfig
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, rasterize_uv
-from mifit.solve import geman_mcclure, minimize
-from mifit.solve.systems import DenseSystem
+from mifit.optim import geman_mcclure, minimize
+from mifit.optim.systems import DenseSystem
 from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.consistency import ConsistencyProblem
 from mifit.stages.geometry.landmarks import LandmarkView, slide_contour

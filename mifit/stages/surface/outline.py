@@ -20,7 +20,7 @@ from scipy.ndimage import uniform_filter1d
 
 from mifit.core.camera import Camera
 from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.threads import on_all_cores
+from mifit.core.process import on_all_cores
 from mifit.render.gbuffer import GBuffer, SurfaceScene
 from mifit.stages.surface.band import look_up
 

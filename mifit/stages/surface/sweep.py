@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.mesh import normalize
-from mifit.core.threads import threads
+from mifit.core.process import threads
 from mifit.core.uv import TexelMap
 from mifit.stages.surface.band import FeatureImage
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
-from mifit.core.threads import on_all_cores
+from mifit.core.process import on_all_cores
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.surface.band import feature_image

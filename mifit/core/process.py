@@ -1,12 +1,14 @@
-"""How many processor cores are used: one number for BLAS, OpenCV, Dr.Jit, networks and pools of our own."""
+"""What a process may use and print: processor cores, memory that is kept, what C libraries say while they decode."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -71,3 +73,37 @@ def one_blas_thread() -> Iterator[None]:
     """
     with threadpool_limits(1, user_api="blas"):
         yield
+
+
+TRIM, MAP = -1, -3
+"""glibc's ``M_TRIM_THRESHOLD`` and ``M_MMAP_THRESHOLD``."""
+KEPT = 1 << 30
+LARGEST = 1 << 25
+"""Arrays of more bytes still come from the system and go back to it."""
+
+
+def keep_freed_memory() -> bool:
+    """Keep what is freed for the arrays that come next; for programs that own their process. True where it took effect.
+
+    NumPy asks for each intermediate array anew. glibc gets those above some hundred kilobytes from the system and gives
+    them back: the system clears the pages every time, which takes longer than most sums over them.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):  # another C library
+        return False
+    return bool(mallopt(TRIM, KEPT)) and bool(mallopt(MAP, LARGEST))
+
+
+_around: Callable[[], AbstractContextManager[None]] = nullcontext
+
+
+def decoding() -> AbstractContextManager[None]:
+    """Context for one call of a decoder that may print about damaged input."""
+    return _around()
+
+
+def set_decoding_context(around: Callable[[], AbstractContextManager[None]]) -> None:
+    """Say what surrounds every decoder call; for programs that own their standard error."""
+    global _around
+    _around = around

@@ -1,4 +1,6 @@
-"""Vertex positions from positions and normals by sparse least squares.
+"""Sparse linear systems on meshes: `MeshUpdater`, and `membrane` for values that are known on a part of one.
+
+Vertex positions from positions and normals by sparse least squares.
 
 After Nehab, Rusinkiewicz, Davis, Ramamoorthi, "Efficiently combining positions and normals for precise 3D geometry",
 2005: positions are trusted for the coarse shape, normals for the detail. Minimised over the free vertices p is
@@ -15,14 +17,15 @@ factorisation for every set of normals.)
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
+from scipy.sparse.linalg import splu
 
-from mifit.core.mesh import edges, edges_of_faces, face_cross, normalize
+from mifit.core.mesh import edges, face_cross, normalize
 from mifit.core.uv import TexelMap
 
 MIN_COTANGENT = 0.05
@@ -198,34 +201,6 @@ def wanted_face_normals(
     return np.where(seen[:, None], normalize(rotate_between(before, after, own)), 0.0)
 
 
-@dataclass(frozen=True)
-class Subdivision:
-    """One step of midpoint subdivision.
-
-    Attributes
-    ----------
-    faces : (4F, 3) int64
-        Face f becomes faces 4f .. 4f + 3.
-    matrix : (V', V) sparse
-        Values at old vertices -> values at new ones; old vertices come first, unchanged.
-    """
-
-    faces: NDArray[np.int64]
-    matrix: sp.csr_matrix
-
-
-def subdivide(faces: NDArray, n_vertices: int) -> Subdivision:
-    """Split every face into four at the midpoints of its edges; works for positions and for texture vertices."""
-    f = np.asarray(faces, dtype=np.int64)
-    unique, which = edges_of_faces(f)
-    ab, bc, ca = n_vertices + which
-    a, b, c = f.T
-    new = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
-    rows = np.repeat(np.arange(len(unique)), 2)
-    middle = sp.csr_matrix((np.full(2 * len(unique), 0.5), (rows, unique.ravel())), shape=(len(unique), n_vertices))
-    return Subdivision(new, sp.vstack([sp.identity(n_vertices), middle]).tocsr())
-
-
 def interior_vertices(faces: NDArray, face_mask: NDArray[np.bool_], n_vertices: int) -> NDArray[np.bool_]:
     """(V,) vertices all of whose faces lie in the mask and none of whose edges has one face only."""
     outside = np.zeros(n_vertices, dtype=bool)
@@ -243,3 +218,49 @@ def displacement(texels: TexelMap, faces: NDArray, vertices: NDArray, moved: NDA
     shift = np.asarray(moved, dtype=np.float64) - np.asarray(vertices, dtype=np.float64)
     at = np.einsum("nk,nkc->nc", texels.weights, shift[faces[texels.face]])
     return np.sum(at * normals, axis=1)
+
+
+GROUND = 1e-8
+"""Pull to zero, relative to the membrane's own stiffness: decides for pieces of which nothing is known."""
+
+
+def membrane(
+    vertices: NDArray,
+    faces: NDArray,
+    where: sp.spmatrix,
+    values: NDArray,
+    weight: NDArray,
+    stiffness: float,
+) -> NDArray[np.float64]:
+    """Vertex values that fit known ones and otherwise are as flat as possible.
+
+    Minimises ``sum_i weight_i |(where x)_i - values_i|^2 + stiffness * tr(x' L x)`` with the cotangent Laplacian L of
+    the mesh: an elastic sheet over the surface, whatever the atlas. A piece of the mesh without known values gets 0.
+
+    Parameters
+    ----------
+    vertices : (V, 3), faces : (F, 3)
+        The mesh that says how far apart vertices are; only its shape counts, not its size.
+    where : (N, V) sparse
+        Interpolation from vertices to the points where values are known.
+    values : (N, C), weight : (N,)
+    stiffness : float
+        Weight of the sheet: the values about a vertex are followed where their weights are well above it.
+
+    Returns
+    -------
+    (V, C) float64
+    """
+    return factored_membrane(vertices, faces, where, weight, stiffness)(values)
+
+
+def factored_membrane(
+    vertices: NDArray, faces: NDArray, where: sp.spmatrix, weight: NDArray, stiffness: float
+) -> Callable[[NDArray], NDArray[np.float64]]:
+    """`membrane` as a function of the values alone: nearly all of its time goes into what doesn't depend on them."""
+    weighted = where.T @ sp.diags(np.asarray(weight, dtype=np.float64))
+    flat = cotangent_laplacian(np.asarray(vertices, dtype=np.float64), faces)
+    floor = GROUND * float(flat.diagonal().max())
+    system = weighted @ where + stiffness * (flat + floor * sp.identity(len(vertices)))
+    factor = splu(sp.csc_matrix(system))
+    return lambda values: factor.solve(np.asarray(weighted @ values, dtype=np.float64))

@@ -5,12 +5,9 @@ into a step; an *acceptance* judges the step and sets the size of the next one; 
 returns a `Solution` that says in an enumerated `Outcome` how it ended.
 """
 
-from mifit.solve.acceptance import Backtracking, TrustRatio
-from mifit.solve.descent import GaussNewton, LevenbergMarquardt
-from mifit.solve.minimize import minimize
-from mifit.solve.robust import geman_mcclure, huber
-from mifit.solve.solution import Outcome, Solution
-from mifit.solve.systems import ArrowSystem, DenseSystem, RowSystem
+from mifit.optim.minimize import Backtracking, GaussNewton, LevenbergMarquardt, Outcome, Solution, TrustRatio, minimize
+from mifit.optim.robust import geman_mcclure, huber
+from mifit.optim.systems import ArrowSystem, DenseSystem, RowSystem
 
 __all__ = [
     "ArrowSystem",

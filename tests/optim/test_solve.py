@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mifit.solve import (
+from mifit.optim import (
     ArrowSystem,
     Backtracking,
     DenseSystem,
