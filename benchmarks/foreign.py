@@ -182,7 +182,7 @@ def write_pictures(folder: Path, case: Case, fits: dict[str, Reconstruction]) ->
     first = next(iter(fits.values()))
     vertices = first.geometry.vertices[first.index(timestep)]
     cameras = [capture.camera(c) for c in case.fitted]
-    base = image_based(capture, cameras, at.camera, timestep, vertices, first.model.faces, first.geometry.gains)
+    base = image_based(capture, cameras, at.camera, timestep, vertices, first.model.faces)
     tiles = [capture.frame(at.name, timestep).image[at.box], base.colour]
     tiles += [r.render(at.camera, timestep, m)[..., :3] for r, m in rows_of(fits).values()]
     name = "".join(c if c.isalnum() else "_" for c in case.label)

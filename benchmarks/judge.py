@@ -71,7 +71,7 @@ def view(capture: Capture, name: str, timestep: int) -> View:
 def rendered(result: Reconstruction, at: View, method: str) -> Image:
     """A render as 8-bit sRGB; black where the model covers less than half of a pixel."""
     linear = result.render(at.camera, at.timestep, method)  # type: ignore[arg-type]
-    image = to_8_bit(linear[..., :3] * result.geometry.gain(at.name))
+    image = to_8_bit(linear[..., :3])
     return image * (np.round(255 * linear[..., 3:]) > 127).astype(np.uint8)
 
 
@@ -175,8 +175,8 @@ def judge_views(
 def _on_mesh(result: Reconstruction, capture: Capture, at: View, timestep: int, fitted: Sequence[str]) -> Any:
     """Image-based rendering on the fitted mesh."""
     vertices = result.geometry.vertices[result.index(timestep)]
-    cameras, gains = [capture.camera(c) for c in fitted], result.geometry.gains
-    return image_based(capture, cameras, at.camera, timestep, vertices, result.model.faces, gains)
+    cameras = [capture.camera(c) for c in fitted]
+    return image_based(capture, cameras, at.camera, timestep, vertices, result.model.faces)
 
 
 def judge_mesh(result: Reconstruction, capture: Capture, fitted: Sequence[str]) -> dict[str, float]:

@@ -27,11 +27,12 @@ from mifit.core.arrays import read_npz
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import Report
 from mifit.core.files import replacing
+from mifit.core.photometry import Photometry
 
 T = TypeVar("T")
 RECORDS: dict[str, type] = {cls.__name__: cls for cls in (Report, Diagnostic, Illumination, Lobe)}
 """Dataclasses that an estimate may hold."""
-ARRAY, RECORD, LIGHT = "$array", "$record", "$light"
+ARRAY, RECORD, LIGHT, PHOTOMETRY = "$array", "$record", "$light", "$photometry"
 
 
 def digest(value: Any) -> str:
@@ -111,6 +112,8 @@ def _plain(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
         return {RECORD: type(value).__name__} | {
             f.name: _plain(getattr(value, f.name), f"{name}.{f.name}", arrays) for f in fields
         }
+    if isinstance(value, Photometry):
+        return {PHOTOMETRY: value.document()}
     if hasattr(value, "document"):
         return {LIGHT: value.document()}
     if isinstance(value, (tuple, list)):
@@ -128,6 +131,8 @@ def _restored(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
         return arrays[value[ARRAY]]
     if LIGHT in value:
         return light_from(value[LIGHT])
+    if PHOTOMETRY in value:
+        return Photometry.from_document(value[PHOTOMETRY])
     if RECORD in value:
         return RECORDS[value[RECORD]](**{k: _restored(v, arrays) for k, v in value.items() if k != RECORD})
     return value

@@ -151,23 +151,6 @@ class GeometryConfig:
     scale_deviation: float = number(
         0.0, "standard deviation of the model's log scale; 0: the units are trusted", least=0, most=10
     )
-    camera_gains: Literal["auto", "always", "never"] = one_of(
-        "auto",
-        "find each camera's exposure and white balance relative to the first one's; auto: where they surely differ and "
-        "more than one timestep tells",
-    )
-    exposures: bool = flag(
-        True,
-        "find images whose exposure differs surely from that of their camera's first timestep, and divide it out",
-    )
-    falloff: bool = flag(
-        True,
-        "find lenses that surely leave the corners of images darker than the middle, and divide it out",
-    )
-    contrast: bool = flag(
-        True,
-        "find cameras whose response surely has another contrast than the first one's, and take it out",
-    )
     landmark_weight: float = number(10.0, "objective paper: weight of the landmarks", least=0, most=WEIGHT)
     prior_weight: float = number(5e-5, "objective paper: weight of the model's prior", least=0, most=WEIGHT)
     pixels: int = number(2000, "objective paper: facial pixels per image, chosen at random", least=1, most=1_000_000)
@@ -234,6 +217,16 @@ class SurfaceConfig:
     close_lips: bool = flag(True, "close the lips on the lip line where the images show a closed mouth")
     close_lids: bool = flag(True, "close the lids where the images show closed eyes")
     finest: int = number(0, "times that the images are halved at the finest level", least=0, most=6)
+
+
+@settings
+class PhotometryConfig:
+    """Gains of cameras and exposures of images (``stages.photometry``)."""
+
+    enabled: bool = flag(
+        True,
+        "divide images by gains of cameras and exposures of images where they surely differ; needs two timesteps",
+    )
 
 
 @settings
@@ -355,6 +348,7 @@ class FitConfig:
 
     geometry: GeometryConfig = part(GeometryConfig)
     surface: SurfaceConfig = part(SurfaceConfig)
+    photometry: PhotometryConfig = part(PhotometryConfig)
     reflectance: ReflectanceConfig = part(ReflectanceConfig)
     normals: NormalsConfig = part(NormalsConfig)
     mesh: MeshConfig = part(MeshConfig)
@@ -376,13 +370,10 @@ class FitConfig:
             geometry=GeometryConfig(
                 objective="paper",
                 as_written=True,
-                camera_gains="never",
-                exposures=False,
-                falloff=False,
-                contrast=False,
                 eyes=False,
             ),
             surface=SurfaceConfig(enabled=False),
+            photometry=PhotometryConfig(enabled=False),
             reflectance=ReflectanceConfig(
                 solver="adam",
                 shading="printed",

@@ -16,6 +16,7 @@ import functools
 import json
 import shutil
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,6 +32,7 @@ from mifit.config import (
     GeometryConfig,
     MeshConfig,
     NormalsConfig,
+    PhotometryConfig,
     ReflectanceConfig,
     ResidualConfig,
     SurfaceConfig,
@@ -50,13 +52,13 @@ from mifit.reconstruction import Reconstruction
 from mifit.result.ownership import CHECKPOINTS, check_ours, locked
 from mifit.result.reading import read_document
 from mifit.stages.eyes import behind_lids
-from mifit.stages.falloff import find_falloff
 from mifit.stages.find_residual import find_residual
 from mifit.stages.find_surface import find_surface
 from mifit.stages.fit_geometry import fit_geometry
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.normals.mesh_refinement import refine_mesh
 from mifit.stages.normals.normal_refinement import refine_normals
+from mifit.stages.photometry import find_photometry
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -125,12 +127,10 @@ class Source:
         }
 
     def seen(self, inputs: Inputs) -> Source:
-        """The source without the exposures, falloff and contrast that its geometry has found."""
-        found = inputs.get("geometry")
-        if found is None or not found.corrects_images:
+        """The source with the gains and exposures that its geometry holds divided out of the images."""
+        if "geometry" not in inputs or not inputs["geometry"].photometry:
             return self
-        capture = self.capture.with_exposures(found.exposed).with_lenses(found.falloff, found.contrast)
-        return replace(self, capture=capture)
+        return replace(self, capture=self.capture.with_photometry(inputs["geometry"].photometry))
 
 
 @dataclass(frozen=True)
@@ -395,12 +395,11 @@ def _is_there(folder: Path, wanted: dict[str, Any], until: Stage) -> bool:
 
 def steps(config: FitConfig, until: Stage = "normals") -> list[Step]:
     """The steps of a fit with these settings, in order."""
-    measured = replace(config.geometry, falloff=False, contrast=False)
-    found = [Step("geometry", "geometry", (), (measured,), _fit_geometry)]
+    found = [Step("geometry", "geometry", (), (config.geometry,), _fit_geometry)]
     if config.surface.enabled:
-        found.append(Step("surface", "geometry", ("geometry",), (config.surface, measured), _find_surface))
-    if config.geometry.falloff or config.geometry.contrast:
-        found.append(Step("falloff", "geometry", ("geometry",), (config.geometry,), _find_falloff))
+        found.append(Step("surface", "geometry", ("geometry",), (config.surface, config.geometry), _find_surface))
+    if config.photometry.enabled:
+        found.append(Step("photometry", "geometry", ("geometry",), (config.photometry,), _find_photometry))
     if until == "geometry":
         return found
     found.append(Step("reflectance", "reflectance", ("geometry",), (config.reflectance,), _infer_reflectance))
@@ -478,9 +477,12 @@ def _find_surface(
     return behind_lids(model, find_surface(capture, model, inputs["geometry"], cameras, config, progress, geometry))
 
 
-def _find_falloff(source: Source, inputs: Inputs, progress: Progress, config: GeometryConfig) -> GeometryEstimate:
-    capture, model, cameras = source.images
-    return find_falloff(capture, model, inputs["geometry"], cameras, config, source.seed, progress)
+def _find_photometry(source: Source, inputs: Inputs, progress: Progress, config: PhotometryConfig) -> GeometryEstimate:
+    (capture, model, cameras), geometry = source.images, inputs["geometry"]
+    began = time.perf_counter()
+    found = find_photometry(capture, model, geometry, cameras, config, source.seed, progress)
+    report = replace(geometry.report, seconds=geometry.report.seconds + time.perf_counter() - began)
+    return replace(geometry, photometry=found, report=report)
 
 
 def _infer_reflectance(

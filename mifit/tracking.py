@@ -195,7 +195,6 @@ def extend(
             name: np.concatenate([getattr(a, name), getattr(b, name)])
             for name in ("expression", "rotation", "translation")
         },
-        exposures={name: (*factors, 1.0) for name, factors in a.exposures.items()},
     )
     before = result.normals or NormalsEstimate((), frame.normal_object[None][:0], Report("converged"))
     details = {
@@ -254,10 +253,6 @@ def _without(result: R, dropped: Sequence[int]) -> R:
             geometry,
             timesteps=left(geometry.timesteps),
             **{name: kept(getattr(geometry, name), geometry.timesteps) for name in parts},
-            exposures={
-                name: tuple(f for t, f in zip(geometry.timesteps, factors, strict=True) if t not in dropped)
-                for name, factors in geometry.exposures.items()
-            },
         ),
         normals=NormalsEstimate(
             left(normals.timesteps), kept(normals.normal_object, normals.timesteps), replace(report, details=details)

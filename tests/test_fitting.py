@@ -26,7 +26,7 @@ from tests.variant import VARIANT
 
 pytestmark = pytest.mark.usefixtures("variant")
 ALL = [
-    "fit_geometry", "find_surface", "find_falloff", "infer_reflectance", "refine_normals", "refine_mesh",
+    "fit_geometry", "find_surface", "find_photometry", "infer_reflectance", "refine_normals", "refine_mesh",
     "find_residual",
 ]  # fmt: skip
 

@@ -84,23 +84,6 @@ def test_what_hides_a_point_from_a_view_is_not_painted_onto_it(sphere):
     assert blocked.seen[free.seen & (aside > 0.3 * RADIUS) & (root > (0.5 * RADIUS) ** 2)].mean() > 0.9
 
 
-def test_a_gain_between_cameras_is_taken_out_of_the_colours(sphere):
-    faces, vertices = sphere
-    capture = photographs(None, lambda p: np.full(p.shape, 0.4))
-    plain = capture.frame
-
-    def brighter(name, timestep):
-        found = plain(name, timestep)
-        return SimpleNamespace(image=found.image * (2 if name == "right" else 1), valid=found.valid)
-
-    capture.frame = brighter
-    cameras, middle = [ball_camera("left", -20), ball_camera("right", 20)], ball_camera("third", 0)
-    gains = {"right": (2.0, 2.0, 2.0), "third": (0.5, 0.5, 0.5)}
-    found = image_based(capture, cameras, middle, 0, vertices, faces, gains)
-    inner = found.seen & (np.linalg.norm(middle.pixel_centres() - 32, axis=-1) < 15)
-    assert found.colour[inner] == pytest.approx(0.2, abs=0.005)
-
-
 def test_distances_are_those_to_the_nearest_point_of_a_face(sphere):
     faces, vertices = sphere
     middle = vertices[faces].mean(1)

@@ -9,6 +9,7 @@ import pytest
 import mifit
 from mifit.config import FitConfig
 from mifit.core.estimate import GeometryEstimate, Report, ResidualEstimate
+from mifit.core.photometry import Photometry
 from mifit.errors import InputError
 from mifit.fitting import PARTS, Source, check_images, choose_timesteps, eyes_note, keys, one_place, steps
 from mifit.morphable import MorphableModel
@@ -116,9 +117,11 @@ def test_views_from_one_place_bring_a_warning():
 
 pytestmark = pytest.mark.usefixtures("variant")
 ORDER = (
-    "geometry", "surface", "falloff", "reflectance", "normals", "mesh", "residual",
+    "geometry", "surface", "photometry", "reflectance", "normals", "mesh", "residual",
 )  # fmt: skip
-FIRST = {"geometry": 0, "surface": 1, "reflectance": 3, "normals": 4, "mesh": 5, "residual": 6}
+FIRST = {
+    "geometry": 0, "surface": 1, "photometry": 2, "reflectance": 3, "normals": 4, "mesh": 5, "residual": 6,
+}  # fmt: skip
 """Section of the settings -> the first step that reads it; all later ones depend on that one's estimate."""
 
 
@@ -126,7 +129,7 @@ def another(section, name, value):
     """The settings of one section with one of them changed to something else that is allowed."""
     allowed = {
         "objective": "paper", "solver": "adam", "shading": "paper",
-        "exponent": 77.0, "subdivisions": 1, "bands": 5, "camera_gains": "always",
+        "exponent": 77.0, "subdivisions": 1, "bands": 5,
     }  # fmt: skip
     if name in allowed:
         changed = allowed[name]
@@ -163,8 +166,8 @@ class Stages:
         }.items():  # fmt: skip
             monkeypatch.setattr(f"mifit.fitting.{name}", self.stand_in(name, getattr(result, part)))
         monkeypatch.setattr(
-            "mifit.fitting.find_falloff",
-            lambda capture, model, geometry, *_: self.stand_in("find_falloff", geometry)(capture),
+            "mifit.fitting.find_photometry",
+            lambda capture, *_: self.stand_in("find_photometry", Photometry())(capture),
         )
 
     def stand_in(self, name, estimate):
@@ -209,7 +212,7 @@ def fitted(stages):
 RUNS = (
     "fit_geometry",
     "find_surface",
-    "find_falloff",
+    "find_photometry",
     "infer_reflectance",
     "refine_normals",
     "refine_mesh",
@@ -228,8 +231,8 @@ def test_a_changed_setting_reruns_the_steps_that_depend_on_it(fitted, tmp_path, 
         assert ran == []
     elif (section, name) == ("surface", "enabled"):
         assert ran == list(RUNS[2:])
-    elif (section, name) in (("geometry", "falloff"), ("geometry", "contrast")):
-        assert ran == list(RUNS[2:])
+    elif section == "photometry":
+        assert ran == list(RUNS[3:])
     else:
         assert ran == list(RUNS[FIRST[section] :])
 

@@ -8,7 +8,6 @@ import threading
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,7 @@ from mifit.core.camera import Camera
 from mifit.core.files import file_digest, note_read
 from mifit.core.image import load_image
 from mifit.core.limits import MAX_IMAGE_BYTES
+from mifit.core.photometry import Photometry
 from mifit.errors import InputError
 
 CACHE_BYTES = 256 * 2**20
@@ -118,14 +118,8 @@ class Capture:
         Unit of length of the poses: ``mm``, ``cm``, ``dm`` or ``m``.
     estimated : dict of str to Camera
         Cameras that were estimated, or refined from their calibration; empty where all are as calibrated.
-    exposures : dict of (camera, timestep) to float
-        What images are divided by, where a fit found that their exposure changed (`with_exposures`); files and `digest`
-        stay as they are.
-    falloff : dict of camera to float
-        Logarithm by which the corners of its images are darker than their middle, where a fit found so; images are
-        divided by ``exp(-falloff * radius^2)`` (`Camera.corner_radius`), files and `digest` stay as they are.
-    contrast : dict of camera to float
-        Exponent of its linear colours over the first camera's, where a fit found one, which is undone last.
+    photometry : Photometry
+        Gains and exposures that images are divided by, where a fit found some; files and `digest` stay as they are.
     """
 
     path: Path
@@ -133,9 +127,7 @@ class Capture:
     shots: Mapping[tuple[str, int], Shot] = field(repr=False)
     units: str = "cm"
     estimated: Mapping[str, Camera] = field(default_factory=dict, repr=False)
-    exposures: Mapping[tuple[str, int], float] = field(default_factory=dict, repr=False)
-    falloff: Mapping[str, float] = field(default_factory=dict, repr=False)
-    contrast: Mapping[str, float] = field(default_factory=dict, repr=False)
+    photometry: Photometry = field(default_factory=Photometry, repr=False)
     _cache: _Cache = field(default_factory=lambda: _Cache(CACHE_BYTES), repr=False, compare=False)
 
     @classmethod
@@ -228,14 +220,9 @@ class Capture:
         if frame is None:
             frame = self._read(shot)
             self._cache.put((name, timestep), frame)
-        factor = self.exposures.get((name, timestep), 1.0)
-        if factor == 1.0 and name not in self.falloff and name not in self.contrast:
+        if not self.photometry:
             return frame
-        image = frame.image / np.float32(factor)
-        if name in self.falloff:
-            image /= _transmission(self.camera(name), self.falloff[name])
-        if name in self.contrast:
-            image = np.sign(image) * np.abs(image) ** np.float32(1.0 / self.contrast[name])
+        image = frame.image / self.photometry.factor(name, timestep)
         image.flags.writeable = False
         return dataclasses.replace(frame, image=image)
 
@@ -268,15 +255,9 @@ class Capture:
         """The same capture with estimated cameras; whether it is `calibrated` stays as it is."""
         return dataclasses.replace(self, estimated={camera.name: camera for camera in cameras}, _cache=self._cache)
 
-    def with_exposures(self, exposures: Mapping[tuple[str, int], float]) -> Capture:
-        """The same capture with images divided by the factors of `exposures`, in place of any that it has."""
-        return dataclasses.replace(self, exposures=dict(exposures), _cache=self._cache) if exposures else self
-
-    def with_lenses(self, falloff: Mapping[str, float], contrast: Mapping[str, float]) -> Capture:
-        """The same capture with falloff and contrast of cameras taken out of their images, in place of any it has."""
-        if not falloff and not contrast:
-            return self
-        return dataclasses.replace(self, falloff=dict(falloff), contrast=dict(contrast), _cache=self._cache)
+    def with_photometry(self, photometry: Photometry) -> Capture:
+        """The same capture with images divided by gains and exposures, in place of any that it has."""
+        return dataclasses.replace(self, photometry=photometry, _cache=self._cache)
 
     def with_fitted(self, cameras: Sequence[Camera]) -> Capture:
         """The capture as a fit with these cameras saw it: its own calibration, or else the estimated cameras."""
@@ -332,14 +313,6 @@ def _lens_camera(view: View) -> Camera:
     """Intrinsics and distortion of a view, pose left at the origin."""
     assert view.intrinsics is not None
     return Camera(view.name, view.width, view.height, *view.intrinsics, np.eye(4), distortion=view.distortion)
-
-
-@lru_cache(maxsize=4)
-def _transmission(camera: Camera, falloff: float) -> NDArray[np.float32]:
-    """(H, W, 1) part of the light that a lens lets through to each pixel, 1 in the middle."""
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    radius = camera.corner_radius(np.stack([x, y], axis=-1))
-    return np.exp(-falloff * radius**2).astype(np.float32)[..., None]
 
 
 def _check_size(shape: tuple[int, ...], view: View, path: Path) -> None:

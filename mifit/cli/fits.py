@@ -98,13 +98,13 @@ def _first_picture(out: Path, result: Reconstruction, capture: Capture) -> Path:
 
     from mifit.core.files import write_bytes
     from mifit.core.image import encode_png, to_8_bit
-    from mifit.output.evaluate import as_photographed, rgba_8_bit
+    from mifit.output.evaluate import rgba_8_bit
     from mifit.output.figures import overlay
 
     camera, timestep = result.cameras[0], result.timesteps[0]
     photograph = to_8_bit(capture.frame(camera.name, timestep).image)
     linear = result.render(camera, timestep, result.methods[-1])
-    laid_over = overlay(photograph, rgba_8_bit(as_photographed(result, linear, camera.name)))
+    laid_over = overlay(photograph, rgba_8_bit(linear))
     path = out / "first.png"
     write_bytes(path, encode_png(np.concatenate([photograph, laid_over], axis=1)))
     return path

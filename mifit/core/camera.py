@@ -107,11 +107,6 @@ class Camera:
         focal = 0.5 * width / math.tan(math.radians(0.5 * fov))
         return cls(name, width, height, focal, focal, 0.5 * width, 0.5 * height, pose)
 
-    def corner_radius(self, pixels: ArrayLike) -> NDArray[np.float64]:
-        """Distance (...,) of image points (..., 2) from the principal point; 1 is half the image's diagonal."""
-        offset = np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]
-        return np.linalg.norm(offset, axis=-1) / (0.5 * math.hypot(self.width, self.height))
-
     def orbit(
         self,
         yaw: float = 0.0,

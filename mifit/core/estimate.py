@@ -6,7 +6,7 @@ morphable model's: ``world = scale * rotation @ object + translation``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.diagnostics import Diagnostic
+from mifit.core.photometry import Photometry
 
 if TYPE_CHECKING:
     from mifit.appearance.illumination import Illumination
@@ -66,18 +67,8 @@ class GeometryEstimate:
         Paper's l_k in I_d = C_d * sum l_k phi_k(n): SH coefficients in world axes, basis of ``core.sh``.
     ambient : float
         The paper's I_a, in linear image units.
-    gains : dict of camera name to (r, g, b)
-        Each camera's linear image over the first one's, where asked for; images are divided by it when they are
-        observed. A camera that isn't named has gain 1.
-    exposures : dict of camera name to (T,) factors
-        Each image's linear colours over those of its camera's first timestep, where they differ; images are divided by
-        it when they are read (`Capture.with_exposures`). A camera that isn't named has one exposure.
-    falloff : dict of camera name to float
-        Logarithm by which the corners of its images are darker than their middle; images are brought to one brightness
-        when they are read (`Capture.with_lenses`). A camera that isn't named has a lens that is bright all over.
-    contrast : dict of camera name to float
-        Exponent of its linear colours over the first camera's, undone when images are read. A camera that isn't named
-        has 1.
+    photometry : Photometry
+        Gains of cameras and exposures of images, which are divided out when a capture is read for this fit.
     displacement : (V, 3) float32 or None
         Neutral surface beyond the model's span, object space: ``model.mean`` plus this is what coefficients add to
         (`displaced`). None where the surface is the model's.
@@ -95,34 +86,13 @@ class GeometryEstimate:
     shading: NDArray
     ambient: float
     report: Report
-    gains: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    exposures: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    falloff: Mapping[str, float] = field(default_factory=dict)
-    contrast: Mapping[str, float] = field(default_factory=dict)
+    photometry: Photometry = field(default_factory=Photometry)
     displacement: NDArray | None = None
 
     @property
     def middle(self) -> NDArray:
         """(3,) mean of the first timestep's vertices: what near lights are turned about."""
         return np.asarray(self.vertices[0], dtype=np.float64).mean(axis=0)
-
-    def gain(self, camera: str) -> NDArray:
-        """(3,) float32 gain of a camera; 1 where none is known."""
-        return np.array(self.gains.get(camera, (1.0, 1.0, 1.0)), dtype=np.float32)
-
-    @property
-    def exposed(self) -> dict[tuple[str, int], float]:
-        """The images' exposures by camera and timestep."""
-        return {
-            (name, timestep): float(factor)
-            for name, factors in self.exposures.items()
-            for timestep, factor in zip(self.timesteps, factors, strict=True)
-        }
-
-    @property
-    def corrects_images(self) -> bool:
-        """Whether exposures, falloff or contrast are to be taken out of images when they are read."""
-        return bool(self.exposures or self.falloff or self.contrast)
 
     def index(self, timestep: int) -> int:
         """Position of a timestep in the per-timestep arrays; KeyError when it was not fitted."""
@@ -140,7 +110,6 @@ class GeometryEstimate:
             rotation=self.rotation[rows],
             translation=self.translation[rows],
             vertices=self.vertices[rows],
-            exposures={name: tuple(factors[k] for k in rows) for name, factors in self.exposures.items()},
         )
 
 

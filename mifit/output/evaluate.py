@@ -175,7 +175,7 @@ def separation_of(reconstruction: Result, capture: Capture, camera: str) -> dict
     view = located(capture, reconstruction, camera).camera(camera)
     surface = visible_surface(alone, view, timestep)
     linear = shade_methods(alone, surface, timestep, ("full", "diffuse"))
-    full, diffuse = (as_photographed(alone, linear[method], camera) for method in ("full", "diffuse"))
+    full, diffuse = (linear[method] for method in ("full", "diffuse"))
     region = pass_region(landmarks_of(capture, camera, timestep), view) & (full[..., 3] > 0)
     parts = diffuse[..., :3], full[..., :3] - diffuse[..., :3]
     return separation(*parts, truth.diffuse, truth.specular, region)
@@ -251,12 +251,12 @@ def compare(
     area &= frame.valid
     if not area.any():
         raise InputError(f"camera {camera}, timestep {timestep}: the face area is not visible, nothing to evaluate")
-    renders = {m: rgba_8_bit(as_photographed(reconstruction, image, camera)) for m, image in linear.items()}
+    renders = {m: rgba_8_bit(image) for m, image in linear.items()}
     photograph = to_8_bit(frame.image)
     if not baseline:
         return Comparison(timestep, photograph, area, renders, landmark_pixels=off)
-    cameras, gains = shown.cameras, shown.geometry.gains
-    base = image_based(capture, cameras, view, timestep, vertices, model.faces, gains, moments=moments)
+    cameras = shown.cameras
+    base = image_based(capture, cameras, view, timestep, vertices, model.faces, moments=moments)
     return Comparison(timestep, photograph, area, renders, to_8_bit(base.colour), area & base.seen, off)
 
 
@@ -273,12 +273,6 @@ def located(capture: Capture, reconstruction: Result, camera: str) -> Capture:
     if camera in capture.estimated:
         return capture
     return reconstruction.seen(capture)
-
-
-def as_photographed(reconstruction: Result, image: NDArray, camera: str) -> NDArray:
-    """A render (H, W, 4) with the exposure and white balance that the fit found for a camera."""
-    gain = reconstruction.geometry.gain(camera)
-    return image if (gain == 1).all() else image * np.append(gain, np.float32(1.0))
 
 
 def rgba_8_bit(linear: NDArray) -> NDArray[np.uint8]:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.output.evaluate import as_photographed, face_area
+from mifit.output.evaluate import face_area
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -90,7 +90,7 @@ def face_mask(
     area = face_area(reconstruction.geometry.vertices[i], model.faces, model.face_mask, view)
     area &= frame.valid & (render[..., 3] > 0.999)
     clipped = area & frame.clipped
-    fitted = as_photographed(reconstruction, render, camera)[..., :3]
+    fitted = render[..., :3]
     return FaceMask(area, clipped, _unexplained(frame.image, fitted, area & ~clipped))
 
 

@@ -80,7 +80,6 @@ def pose_head(result: R, capture: Capture, timestep: int) -> tuple[R, float]:
         rotation=turn[None],
         translation=shift[None],
         vertices=(head @ turn.T + shift)[None].astype(np.float32),
-        exposures={},
     )
     normal = result.refined_normal(result.timesteps[nearest])
     normals = None

@@ -14,7 +14,7 @@ import numpy as np
 import mifit
 from mifit.core.files import write_text
 from mifit.core.image import to_8_bit
-from mifit.output.evaluate import Comparison, as_photographed, compare, held_out, rgba_8_bit
+from mifit.output.evaluate import Comparison, compare, held_out, rgba_8_bit
 from mifit.output.face_mask import face_mask
 from mifit.output.figures import (
     CLIPPED_TINT,
@@ -230,7 +230,7 @@ def _inputs(result: Result, capture: Capture, timesteps: tuple[int, ...]) -> str
             view, frame = capture.camera(camera), capture.frame(camera, timestep)
             photograph = to_8_bit(frame.image)
             linear = result.render(view, timestep, result.methods[-1], samples=1)
-            render = rgba_8_bit(as_photographed(result, linear, camera))
+            render = rgba_8_bit(linear)
             box = bounding_box(render[..., 3] > 0)
             marked = draw_landmarks(photograph, view, frame.landmarks, frame.visible, points)
             label = html.escape(camera)

@@ -17,7 +17,7 @@ from mifit.core.mesh import normalize
 from mifit.core.process import decoding
 from mifit.errors import InputError, MifitError
 from mifit.output.deferred import shade_methods, visible_surface
-from mifit.output.evaluate import as_photographed, rgba_8_bit
+from mifit.output.evaluate import rgba_8_bit
 from mifit.output.figures import overlay
 from mifit.output.gltf import write_glb
 from mifit.progress import Progress, silent
@@ -195,7 +195,7 @@ def write_overlay(
             progress(f"overlay {camera}", k, len(steps))
             photograph = to_8_bit(capture.frame(camera, timestep).image)
             linear = reconstruction.render(view, timestep, reconstruction.methods[-1], samples=1)
-            render = rgba_8_bit(as_photographed(reconstruction, linear, camera))
+            render = rgba_8_bit(linear)
             yield np.concatenate([photograph, overlay(photograph, render)], axis=1)
         progress(f"overlay {camera}", len(steps), len(steps))
 

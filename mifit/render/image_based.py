@@ -58,7 +58,6 @@ def image_based(
     timestep: int,
     vertices: NDArray,
     faces: NDArray,
-    gains: Mapping[str, Sequence[float]] | None = None,
     scene: SurfaceScene | None = None,
     moments: Mapping[int, NDArray] | None = None,
 ) -> ImageBased:
@@ -75,8 +74,6 @@ def image_based(
     timestep : int
     vertices : (V, 3), faces : (F, 3)
         Mesh in the capture's world space.
-    gains : dict of camera name to (r, g, b), optional
-        Linear image of each camera over the first one's; 1 for cameras that aren't named.
     scene : SurfaceScene, optional
         The mesh, where one was made of it already.
     moments : dict of timestep to (V, 3), optional
@@ -108,12 +105,11 @@ def image_based(
             point = interpolate(np.asarray(then, np.float64), faces, face, weights)
         for view in fitted:
             frame = capture.frame(view.name, moment)
-            gain = np.asarray((gains or {}).get(view.name, (1.0, 1.0, 1.0)))
             x, y = (view.project(point) - 0.5).T
             inside = (x >= 0) & (y >= 0) & (x <= view.width - 1) & (y <= view.height - 1)
             x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
             inside &= bilinear(frame.valid.astype(np.float32), x, y) > 0.999
-            colour = bilinear(frame.image, x, y) / gain
+            colour = bilinear(frame.image, x, y)
             cosine = np.sum(normal * normalize(view.position - point), axis=1)
             facing = np.where(inside, cosine, -np.inf)
             spare[facing > best] = colour[facing > best]
@@ -122,7 +118,6 @@ def image_based(
             total += np.where(visible, cosine**2, 0.0)[:, None] * colour
             weight += np.where(visible, cosine**2, 0.0)
     total = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-12)[:, None], spare)
-    total *= np.asarray((gains or {}).get(camera.name, (1.0, 1.0, 1.0)))
     shape = (camera.height, camera.width)
     image, shown, seen = np.zeros((*shape, 3), np.float32), np.full(shape, -1, np.int32), np.zeros(shape, bool)
     image.reshape(-1, 3)[index], shown.ravel()[index], seen.ravel()[index] = total, face, weight > 0

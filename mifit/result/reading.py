@@ -30,6 +30,7 @@ from mifit.core.files import read_text
 from mifit.core.image import read_image, to_8_bit
 from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_PIXELS
 from mifit.core.mesh import SplitMesh, split_at_seams, split_faces
+from mifit.core.photometry import Photometry
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import lacks_eyes, with_eyes
@@ -186,22 +187,7 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
         shading=_array(lighting["shading"], (9, 3), "shading"),
         ambient=float(lighting["shading_ambient"]),
         report=_report(document, "geometry"),
-        gains={
-            name: tuple(_array(gain, (3,), f"gain of {name}").tolist())
-            for name, gain in document["capture"].get("gains", {}).items()
-        },
-        exposures={
-            name: tuple(_array(factors, (n,), f"exposures of {name}").tolist())
-            for name, factors in document["capture"].get("exposures", {}).items()
-        },
-        falloff={
-            name: float(_array(value, (), f"falloff of {name}"))
-            for name, value in document["capture"].get("falloff", {}).items()
-        },
-        contrast={
-            name: float(_array(value, (), f"contrast of {name}"))
-            for name, value in document["capture"].get("contrast", {}).items()
-        },
+        photometry=Photometry.from_document(document["capture"].get("photometry", {})),
         displacement=_displacement(folder, len(model.mean)) if entry.get("displaced") else None,
     )
 

@@ -176,11 +176,9 @@ class Result:
         return self.geometry.timesteps
 
     def seen(self, capture: Capture) -> Capture:
-        """A capture with the cameras, in the exposures, without the falloff and contrast that the fit found."""
-        capture = capture.with_fitted(self.cameras)
-        if not self.geometry.corrects_images:
-            return capture
-        return capture.with_exposures(self.geometry.exposed).with_lenses(self.geometry.falloff, self.geometry.contrast)
+        """A capture with the cameras, gains and exposures that the fit found."""
+        capture, photometry = capture.with_fitted(self.cameras), self.geometry.photometry
+        return capture.with_photometry(photometry) if photometry else capture
 
     @property
     def methods(self) -> tuple[Method, ...]:

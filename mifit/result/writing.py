@@ -160,10 +160,7 @@ def _document(result: Result) -> dict[str, Any]:
                 "units": result.units,
                 "unit_mm": result.unit_mm,
                 "cameras": [_camera_document(c) for c in result.cameras],
-                "gains": {name: list(gain) for name, gain in geometry.gains.items()},
-                "exposures": {name: list(factors) for name, factors in geometry.exposures.items()},
-                "falloff": dict(geometry.falloff),
-                "contrast": dict(geometry.contrast),
+                "photometry": geometry.photometry.document(),
             },
             "model": {
                 "source": _source(result.model_source),

@@ -117,9 +117,7 @@ def find_surface(
         other = search.descend(Reached.at(fitted), coarse)
         # Colours mislead where the albedo model doesn't explain them; through the truer surface views predict others.
         # What the finest sweep adds is small beside what parts the two, and dear.
-        between = errors_between_views(
-            capture, model, cameras, geometry.timesteps, [last.world, other.world], geometry.gains
-        )
+        between = errors_between_views(capture, model, cameras, geometry.timesteps, [last.world, other.world])
         refit = between[1] < between[0]
         if refit:
             last = other

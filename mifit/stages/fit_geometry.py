@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,8 +17,6 @@ from mifit.errors import ConvergenceError, InputError
 from mifit.morphable import MorphableModel
 from mifit.optim import Solution
 from mifit.progress import Progress, silent
-from mifit.stages.exposures import estimate_exposures
-from mifit.stages.gains import estimate_gains
 from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.displaced import displaced
 from mifit.stages.geometry.faults import calibration_warnings, unseen_warnings
@@ -28,8 +26,6 @@ from mifit.stages.geometry.refine import Reference, priors_of, refine_by_renderi
 from mifit.stages.geometry.start import FEWEST_LANDMARKS, State, fit_landmarks, initial_state, landmark_views
 from mifit.stages.geometry.summary import Journal, pack
 from mifit.stages.geometry.visibility import Visibility, spread_points
-from mifit.stages.image_factors import MAP_SIZE
-from mifit.stages.observations import Surface
 
 __all__ = ["fit_geometry", "fit_pose_expression", "texture_reference"]
 
@@ -94,37 +90,7 @@ def fit_geometry(
     for message in calibration_warnings(views, model, state.frames.scale, start.noise):
         journal.warn(message)
 
-    def refine(
-        capture: Capture, gains: Mapping[str, Sequence[float]], exposures: Mapping[str, Sequence[float]]
-    ) -> GeometryEstimate:
-        found = _refine_and_pack(
-            capture, model, cameras, timesteps, config, seed, journal, start.state, used, None, None, gains
-        )
-        return replace(found, exposures=exposures)
-
-    found = refine(capture, {}, {})
-    exposing = config.exposures and len(timesteps) > 1
-    # Where a head stands still, skin that shines towards one camera looks like a camera that is brighter.
-    too_few = len(cameras) == 1 or len(timesteps) == 1
-    gaining = config.camera_gains == "always" or (config.camera_gains == "auto" and not too_few)
-    if not exposing and not gaining:
-        return found
-    surface = Surface(capture, model, found, cameras, MAP_SIZE)
-    exposures = estimate_exposures(surface, found, cameras, seed, progress) if exposing else {}
-    if exposures:
-        capture = capture.with_exposures(replace(found, exposures=exposures).exposed)
-        found = refine(capture, {}, exposures)
-        surface = Surface(capture, model, found, cameras, MAP_SIZE)
-    if not gaining:
-        return found
-    gains = estimate_gains(surface, found, cameras, seed, progress, certain=config.camera_gains == "auto")
-    if not gains:
-        return found
-    for name in cameras:
-        if name not in gains:
-            text = f"camera {name}: shares too little of the face with {cameras[0]} to tell its gain; taken as 1"
-            journal.warn(Diagnostic("gain-unknown", text, camera=name))
-    return refine(capture, gains, found.exposures)
+    return _refine_and_pack(capture, model, cameras, timesteps, config, seed, journal, start.state, used, None, None)
 
 
 def fit_pose_expression(
@@ -183,9 +149,9 @@ def fit_pose_expression(
         text = f"timestep {timestep}: too few landmarks; started from timestep {geometry.timesteps[-1]} alone"
         journal.warn(Diagnostic("few-landmarks", text))
     found = _refine_and_pack(
-        capture, baked, cameras, (timestep,), config, seed, journal, state, views, reference, geometry, geometry.gains
+        capture, baked, cameras, (timestep,), config, seed, journal, state, views, reference, geometry
     )
-    return replace(found, displacement=geometry.displacement)
+    return replace(found, displacement=geometry.displacement, photometry=geometry.photometry)
 
 
 def _landmark_noise(
@@ -232,10 +198,9 @@ def _refine_and_pack(
     views: tuple[LandmarkView, ...],
     reference: Reference | None,
     fixed: GeometryEstimate | None,
-    gains: Mapping[str, Sequence[float]],
 ) -> GeometryEstimate:
     """Photometric rounds, then albedo and lighting unless ``fixed`` has them."""
-    visibility = Visibility(capture, model, cameras, timesteps, gains)
+    visibility = Visibility(capture, model, cameras, timesteps)
     if config.objective == "paper" and fixed is None:
         appearance = _appearance(model, state, visibility, config, seed)
         for number in range(config.rounds):
@@ -271,7 +236,6 @@ def _refine_and_pack(
         views,
         config.landmark_noise,
         fixed,
-        gains,
     )
 
 

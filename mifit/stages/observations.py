@@ -9,7 +9,7 @@ no more than the probability that it shows the point (`stages.trust`).
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
@@ -51,7 +51,7 @@ class Observations:
     step, camera : (J,) int
         Index of the timestep in the geometry and of the camera in the list of cameras.
     colour : (N, J, 3) float32
-        Linear image colour over the camera's gain, bilinear; 0 where not observed.
+        Linear image colour, bilinear; 0 where not observed.
     weight : (N, J) float32
         Pixels that the texel covers, faded at grazing angles, times ``right``; 0 where occluded, outside or invalid.
     clipped : (N, J) bool
@@ -184,7 +184,6 @@ class Surface:
             covered, edge, outline, facial = face_pixels(
                 buffer, self.vertices[i], model.faces, shown, camera, model.face_mask
             )
-            colour = frame.image / geometry.gain(camera.name)
             unusable = edge | ~covered | ~frame.valid | ~np.isfinite(frame.image).all(-1)
             if whole:
                 unusable |= background(frame.image, outline > 0, facial)
@@ -192,7 +191,7 @@ class Surface:
                 i,
                 k,
                 camera,
-                np.where(unusable[..., None], 0, colour).astype(np.float32),
+                np.where(unusable[..., None], 0, frame.image).astype(np.float32),
                 unusable.astype(np.float32),
                 frame.clipped.astype(np.float32),
                 footprint(self.vertices[i], model.faces, camera, area),
@@ -243,16 +242,6 @@ class Surface:
         for name, values in changed.items():
             values[rows] = getattr(again, name)
         return replace(kept, **changed)
-
-    def exposed(self, gains: Mapping[str, Sequence[float]]) -> Surface:
-        """The same surface with the images over gains of the cameras, where it was made without."""
-        other = copy.copy(self)
-        other._kept, other.geometry = None, replace(self.geometry, gains=gains)
-        other._images = [
-            replace(image, colour=(image.colour / other.geometry.gain(image.camera.name)).astype(np.float32))
-            for image in self._images
-        ]
-        return other
 
     @property
     def image_count(self) -> int:

@@ -78,20 +78,17 @@ def segment(surface: Surface, capture: Capture, model: MorphableModel, seed: int
         `Label` values, in the order of the surface's images.
     """
     agreed = consensus(surface, seed)
-    gain = surface.geometry.gain
 
     def labelled(view: Seen) -> NDArray[np.uint8]:
-        return _segment_image(view, agreed, capture, model, gain(view.camera.name))
+        return _segment_image(view, agreed, capture, model)
 
     return tuple(on_all_cores(labelled, list(surface.views())))
 
 
-def _segment_image(
-    view: Seen, agreed: Consensus, capture: Capture, model: MorphableModel, gain: NDArray
-) -> NDArray[np.uint8]:
+def _segment_image(view: Seen, agreed: Consensus, capture: Capture, model: MorphableModel) -> NDArray[np.uint8]:
     frame = capture.frame(view.camera.name, view.timestep)
     number = np.asarray(np.isfinite(frame.image).all(axis=-1))
-    image = np.where(number[..., None], frame.image / gain, 0.0).astype(np.float32)  # as the consensus was formed
+    image = np.where(number[..., None], frame.image, 0.0).astype(np.float32)
     hit = view.face >= 0
     labels = np.where(hit, np.uint8(Label.SKIN), np.uint8(Label.BACKGROUND))
     facial = hit & model.face_mask[np.maximum(view.face, 0)]

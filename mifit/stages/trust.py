@@ -112,7 +112,7 @@ def agreement(
     Parameters
     ----------
     colour : (N, J, 3)
-        Linear, over the cameras' gains.
+        Linear.
     weight : (N, J)
         0 where not observed.
     wrong : (N, J)

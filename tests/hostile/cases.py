@@ -858,7 +858,7 @@ def results(base: Path) -> Iterator[Case]:
         "warnings",
         "mifit_version",
         "digest",
-        "gains",
+        "photometry",
         "name",
         "status",
         "energies",

@@ -24,7 +24,6 @@ COARSE = ("--model", "builtin:coarse", "--quiet")
 CONFIG = """
 [geometry]
 rounds = 1
-camera_gains = "never"
 [surface]
 refit = false
 [reflectance]

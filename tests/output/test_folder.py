@@ -12,6 +12,7 @@ import pytest
 import trimesh
 
 from mifit.core.mesh import split_at_seams, tangents, vertex_normals
+from mifit.core.photometry import Photometry
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.output.map_figures import picture_maps
@@ -50,12 +51,9 @@ def test_round_trip_is_exact(ball, saved):
 
 
 def test_what_images_are_divided_by_round_trips(ball, tmp_path):
-    gains = {"left": (1.0, 1.0, 1.0), "right": (1.25, 0.9, 1.1)}
-    geometry = dataclasses.replace(ball.geometry, gains=gains, falloff={"left": 0.25}, contrast={"right": 1.1})
-    dataclasses.replace(ball, geometry=geometry).save(tmp_path)
-    again = Reconstruction.load(tmp_path, ball.model).geometry
-    assert again.gains == geometry.gains and again.falloff == geometry.falloff
-    assert again.contrast == geometry.contrast
+    photometry = Photometry({"left": (1.0, 1.0, 1.0), "right": (1.25, 0.9, 1.1)}, {("right", 3): 0.5})
+    dataclasses.replace(ball, geometry=dataclasses.replace(ball.geometry, photometry=photometry)).save(tmp_path)
+    assert Reconstruction.load(tmp_path, ball.model).geometry.photometry == photometry
 
 
 def test_confidence_of_the_specular_map_round_trips(ball, tmp_path):

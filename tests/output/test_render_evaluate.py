@@ -11,6 +11,7 @@ import pytest
 from mifit.core import sh
 from mifit.core.image import srgb_to_linear, write_image
 from mifit.core.mesh import vertex_normals
+from mifit.core.photometry import Photometry
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import with_eyes
@@ -43,6 +44,10 @@ class FakeCapture:
 
     def with_fitted(self, cameras):
         return self
+
+    def with_photometry(self, photometry):
+        images = self.images
+        return replace(self, images=lambda c, t: images(c, t) / photometry.factor(c.name, t))
 
     def frame(self, name, t):
         image = self.images(self.camera(name), t)
@@ -136,7 +141,8 @@ def test_evaluation_of_a_perfect_photograph_and_of_a_known_error(ball, variant):
 
 def test_a_photograph_is_compared_at_its_cameras_gain(ball, variant):
     gain = np.float32((1.25, 0.9, 1.1))
-    scaled = replace(ball, geometry=replace(ball.geometry, gains={"left": (1.0, 1.0, 1.0), "right": tuple(gain)}))
+    photometry = Photometry({"left": (1.0, 1.0, 1.0), "right": tuple(gain)})
+    scaled = replace(ball, geometry=replace(ball.geometry, photometry=photometry))
     capture = FakeCapture(ball.cameras, lambda c, t: ball.render(c, t)[..., :3] * (gain if c.name == "right" else 1))
     for camera in ("left", "right"):
         assert evaluate(scaled, capture, camera)["methods"]["full"]["rmse"] < 0.6

@@ -154,21 +154,6 @@ def test_the_background_beside_a_mesh_that_is_too_wide_counts_for_little(variant
     assert surface.quality()[edge] < surface.quality()[middle]
 
 
-def test_images_over_gains_are_those_of_a_surface_that_has_them(variant):
-    from mifit.stages.observations import Surface
-
-    shot, model, gains = capture((0.0, 0.3)), quad(), {"left": (1.0, 1.0, 1.0), "right": (1.25, 0.9, 1.1)}
-    plain = Surface(shot, model, geometry(), ("left", "right"), SIZE)
-    plain.observe(np.arange(len(plain)))
-    found = plain.exposed(gains).observe(np.arange(len(plain)))
-    wanted = Surface(shot, model, replace(geometry(), gains=gains), ("left", "right"), SIZE).observe(
-        np.arange(len(plain))
-    )
-    for name in ("colour", "weight", "right", "clipped"):
-        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-5)
-    assert not np.allclose(found.colour, plain.observe(np.arange(len(plain))).colour)
-
-
 def test_pixels_left_out_are_read_as_if_they_had_never_been_there(variant):
     from mifit.stages.observations import Surface
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +74,6 @@ def pack(
     views: tuple[LandmarkView, ...],
     noise: float,
     fixed: GeometryEstimate | None,
-    gains: Mapping[str, Sequence[float]],
 ) -> GeometryEstimate:
     """Turn a state into the stage's result.
 
@@ -88,7 +86,6 @@ def pack(
         Standard deviation of a landmark coordinate that the fit used, pixels.
     fixed : GeometryEstimate, optional
         Where identity and albedo come from when they weren't fitted.
-    gains : dict of camera name to (r, g, b)
     """
     layout, x = state.layout, state.x
     poses = [state.frames.pose(layout, x, k) for k in range(len(timesteps))]
@@ -133,7 +130,6 @@ def pack(
             tuple(journal.warnings),
             details,
         ),
-        gains=dict(gains),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -63,10 +63,8 @@ class Visibility:
         model: MorphableModel,
         cameras: Sequence[str],
         timesteps: Sequence[int],
-        gains: Mapping[str, Sequence[float]] | None = None,
         scenes: Scenes | None = None,
     ) -> None:
-        self._gains = gains or {}
         self._scenes = scenes or Scenes(model.faces)
         self.capture, self.model = capture, model
         self.cameras: list[Camera] = [capture.camera(name) for name in cameras]
@@ -109,12 +107,11 @@ class Visibility:
         return (on > 0) & self._measured[at]
 
     def _level(self, step: int, camera: Camera, sigma: float) -> SmoothImage:
-        """An image in the first camera's exposure, blurred: the same in every round."""
+        """An image, blurred: the same in every round."""
         at = (step, camera.name, sigma)
         if at not in self._levels:
             frame = self.capture.frame(camera.name, self.timesteps[step])
-            gain = np.asarray(self._gains.get(camera.name, 1.0), dtype=np.float32)
-            self._levels[at] = level(frame.image / gain, frame.valid, sigma)
+            self._levels[at] = level(frame.image, frame.valid, sigma)
         return self._levels[at]
 
     def _warn_unusable(self, camera: Camera, step: int) -> None:

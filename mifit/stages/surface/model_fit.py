@@ -197,7 +197,7 @@ def fit_model(
     capture, model, cameras
         As in `fit_geometry`.
     geometry : GeometryEstimate
-        Where to start; albedo, lighting and gains stay.
+        Where to start; albedo, lighting and photometry stay.
     measure : callable
         Sweeps the model's surface.
     sweeps : sequence of (int, int)
@@ -225,7 +225,7 @@ def fit_model(
         capture, model, cameras, steps, biased_noise(noise, images, scatter_pixels(geometry)), fewest=0
     )
     views = slid(model, geometry, views)
-    visibility = Visibility(capture, model, tuple(cameras), steps, geometry.gains, scenes)
+    visibility = Visibility(capture, model, tuple(cameras), steps, scenes)
     points = spread_points(model, min(config.surface_points, TEXTURE_POINTS), seed)
     texels = rasterize_uv(model.uv, model.faces_uv, COUNTERPART_MAP, model.face_mask)
     farthest = FARTHEST_MM * float(geometry.scale) / model.unit_mm

@@ -6,7 +6,7 @@ places of the others. No light, no albedo and no landmark enters, so that what w
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -32,7 +32,6 @@ def errors_between_views(
     cameras: Sequence[str],
     timesteps: Sequence[int],
     surfaces: Sequence[NDArray],
-    gains: Mapping[str, Sequence[float]],
 ) -> list[float]:
     """Root mean square error of each fitted view as the others show it, for each candidate surface.
 
@@ -44,8 +43,6 @@ def errors_between_views(
     timesteps : sequence of int
     surfaces : sequence of (T, V, 3)
         Candidates: the model's vertices in world space at each timestep.
-    gains : dict of camera name to (r, g, b)
-        Linear image of each camera over the first one's; 1 for cameras that aren't named.
 
     Returns
     -------
@@ -66,7 +63,7 @@ def errors_between_views(
             judged = (frame.valid & ~frame.clipped)[::EVERY, ::EVERY]
             some, predicted = every(view, EVERY), []
             for scene, surface in zip(scenes, surfaces, strict=True):
-                shown = image_based(capture, others, some, timestep, surface[k], model.faces, gains, scene)
+                shown = image_based(capture, others, some, timestep, surface[k], model.faces, scene)
                 judged = judged & shown.seen & model.face_mask[shown.face]  # nothing is seen where no face is hit
                 predicted.append(shown.colour)
             wanted = linear_to_srgb(frame.image[::EVERY, ::EVERY][judged])
