@@ -18,6 +18,8 @@ from mifit.morphable.formats.bfm_h5 import load_bfm_h5
 from mifit.morphable.formats.eos import load_eos, looks_like_eos
 from mifit.morphable.formats.flame import KEYS as FLAME_KEYS
 from mifit.morphable.formats.flame import load_flame_npz, load_flame_pickle
+from mifit.morphable.formats.gnm import KEYS as GNM_KEYS
+from mifit.morphable.formats.gnm import load_gnm
 from mifit.morphable.formats.ict import is_ict_folder, is_ict_npz, load_ict_folder, load_ict_npz
 from mifit.morphable.formats.mat5 import is_mat5, mat_names
 from mifit.morphable.formats.own import FORMAT_KEY, load_own
@@ -32,6 +34,7 @@ KINDS: dict[str, Callable[[Path], MorphableModel]] = {
     "ict-npz": load_ict_npz,
     "ict-folder": load_ict_folder,
     "flame-npz": load_flame_npz,
+    "gnm": load_gnm,
     "flame-pickle": load_flame_pickle,
     "bfm2009": bfm2009.load_bfm2009,
     "3ddfa": threeddfa.load_3ddfa,
@@ -100,6 +103,7 @@ def recognise(path: Path) -> str:
             ("mifit", FORMAT_KEY in keys),
             ("ict-npz", is_ict_npz(keys)),
             ("flame-npz", set(FLAME_KEYS) <= set(keys)),
+            ("gnm", set(GNM_KEYS) <= set(keys)),
         ):
             if fits:
                 return kind

@@ -217,3 +217,56 @@ def _blendshapes(m: MorphableModel) -> bytes:
 
 def write_eos_blendshapes(path: Path, m: MorphableModel) -> None:
     path.write_bytes(_blendshapes(m))
+
+
+def write_gnm(path: Path, m: MorphableModel, changes: dict | None = None) -> np.ndarray:
+    """A GNM head: the model in metres with corneas before its eyes; returns their vertices.
+
+    Every piece has the unit square of texture coordinates, names are those of version 3.
+    """
+    from mifit.morphable.openings import eyeballs
+
+    eyes = np.concatenate(eyeballs(m))
+    count = m.n_vertices
+    corneas = np.arange(count, count + len(eyes))
+    metres = 0.001 * m.unit_mm
+    shift = np.array([0.0, 0.0, 0.0005])
+    after = np.full(count, -1)
+    after[eyes] = corneas
+    faces = np.concatenate([m.faces, after[m.faces[np.isin(m.faces, eyes).all(axis=1)]]])
+
+    def doubled(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([values, values[eyes]])
+
+    mean = doubled(metres * m.mean.astype(np.float64))
+    mean[corneas] += shift
+    groups = {"skin": np.ones(len(mean)), "eyes": np.zeros(len(mean)), "eye_exteriors": np.zeros(len(mean))}
+    groups["skin"][eyes], groups["skin"][corneas] = 0.0, 0.0
+    groups["eyes"][eyes], groups["eyes"][corneas], groups["eye_exteriors"][corneas] = 1.0, 1.0, 1.0
+    groups["scleras"] = groups["eyes"] - groups["eye_exteriors"]
+    # A third of the identity modes move teeth alone, which are not there.
+    identity = np.moveaxis(metres * doubled(m.identity), 2, 0)
+    identity = np.concatenate([identity, np.zeros((len(identity) // 2, *identity.shape[1:]))])
+    low, high = mean.min(axis=0)[:2], mean.max(axis=0)[:2]
+    uv = (mean[:, :2] - low) / (high - low)
+    joints = 4
+    data = {
+        "version": "3.0", "variant": "head", "template_vertex_positions": mean.astype(np.float32),
+        "template_joint_positions": np.zeros((joints, 3)), "vertex_identity_basis": identity.astype(np.float32),
+        "joint_identity_basis": np.zeros((len(identity), joints, 3)),
+        "expression_basis": np.moveaxis(metres * doubled(m.expression), 2, 0).astype(np.float32),
+        "identity_names": np.array([f"head_{k}" for k in range(len(identity))]),
+        "joint_names": np.array(["neck", "head", "left_eye", "right_eye"]),
+        "expression_names": np.array([f"lower_face_region_{k}" for k in range(m.n_expression)]),
+        "joint_parent_indices": np.array([-1, 0, 1, 1]), "skinning_weights": np.zeros((joints, len(mean))),
+        "quads": np.zeros((0, 4), np.int32), "triangles": faces.astype(np.int32),
+        "quad_uvs": np.zeros((0, 4, 2)), "triangle_uvs": uv[faces].astype(np.float32),
+        "mesh_component_names": np.array(["skin", "eyes"]), "mirror_indices": np.arange(len(mean)),
+        "joint_regressor": np.zeros((joints, len(mean))),
+        "pose_correctives_regressor": np.zeros((9 * joints, 3)),
+        "bone_aligned_template_joint_orientations": np.tile(np.eye(3), (joints, 1, 1)),
+        "vertex_groups": np.stack(list(groups.values())).astype(np.float32),
+        "vertex_group_names": np.array(list(groups)),
+    } | (changes or {})  # fmt: skip
+    np.savez_compressed(path, **{key: value for key, value in data.items() if value is not None})
+    return corneas

@@ -6,9 +6,12 @@ import layouts
 import numpy as np
 import pytest
 
+from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.formats.bfm2009 import load_bfm2009
 from mifit.morphable.formats.bfm_h5 import read_specular_albedo
+from mifit.morphable.formats.gnm import STRIP
+from mifit.morphable.openings import SCLERA_ALBEDO, eyeballs, lacks_eyes
 from mifit.morphable.recognise import recognise
 
 
@@ -146,3 +149,54 @@ def test_ict_folder_agrees_with_the_head_npz(shared, ict_path):
         j = whole.expression_names.index(name)
         np.testing.assert_allclose(folder.expression[:, :, k], whole.expression[:, :, j], atol=5e-6)
     assert folder.expression_names == ("browInnerUp_L", "jawOpen", "mouthSmile_L", "mouthSmile_R")
+
+
+@pytest.fixture(scope="module")
+def gnm(source, tmp_path_factory):
+    """A head in the layout of GNM, loaded, with its landmarks beside it."""
+    path = tmp_path_factory.mktemp("gnm") / "gnm_head.npz"
+    layouts.write_gnm(path, source)
+    layouts.landmarks_beside(path, source)
+    assert recognise(path) == "gnm"
+    return MorphableModel.load(path)
+
+
+def test_gnm_has_skin_and_eyes_and_no_clear_corneas(gnm, source):
+    same_shape(gnm, source)
+    assert gnm.n_vertices == source.n_vertices  # modes of teeth that aren't there and corneas are gone
+    eyes = eyeballs(gnm)
+    assert len(eyes) == 2 and not lacks_eyes(gnm)
+    np.testing.assert_allclose(gnm.mean_albedo[eyes[0]], np.tile(SCLERA_ALBEDO, (len(eyes[0]), 1)), atol=1e-6)
+    assert not gnm.albedo_modes[np.concatenate(eyes)].any() and gnm.albedo_modes.any()
+
+
+def test_every_piece_of_gnm_has_a_place_of_its_own_in_the_maps(gnm):
+    on_eye = np.isin(gnm.faces[:, 0], np.concatenate(eyeballs(gnm)))
+    skin, eyes = (gnm.uv[gnm.faces_uv[rows]].reshape(-1, 2) for rows in (~on_eye, on_eye))
+    assert skin[:, 1].min() >= STRIP - 1e-6 > eyes[:, 1].max() and 0 <= eyes.min() and skin.max() <= 1 + 1e-6
+    left, right = (gnm.uv[gnm.faces_uv[np.isin(gnm.faces[:, 0], ball)]].reshape(-1, 2)[:, 0] for ball in eyeballs(gnm))
+    assert left.max() < right.min() or right.max() < left.min()
+
+
+def test_gnm_finds_its_landmarks_on_the_skin(source, tmp_path):
+    path = tmp_path / "head.npz"
+    layouts.write_gnm(path, source)
+    found = MorphableModel.load(path)
+    away = np.linalg.norm(found.mean[found.landmarks] * 100 - source.mean[source.landmarks], axis=1)  # cm
+    assert np.median(away) < 0.5 and not np.isin(found.landmarks, np.concatenate(eyeballs(found))).any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"triangle_uvs": np.zeros((3, 3, 2))}, "triangle_uvs has shape"),
+        ({"triangles": np.full((4, 3), 10**6)}, "with indices in 0"),
+        ({"vertex_groups": np.zeros((2, 2))}, "vertex_groups has shape"),
+        ({"expression_basis": np.zeros((2, 7, 3))}, "expression_basis has shape"),
+        ({"template_vertex_positions": np.zeros((9, 2))}, "must be"),
+    ],
+)
+def test_bad_gnm_files(source, tmp_path, changes, message):
+    layouts.write_gnm(tmp_path / "head.npz", source, changes)
+    with pytest.raises(InputError, match=message):
+        MorphableModel.load(tmp_path / "head.npz")
