@@ -29,8 +29,7 @@ from mifit.output.evaluate import evaluate
 from mifit.stages.normals.mesh_refinement import refine_mesh
 from mifit.stages.normals.normal_refinement import frame_problem, refine_normals
 from mifit.stages.normals.solvers import adam_steps, gauss_newton
-from mifit.stages.track import track
-from mifit.tracking import extend
+from mifit.tracking import extend, track
 
 WEIGHTS = (0.3, 3.0)
 EQUAL = 1e-3

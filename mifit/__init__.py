@@ -33,7 +33,7 @@ _EXPORTS = {
     "register_plugins": "mifit.render.plugins",
     "load_scene": "mifit.render.scene",
     "fit": "mifit.fitting",
-    "track": "mifit.stages.track",
+    "track": "mifit.tracking",
     "refine": "mifit.extras.refine",
     "choose_frames": "mifit.capture.choose_frames",
     "fit_geometry": "mifit.stages.fit_geometry",

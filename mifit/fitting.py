@@ -365,8 +365,8 @@ def _is_there(folder: Path, wanted: dict[str, Any], until: Stage) -> bool:
     document = read_document(folder)
     try:
         stages = document["stages"]
-        tracked = list(stages.get("normals", {}).get("details", {}).get("tracked", []))
         timesteps = [t["timestep"] for t in document["timesteps"]]
+        tracked = [t["timestep"] for t in document["timesteps"] if t["tracked"]]
         found = {
             "version": document["mifit_version"],
             "capture": document["capture"]["digest"],
@@ -582,8 +582,7 @@ def choose_timesteps(capture: Capture, wanted: Sequence[int] | FrameChoice | Non
 def fitted_to(result: Result, capture: Capture) -> bool:
     """Whether a result was fitted to this very capture: its calibration, images, masks and landmarks."""
     names = [camera.name for camera in result.cameras]
-    tracked = [] if result.normals is None else result.normals.report.details.get("tracked", [])
-    timesteps = [t for t in result.timesteps if t not in tracked]
+    timesteps = result.fitted
     if not set(names) <= set(capture.cameras) or not set(timesteps) <= set(capture.timesteps):
         return False
     return capture.digest(names, timesteps) == result.capture_digest

@@ -53,9 +53,8 @@ def tracked(fit, tmp_path):
     folder = tmp_path / "tracked"
     fit(folder)
     result = Reconstruction.load(folder)
-    report = result.normals.report
-    report = dataclasses.replace(report, details={**report.details, "tracked": [3]})
-    dataclasses.replace(result, normals=dataclasses.replace(result.normals, report=report)).save(folder)
+    normals = dataclasses.replace(result.normals, tracked={3: "digest"})
+    dataclasses.replace(result, normals=normals).save(folder)
     return folder
 
 

@@ -6,7 +6,7 @@ morphable model's: ``world = scale * rotation @ object + translation``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING
@@ -72,6 +72,10 @@ class GeometryEstimate:
     displacement : (V, 3) float32 or None
         Neutral surface beyond the model's span, object space: ``model.mean`` plus this is what coefficients add to
         (`displaced`). None where the surface is the model's.
+    landmark_noise : float
+        Standard deviation of a landmark coordinate, pixels: of the detector as set, or of residuals where that is more.
+    face_width : float
+        Mean width of the face in the images, pixels, as a view from the front would have it; 0 where not known.
     """
 
     timesteps: tuple[int, ...]
@@ -88,6 +92,8 @@ class GeometryEstimate:
     report: Report
     photometry: Photometry = field(default_factory=Photometry)
     displacement: NDArray | None = None
+    landmark_noise: float = 0.0
+    face_width: float = 0.0
 
     @property
     def middle(self) -> NDArray:
@@ -181,11 +187,14 @@ class NormalsEstimate:
     timesteps : tuple of int
     normal_object : (T, S, S, 3) float32
         Unit normals in object space; (0, 0, 0) outside the covered texels.
+    tracked : dict of int to str
+        Timesteps that were tracked after the fit, each with the digest of the images that it was tracked in.
     """
 
     timesteps: tuple[int, ...]
     normal_object: NDArray
     report: Report
+    tracked: Mapping[int, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -221,6 +230,8 @@ class MeshEstimate:
     uv : (T', 2) float32
     displacement : (T, S, S) float32
         Distance from the fitted mesh along its normals, capture units; 0 outside the covered texels.
+    subdivisions : int
+        Times that every face of the model was split into four.
     """
 
     timesteps: tuple[int, ...]
@@ -230,11 +241,7 @@ class MeshEstimate:
     uv: NDArray
     displacement: NDArray
     report: Report
-
-    @property
-    def subdivisions(self) -> int:
-        """Times that every face of the model was split into four."""
-        return int(self.report.details["subdivisions"])
+    subdivisions: int = 0
 
 
 class Label(IntEnum):

@@ -25,7 +25,7 @@ from mifit.stages.find_surface import find_surface
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.normals.mesh_refinement import refine_mesh
 from mifit.stages.normals.normal_refinement import refine_normals
-from mifit.stages.track import Follower
+from mifit.tracking import Follower
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -80,7 +80,7 @@ def refine(
         raise InputError(f"timestep {unknown[0]}: not in the capture; it has {', '.join(map(str, capture.timesteps))}")
     config = settings_of(result)
     model, names, capture = result.model, [camera.name for camera in result.cameras], result.seen(capture)
-    fitted = fitted_jointly(result)
+    fitted = result.fitted
     further = [t for t in wanted if t not in fitted]
     chosen = choose_frames(capture, names, MOST - len(fitted), further, fitted) if further else None
     left_out = {} if chosen is None else {t: why for t, why in chosen.left_out.items() if t in further}
@@ -112,12 +112,6 @@ def refine(
     return replace(result, geometry=home, reflectance=reflectance, normals=normals, mesh=mesh, residual=residual)
 
 
-def fitted_jointly(result: Reconstruction) -> list[int]:
-    """Timesteps that were fitted jointly, not tracked."""
-    tracked = [] if result.normals is None else result.normals.report.details.get("tracked", [])
-    return [t for t in result.timesteps if t not in tracked]
-
-
 def settings_of(result: Reconstruction) -> FitConfig:
     """The settings that a result was fitted with."""
     return from_mapping(FitConfig, {k: v for k, v in result.config.items() if k != "seed"}, "result.json: config")
@@ -132,7 +126,7 @@ def _followed(
     progress: Progress,
 ) -> tuple[GeometryEstimate, dict[int, str]]:
     """Geometry of the fitted and of further timesteps, and why some of these are left out."""
-    names, fitted = [camera.name for camera in result.cameras], fitted_jointly(result)
+    names, fitted = [camera.name for camera in result.cameras], result.fitted
     home = result.geometry.at(fitted)
     usual = float(np.median([_difference(result, capture, home.at((t,))) for t in fitted]))
     follower: Follower | None = None
@@ -157,8 +151,7 @@ def _followed(
     names_of = ("expression", "rotation", "translation", "vertices")
     rows: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in found]) for name in names_of}
     timesteps = tuple(t for one in found for t in one.timesteps)
-    exposures = {name: (*factors, *[1.0] * (len(found) - 1)) for name, factors in home.exposures.items()}
-    joined = replace(home, timesteps=timesteps, exposures=exposures, **rows)
+    joined = replace(home, timesteps=timesteps, **rows)
     return joined.at(sorted(timesteps)), failed
 
 
@@ -170,6 +163,6 @@ def _difference(result: Reconstruction, capture: Capture, geometry: GeometryEsti
         frame = capture.frame(camera.name, geometry.timesteps[0])
         shown = predicted.render(camera, geometry.timesteps[0])
         usable = frame.valid & ~frame.clipped & (shown[..., 3] > 0.5)
-        off = np.abs(frame.image / geometry.gain(camera.name) - shown[..., :3]).mean(axis=2)
+        off = np.abs(frame.image - shown[..., :3]).mean(axis=2)
         found.append(float(np.median(off[usable])) if usable.any() else np.inf)
     return max(found)

@@ -189,6 +189,8 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
         report=_report(document, "geometry"),
         photometry=Photometry.from_document(document["capture"].get("photometry", {})),
         displacement=_displacement(folder, len(model.mean)) if entry.get("displaced") else None,
+        landmark_noise=float(document["capture"]["landmark_noise"]),
+        face_width=float(document["capture"]["face_width"]),
     )
 
 
@@ -294,7 +296,8 @@ def _normals(folder: Path, document: dict[str, Any]) -> NormalsEstimate | None:
         return None
     timesteps = [int(s["timestep"]) for s in document["timesteps"] if s["refined_normals"]]
     paths = [folder / "maps" / f"normal_object_{t:04d}.exr" for t in timesteps]
-    return NormalsEstimate(tuple(timesteps), _read_maps(paths, 3), _report(document, "normals"))
+    tracked = {int(s["timestep"]): str(s["tracked"]) for s in document["timesteps"] if s["tracked"]}
+    return NormalsEstimate(tuple(timesteps), _read_maps(paths, 3), _report(document, "normals"), tracked)
 
 
 def _residual(folder: Path, document: dict[str, Any], size: int) -> ResidualEstimate | None:
@@ -312,7 +315,7 @@ def _mesh(
     if "mesh" not in document["stages"]:
         return None
     report = _report(document, "mesh")
-    subdivisions = MeshConfig(subdivisions=int(report.details["subdivisions"])).subdivisions  # in its bounds
+    subdivisions = MeshConfig(subdivisions=int(document["model"]["subdivisions"])).subdivisions  # in its bounds
     topology = split_faces(model, subdivisions)
     timesteps = tuple(int(s["timestep"]) for s in document["timesteps"] if s["refined_mesh"])
     mesh = split_at_seams(topology)
@@ -331,4 +334,5 @@ def _mesh(
         topology.uv,
         _read_maps(heights, 1),
         report,
+        subdivisions,
     )

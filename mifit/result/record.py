@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Literal, TypeVar
 
@@ -174,6 +175,16 @@ class Result:
     def timesteps(self) -> tuple[int, ...]:
         """Timesteps with geometry."""
         return self.geometry.timesteps
+
+    @property
+    def tracked(self) -> Mapping[int, str]:
+        """Timesteps that were tracked after the fit, with digests of their images."""
+        return {} if self.normals is None else self.normals.tracked
+
+    @property
+    def fitted(self) -> tuple[int, ...]:
+        """Timesteps that were fitted jointly, not tracked."""
+        return tuple(t for t in self.timesteps if t not in self.tracked)
 
     def seen(self, capture: Capture) -> Capture:
         """A capture with the cameras, gains and exposures that the fit found."""

@@ -161,6 +161,8 @@ def _document(result: Result) -> dict[str, Any]:
                 "unit_mm": result.unit_mm,
                 "cameras": [_camera_document(c) for c in result.cameras],
                 "photometry": geometry.photometry.document(),
+                "landmark_noise": float(geometry.landmark_noise),
+                "face_width": float(geometry.face_width),
             },
             "model": {
                 "source": _source(result.model_source),
@@ -170,6 +172,7 @@ def _document(result: Result) -> dict[str, Any]:
                 "albedo": geometry.albedo.tolist(),
                 "scale": float(geometry.scale),
                 "displaced": geometry.displacement is not None,
+                "subdivisions": 0 if result.mesh is None else result.mesh.subdivisions,
             },
             "lighting": lighting,
             "timesteps": [
@@ -178,6 +181,7 @@ def _document(result: Result) -> dict[str, Any]:
                     "rotation": geometry.rotation[i].tolist(),
                     "translation": geometry.translation[i].tolist(),
                     "expression": geometry.expression[i].tolist(),
+                    "tracked": result.tracked.get(t),
                     "refined_normals": result.refined_normal(t) is not None,
                     "refined_mesh": result.mesh is not None and t in result.mesh.timesteps,
                     "residual": result.residual is not None and t in result.residual.timesteps,

@@ -21,7 +21,7 @@ from mifit.core.image import to_8_bit
 from mifit.experiments import load_plan
 from mifit.extras.boards import Board
 from mifit.output.views import write_video
-from tests.capture import photogrammetry
+from tests.extras import photogrammetry
 from tests.extras.board_video import Studio, pair, poses
 from tests.extras.photogrammetry import write_colmap
 

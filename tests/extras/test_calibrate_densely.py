@@ -14,7 +14,7 @@ from mifit.capture.landmark_files import Landmarks, write_landmarks
 from mifit.capture.transforms import Shot, View, write_transforms
 from mifit.core.image import write_image
 from mifit.extras.bundle import Bundle, Intrinsics, Sightings, adjust_bundle
-from mifit.fitting import calibrated
+from mifit.extras.calibrate_densely import calibrate_capture
 from mifit.morphable import MorphableModel
 from tests.stages.memory_capture import make_capture
 
@@ -51,7 +51,7 @@ def test_matches_give_the_focal_length_that_biased_landmarks_miss(model, uncalib
     marks, modes = model.mean[model.landmarks], model.identity[model.landmarks]
     by_landmarks = calibrate(uncalibrated, marks, modes).camera("left").fx
     assert abs(by_landmarks / FOCAL - 1) > 0.1
-    found = calibrated(uncalibrated, model, BOTH, (0, 1, 2))
+    found = calibrate_capture(uncalibrated, model, BOTH, (0, 1, 2))
     left, right = (found.capture.camera(name) for name in BOTH)
     assert left.fx == left.fy == right.fx == pytest.approx(FOCAL, rel=0.02)
     turn = right.rotation @ left.rotation.T
@@ -68,20 +68,20 @@ def test_two_images_leave_the_landmarks_value_and_say_so(model, uncalibrated) ->
 
     marks, modes = model.mean[model.landmarks], model.identity[model.landmarks]
     by_landmarks = calibrate(uncalibrated, marks, modes, timesteps=[0])
-    found = calibrated(uncalibrated, model, BOTH, (0,))
+    found = calibrate_capture(uncalibrated, model, BOTH, (0,))
     assert found.deviation is None and found.residual is None
     assert found.capture.camera("left").fx == pytest.approx(by_landmarks.camera("left").fx)
     assert found.note.endswith("is from landmarks, which may be off by a third: 2 images can't tell more, expected 3")
 
 
 def test_one_camera_leaves_the_landmarks_value_and_says_so(model, uncalibrated) -> None:
-    found = calibrated(uncalibrated, model, ("left",), (0, 1, 2))
+    found = calibrate_capture(uncalibrated, model, ("left",), (0, 1, 2))
     assert found.deviation is None
     assert found.note.endswith("one camera can't tell expressions from perspective, expected two")
 
 
 def test_many_sightings_are_thinned_by_whole_tracks(model, uncalibrated, monkeypatch) -> None:
-    from mifit.stages.calibration import tracks
+    from mifit.extras import tracks
 
     found = []
     follow = tracks.follow_points
@@ -89,7 +89,7 @@ def test_many_sightings_are_thinned_by_whole_tracks(model, uncalibrated, monkeyp
     for most in (10**6, 3000):
         monkeypatch.setattr(tracks, "MOST_SIGHTINGS", most)
         with pytest.raises(AttributeError):  # nothing is handed on
-            calibrated(uncalibrated, model, BOTH, (0, 1, 2))
+            calibrate_capture(uncalibrated, model, BOTH, (0, 1, 2))
     whole, thinned = found
     assert len(whole.point) > 3000 >= 0.5 * len(thinned.point) and len(thinned.point) < 0.7 * len(whole.point)
     assert np.bincount(thinned.point).min() >= 3

@@ -157,11 +157,10 @@ def test_the_choice_is_of_what_is_asked_for_and_says_what_it_left_out(scene, res
 
 
 def test_the_settings_are_those_of_the_fit_and_tracked_timesteps_are_left_to_be_tracked(scene, result, quick):
-    tracked = Report("converged", details={"tracked": [2]})
     longer = replace(
         result,
         geometry=scene.geometry.at((0, 1, 2)),
-        normals=NormalsEstimate((0, 1, 2), np.stack([scene.normal_map] * 3), tracked),
+        normals=NormalsEstimate((0, 1, 2), np.stack([scene.normal_map] * 3), Report("converged"), {2: "digest"}),
     )
     found = refine(longer, scene)
     assert found.timesteps == (0, 1) and quick["config"].texture_size == 96 and quick["config"].bands == 3

@@ -197,7 +197,7 @@ def test_a_result_that_claims_endless_subdivisions_is_refused(saved: tuple[Path,
     path = saved[0] / "result.json"
     whole = path.read_text()
     document = json.loads(whole)
-    document["stages"]["mesh"]["details"]["subdivisions"] = count
+    document["model"]["subdivisions"] = count
     try:
         path.write_text(json.dumps(document))
         with pytest.raises(InputError, match=r"mesh\.subdivisions: found .*, expected a whole number from 0 to 3"):

@@ -23,7 +23,7 @@ import numpy as np
 from mifit.capture.stereo import write_stereo
 from mifit.core.image import encode_png, write_image
 from mifit.morphable import MorphableModel
-from tests.capture import photogrammetry as exports
+from tests.extras import photogrammetry as exports
 from tests.extras.photogrammetry import write_colmap
 from tests.morphable import layouts
 from tests.output.conftest import ball_camera, ball_result

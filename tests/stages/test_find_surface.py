@@ -416,14 +416,13 @@ def test_outlines_lead_a_refit_and_what_is_matched_has_the_last_word(model, bump
     ],
 )
 def test_a_bias_is_told_in_terms_of_the_face(start, noise, width, biased):
-    details = {"landmark_noise_pixels": noise, "face_width_pixels": width}
-    assert landmarks_are_biased(replace(start, report=replace(start.report, details=details))) is biased
+    assert landmarks_are_biased(replace(start, landmark_noise=noise, face_width=width)) is biased
 
 
 def test_the_width_of_the_face_is_that_in_the_images(model, bumpy, start):
     ends = bumpy.vertices[0][model.landmarks[[0, 16]]]
     width = np.mean([np.ptp(bumpy.camera(name).project(ends)[:, 0]) for name in BOTH])  # turned by 20 degrees
-    assert 1.0 < start.report.details["face_width_pixels"] / width < 1.2
+    assert 1.0 < start.face_width / width < 1.2
 
 
 def test_a_refit_on_which_the_views_agree_less_is_dropped(model, small, monkeypatch):

@@ -309,10 +309,10 @@ def test_settings_out_of_range_are_named(settings):
 
 
 def test_landmark_noise_is_raised_to_what_the_residuals_show(model, capture, fitted):
-    noise = fitted.report.details["landmark_noise_pixels"]
+    noise = fitted.landmark_noise
     assert noise == QUICK.landmark_noise  # 0.4 px were added: the setting is the floor
     rough = fit_geometry(capture.changed(noisy), model, BOTH, (0, 1), replace(QUICK, rounds=0))
-    assert 3.0 < rough.report.details["landmark_noise_pixels"] < 7.0  # 5 px were added, and outliers
+    assert 3.0 < rough.landmark_noise < 7.0  # 5 px were added, and outliers
 
 
 def test_a_detector_that_is_wrong_the_same_way_everywhere_is_outweighed_by_the_images(model, capture):

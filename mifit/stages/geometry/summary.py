@@ -94,8 +94,6 @@ def pack(
     details = {
         "phases": journal.phases,
         "landmark_rms_pixels": _landmark_rms(state, views),
-        "landmark_noise_pixels": noise,
-        "face_width_pixels": _face_width(model, world, views),
     }
     if journal.last is not None and journal.last.system is not None:
         details["standard_deviations"] = _deviations(state, journal.last)
@@ -130,6 +128,8 @@ def pack(
             tuple(journal.warnings),
             details,
         ),
+        landmark_noise=noise,
+        face_width=_face_width(model, world, views),
     )
 
 

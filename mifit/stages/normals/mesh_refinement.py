@@ -66,7 +66,6 @@ def refine_mesh(
     progress("refine mesh", len(steps), len(steps))
     seconds = time.perf_counter() - factorised
     details = {
-        "subdivisions": refiner.config.subdivisions,
         "seconds_to_factorise": factorised - began,
         "seconds_per_timestep": seconds / max(len(steps), 1),
     }
@@ -79,6 +78,7 @@ def refine_mesh(
         topology.uv,
         heights,
         Report(Outcome.worst(outcomes).value, seconds=time.perf_counter() - began, details=details),
+        refiner.config.subdivisions,
     )
 
 

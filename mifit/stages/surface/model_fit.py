@@ -217,7 +217,7 @@ def fit_model(
         On the model's surface, without displacement; ``geometry`` where a round ends without a usable result.
     """
     steps = geometry.timesteps
-    noise = float(geometry.report.details.get("landmark_noise_pixels", config.landmark_noise))
+    noise = geometry.landmark_noise or config.landmark_noise
     images = len(cameras) * len(steps)
     pixels = min(config.pixels, max(PIXELS // images, FEWEST_PIXELS))
     config = replace(config, as_written=False, scale_deviation=0.0, landmark_noise=noise, pixels=pixels)
@@ -300,12 +300,12 @@ def _counterparts(
 
 def scatter_pixels(geometry: GeometryEstimate) -> float:
     """Deviation of a landmark coordinate that a good detector has between images of this face, pixels."""
-    return max(LEAST_SCATTER, SCATTER_OF_FACE * float(geometry.report.details.get("face_width_pixels", 0.0)))
+    return max(LEAST_SCATTER, SCATTER_OF_FACE * geometry.face_width)
 
 
 def landmarks_are_biased(geometry: GeometryEstimate) -> bool:
     """Whether the landmarks lie farther from the fit than a good detector scatters."""
-    return float(geometry.report.details.get("landmark_noise_pixels", 0.0)) > scatter_pixels(geometry)
+    return geometry.landmark_noise > scatter_pixels(geometry)
 
 
 def biased_noise(deviation: float, images: int, scatter: float) -> float:
