@@ -66,8 +66,8 @@ def detect_landmarks(path: str | Path, detector: str | Detector | None = None, p
         if shot.image not in without
     }
     names = {key: f"landmarks/{file_name(key[0])}/{key[1]:04d}.json" for key in found}
-    for name in names.values():
-        check_no_links(capture.path, capture.path / name)
+    for place in names.values():
+        check_no_links(capture.path, capture.path / place)
     kept = _keep_landmarks(capture.path)
     for key, landmarks in found.items():
         write_landmarks(capture.path / names[key], landmarks, more.get(key))

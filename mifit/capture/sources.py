@@ -35,8 +35,8 @@ class Source(Protocol):
     def length(self) -> int:
         """Number of frames."""
 
-    def files(self, start: int, every: int) -> Iterator[tuple[str, bytes]]:
-        """(suffix, content) of every N-th frame from `start` on, each checked to decode."""
+    def files(self, numbers: Sequence[int]) -> Iterator[tuple[str, bytes]]:
+        """(suffix, content) of the frames of ascending numbers, each checked to decode."""
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,9 @@ class ImageFiles:
         """Number of images."""
         return len(self.paths)
 
-    def files(self, start: int, every: int) -> Iterator[tuple[str, bytes]]:
+    def files(self, numbers: Sequence[int]) -> Iterator[tuple[str, bytes]]:
         """Contents as they are on disk, once they have been seen to decode to the right size; suffix by content."""
-        for path in self.paths[start::every]:
+        for path in (self.paths[i] for i in numbers):
             content = read_bytes(path, MAX_IMAGE_BYTES, "image file")  # once: what is checked is what is copied
             height, width = decode_image(content, path).pixels.shape[:2]
             if (width, height) != self.size:
@@ -98,14 +98,18 @@ class Video:
         with _reader(path) as reader:
             size = (int(reader.get(cv2.CAP_PROP_FRAME_WIDTH)), int(reader.get(cv2.CAP_PROP_FRAME_HEIGHT)))
             length, rate = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)), float(reader.get(cv2.CAP_PROP_FPS))
-        if not 1 <= length <= MAX_VIDEO_FRAMES or min(size) < 1 or size[0] * size[1] > MAX_PIXELS:
-            raise InputError(f"{path}: found {length} frames of {size[0]} x {size[1]} pixels, expected a whole video")
+        if not 1 <= length <= MAX_VIDEO_FRAMES or min(size) < 1 or size[0] * size[1] > MAX_PIXELS or not rate > 0:
+            raise InputError(
+                f"{path}: found {length} frames of {size[0]} x {size[1]} pixels at {rate:g} a second, expected a whole "
+                "video"
+            )
         return cls(path, name, size, length, rate)
 
-    def files(self, start: int, every: int) -> Iterator[tuple[str, bytes]]:
+    def files(self, numbers: Sequence[int]) -> Iterator[tuple[str, bytes]]:
         """Decode in order; frames between the wanted ones are passed over without conversion."""
+        wanted = set(numbers)
         with _reader(self.path) as reader:
-            for i in range(self.length):
+            for i in range(max(wanted, default=-1) + 1):
                 with decoding():
                     there = reader.grab()
                 if not there:
@@ -113,7 +117,7 @@ class Video:
                         f"{self.path}: the header promises {self.length} frames but frame {i} can't be read: truncated "
                         "or damaged; copy or encode it again"
                     )
-                if i >= start and (i - start) % every == 0:
+                if i in wanted:
                     ok, frame = reader.retrieve()
                     if not ok or frame is None or frame.shape[1::-1] != self.size:
                         raise InputError(f"{self.path}: frame {i} can't be decoded; copy or encode the video again")
@@ -132,8 +136,10 @@ def _reader(path: Path) -> Iterator[cv2.VideoCapture]:
         reader.release()
 
 
-def open_sources(videos: Sequence[str | Path], images: Sequence[str | Path]) -> list[Source]:
-    """One camera for each video, or else for each folder of images, named after it.
+def open_sources(
+    videos: Sequence[str | Path], images: Sequence[str | Path], names: Sequence[str] | None = None
+) -> list[Source]:
+    """One camera for each video, or else for each folder of images or single photograph, named after it.
 
     Raises
     ------
@@ -142,9 +148,17 @@ def open_sources(videos: Sequence[str | Path], images: Sequence[str | Path]) -> 
     """
     if bool(videos) == bool(images):
         raise InputError("expected videos or folders of images, one kind")
+    paths = [Path(v) for v in videos or images]
+    folders = not videos and not all(path.is_file() for path in paths)
+    if names is None:
+        named = _named(paths, stems=not folders)
+    elif len(names) == len(paths) == len(set(names)):
+        named = list(zip(paths, names, strict=True))
+    else:
+        raise InputError(f"names: found {', '.join(names)}, expected {len(paths)} different ones")
     if videos:
-        return [Video.open(path, name) for path, name in _named([Path(v) for v in videos], stems=True)]
-    return [ImageFiles.folder(path, name) for path, name in _named([Path(v) for v in images], stems=False)]
+        return [Video.open(path, name) for path, name in named]
+    return [ImageFiles.folder(path, name) if folders else ImageFiles.of(name, [path]) for path, name in named]
 
 
 def _named(paths: list[Path], stems: bool) -> list[tuple[Path, str]]:
@@ -156,33 +170,6 @@ def _named(paths: list[Path], stems: bool) -> list[tuple[Path, str]]:
         if len(set(names)) == len(names) and all(names):
             return list(zip(paths, names, strict=True))
     raise InputError(f"found {', '.join(map(str, paths))}, expected files or folders with different names")
-
-
-def check_synchronous(sources: Sequence[Source]) -> None:
-    """Refuse cameras with different numbers of frames, frame rates, or videos of different sizes."""
-    first = sources[0]
-    for other in sources[1:]:
-        if other.length != first.length:
-            raise InputError(
-                f"{_place(other)}: found {other.length} frames, expected {first.length} as in {_place(first)}; "
-                "synchronised cameras have equally many"
-            )
-        if isinstance(first, Video) and isinstance(other, Video):
-            if abs(other.rate - first.rate) > 0.01 * max(first.rate, 1e-6):
-                raise InputError(
-                    f"{other.path}: found {other.rate:g} frames a second, expected {first.rate:g} as in {first.path}"
-                )
-            if other.size != first.size:
-                raise InputError(
-                    f"{other.path}: found {other.size[0]} x {other.size[1]} pixels, expected {first.size[0]} x "
-                    f"{first.size[1]} as in {first.path}"
-                )
-
-
-def _place(source: Source) -> str:
-    if isinstance(source, Video):
-        return str(source.path)
-    return str(source.paths[0].parent) if isinstance(source, ImageFiles) else source.name
 
 
 def _natural(path: Path) -> list[tuple[int, int, str]]:

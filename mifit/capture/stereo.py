@@ -81,8 +81,9 @@ def write_stereo(path: str | Path, first: Camera, second: Camera) -> None:
             file.write(f"D{i}", np.array([camera.distortion or (0.0,) * 5], dtype=np.float64))
         file.write("R", np.ascontiguousarray(relative[:3, :3]))
         file.write("T", np.ascontiguousarray(relative[:3, 3:]))
-        file.write("image_width", first.width)
-        file.write("image_height", first.height)
+        if (first.width, first.height) == (second.width, second.height):
+            file.write("image_width", first.width)
+            file.write("image_height", first.height)
         file.release()
 
 

@@ -88,6 +88,16 @@ def add_force(p: argparse.ArgumentParser) -> None:
     p.add_argument("--force", action="store_true", help="replace files that are there, but never what is read")
 
 
+def add_offset(p: argparse.ArgumentParser) -> None:
+    """Add ``--offset``."""
+    p.add_argument(
+        "--offset",
+        type=offsets,
+        metavar="S,S",
+        help="of clips: seconds by which each began after the first, such as 0,0.4; or auto, found by sound or motion",
+    )
+
+
 def add_address(p: argparse.ArgumentParser) -> None:
     """Add ``--host`` and ``--port``."""
     p.add_argument("--host", default="127.0.0.1", help="of the view: address (default: this machine only)")
@@ -215,3 +225,8 @@ def rate(text: str) -> float:
 def exposure(text: str) -> float | str:
     """``auto``, or a number above 0."""
     return text if text == "auto" else rate(text)
+
+
+def offsets(text: str) -> list[float] | str:
+    """``0,0.4`` -> [0.0, 0.4], or ``auto``."""
+    return text if text == "auto" else [real(part) for part in listed(text)]

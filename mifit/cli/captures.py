@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from mifit.cli import arguments as types
 from mifit.cli.arguments import use_variant
+from mifit.cli.clips import start_times
 from mifit.cli.console import console_progress
 from mifit.core.limits import MAX_RENDERED_PIXELS, MAX_SAMPLES
 from mifit.errors import InputError
@@ -79,6 +80,7 @@ def _synth_scan(arguments: Namespace) -> None:
 def import_(arguments: Namespace) -> None:
     """Make a capture from other files."""
     from mifit.capture import import_capture
+    from mifit.capture.sources import open_sources
     from mifit.extras.importers import KINDS, REGISTRATIONS, import_from
 
     sources = {name: getattr(arguments, name) for name in ("calibration", "transforms", *KINDS, "digital_emily")}
@@ -98,6 +100,8 @@ def import_(arguments: Namespace) -> None:
         "videos": arguments.video,
         "progress": console_progress(arguments.quiet),
     }
+    if arguments.video and arguments.offset:
+        options["starts"] = start_times(arguments, open_sources(arguments.video, ()), options["progress"])
     if kind in KINDS:
         import_from(kind, sources[kind], arguments.out, photos=arguments.photos, **options)
     else:
@@ -126,9 +130,8 @@ def calibrate(arguments: Namespace) -> None:
             print(f"Board: {path}")
         print("Print it at 100 per cent, glue it onto something flat, and measure a square.")
         return
-    calibration = calibrate_boards(
-        open_sources(arguments.video, arguments.images), board, arguments.units, console_progress(arguments.quiet)
-    )
+    sources = open_sources(arguments.video, arguments.images, arguments.names)
+    calibration = calibrate_boards(sources, board, arguments.units, console_progress(arguments.quiet))
     write_calibration(calibration, out, arguments.units)
     print(calibration.summary())
     print(f"Calibration: {out}")
@@ -270,6 +273,7 @@ def add_commands(add: types.Add) -> None:
     p.add_argument(
         "--units", help="unit of length of the cameras: mm, cm, dm or m (default: as the source has it, or cm)"
     )
+    types.add_offset(p)
     p.add_argument("--every", type=types.at_least(1), default=1, help="keep every N-th frame (default: 1)")
     p.add_argument("--start", type=types.at_least(0), default=0, help="first frame (default: 0)")
     p.add_argument("--count", type=types.at_least(1), help="number of frames to keep")
@@ -288,6 +292,7 @@ def add_commands(add: types.Add) -> None:
         help="charuco:9x6:30:22, chessboard:10x7:25 or apriltag:6x4:34:9: columns, rows and lengths in millimetres; "
         "without videos and images it is written for printing",
     )
+    p.add_argument("--names", type=types.listed, help="of a board: names of the cameras; default: those of the files")
     p.add_argument("--units", default="cm", help="unit of length of the calibration: mm, cm or m (default: cm)")
     p.add_argument("--model", default="builtin", help="of a capture: morphable model, a path or builtin (default)")
     p.add_argument("--cameras", type=types.listed, help="of a capture: cameras that decide; default: the first two")

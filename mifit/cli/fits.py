@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mifit.cli import arguments as types
-from mifit.cli.arguments import say, tell, use_variant
+from mifit.cli.arguments import add_offset, say, tell, use_variant
+from mifit.cli.clips import capture_of
 from mifit.cli.console import console_progress
 from mifit.cli.results import judge
 from mifit.config import PRESETS, FitConfig, NormalsConfig, ReflectanceConfig, from_mapping
@@ -124,13 +125,16 @@ def fit(arguments: Namespace) -> int:
             f"--preset {arguments.preset}: found with --config {arguments.config}, expected one of the two"
         )
     config = FitConfig.load(arguments.config) if arguments.config else PRESETS[arguments.preset or "default"]()
-    capture = mifit.Capture.load(arguments.capture)
     model = mifit.MorphableModel.load(arguments.model)
+    folder = capture_of(arguments)
+    capture = mifit.Capture.load(folder)
     use_variant(arguments)
     from mifit.fitting import fit_into
     from mifit.output.report import write_report
 
     timesteps = arguments.timesteps
+    if timesteps is None and folder not in arguments.capture:
+        timesteps = 4  # of clips the moments that tell most
     if isinstance(timesteps, int):
         timesteps = _chosen(arguments, capture, timesteps)
     progress, view = console_progress(arguments.quiet), None
@@ -254,9 +258,20 @@ def add_commands(add: types.Add) -> None:
     p = add("demo", demo, "fit a small capture made on the spot, judge it on the held-out view, write a report")
     p.add_argument("--out", type=types.path, default=Path("out/demo"), help="folder to write (default: out/demo)")
 
-    p = add("fit", fit, "fit geometry, reflectance and normals to a capture")
-    p.add_argument("capture", type=types.path, help="capture folder, or its transforms.json")
+    p = add("fit", fit, "fit geometry, reflectance and normals to a capture, or to clips of a face")
+    p.add_argument(
+        "capture",
+        type=types.path,
+        nargs="+",
+        help="capture folder; or a clip, folder of frames or photograph of each camera, of which a capture is made in "
+        "the result's folder: frames brought into step and chosen, landmarks found, cameras estimated",
+    )
     p.add_argument("--out", type=types.path, required=True, help="result folder to write")
+    p.add_argument("--calibration", type=types.path, help="of clips: stereo calibration or transforms.json")
+    p.add_argument("--board", type=types.path, nargs="+", help="of clips: a clip of a calibration board by each camera")
+    p.add_argument("--pattern", default="charuco:9x6:30:22", help="of --board: as mifit calibrate --board takes it")
+    add_offset(p)
+    p.add_argument("--every", type=types.at_least(1), help="of clips: keep every N-th frame; default: 24 in all")
     p.add_argument(
         "--config", type=types.path, help="TOML file with tables geometry, reflectance, shape, normals, mesh"
     )
@@ -266,7 +281,8 @@ def add_commands(add: types.Add) -> None:
     p.add_argument(
         "--timesteps",
         type=types.timesteps_or_auto,
-        help="e.g. 0,1,2,3 or 0-3, or auto (auto:6): the four (six) that tell most; default: the first four",
+        help="e.g. 0,1,2,3 or 0-3, or auto (auto:6): the four (six) that tell most; default: the first four, of clips "
+        "auto",
     )
     p.add_argument(
         "--until",

@@ -16,12 +16,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.capture.sources import Source, check_synchronous
+from mifit.capture.clips import aligned
+from mifit.capture.sources import Source
 from mifit.capture.stereo import write_stereo
 from mifit.capture.transforms import UNITS_MM, Shot, View, write_transforms
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.core.files import file_name, write_bytes, write_text
-from mifit.core.image import encode_png
+from mifit.core.image import decode_image, encode_png, to_8_bit
 from mifit.errors import InputError
 from mifit.extras.board_adjustment import adjust
 from mifit.extras.board_camera import (
@@ -40,6 +41,8 @@ from mifit.extras.boards import Board
 from mifit.progress import Progress, silent
 
 LEAST_SHARED = 3
+LOOKS = 12
+"""Frames in which markers of other dictionaries are looked for."""
 OUT_OF_STEP = 0.5
 """Error in pixels, at the least, of frames that are left out for what other cameras show: a tilted board that is found
 a little off still tells more than it harms."""
@@ -55,10 +58,11 @@ class BoardCalibration:
     watched: tuple[Watched, ...]
     pair_errors: dict[str, float]
     warnings: tuple[str, ...]
+    board: Board
 
     def summary(self) -> str:
-        """What was found, in a few lines."""
-        lines = []
+        """What was looked for and found, in a few lines."""
+        lines = [f"Looked for {self.board.describe()}"]
         for camera, seen in zip(self.cameras, self.watched, strict=True):
             k = ", ".join(f"{value:.4f}" for value in seen.distortion)
             lines.append(
@@ -81,7 +85,7 @@ def calibrate_boards(
     Parameters
     ----------
     sources : sequence of Source
-        One synchronised video or folder of images per camera; with a single camera only its intrinsics are found.
+        One video or folder of images per camera, in step; with a single camera only its intrinsics are found.
     board : Board
     units : str
         Unit of length of the poses.
@@ -93,7 +97,7 @@ def calibrate_boards(
         The board is seen sharply in too few frames (the message says why the others don't count), cameras don't see it
         together, or the solution is too uncertain to be used.
     """
-    check_synchronous(sources)
+    sources = aligned(sources)
     if len({file_name(source.name) for source in sources}) != len(sources):
         raise InputError("found cameras of one name, expected different names of videos or folders")
     if len(sources) > 1 and board.turns_into_itself:
@@ -101,6 +105,7 @@ def calibrate_boards(
             f"--board: a chessboard of {board.columns} x {board.rows} squares looks the same after a half turn, so two "
             "cameras can't agree on its corners; use an even and an odd number of squares, or a ChArUco board"
         )
+    board = recognise(board, sources[0])
     total = sum(min(source.length, MAX_LOOKED_AT) for source in sources)
     watched, done = [], 0
     for source in sources:
@@ -118,7 +123,20 @@ def calibrate_boards(
         cameras.append(
             Camera(seen.name, *seen.size, fx, fy, cx + 0.5, cy + 0.5, pose @ OPENGL_FROM_OPENCV, seen.distortion)
         )
-    return BoardCalibration(tuple(cameras), tuple(watched), pair_errors, _warnings(watched))
+    return BoardCalibration(tuple(cameras), tuple(watched), pair_errors, _warnings(watched), board)
+
+
+def recognise(board: Board, source: Source) -> Board:
+    """The board with the dictionary whose markers a camera's images show most of, where it was not named."""
+    if board.kind != "charuco" or board.named:
+        return board
+    every = range(0, source.length, max(source.length // LOOKS, 1))
+    pictures = [
+        np.asarray(cv2.cvtColor(to_8_bit(decode_image(content, source.name).pixels), cv2.COLOR_RGB2GRAY), np.uint8)
+        for _, content in source.files(every)
+    ]
+    boards = [board, *board.of_other_dictionaries()]
+    return max(boards, key=lambda one: sum(len(one.find(picture)) for picture in pictures))
 
 
 def write_calibration(calibration: BoardCalibration, folder: str | Path, units: str) -> None:

@@ -86,7 +86,7 @@ def look(
     every = -(-source.length // MAX_LOOKED_AT)
     found: dict[int, tuple[BoardPoints, float]] = {}
     left_out: dict[int, str] = {}
-    for k, (_, content) in enumerate(source.files(0, every)):
+    for k, (_, content) in enumerate(source.files(range(0, source.length, every))):
         progress("Looking for the board", done + k, total)
         i = k * every
         codes = to_8_bit(decode_image(content, f"{source.name}: frame {i}").pixels)
@@ -119,7 +119,7 @@ def calibrate_one(
     spare = {i: "like other frames" for i in used if i not in chosen}
     while True:
         if len(chosen) < LEAST_FRAMES:
-            raise InputError(_too_few(source, len(chosen), left_out))
+            raise InputError(_too_few(source, board, len(chosen), left_out))
         matrix, distortion, deviation, errors = _solve({i: used[i] for i in chosen}, board, source.size)
         limit = max(OUTLIER * float(np.median(list(errors.values()))), LEAST_OUTLIER)
         bad = [i for i, error in errors.items() if error > limit]
@@ -141,14 +141,14 @@ def calibrate_one(
     return seen
 
 
-def _too_few(source: Source, count: int, left_out: dict[int, str]) -> str:
+def _too_few(source: Source, board: Board, count: int, left_out: dict[int, str]) -> str:
     reasons: dict[str, int] = {}
     for text in left_out.values():
         reasons[text.split(":")[0]] = reasons.get(text.split(":")[0], 0) + 1
     told = ", ".join(f"{n} {reason}" for reason, n in sorted(reasons.items(), key=lambda item: -item[1]))
     return (
         f"{source.name}: found {count} frames that can be used of {count + len(left_out)} ({told or 'none else'}), "
-        f"expected at least {LEAST_FRAMES} with the whole board, sharp, not mirrored; check --board too"
+        f"expected at least {LEAST_FRAMES} with the whole board, sharp, not mirrored; looked for {board.describe()}"
     )
 
 

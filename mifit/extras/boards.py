@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from mifit.errors import InputError
 
 FORMS = "charuco:COLUMNSxROWS:SQUARE:MARKER, chessboard:COLUMNSxROWS:SQUARE or apriltag:COLUMNSxROWS:TAG:GAP"
 DICTIONARIES = {"charuco": "DICT_5X5_250", "apriltag": "DICT_APRILTAG_36h11"}
+COMMON = ("DICT_5X5_1000", "DICT_4X4_50", "DICT_4X4_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL")
+"""Dictionaries of ChArUco boards to try where none was named; smaller ones of a size begin as these do."""
 PRINT_DPI = 300
 
 
@@ -52,6 +54,8 @@ class Board:
         Millimetres: side of a square and of the marker in it; side of a tag and the gap between two.
     dictionary : str
         OpenCV's name of the set of markers; empty for a chessboard.
+    named : bool
+        Whether the user named it: then no other is tried.
     """
 
     kind: str
@@ -60,6 +64,7 @@ class Board:
     size: float
     other: float = 0.0
     dictionary: str = ""
+    named: bool = False
 
     @classmethod
     def parse(cls, text: str) -> Board:
@@ -92,12 +97,27 @@ class Board:
             raise InputError(
                 f"--board: found dictionary {name[:40]!r}, expected a name of OpenCV's such as DICT_5X5_250"
             )
-        board = cls(kind, columns, rows, size, other, name)
+        board = cls(kind, columns, rows, size, other, name, bool(names))
         try:
             board._aruco  # noqa: B018 - OpenCV refuses what doesn't go together
         except cv2.error:
             raise InputError(f"--board {text}: needs more markers than dictionary {name} has") from None
         return board
+
+    def of_other_dictionaries(self) -> list[Board]:
+        """The same board with other common dictionaries that have markers enough."""
+        enough = self.columns * self.rows // 2
+        size = {name: len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList) for name in COMMON}
+        return [replace(self, dictionary=name) for name in COMMON if size[name] >= enough]
+
+    def describe(self) -> str:
+        """What is looked for, in words."""
+        if self.kind == "apriltag":
+            what = f"an AprilTag grid of {self.columns} x {self.rows} tags of {self.size:g} mm, {self.other:g} mm apart"
+        else:
+            what = f"a {self.kind} board of {self.columns} x {self.rows} squares of {self.size:g} mm"
+            what += f" with markers of {self.other:g} mm" if self.kind == "charuco" else ""
+        return what + (f", dictionary {self.dictionary}" if self.dictionary else "")
 
     @cached_property
     def _aruco(self) -> Any:

@@ -33,6 +33,7 @@ def import_from(
     start: int = 0,
     count: int | None = None,
     units: str | None = None,
+    starts: Sequence[float] = (),
     progress: Progress = silent,
 ) -> Path:
     """Make a capture folder from cameras of another program or a data set; else as `mifit.capture.import_capture`.
@@ -53,6 +54,7 @@ def import_from(
     every, start, count : int
     units : str, optional
         Default: cm for ``colmap``, else metres.
+    starts : sequence of float
     progress : Progress
 
     Raises
@@ -76,7 +78,7 @@ def import_from(
             return Material(sequence.sources, sequence.views, sequence.annotated, unit)
         return _registered(kind, where, sources_of(videos, images), photos, unit)
 
-    return import_material(out, gather, every, start, count, units, progress)
+    return import_material(out, gather, every, start, count, units, starts, progress)
 
 
 def _registered(kind: str, where: Path, sources: list[Source], photos: str | Path | None, units: str) -> Material:

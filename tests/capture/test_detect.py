@@ -121,7 +121,7 @@ def test_detectors_that_cannot_start_say_why(tmp_path: Path, monkeypatch: pytest
 def test_networks_that_are_not_there_are_named_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MIFIT_CACHE", str(tmp_path))
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert missing() == "mediapipe: the package ai-edge-litert isn't installed; pip install 'mifit[landmarks]'"
+    assert missing() == "mediapipe: the package ai-edge-litert isn't installed; pip install ai-edge-litert"
     monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
     with pytest.raises(MifitError) as caught:
         open_detector("mediapipe")

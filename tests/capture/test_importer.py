@@ -72,9 +72,6 @@ def test_bad_videos(tmp_path: Path, pair: list[Path]) -> None:
     text = tmp_path / "text.mp4"
     text.write_text("no video")
     for second, message in (
-        (write_video(tmp_path / "short.avi", frames=5), r"short.avi: found 5 frames, expected 6 as in .*links.avi"),
-        (write_video(tmp_path / "wide.avi", size=(80, 48)), r"wide.avi: found 80 x 48 pixels, expected 64 x 48"),
-        (write_video(tmp_path / "fast.avi", rate=50.0), r"fast.avi: found 50 frames a second, expected 25"),
         (
             cut,
             r"cut.avi: (the header promises 6 frames but|not a readable video: truncated)",

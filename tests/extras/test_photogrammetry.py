@@ -196,9 +196,7 @@ def test_videos_with_a_photogrammetric_calibration(tmp_path: Path) -> None:
     for camera in cameras:
         make_photos(tmp_path / camera.name, [Camera(str(t), *SIZE, 1, 1, 0, 0, np.eye(4)) for t in range(3)])
     model = write.write_metashape(tmp_path / "c.xml", [(camera, f"{camera.name}.png") for camera in cameras])
-    out = imported(
-        tmp_path / "out", images=[tmp_path / camera.name for camera in cameras], metashape=model, units="cm"
-    )
+    out = imported(tmp_path / "out", images=[tmp_path / camera.name for camera in cameras], metashape=model, units="cm")
     capture = Capture.load(out)
     assert (capture.units, capture.timesteps) == ("cm", (0, 1, 2))
     assert_same_cameras(stored(capture), cameras)
