@@ -3,14 +3,15 @@ ACTIVE := $(or $(VIRTUAL_ENV),$(CONDA_PREFIX))
 BIN := $(or $(ACTIVE),.venv)/bin
 OUT ?= out/demo
 
-.PHONY: help demo test quick attack bench notebooks docs lint package clean
+.PHONY: help demo test quick attack bench bench-full notebooks docs lint package clean
 
 help:
 	@echo "make demo       fit a small capture made on the spot and write $(OUT)/report.html"
 	@echo "make test       all tests"
 	@echo "make quick      the tests that take seconds"
 	@echo "make attack     all damaged and hostile inputs, kills and full disks (an hour)"
-	@echo "make bench      reduced benchmarks, renews benchmarks/results"
+	@echo "make bench      every quoted benchmark in reduced size, within an hour"
+	@echo "make bench-full the same in full size, in a night"
 	@echo "make notebooks  runs the notebooks in reduced size"
 	@echo "make docs       builds the documentation into site/"
 	@echo "make lint       ruff and mypy"
@@ -32,6 +33,10 @@ quick:
 bench:
 	@.ci/setup bench
 	$(BIN)/python -m benchmarks
+
+bench-full:
+	@.ci/setup bench
+	$(BIN)/python -m benchmarks --full
 
 notebooks:
 	@.ci/setup notebooks

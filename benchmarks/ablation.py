@@ -1,262 +1,327 @@
-"""What each part of the model buys: one part changed at a time, its cost and the held-out view's error.
+"""What each part of a fit buys: heads fitted without it, one part at a time, and its cost.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.ablation [gloss hard] [--size 128] [--work out/ablation]
+    python -m benchmarks.ablation [--heads scan_city gloss] [--parts TEXT ...] [--size 256]
 
-Cameras ``left`` and ``right`` at four timesteps are fitted; ``third`` is rendered at one sample per pixel and compared
-over the true face area, and never fitted. Stage 1 is fitted once per capture, and again only where a part changes it;
-those fits are kept in the work folder. The base is the default settings with a small map, the shading model that
-``auto`` chooses, and the model's normals. Rows that were fitted to fewer timesteps are compared with the base on these
-timesteps. Writes ``benchmarks/results/ablation.json`` and ``ablation.md``.
+`PARTS` is the table: a name, and how the part is switched off, by settings or by what stands in for a function of the
+package. Steps of a fit that a part doesn't touch are run once per head. Judged by the held-out view over skin and over
+the whole face, relit views, separation of the specular image, and distances from the scan; cost is processor seconds of
+the whole fit. A part that the package doesn't have is named as gone. Rows that aren't asked for keep their figures.
+Writes ``benchmarks/results/ablation.json`` and ``ablation.md``.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from typing import Any
+from unittest.mock import patch
+
+import numpy as np
 
 import mifit
-from benchmarks.matt import infer_matt
-from benchmarks.measure import conditions, measured
-from benchmarks.record import RESULTS, SHARED, record
-from benchmarks.third_view import Error, ThirdView, pooled_psnr
-from mifit import Capture, MorphableModel, Reconstruction
-from mifit.config import SHADINGS, FitConfig, GeometryConfig, NormalsConfig, ReflectanceConfig
-from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate
+from benchmarks import heads, judge
+from benchmarks.foreign import replace_size, separation_of
+from benchmarks.heads import ICT, Case
+from benchmarks.judge import Row
+from benchmarks.record import RESULTS, conditions, record
+from mifit import Capture, FitConfig, MorphableModel, Reconstruction, fitting
 from mifit.core.files import write_text
-from mifit.errors import ConvergenceError, InputError
-from mifit.morphable.openings import with_eyes
+from mifit.core.process import one_blas_thread
+from mifit.errors import MifitError
+from mifit.output.truth import relit_truths, true_passes
+from mifit.progress import silent
 
-MODEL = SHARED / "models" / "ict_facekit" / "ict_facekit_head.npz"
-CAMERAS = ("left", "right")
-TIMESTEPS = (0, 1, 2, 3)
-GEOMETRY = GeometryConfig()
+SEED, SIZE, LIGHTS = 0, 256, 2
+BASE = "base"
 
 
 @dataclass(frozen=True)
-class Scene:
-    """One capture and how to fit it."""
+class Part:
+    """One part of a fit and how it is switched off.
 
-    name: str
-    capture: Capture
-    model: MorphableModel
-    work: Path
+    Attributes
+    ----------
+    label : str
+    settings : dict of str to value
+        ``stage.setting``, instead of the defaults.
+    patches : dict of str to value
+        What stands in for names of the package.
+    step : str
+        The first step of a fit that the patches touch.
+    without : tuple of str
+        Steps that are left out.
+    photometry : bool
+        Whether it is tried on changed photographs of two timesteps too, and only there if it does nothing elsewhere.
+    """
 
-    def geometry(
-        self,
-        config: GeometryConfig = GEOMETRY,
-        cameras: Sequence[str] = CAMERAS,
-        timesteps: Sequence[int] = TIMESTEPS,
-    ) -> GeometryEstimate:
-        """Stage 1, kept in the work folder."""
-        label = f"{config.objective}{config.rounds}_{'_'.join(cameras)}_{len(timesteps)}"
-        fitted = mifit.fit(
-            self.capture,
-            self.model,
-            cameras,
-            timesteps,
-            FitConfig(geometry=config),
-            until="geometry",
-            checkpoints=self.work / self.name / label,
-        )
-        return fitted.geometry
+    label: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    patches: Mapping[str, Any] = field(default_factory=dict)
+    step: str = ""
+    without: tuple[str, ...] = ()
+    photometry: bool = False
 
-    def reflectance(
-        self, geometry: GeometryEstimate, config: ReflectanceConfig, cameras: Sequence[str] = CAMERAS
-    ) -> ReflectanceEstimate:
-        """Stage 2."""
-        return mifit.infer_reflectance(self.capture, self.model, geometry, cameras, config)
+    def config(self, size: int) -> FitConfig:
+        """The settings; TypeError for one that there is no more."""
+        config, changes = replace_size(FitConfig(), size), dict[str, dict[str, Any]]()
+        for name, value in self.settings.items():
+            stage, _, key = name.partition(".")
+            changes.setdefault(stage, {})[key] = value
+        parts = {stage: replace(getattr(config, stage), **values) for stage, values in changes.items()}
+        return replace(config, **parts)
 
-    def diffuse_only(self, geometry: GeometryEstimate, config: ReflectanceConfig) -> ReflectanceEstimate:
-        """Stage 2 by the fast solver without any specular reflection: lighting and diffuse map fitted anew."""
-        return infer_matt(self.capture, self.model, geometry, CAMERAS, config)
-
-
-Fitted = tuple[GeometryEstimate, ReflectanceEstimate, NormalsEstimate | None]
-Row = dict[str, Any]
-
-
-class Table:
-    """Rows of one capture; each is written into ``rows`` as it is done."""
-
-    def __init__(self, scene: Scene) -> None:
-        self.scene, self.judge = scene, ThirdView(scene.capture)
-        self.rows: dict[str, Row] = {}
-        self.base: dict[int, Error] = {}
-
-    def add(self, label: str, fit: Callable[[], Fitted], timesteps: Sequence[int] = TIMESTEPS) -> Fitted | None:
-        """Fit, measure and judge; a part that can't be changed so stays in the table as failing."""
-        scene = self.scene
+    @contextmanager
+    def applied(self) -> Iterator[None]:
+        """The package with the patches; AttributeError for a name that there is no more."""
+        started = [patch(name, value) for name, value in self.patches.items()]
+        begun = []
         try:
-            with measured() as cost:
-                geometry, reflectance, normals = fit()
-            result = Reconstruction(
-                model=scene.model,
-                geometry=geometry,
-                reflectance=reflectance,
-                normals=normals,
-                cameras=tuple(scene.capture.camera(c) for c in CAMERAS),
-            )
-            errors = self.judge.errors(result, timesteps)
-            dropped = self.judge.errors(result, timesteps, "diffuse") if not self.base else None
-        except (InputError, ConvergenceError) as error:
-            self.rows[label] = {"failed": str(error)}
-            print(f"{scene.name}: {label}: failed: {error}", file=sys.stderr, flush=True)
-            return None
-        self.base = self.base or errors
-        self.rows[label] = self._row(errors, cost.figures(), reflectance)
-        if dropped is not None:
-            self.rows["specular: dropped from the base, nothing refitted"] = self._row(dropped, {}, reflectance)
-        print(f"{scene.name}: {label}: {self.rows[label]}", file=sys.stderr, flush=True)
-        return geometry, reflectance, normals
-
-    def _row(self, errors: dict[int, Error], cost: dict[str, float], reflectance: ReflectanceEstimate) -> Row:
-        third = pooled_psnr(errors.values())
-        return {
-            "third_db": round(third, 3),
-            "over_base_db": round(third - pooled_psnr(self.base[t] for t in errors), 3),
-            "timesteps_compared": list(errors),
-            "shading": reflectance.report.details["shading"]["chosen"],
-            "exponent": reflectance.lobe.typical,
-            "outcome": reflectance.report.outcome,
-            **cost,
-        }
+            for each in started:
+                each.start()
+                begun.append(each)
+            yield
+        finally:
+            for each in begun:
+                each.stop()
 
 
-def ablate(scene: Scene, size: int, check: int) -> dict[str, Any]:
-    """All rows of one capture."""
-    table = Table(scene)
-    geometry = scene.geometry()
-    config = ReflectanceConfig(texture_size=size)
-    chosen = scene.reflectance(geometry, config).report.details["shading"]["chosen"]
-    config = replace(config, shading=chosen)  # type: ignore[arg-type]
-
-    def stage2(cameras: Sequence[str] = CAMERAS, count: int = len(TIMESTEPS), **changes: Any) -> Callable[[], Fitted]:
-        """Stage 2 with changed settings on the base's geometry, of its first timesteps."""
-
-        def fit() -> Fitted:
-            used = geometry.at(geometry.timesteps[:count])
-            return geometry, scene.reflectance(used, replace(config, **changes), cameras), None
-
-        return fit
-
-    def afresh(
-        geometry_config: GeometryConfig = GEOMETRY,
-        cameras: Sequence[str] = CAMERAS,
-        timesteps: Sequence[int] = TIMESTEPS,
-    ) -> Callable[[], Fitted]:
-        """Stages 1 and 2 anew; the cost is stage 2's."""
-        own = scene.geometry(geometry_config, cameras, timesteps)
-        return lambda: (own, scene.reflectance(own, config, cameras), None)
-
-    base = table.add(f"base: {chosen}, {config.bands} bands, {size} texels, model's normals", stage2())
-    assert base is not None, "the base must fit"
-    reflectance = base[1]
-    table.add("specular: none, all refitted", lambda: (geometry, scene.diffuse_only(geometry, config), None))
-    table.add("specular difference term: off", stage2(specular_difference_weight=0.0))
-    table.add("smoothness of both maps: off", stage2(smoothness_weight=0.0))
-    table.add("specular map smoothed like the diffuse one", stage2(specular_smoothness=1.0))
-    for shading in SHADINGS:
-        if shading != chosen:
-            table.add(f"shading: {shading}", stage2(shading=shading))
-    if chosen != "paper":
-        for bands in (3, 5, 7):
-            table.add(f"lighting: {bands} bands", stage2(bands=bands))
-    for exponent in (20.0, 150.0):
-        table.add(f"exponent: fixed at {exponent:.0f}", stage2(exponent=exponent))
-    table.add("robust weights: off", stage2(robust=False))
-    table.add("second view: off in stage 2", stage2(cameras=CAMERAS[:1]))
-    table.add("second view: off in both stages", afresh(cameras=CAMERAS[:1]))
-    for count in (1, 2):
-        table.add(f"timesteps: {count} in stage 2", stage2(count=count))
-    for count in (1, 2):
-        steps = TIMESTEPS[:count]
-        table.add(f"timesteps: {count} in both stages", afresh(timesteps=steps), steps)
-    table.add("stage 1: paper's objective", afresh(GeometryConfig(objective="paper")))
-    table.add("stage 1: landmarks alone", afresh(GeometryConfig(rounds=0)))
-
-    def refined() -> Fitted:
-        found = mifit.refine_normals(scene.capture, scene.model, geometry, reflectance, CAMERAS, NormalsConfig())
-        return geometry, reflectance, found
-
-    table.add("normals: refined (cost of stage 3)", refined)
-    if check != size:
-        table.add(f"texture: {check} texels", stage2(texture_size=check))
-    return {"rows": table.rows, "geometry_seconds": round(geometry.report.seconds, 2)}
+def _prior_alone(colour: Any, weight: Any, wrong: Any, *rest: Any) -> Any:
+    """In place of `trust.agreement`: an observation's own probability, whatever other cameras see."""
+    return (1.0 - wrong).astype(np.float32)
 
 
-def markdown(captures: dict[str, dict[str, Any]]) -> str:
-    """One line per part: dB against the base and cost, for each capture."""
-    labels: list[str] = []
-    for found in captures.values():
-        labels += [label for label in found["rows"] if label not in labels and not label.startswith("base")]
-    lines = []
-    for name, found in captures.items():
-        label, row = next((k, v) for k, v in found["rows"].items() if k.startswith("base"))
-        lines.append(
-            f"`{name}`: {label}: {row['third_db']:.2f} dB in {row['steady_seconds']:.1f} s of stage 2 "
-            f"({row['processor_seconds']:.1f} s of processor time) after {found['geometry_seconds']:.1f} s "
-            "of stage 1.\n"
+PARTS = (
+    Part(BASE),
+    Part("surface: off", {"surface.enabled": False}),
+    Part("surface: refit of the model", {"surface.refit": False}),
+    Part("surface: lids and lips closed", {"surface.close_lids": False, "surface.close_lips": False}),
+    Part("stage 1: images (landmarks alone)", {"geometry.rounds": 0}),
+    Part("stage 1: albedo prior of skin's contrast", {"geometry.albedo_prior": 1.0}),
+    Part("light: compact lights and highlights (shadowed)", {"reflectance.shading": "shadowed"}),
+    Part("light: shadows", {"reflectance.shading": "prefiltered"}),
+    Part("light: specular reflection", {"reflectance.shading": "matt"}),
+    Part("light: bands beyond three", {"reflectance.bands": 3}),
+    Part("light: exponent (20)", {"reflectance.exponent": 20.0}),
+    Part("stage 2: segmentation", {"reflectance.segment": False}),
+    Part(
+        "stage 2: agreement of the observations of a point",
+        patches={"mifit.stages.observations.agreement": _prior_alone},
+        step="reflectance",
+    ),
+    Part("stage 2: robust weights and what needs them", {"reflectance.robust": False}),
+    Part("stage 2: relief in the light", {"reflectance.relief": False}),
+    Part(
+        "stage 2: film of the eyes",
+        patches={
+            "mifit.stages.infer_reflectance.reflects": lambda lobe: False,
+            "mifit.output.surface.reflects": lambda lobe: False,
+        },
+        step="reflectance",
+    ),
+    Part("stage 2: difference term", {"reflectance.specular_difference_weight": 0.0}),
+    Part("stage 3: off", without=("normals", "mesh", "residual")),
+    Part("stage 3: robust weights", {"normals.robust": False}),
+    Part("residual", {"residual.enabled": False}),
+    Part("photometry: falloff", {"geometry.falloff": False}, photometry=True),
+    Part("photometry: contrast", {"geometry.contrast": False}, photometry=True),
+    Part("photometry: gains", {"geometry.camera_gains": "never"}, photometry=True),
+    Part("photometry: exposures", {"geometry.exposures": False}, photometry=True),
+)
+"""Every part, switched off alone."""
+
+TWO = (0, 1)
+HEADS = {
+    "scan_city": Case("scan_city", timesteps=(0,), development=True),
+    "emily 3, 4": Case("emily", ICT, ("c3", "c4"), ("c2", "c5"), (0,), development=True),
+    "gloss": Case("gloss", ICT, timesteps=(0,), development=True),
+    "scan_sun": Case("scan_sun", timesteps=TWO),
+    "scan_studio": Case("scan_studio", timesteps=(0,)),
+    "emily 2, 5": Case("emily", ICT, ("c2", "c5"), ("c3", "c4"), (0,)),
+    "soft": Case("soft", ICT, timesteps=(0,)),
+    "hard": Case("hard", ICT, timesteps=(0,)),
+}
+PHOTOGRAPHED = {
+    f"scan_studio, {change or 'as it is'}": Case("scan_studio", timesteps=TWO, changed=change)
+    for change in ("", *heads.CHANGES)
+}
+"""Heads by which photometric parts are tried."""
+
+
+class Fits:
+    """Fits of one head; steps that several parts have in common are run once."""
+
+    def __init__(self, case: Case) -> None:
+        self.case, self.capture = case, Capture.load(case.path)
+        self.model = fitting.fitted_model(MorphableModel.load(case.model), FitConfig())
+        self._digest = self.capture.digest(case.fitted, case.timesteps)
+        self._kept: dict[str, tuple[Any, float]] = {}
+
+    @one_blas_thread()
+    def fit(self, part: Part, size: int) -> tuple[Reconstruction, float]:
+        """A result without the part, and the processor seconds of all its steps."""
+        config = part.config(size)
+        source = fitting.Source(self.capture, self._digest, self.model, self.case.fitted, self.case.timesteps, SEED)
+        listed = [step for step in fitting.steps(config) if step.name not in part.without]
+        keys, touched, spent = fitting.keys(listed, source), False, 0.0
+        found: dict[Any, Any] = {}
+        for step in listed:
+            touched = touched or step.name == part.step
+            key = keys[step.name] + (part.label if touched else "")
+            if key not in self._kept:
+                began, inputs = time.process_time(), {name: found[name] for name in step.inputs}
+                done = step.run(source.seen(inputs), inputs, silent, *step.settings)
+                self._kept[key] = done, time.process_time() - began
+            found[step.part], seconds = self._kept[key]
+            spent += seconds
+        result = Reconstruction(
+            model=self.model,
+            **found,
+            config={**dataclasses.asdict(config), "seed": SEED},
+            cameras=tuple(self.capture.camera(name) for name in self.case.fitted),
+            units=self.capture.units,
+            unit_mm=self.capture.unit_mm,
         )
-    head = " | ".join(f"{name} dB | {name} s | {name} cpu s" for name in captures)
-    lines += [f"| changed part | {head} |", "|---|" + "---|---|---|" * len(captures)]
-    for label in labels:
+        return result, spent
+
+
+def figures(case: Case, result: Reconstruction) -> dict[str, Any]:
+    """Errors of one result; photographs and truth are the unchanged capture's."""
+    plain = replace(case, changed="")
+    capture = Capture.load(plain.path)
+    rows = {"full": Row.of(result), "alone": Row.of(replace(result, residual=None))}
+    views = judge.judge_views(plain, capture, rows, plain.held_out)
+    out: dict[str, Any] = {
+        "skin": views["full"]["skin"]["psnr"],
+        "whole": views["full"]["whole"]["psnr"],
+        "alone": views["alone"]["skin"]["psnr"],
+        "based": views[f"image-based, our mesh, {judge.best_blend(views, 'our mesh')}"]["skin"]["psnr"],
+    }
+    if judge.scan_of(plain, capture, plain.timesteps[0]) is not None:
+        out["mm"] = judge.judge_mesh(plain, capture, rows["full"])["mean_mm"]
+    if relit_truths(capture) and not case.changed:
+        relit = judge.judge_relit(plain, capture, {"full": rows["full"]}, ("local",), 1, LIGHTS)
+        out["relit"] = relit["full, local"]["mean"]
+    if true_passes(capture, plain.held_out[0]) is not None:
+        found = separation_of(result, capture, plain.held_out[0])
+        out["separation"] = found["correlation_smooth"]
+    return out
+
+
+def row_of(part: Part, fits: Fits, size: int) -> dict[str, Any]:
+    """One row; a part that can't be switched off so says why."""
+    try:
+        with part.applied():
+            result, cpu = fits.fit(part, size)
+            return {**figures(fits.case, result), "cpu": round(cpu, 1)}
+    except (TypeError, AttributeError, ModuleNotFoundError) as error:
+        return {"gone": str(error)}
+    except MifitError as error:
+        return {"failed": str(error)}
+
+
+MEASURES: dict[str, tuple[str, int]] = {
+    "skin": ("skin dB", 2), "alone": ("model alone", 2), "whole": ("whole face", 2), "relit": ("relit dB", 2),
+    "mm": ("mm", 3), "separation": ("separation", 2), "cpu": ("cpu s", 0),
+}  # fmt: skip
+
+
+def markdown(measured: Mapping[str, Mapping[str, Any]], size: int) -> str:
+    """Mean change over the heads of each set and the worst one, then every head, part by part."""
+    lines = [
+        f"One part switched off at a time; maps of {size} texels a side. Changes against the head's own base: dB and"
+    ]
+    lines += ["separation below 0 and mm above 0 are worse without the part; cpu s below 0 is what it costs.", ""]
+    sets = {name: [h for h, one in measured.items() if one["set"] == name] for name in ("development", "locked")}
+    titles = [f"{name}: {title}" for name in sets for title, _ in MEASURES.values()]
+    lines += [f"| part switched off | {' | '.join(titles)} |", "|---|" + "---|" * len(titles)]
+    for part in PARTS[1:]:
         cells = []
-        for found in captures.values():
-            row = found["rows"].get(label)
+        for members in sets.values():
+            changes = [_change(measured[h]["rows"], part.label) for h in members if not measured[h]["changed"]]
+            for key, (_, digits) in MEASURES.items():
+                values = [c[key] for c in changes if c is not None and key in c]
+                cells.append(f"{float(np.mean(values)):+.{digits}f}" if values else "")
+        lines.append(f"| {part.label} | {' | '.join(cells)} |")
+    for name, one in measured.items():
+        base = one["rows"].get(BASE, {})
+        lines += ["", f"`{name}` ({one['set']}): " + ", ".join(
+            f"{title} {base[key]:.{digits}f}" for key, (title, digits) in MEASURES.items() if key in base
+        ) + f", image-based {base.get('based', float('nan')):.2f} dB", ""]  # fmt: skip
+        lines += [f"| part | {' | '.join(t for t, _ in MEASURES.values())} |", "|---|" + "---|" * len(MEASURES)]
+        for part in PARTS[1:]:
+            row, change = one["rows"].get(part.label), _change(one["rows"], part.label)
             if row is None:
-                cells += ["", "", ""]
-            elif "failed" in row:
-                cells += ["failed", "", ""]
-            elif "seconds" not in row:
-                cells += [f"{row['over_base_db']:+.2f}", "", ""]
-            else:
-                cells += [
-                    f"{row['over_base_db']:+.2f}",
-                    f"{row['steady_seconds']:.1f}",
-                    f"{row['processor_seconds']:.1f}",
-                ]
-        lines.append(f"| {label} | {' | '.join(cells)} |")
-    lines.append(
-        "\ndB: held-out third view against the base (below 0: worse). s: wall time of the stage without compilation; "
-        "cpu s: processor time of all threads."
-    )
+                continue
+            cells = [next(iter(row.items()))[0]] if change is None else [
+                f"{change[key]:+.{digits}f}" if key in change else "" for key, (_, digits) in MEASURES.items()
+            ]  # fmt: skip
+            lines.append(f"| {part.label} | {' | '.join([*cells, *[''] * (len(MEASURES) - len(cells))])} |")
     return "\n".join(lines) + "\n"
+
+
+def _change(rows: Mapping[str, Any], label: str) -> dict[str, float] | None:
+    """A row minus the base; None for one that isn't there, is gone or failed."""
+    row, base = rows.get(label), rows.get(BASE)
+    if not row or not base or "skin" not in row or "skin" not in base:
+        return None
+    return {key: row[key] - base[key] for key in MEASURES if key in row and key in base}
+
+
+def run(
+    cases: Mapping[str, Case], size: int, wanted: Callable[[str], bool], stored: dict[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """All heads' rows so far, after each that is done."""
+    for name, case in cases.items():
+        if case.missing:
+            print(f"left out: {name}: {case.missing} is not there", file=sys.stderr, flush=True)
+            continue
+        one = stored.setdefault(name, {"rows": {}})
+        one |= {"set": case.set, "changed": case.changed, "label": case.label}
+        fits, photographed = Fits(case), name in PHOTOGRAPHED
+        for part in PARTS:
+            useless = part.photometry and "camera" in part.label and len(case.timesteps) == 1
+            if (photographed and part.label != BASE and not part.photometry) or useless:
+                continue
+            if part.label != BASE and not wanted(part.label):
+                continue
+            one["rows"][part.label] = row_of(part, fits, size)
+            print(f"{name}: {part.label}: {one['rows'][part.label]}", file=sys.stderr, flush=True)
+            yield stored
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", default=["gloss", "hard"])
-    parser.add_argument("--size", type=int, default=128)
-    parser.add_argument(
-        "--check", type=int, default=512, help="map size of the one row that tells whether size matters"
-    )
-    parser.add_argument("--work", type=Path, default=Path("out/ablation"))
-    parser.add_argument("--name", default="ablation", help="of the files in benchmarks/results")
+    parser.add_argument("--heads", nargs="+", help=f"default: all of {', '.join(HEADS)} and the changed ones")
+    parser.add_argument("--parts", nargs="+", default=[], help="renew rows whose labels have one of these texts alone")
+    parser.add_argument("--size", type=int, default=SIZE)
     a = parser.parse_args()
-    if not SHARED.is_dir():
-        print(f"ablation: left out, it needs the data folder {SHARED}", file=sys.stderr)
-        return 0
+    every = {**HEADS, **PHOTOGRAPHED}
+    unknown = [name for name in a.heads or () if name not in every]
+    if unknown:
+        parser.error(f"no head {unknown[0]!r}; there are {', '.join(every)}")
+    cases = {name: every[name] for name in a.heads or every}
     mifit.set_variant("auto")
-    model = with_eyes(MorphableModel.load(MODEL))  # as a fit has it
-    captures: dict[str, dict[str, Any]] = {}
-    stored = RESULTS / f"{a.name}.json"
-    if stored.exists():  # captures that aren't named keep their figures
-        kept = json.loads(stored.read_text())["figures"]
-        captures = kept["captures"] if kept["size"] == a.size else {}
-    for name in a.names:
-        before = conditions()
-        scene = Scene(name, Capture.load(SHARED / "captures" / name), model, a.work)
-        captures[name] = {**ablate(scene, a.size, a.check), "conditions": [before, conditions()]}
-        # After each capture, so that a run that is broken off leaves what it measured.
-        record(a.name, {"size": a.size, "captures": captures})
-        write_text(RESULTS / f"{a.name}.md", markdown(captures))
-    print(markdown(captures))
+    path, stored = RESULTS / "ablation.json", dict[str, Any]()
+    if path.exists() and (a.heads or a.parts):
+        known = json.loads(path.read_text())["figures"]
+        stored = known["heads"] if known.get("size") == a.size else {}
+    before = conditions()
+    for measured in run(cases, a.size, _wanted(a.parts), stored):
+        out = {"size": a.size, "heads": measured, "conditions": {"before": before, "after": conditions()}}
+        record("ablation", out, seeds=SEED)
+        write_text(RESULTS / "ablation.md", markdown(measured, a.size))
+    print(markdown(stored, a.size))
     return 0
+
+
+def _wanted(texts: Sequence[str]) -> Callable[[str], bool]:
+    return lambda label: not texts or any(text in label for text in texts)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,14 @@
-"""Faces that this project did not make: measured and scanned heads, photographed or path traced elsewhere.
+"""Heads that this project did not make, fitted and judged by photographs, path-traced truth and scans.
 
-    python -m benchmarks.foreign [--captures emily scan_city ...] [--rows full refit ...] [--size 512]
-        [--timesteps 0,1] [--cameras left,right] [--config FILE.toml] [--judge RESULT] [--pictures DIR]
-    python -m benchmarks.foreign --captures FOLDER --cameras a,b --held-out c [--model M]
+    python -m benchmarks.foreign [--own] [--reduced] [--captures scan_city emily] [--rows full refit paper]
+    python -m benchmarks.foreign --captures FOLDER --cameras left,right --held-out third [--timesteps 0]
 
-Fits the named cameras and judges by the others: fitted and held-out views of the stage-1 model (`pca`), of a fit
-without specular reflection (`refit`), of the full fit and of image-based rendering on our mesh and on the scan, all
-on the same pixels; distances from the scan to the mesh; relit views against path-traced ones; albedo, specular map and
-normals at the scan's own surface points. Landmarks are a detector's, no head is in the span of a model, and no image
-is lit by a shading model of this project. ``--judge`` judges a result folder in place of fitting. With nothing but
-defaults the figures become ``benchmarks/results/foreign.json``, ``foreign.md`` and ``foreign_short.md``.
+Rows: ``full`` with all defaults, the same without its residual, the stage-1 model, light and albedo fitted again
+without specular reflection, one albedo for the whole head under the recovered light, the paper as it is written
+(literal units, and colours and pixels both normalised; each pair of photographs by itself, scale free), and
+image-based rendering by three blends on our mesh and on the scan. All on the same pixels, with the same samples per
+pixel. ``--own`` takes the path-traced heads that the fitted model holds. With nothing but defaults (or ``--own`` or
+``--reduced``) the figures become ``benchmarks/results/foreign.json`` (``captures.json``) and the tables beside them.
 """
 
 from __future__ import annotations
@@ -19,99 +18,102 @@ import json
 import multiprocessing
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import mifit
-from benchmarks import foreign_tables, judge
-from benchmarks.matt import as_chosen, infer_matt
-from benchmarks.measure import conditions
-from benchmarks.record import RESULTS, SHARED, record
+from benchmarks import heads, judge
+from benchmarks.heads import ICT, Case
+from benchmarks.judge import Row
+from benchmarks.record import RESULTS, conditions, record
 from mifit import Capture, FitConfig, MorphableModel, Reconstruction
+from mifit.config import ReflectanceConfig
 from mifit.core.files import write_text
-from mifit.core.image import write_image
 from mifit.core.process import set_threads, threads
 from mifit.errors import MifitError
-from mifit.render.image_based import image_based
+from mifit.output.evaluate import separation_of
+from mifit.output.truth import relit_truths, true_passes
 
-ICT = str(SHARED / "models" / "ict_facekit" / "ict_facekit_head.npz")
 FITS = ("full", "refit", "paper")
-JUDGED = ("views", "mesh", "surface", "relit")
 RELIT_SAMPLES = 64
-SIZE = FitConfig().reflectance.texture_size
-"""Texels along the side of the maps, unless --size says otherwise: what a user gets who says nothing."""
+SCALE_DEVIATION = 0.2
+"""Of the paper's scale, which it estimates: logarithm."""
 SEED = 0
+REDUCED_TEXELS = 256
 
 
-@dataclass(frozen=True)
-class Case:
-    """One fit of one capture.
-
-    Attributes
-    ----------
-    capture : str
-        A folder, or the name of one of the shared captures.
-    model : str
-    fitted, held_out : tuple of str
-        Cameras; the held-out ones are never read by a fit.
-    timesteps : tuple of int
-    """
-
-    capture: str
-    model: str
-    fitted: tuple[str, ...]
-    held_out: tuple[str, ...]
-    timesteps: tuple[int, ...]
-
-    @property
-    def path(self) -> Path:
-        """The capture's folder."""
-        shared = SHARED / "captures" / self.capture
-        return shared if shared.is_dir() else Path(self.capture)
-
-    @property
-    def label(self) -> str:
-        """What a table calls it."""
-        model = "ICT" if self.model == ICT else Path(self.model).stem
-        steps = "" if len(self.timesteps) > 1 or self.fitted[0].startswith("c") else ", one timestep"
-        return f"{Path(self.capture).name}{steps} ({model}), {','.join(self.fitted)} → {','.join(self.held_out)}"
+# -- fits ------------------------------------------------------------
 
 
-CASES = (
-    Case("scan_city", "builtin", ("left", "right"), ("third",), (0, 1, 2, 3)),
-    Case("emily", ICT, ("c3", "c4"), ("c2", "c5"), (0,)),
-    Case("scan_studio", "builtin", ("left", "right"), ("third",), (0, 1, 2, 3)),
-    Case("scan_city", ICT, ("left", "right"), ("third",), (0,)),
-    Case("emily", "builtin", ("c3", "c4"), ("c2", "c5"), (0,)),
-    Case("emily", ICT, ("c2", "c5"), ("c3", "c4"), (0,)),
-)
-
-
-def fits_of(case: Case, wanted: Sequence[str], config: FitConfig) -> dict[str, Reconstruction]:
-    """The reconstructions that the rows show; only fitted cameras are read."""
+def rows_of(case: Case, wanted: Sequence[str], config: FitConfig) -> dict[str, Row]:
+    """The rows of a case's tables; only fitted cameras are read."""
     capture, model = Capture.load(case.path), MorphableModel.load(case.model)
-    found = {}
     full = mifit.fit(capture, model, case.fitted, case.timesteps, config, seed=SEED)
-    if "full" in wanted:
-        found["full"] = full
+    rows = {"full": Row.of(full)}
+    if full.residual is not None:
+        rows["model alone"] = Row.of(replace(full, residual=None))
+    rows["pca"] = Row.of(full, "pca")
     if "refit" in wanted:
-        whole = full.model  # with eyes, if it had none
-        matt = infer_matt(capture, whole, full.geometry, case.fitted, as_chosen(full, config.reflectance), SEED)
-        normals = mifit.refine_normals(capture, whole, full.geometry, matt, case.fitted, config.normals, seed=SEED)
-        residual = full.residual  # of the refit's own, so that both rows show what theirs leaves unexplained
-        if residual is not None:
-            given = full.geometry, matt, normals, case.fitted
-            residual = mifit.find_residual(capture, whole, *given, config.residual, SEED)
-        found["refit"] = replace(full, reflectance=matt, normals=normals, mesh=None, residual=residual)
-    if "paper" in wanted and hasattr(FitConfig, "paper"):
-        paper = replace_size(FitConfig.paper(), config.reflectance.texture_size)
-        found["paper"] = mifit.fit(capture, model, case.fitted, case.timesteps, paper, seed=SEED)
-    return found
+        rows["refit"] = Row.of(without_specular(full, capture, case.fitted, config))
+        rows["constant albedo"] = Row.of(constant_albedo(full))
+    if "paper" in wanted:
+        for name, paper in paper_settings(case, capture).items():
+            paper = replace_size(paper, config.reflectance.texture_size)
+            rows[name] = Row(
+                {t: mifit.fit(capture, model, case.fitted, (t,), paper, seed=SEED) for t in case.timesteps}
+            )
+    return rows
+
+
+def without_specular(
+    full: Reconstruction, capture: Capture, cameras: Sequence[str], config: FitConfig
+) -> Reconstruction:
+    """The same mesh with light, albedo, normals and residual fitted again, without specular reflection."""
+    given = capture, full.model, full.geometry
+    reflectance = mifit.infer_reflectance(*given, cameras, lambertian(config.reflectance), seed=SEED)
+    normals = mifit.refine_normals(*given, reflectance, cameras, config.normals, seed=SEED)
+    residual = full.residual
+    if residual is not None:
+        residual = mifit.find_residual(*given, reflectance, normals, cameras, config.residual, SEED)
+    return replace(full, reflectance=reflectance, normals=normals, mesh=None, residual=residual)
+
+
+def lambertian(config: ReflectanceConfig) -> ReflectanceConfig:
+    """Settings of stage 2 without specular reflection."""
+    return replace(config, shading="matt")
+
+
+def constant_albedo(full: Reconstruction) -> Reconstruction:
+    """The recovered light on a head of one colour: what the albedo's detail is worth."""
+    assert full.reflectance is not None
+    seen = full.reflectance.confidence > 0.5
+    diffuse, specular = full.reflectance.diffuse.copy(), full.reflectance.specular.copy()
+    painted = diffuse.any(-1)
+    diffuse[painted], specular[painted] = diffuse[seen].mean(0), specular[seen].mean()
+    flat = replace(full.reflectance, diffuse=diffuse, specular=specular, relief=None)
+    return replace(full, reflectance=flat, residual=None)
+
+
+def paper_settings(case: Case, capture: Capture) -> dict[str, FitConfig]:
+    """The paper as written, in its literal units, and with colours and image coordinates both normalised to 0..1.
+
+    Dividing colours by 255 and pixels by the picture's width is the same as keeping both and raising the prior by 255^2
+    and the landmarks' weight by the square of 255 over the width.
+    """
+    width = capture.camera(case.fitted[0]).width
+    literal = FitConfig.paper()
+    geometry = replace(literal.geometry, scale_deviation=SCALE_DEVIATION)
+    ours = geometry.landmark_weight * (255.0 / width) ** 2, geometry.prior_weight * 255.0**2
+    normalised = replace(geometry, landmark_weight=ours[0], prior_weight=ours[1])
+    return {
+        "paper": replace(literal, geometry=geometry),
+        "paper, normalised": replace(literal, geometry=normalised),
+    }
 
 
 def replace_size(config: FitConfig, size: int) -> FitConfig:
@@ -119,105 +121,42 @@ def replace_size(config: FitConfig, size: int) -> FitConfig:
     return replace(config, reflectance=replace(config.reflectance, texture_size=size))
 
 
-def rows_of(fits: dict[str, Reconstruction]) -> dict[str, tuple[Reconstruction, Any]]:
-    """Rows of a table: reconstruction and method."""
-    rows: dict[str, tuple[Reconstruction, Any]] = {}
-    for name, result in fits.items():
-        rows[name] = (result, "full")
-        if name == "refit":
-            continue
-        if result.residual is not None:
-            rows[f"{name}: model alone"] = (replace(result, residual=None), "full")
-        rows[f"{name}: pca"] = (result, "pca")
-        rows[f"{name}: specular dropped"] = (result, "diffuse")
-    return {label: row for label, row in rows.items() if row[1] in row[0].methods}
+# -- judging ------------------------------------------------------------
 
 
 def judge_case(
-    case: Case, fits: dict[str, Reconstruction], parts: Sequence[str], samples: int = RELIT_SAMPLES
+    case: Case, rows: Mapping[str, Row], integrators: Sequence[str], samples: int, lights: int
 ) -> dict[str, Any]:
     """All figures of one case."""
-    capture = Capture.load(case.path)
-    rows, main = rows_of(fits), next(iter(fits.values()))
-    has_scan = judge.scan.read_scan(capture, case.timesteps[0]) is not None
-    found: dict[str, Any] = {"label": case.label, "model": case.model if case.model == "builtin" else "ICT"}
-    if "views" in parts:
-        found["held_out"] = judge.judge_views(rows, capture, case.held_out, case.timesteps, case.fitted)
-        some = {label: row for label, row in rows.items() if not label.endswith(("dropped", "alone"))}
-        found["fitted"] = judge.judge_views(some, capture, case.fitted, case.timesteps, case.fitted, perceptual=False)
-        found["fitted"] = {k: v for k, v in found["fitted"].items() if not k.startswith("image-based")}
-    if "mesh" in parts and has_scan:
-        meshes = {name: result for name, result in fits.items() if name != "refit"} or {"refit": main}
-        found["mesh"] = {name: judge.judge_mesh(result, capture, case.fitted) for name, result in meshes.items()}
-    if "surface" in parts and has_scan:
-        found["surface"] = {name: judge.judge_surface(r, capture, case.fitted) for name, r in fits.items()}
-    if "relit" in parts and judge.scan.relit_truths(capture):
-        alike = ("pca", "alone", "paper: specular dropped")  # under another light there is no residual
-        lit = {label: row for label, row in rows.items() if not label.endswith(alike)}
-        found["relit"] = judge.judge_relit(
-            lit, capture, case.held_out[0], case.timesteps[0], ("local", "path"), samples
-        )
-    found["fits"] = {name: outcome(result) for name, result in fits.items()}
+    capture, full = Capture.load(case.path), rows["full"].first
+    found: dict[str, Any] = {"held_out": judge.judge_views(case, capture, rows, case.held_out)}
+    fitted = {"full": rows["full"]}
+    found["fitted"] = {"full": judge.judge_views(case, capture, fitted, case.fitted)["full"]}
+    if judge.scan_of(case, capture, case.timesteps[0]) is not None:
+        made = {name: row for name, row in rows.items() if name in ("full", "refit") or name.startswith("paper")}
+        found["mesh"] = {n: judge.judge_mesh(case, capture, row) for n, row in made.items() if n != "refit"}
+        found["surface"] = {n: judge.judge_surface(case, capture, row) for n, row in made.items()}
+    if relit_truths(capture):
+        alike = ("pca", "model alone")  # under another light there is no residual
+        lit = {name: row for name, row in rows.items() if name not in alike}
+        found["relit"] = judge.judge_relit(case, capture, lit, integrators, samples, lights)
+    if true_passes(capture, case.held_out[0]) is not None and capture.timesteps[0] in case.timesteps:
+        found["separation"] = separation_of(full, capture, case.held_out[0])
+    found["fits"] = {name: outcome(row.first) for name, row in rows.items() if row.method == "full"}
     return found
 
 
 def outcome(result: Reconstruction) -> dict[str, Any]:
     """How the stages of a fit ended."""
     reports = result.reports
+    lights = result.reflectance.illumination.lights if result.reflectance else ()
     return {
         "unconverged": [name for name, report in reports.items() if report.outcome != "converged"],
         "seconds": {name: round(report.seconds, 1) for name, report in reports.items()},
-        "shading": reports["reflectance"].details.get("shading", {}).get("chosen")
-        if "reflectance" in reports
-        else None,
+        "compact_lights": len(lights),
         "exponent": result.reflectance.lobe.typical if result.reflectance else None,
         "warnings": [one.text for one in result.diagnostics],
     }
-
-
-def write_pictures(folder: Path, case: Case, fits: dict[str, Reconstruction]) -> None:
-    """One strip: photograph, image-based rendering on our mesh, then every row, of the first held-out view."""
-    capture, timestep = Capture.load(case.path), case.timesteps[0]
-    at = judge.view(capture, case.held_out[0], timestep)
-    first = next(iter(fits.values()))
-    vertices = first.geometry.vertices[first.index(timestep)]
-    cameras = [capture.camera(c) for c in case.fitted]
-    base = image_based(capture, cameras, at.camera, timestep, vertices, first.model.faces)
-    tiles = [capture.frame(at.name, timestep).image[at.box], base.colour]
-    tiles += [r.render(at.camera, timestep, m)[..., :3] for r, m in rows_of(fits).values()]
-    name = "".join(c if c.isalnum() else "_" for c in case.label)
-    write_image(folder / f"{name}.png", np.concatenate([np.asarray(t, np.float32) for t in tiles], axis=1))
-
-
-def cases_of(arguments: argparse.Namespace) -> tuple[list[Case], list[str]]:
-    """The cases asked for, and why others are left out."""
-    known = {case.capture for case in CASES}
-    cases, skipped = [], []
-    for name in arguments.captures:
-        if name in known:
-            cases += [case for case in CASES if case.capture == name]
-        else:
-            if not (arguments.cameras and arguments.held_out):
-                raise SystemExit(f"--captures {name}: no known capture; name --cameras and --held-out for a folder")
-            cases.append(Case(name, arguments.model or "builtin", (), (), arguments.timesteps or (0,)))
-    changes: dict[str, Any] = {
-        "fitted": arguments.cameras,
-        "held_out": arguments.held_out,
-        "timesteps": arguments.timesteps,
-        "model": ICT if arguments.model == "ict" else arguments.model,
-    }
-    changes = {key: value for key, value in changes.items() if value}
-    if arguments.cameras:  # the other cameras of a shared capture are held out
-        for i, case in enumerate(cases):
-            rest = tuple(c for c in (*case.fitted, *case.held_out) if c not in arguments.cameras)
-            cases[i] = replace(case, held_out=rest)
-    cases = list(dict.fromkeys(replace(case, **changes) for case in cases))
-    for case in list(cases):
-        missing = next((p for p in (case.path, Path(case.model)) if not p.exists() and str(p) != "builtin"), None)
-        if missing is not None:
-            skipped.append(f"{case.label}: {missing} is not there")
-            cases.remove(case)
-    return cases, skipped
 
 
 def run_case(case: Case, arguments: argparse.Namespace, config: FitConfig) -> dict[str, Any]:
@@ -225,18 +164,220 @@ def run_case(case: Case, arguments: argparse.Namespace, config: FitConfig) -> di
     set_threads(max(1, threads() // arguments.jobs))
     mifit.set_variant("auto")
     began, used = time.perf_counter(), time.process_time()
+    named = {"label": case.label, "set": case.set, "development": case.development}
     try:
-        if arguments.judge:
-            fits = {"full": Reconstruction.load(arguments.judge)}
-        else:
-            fits = fits_of(case, arguments.rows, config)
-        figures = judge_case(case, fits, arguments.parts, arguments.relit_samples)
-        if arguments.pictures:
-            write_pictures(arguments.pictures, case, fits)
+        rows = rows_of(case, arguments.rows, config)
+        fitted = time.process_time() - used
+        integrators = ("local",) if arguments.reduced else ("local", "path")
+        figures = judge_case(case, rows, integrators, RELIT_SAMPLES, 2 if arguments.reduced else 9)
     except MifitError as error:
-        return {"label": case.label, "failed": str(error)}
-    spent = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - used}
-    return {**figures, **{key: round(value, 1) for key, value in spent.items()}}
+        return {**named, "failed": str(error)}
+    spent = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - used, "fit_cpu": fitted}
+    return {**named, **figures, **{key: round(value, 1) for key, value in spent.items()}}
+
+
+# -- tables ------------------------------------------------------------
+
+Columns = dict[str, Callable[[dict[str, Any]], str]]
+
+
+def _figure(case: dict[str, Any], digits: int, *keys: str) -> str:
+    found: Any = case
+    for key in keys:
+        found = found.get(key, {}) if isinstance(found, dict) else {}
+    return f"{found:.{digits}f}" if isinstance(found, (int, float)) else "-"
+
+
+def _psnr(case: dict[str, Any], row: str, region: str = "skin") -> str:
+    return _figure(case, 1, "held_out", row, region, "psnr")
+
+
+def _based(case: dict[str, Any], mesh: str, region: str = "skin", measure: str = "psnr", digits: int = 1) -> str:
+    """The best blend by skin on a mesh, which is named where the region is skin."""
+    blend = judge.best_blend(case.get("held_out", {}), mesh)
+    text = _figure(case, digits, "held_out", f"image-based, {mesh}, {blend}", region, measure)
+    return f"{text} ({blend})" if blend and (region, measure) == ("skin", "psnr") else text
+
+
+def _measures(measure: str, digits: int) -> Columns:
+    columns: Columns = {}
+    for region in ("skin", "face", "whole"):
+        for title, row in (("`full`", "full"), ("model alone", "model alone"), ("refitted", "refit")):
+            columns[f"{title}, {region}"] = lambda c, r=row, g=region: _figure(c, digits, "held_out", r, g, measure)
+        columns[f"image-based, {region}"] = lambda c, g=region: _based(c, "our mesh", g, measure, digits)
+    return columns
+
+
+def _millimetres(case: dict[str, Any], row: str) -> str:
+    return " / ".join(_figure(case, 2, "mesh", row, key) for key in ("median_mm", "mean_mm", "p90_mm"))
+
+
+def _relit(case: dict[str, Any], row: str) -> str:
+    """Path traced where that was done, else by local shading."""
+    how = "path" if f"{row}, path" in case.get("relit", {}) else "local"
+    return _figure(case, 1, "relit", f"{row}, {how}", "mean")
+
+
+def _unconverged(case: dict[str, Any]) -> str:
+    found = [f"{name}: {', '.join(fit['unconverged'])}" for name, fit in case["fits"].items() if fit["unconverged"]]
+    return "; ".join(found) or "none"
+
+
+HELD_OUT: Columns = {
+    "`full`": lambda c: _psnr(c, "full"),
+    "`full`, model alone": lambda c: _psnr(c, "model alone"),
+    "refitted without specular": lambda c: _psnr(c, "refit"),
+    "one albedo": lambda c: _psnr(c, "constant albedo"),
+    "stage 1's model": lambda c: _psnr(c, "pca"),
+    "paper, literal units": lambda c: _psnr(c, "paper"),
+    "paper, normalised": lambda c: _psnr(c, "paper, normalised"),
+    "image-based, our mesh": lambda c: _based(c, "our mesh"),
+    "image-based, scan": lambda c: _based(c, "scan"),
+    "`full`, fitted views": lambda c: _figure(c, 1, "fitted", "full", "skin", "psnr"),
+}
+SURFACE: Columns = {
+    "scan to mesh, median / mean / 90 % mm": lambda c: _millimetres(c, "full"),
+    "paper, literal": lambda c: _millimetres(c, "paper"),
+    "paper, normalised": lambda c: _millimetres(c, "paper, normalised"),
+    "normals °": lambda c: _figure(c, 1, "surface", "full", "normal_degrees"),
+    "stage 1's normals °": lambda c: _figure(c, 1, "surface", "full", "normal_degrees_stage1"),
+    "albedo dB, scaled / as it is": lambda c: " / ".join(
+        _figure(c, 1, "surface", "full", key) for key in ("albedo_psnr", "albedo_psnr_unscaled")
+    ),
+    "specular map corr.": lambda c: _figure(c, 2, "surface", "full", "specular_correlation"),
+    "unconverged": _unconverged,
+    "cpu s of all fits": lambda c: _figure(c, 0, "fit_cpu"),
+}
+RELIT: Columns = {
+    f"{title}, {how}": lambda c, row=row, how=how: _figure(c, 1, "relit", f"{row}, {how}", "mean")
+    for how in ("local", "path")
+    for title, row in (("`full`", "full"), ("refitted", "refit"), ("one albedo", "constant albedo"), ("paper", "paper"))
+    if how == "local" or row in ("full", "refit")
+}
+SEPARATION: Columns = {
+    "corr., raw / smoothed": lambda c: " / ".join(
+        _figure(c, 2, "separation", key) for key in ("correlation", "correlation_smooth")
+    ),
+    "error (even image)": lambda c: (
+        f"{_figure(c, 2, 'separation', 'error')} ({_figure(c, 2, 'separation', 'error_flat')})"
+    ),
+    "share (truth)": lambda c: f"{_figure(c, 3, 'separation', 'share')} ({_figure(c, 3, 'separation', 'share_truth')})",
+    "diffuse dB (no separation)": lambda c: (
+        f"{_figure(c, 1, 'separation', 'diffuse_psnr')} ({_figure(c, 1, 'separation', 'diffuse_psnr_unseparated')})"
+    ),
+}
+
+
+def _table(cases: Sequence[dict[str, Any]], columns: Columns) -> list[str]:
+    lines = ["| head (fitted model), fitted → held out | set | " + " | ".join(columns) + " |"]
+    lines.append("|---|---|" + "---|" * len(columns))
+    for case in cases:
+        start = f"| {case['label']} | {case['set']} |"
+        if "failed" in case:
+            lines.append(f"{start} failed: {case['failed'].replace('|', '/')} |" + " |" * (len(columns) - 1))
+        else:
+            lines.append(f"{start} " + " | ".join(cell(case) for cell in columns.values()) + " |")
+    return lines
+
+
+def spread(cases: Sequence[dict[str, Any]]) -> str:
+    """How far `full` is above the best image-based rendering on its mesh: worst, middle and best head of each set."""
+    lines = []
+    for name in ("development", "locked"):
+        over = {}
+        for case in cases:
+            blend = judge.best_blend(case.get("held_out", {}), "our mesh")
+            if case["set"] == name and blend:
+                base = case["held_out"][f"image-based, our mesh, {blend}"]["skin"]["psnr"]
+                over[case["label"]] = case["held_out"]["full"]["skin"]["psnr"] - base
+        if over:
+            worst = min(over, key=lambda label: over[label])
+            values = sorted(over.values())
+            lines.append(
+                f"{name}, {len(values)} rows: `full` over image-based rendering on its mesh {values[0]:+.1f} "
+                f"({worst}), "
+                f"{float(np.median(values)):+.1f} and {values[-1]:+.1f} dB (worst, median, best)."
+            )
+    return "\n".join(lines)
+
+
+def markdown(cases: Sequence[dict[str, Any]], run: Mapping[str, Any] | None = None) -> str:
+    """All tables; ``run`` says how and under which load they were made."""
+    lines = []
+    if run is not None:
+        load = [run["conditions"][when]["load_average"][0] for when in ("before", "after")]
+        cpu = sum(case.get("cpu_seconds", 0) for case in cases) / 60
+        lines = [
+            f"Maps of {run['settings']['texels']} texels a side; {run['seconds'] / 60:.0f} minutes, {cpu:.0f} of "
+            f"processor time, at load averages of {load[0]:.1f} to {load[1]:.1f}.",
+            *(f"Left out: {text}." for text in run["left_out"]),
+            "",
+        ]
+    lines += [
+        spread(cases),
+        "",
+        "Held-out views, PSNR in dB of 8-bit sRGB over skin (the hull of the landmarks without eyes and inner",
+        "mouth, where a fitted view sees the scan), the same pixels in every column but the last; of image-based",
+        "rendering the best of three blends, which is named:",
+        "",
+        *_table(cases, HELD_OUT),
+    ]
+    for measure, title, digits in (("psnr", "PSNR dB", 1), ("ssim", "SSIM", 3), ("flip", "FLIP", 3)):
+        lines += ["", f"{title} over skin, face (the hull where a fitted view sees it) and the whole hull:", ""]
+        lines += _table(cases, _measures(measure, digits))
+    lines += ["", "The surface at the scan's points that all fitted views see, without alignment:", ""]
+    lines += _table(cases, SURFACE)
+    for key, columns, title in (
+        ("relit", RELIT, "Relit held-out view against path-traced truth, one factor per channel, mean PSNR in dB:"),
+        ("separation", SEPARATION, "Diffuse and specular image of the held-out view against the renderer's passes:"),
+    ):
+        some = [case for case in cases if case.get(key)]
+        lines += ["", title, "", *_table(some, columns)] if some else []
+    return "\n".join(lines) + "\n"
+
+
+def short(cases: Sequence[dict[str, Any]]) -> str:
+    """One table for the front page, worst rows included."""
+    columns: Columns = {
+        **{key: HELD_OUT[key] for key in ("`full`", "`full`, model alone", "refitted without specular")},
+        "image-based, our mesh": HELD_OUT["image-based, our mesh"],
+        "whole face: `full`": lambda c: _psnr(c, "full", "whole"),
+        "whole face: image-based": lambda c: _based(c, "our mesh", "whole"),
+        "scan to mesh, median / mean mm": lambda c: " / ".join(
+            _figure(c, 2, "mesh", "full", key) for key in ("median_mm", "mean_mm")
+        ),
+        "relit: `full`": lambda c: _relit(c, "full"),
+        "relit: refitted": lambda c: _relit(c, "refit"),
+    }
+    return "\n".join([spread(cases), "", *_table(cases, columns)]) + "\n"
+
+
+# -- the command ------------------------------------------------------------
+
+
+def cases_of(arguments: argparse.Namespace) -> tuple[list[Case], list[str]]:
+    """The cases asked for, and why others are left out."""
+    known = heads.OWN if arguments.own else heads.FOREIGN
+    cases: list[Case] = []
+    for name in arguments.captures or dict.fromkeys(case.capture for case in known):
+        found = [case for case in (*known, *heads.OWN, *heads.FOREIGN) if case.capture == name]
+        if not found and not (arguments.cameras and arguments.held_out):
+            raise SystemExit(f"--captures {name}: no known capture; name --cameras and --held-out for a folder")
+        cases += found or [Case(name, arguments.model or "builtin", (), (), arguments.timesteps or (0,))]
+    changes: dict[str, Any] = {
+        "fitted": arguments.cameras,
+        "held_out": arguments.held_out,
+        "timesteps": arguments.timesteps or ((0,) if arguments.reduced else None),
+        "model": ICT if arguments.model == "ict" else arguments.model,
+    }
+    changes = {key: value for key, value in changes.items() if value}
+    if arguments.cameras:  # the other cameras of a known capture are held out
+        for i, case in enumerate(cases):
+            rest = tuple(c for c in (*case.fitted, *case.held_out) if c not in arguments.cameras)
+            cases[i] = replace(case, held_out=rest)
+    cases = list(dict.fromkeys(replace(case, **changes) for case in cases))
+    skipped = [f"{case.label}: {case.missing} is not there" for case in cases if case.missing]
+    return [case for case in cases if not case.missing], skipped
 
 
 def main() -> int:
@@ -247,56 +388,53 @@ def main() -> int:
         return tuple(map(int, text.split(",")))
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--captures", nargs="+", default=list(dict.fromkeys(case.capture for case in CASES)))
+    parser.add_argument("--captures", nargs="+", help="default: all of the table")
+    parser.add_argument("--own", action="store_true", help="the path-traced heads in the span of the fitted model")
+    parser.add_argument("--reduced", action="store_true", help="one timestep, small maps, two lights, no path tracing")
     parser.add_argument("--rows", nargs="+", choices=FITS, default=list(FITS), help="fits to make")
-    parser.add_argument("--parts", nargs="+", choices=JUDGED, default=list(JUDGED), help="what to judge")
-    parser.add_argument("--size", type=int, default=SIZE, help="texels along the side of the maps")
     parser.add_argument("--timesteps", type=numbers, help="0,1,... instead of each case's")
     parser.add_argument("--cameras", type=names, help="cameras to fit, instead of each case's")
     parser.add_argument("--held-out", type=names, help="cameras to judge by")
     parser.add_argument("--model", help="builtin, ict or a file, instead of each case's")
     parser.add_argument("--config", type=Path, help="settings of the fit")
-    parser.add_argument("--judge", type=Path, help="a result folder to judge in place of fitting")
-    parser.add_argument("--relit-samples", type=int, default=RELIT_SAMPLES)
-    parser.add_argument("--pictures", type=Path, help="folder for one strip of images per case")
-    parser.add_argument("--record", action="store_true", help="write the tables whatever the options; they say which")
     parser.add_argument("--jobs", type=int, default=2, help="cases at a time, each in a process of its own")
     parser.add_argument("--json", type=Path, help="write the figures to a file of one's own")
     a = parser.parse_args()
-    before = conditions()
+    before, started = conditions(), time.perf_counter()
     config = FitConfig.load(a.config) if a.config else FitConfig()
-    config = replace_size(config, a.size)
+    config = replace_size(config, REDUCED_TEXELS) if a.reduced else config
     cases, skipped = cases_of(a)
-    started = time.perf_counter()
     for text in skipped:
         print(f"left out: {text}", file=sys.stderr, flush=True)
-    whole = all(
-        getattr(a, k) == parser.get_default(k) for k in vars(a) if k not in ("pictures", "json", "jobs", "record")
-    )
+    free = ("own", "reduced", "jobs", "json", "rows")
+    whole = all(getattr(a, key) == parser.get_default(key) for key in vars(a) if key not in free)
     found: list[dict[str, Any]] = []
+    for case in cases:
+        if case.capture.startswith("ict_"):
+            mifit.set_variant("auto")
+            _ = case.path  # rendered once, before processes ask for it
     with ProcessPoolExecutor(a.jobs, multiprocessing.get_context("spawn")) as pool:
         waiting = [pool.submit(run_case, case, a, config) for case in cases]
         for case, future in zip(cases, waiting, strict=True):
             found.append(future.result())
-            text = json.dumps({k: v for k, v in found[-1].items() if k != "fits"})
-            print(f"{case.label}: {found[-1].get('seconds', 0):.0f} s\n{text}", file=sys.stderr, flush=True)
+            print(f"{case.label}: {found[-1].get('seconds', 0):.0f} s", file=sys.stderr, flush=True)
+            settings = {"texels": config.reflectance.texture_size, "fits": a.rows, "reduced": a.reduced}
             out = {
-                "settings": {"texels": a.size, "fits": a.rows, "parts": a.parts, "relit_samples": a.relit_samples},
+                "settings": settings,
                 "cases": found,
                 "left_out": [*skipped, *(f"{c.label}: the run was broken off" for c in cases[len(found) :])],
                 "seconds": round(time.perf_counter() - started, 1),
-                "jobs": a.jobs,
                 "conditions": {"before": before, "after": conditions()},
             }
-            if a.record or (
-                whole and not skipped
-            ):  # after each case, so that a run that is broken off leaves what it measured
-                record("foreign", out, seeds=SEED)
-                write_text(RESULTS / "foreign.md", foreign_tables.markdown(found, out))
-                write_text(RESULTS / "foreign_short.md", foreign_tables.short(found))
+            if whole and not skipped:  # after each case, so that a run that is broken off leaves what it measured
+                name = "captures" if a.own else "foreign"
+                record(name, out, seeds=SEED)
+                write_text(RESULTS / f"{name}.md", short(found) if a.own else markdown(found, out))
+                if not a.own:
+                    write_text(RESULTS / "foreign_short.md", short(found))
     if a.json:
         write_text(a.json, json.dumps(out, indent=2) + "\n")
-    print(foreign_tables.markdown(found))
+    print(markdown(found))
     return 1 if any("failed" in case for case in found) else 0
 
 

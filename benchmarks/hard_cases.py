@@ -12,41 +12,235 @@ folder and made again when it is deleted.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import shutil
 import sys
 import time
 import traceback
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 import mifit
-from benchmarks import hard_captures as captures
-from benchmarks.hard_captures import (
-    HEIGHT,
-    MODEL,
-    SEED,
-    TIMESTEPS,
-    WIDTH,
-    damaged,
-    exposed,
-    file_changed,
-    moved,
-    spot,
-    traced,
-)
 from benchmarks.record import RESULTS, machine, record
 from benchmarks.truth import mesh_error
 from mifit import Capture, MorphableModel, Reconstruction
+from mifit.capture.landmark_files import Landmarks, read_landmarks, write_landmarks
 from mifit.config import FitConfig, ReflectanceConfig
 from mifit.core.files import write_text
-from mifit.core.image import write_image
+from mifit.core.image import read_image, write_image
 from mifit.errors import InputError, MifitError
 from mifit.output.evaluate import evaluate
+from mifit.synth import compose, head
+from mifit.synth.skin import SkinMaps, SkinStyle
+from mifit.synth.studio import studio_environment
+
+SEED = 7
+WIDTH, HEIGHT, TIMESTEPS, SPP = 192, 144, 2, 16
+MODEL = "builtin:coarse"
+
+Make = Callable[[Path, Path], None]
+"""Makes a capture in the second folder, from the base capture in the first where it needs one."""
+
+
+# -- captures that are path traced ------------------------------------------------------------
+
+
+def traced(
+    light: Callable[[], NDArray] = lambda: studio_environment(SEED),
+    skin: Callable[[SkinMaps], SkinMaps] = lambda maps: maps,
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    angles: Sequence[float] = (-20.0, 20.0),
+) -> Make:
+    """A capture as `synthesize` makes it, with a choice of light, skin, head pose (pitch, yaw, roll) and views."""
+
+    def make(base: Path, out: Path) -> None:
+        model = MorphableModel.load(MODEL)
+        subject = compose._draw_subject(model, SkinStyle.draw(SEED), TIMESTEPS, 512, "poses", head.OUTSIDE)
+        rotation = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+        subject = dataclasses.replace(
+            subject,
+            skin={name: skin(maps) for name, maps in subject.skin.items()},
+            poses=[
+                dataclasses.replace(p, rotation=rotation @ p.rotation, translation=rotation @ p.translation)
+                for p in subject.poses
+            ],
+        )
+        cameras = compose.place_cameras(WIDTH, HEIGHT)
+        cameras[:2] = [
+            compose._camera(camera.name, WIDTH, HEIGHT, camera.fx, compose.DISTANCE, angle, 0.0)
+            for camera, angle in zip(cameras, angles, strict=False)
+        ]
+        compose._write_capture(out, subject, cameras, light().astype(np.float32), SPP, lambda done: None)
+
+    return make
+
+
+def uniform() -> NDArray:
+    return np.ones((64, 128, 3))
+
+
+def spot(column: int, ambient: float = 0.01) -> Callable[[], NDArray]:
+    """One small source of 3 degrees, a little above the horizon; column 64 of 128 is in front of the face."""
+
+    def light() -> NDArray:
+        image = np.full((64, 128, 3), ambient)
+        image[24, column] = 3000.0
+        return image
+
+    return light
+
+
+def recoloured(albedo: Callable[[NDArray], NDArray], **others: float) -> Callable[[SkinMaps], SkinMaps]:
+    """Skin with another albedo, and other maps set to one value."""
+
+    def change(maps: SkinMaps) -> SkinMaps:
+        flat = {name: np.full_like(maps.specular, value) for name, value in others.items()}
+        return dataclasses.replace(maps, albedo=albedo(maps.albedo).astype(np.float32), **flat)
+
+    return change
+
+
+# -- captures that are damaged ------------------------------------------------------------
+
+
+def damaged(
+    images: Callable[[NDArray, np.random.Generator], NDArray] | None = None,
+    cameras: tuple[str, ...] = ("left", "right", "third"),
+    landmarks: Callable[[Landmarks, np.random.Generator], Landmarks] | None = None,
+    document: Callable[[dict[str, Any]], None] | None = None,
+    world: Callable[[NDArray], NDArray] | None = None,
+    suffix: str = ".png",
+) -> Make:
+    """The base capture with other images (linear in, linear out; of some cameras), landmarks, transforms.json or world
+    coordinates.
+    """
+
+    def make(base: Path, out: Path) -> None:
+        shutil.copytree(base, out)
+        rng = np.random.default_rng(SEED)
+        file = out / "transforms.json"
+        content = json.loads(file.read_text())
+        for frame in content["frames"]:
+            if images and frame["camera_id"] in cameras:
+                path = out / frame["file_path"]
+                frame["file_path"] = str(Path(frame["file_path"]).with_suffix(suffix))
+                write_image(out / frame["file_path"], images(read_image(path), rng))
+            if landmarks:
+                path = out / frame["landmark_path"]
+                write_landmarks(path, landmarks(read_landmarks(path), rng))
+            if world:
+                matrix = np.array(frame["transform_matrix"])
+                matrix[:3, 3] = world(matrix[:3, 3])
+                frame["transform_matrix"] = matrix.tolist()
+        if world:
+            for path in (out / "truth").glob("0*.npz"):
+                truth = dict(np.load(path))
+                np.savez(path, **{**truth, "vertices": world(truth["vertices"].astype(np.float64))})
+        if document:
+            document(content)
+        file.write_text(json.dumps(content))
+
+    return make
+
+
+def exposed(factor: float) -> Make:
+    return damaged(images=lambda x, rng: np.clip(factor * x, 0, 1))
+
+
+def spoilt_exr(value: float) -> Make:
+    """EXR images of the fitted cameras; 3 % of the pixels and a block in the face take a value that is no light."""
+
+    def change(image: NDArray, rng: np.random.Generator) -> NDArray:
+        out = image.copy()
+        out[rng.random(out.shape[:2]) < 0.03] = value
+        out[65:75, 90:100] = value
+        return out
+
+    return damaged(images=change, cameras=("left", "right"), suffix=".exr")
+
+
+def moved(points: Callable[[NDArray, np.random.Generator], NDArray]) -> Make:
+    return damaged(landmarks=lambda found, rng: Landmarks(points(found.points, rng), found.visible))
+
+
+def noisy(image: NDArray, rng: np.random.Generator) -> NDArray:
+    return np.clip(image + rng.normal(0, 0.1, image.shape), 0, 1)
+
+
+MIRRORED = np.array(
+    [*range(16, -1, -1), *range(26, 16, -1), *range(27, 31), *range(35, 30, -1), 45, 44, 43, 42, 47, 46, 39, 38, 37, 36,
+     41, 40, 54, 53, 52, 51, 50, 49, 48, 59, 58, 57, 56, 55, 64, 63, 62, 61, 60, 67, 66, 65]
+)  # fmt: skip
+"""The 68 points as a detector names them that takes left for right."""
+
+
+def outliers(points: NDArray, rng: np.random.Generator) -> NDArray:
+    out = points.copy()
+    out[rng.choice(68, 8, replace=False)] += rng.choice([-1.0, 1.0], (8, 2)) * 25.0
+    return out
+
+
+def anywhere(points: NDArray, rng: np.random.Generator) -> NDArray:
+    return rng.uniform((0, 0), (WIDTH, HEIGHT), (68, 2))
+
+
+def half_hidden(found: Landmarks, rng: np.random.Generator) -> Landmarks:
+    return Landmarks(found.points, found.visible & (rng.random(68) < 0.5))
+
+
+def without_landmarks(*cameras: str) -> Callable[[dict[str, Any]], None]:
+    def change(content: dict[str, Any]) -> None:
+        for frame in content["frames"]:
+            if not cameras or frame["camera_id"] in cameras:
+                del frame["landmark_path"]
+
+    return change
+
+
+def with_units(units: str) -> Callable[[dict[str, Any]], None]:
+    return lambda content: content.update(units=units)
+
+
+def shuffled(content: dict[str, Any]) -> None:
+    np.random.default_rng(SEED).shuffle(content["frames"])
+
+
+def doubled(content: dict[str, Any]) -> None:
+    """Camera ``left`` once more under the name ``copy``."""
+    content["frames"] += [{**f, "camera_id": "copy"} for f in content["frames"] if f["camera_id"] == "left"]
+
+
+def file_changed(change: Callable[[Path], object], name: str = "images/left/0001.png") -> Make:
+    def make(base: Path, out: Path) -> None:
+        shutil.copytree(base, out)
+        change(out / name)
+
+    return make
+
+
+def masked(covered: Callable[[NDArray], NDArray]) -> Make:
+    """Masks that cover a part of every image (the function takes columns 0..1)."""
+
+    def make(base: Path, out: Path) -> None:
+        shutil.copytree(base, out)
+        keep = ~covered(np.linspace(0, 1, WIDTH)[None].repeat(HEIGHT, 0))
+        write_image(out / "mask.png", keep.astype(np.float32))
+        content = json.loads((out / "transforms.json").read_text())
+        for frame in content["frames"]:
+            frame["mask_path"] = "mask.png"
+        (out / "transforms.json").write_text(json.dumps(content))
+
+    return make
+
+
+# -- the cases ------------------------------------------------------------
 
 CONFIG = FitConfig(reflectance=ReflectanceConfig(texture_size=64))
 WRONG_MM, WRONG_DB = 5.0, 20.0
@@ -91,7 +285,7 @@ class Case:
 
     name: str
     group: str
-    make: captures.Make
+    make: Make
     expect: Literal["fit", "refuse", "either"] = "fit"
     cameras: tuple[str, ...] = ("left", "right")
     timesteps: tuple[int, ...] | None = None
@@ -102,7 +296,7 @@ class Case:
 
 CASES = (
     Case("base", "reference", traced(), until="normals"),
-    Case("uniform light", "light", traced(captures.uniform)),
+    Case("uniform light", "light", traced(uniform)),
     Case("one small source in front", "light", traced(spot(64))),
     Case("one small source at the side", "light", traced(spot(90))),
     Case("one small source behind", "light", traced(spot(2, 0.05)), "either"),
@@ -113,58 +307,56 @@ CASES = (
     Case("two views from one place", "views", traced(angles=(-20.0, -20.0))),
     Case("views 1 degree apart", "views", traced(angles=(-0.5, 0.5))),
     Case("views 140 degrees apart", "views", traced(angles=(-70.0, 70.0))),
-    Case("camera twice under two names", "views", damaged(document=captures.doubled), cameras=("left", "copy")),
+    Case("camera twice under two names", "views", damaged(document=doubled), cameras=("left", "copy")),
     Case("three times overexposed", "exposure", exposed(3.0)),
     Case("thirty times overexposed", "exposure", exposed(30.0), "either"),
     Case("all white", "exposure", exposed(1e6), "refuse"),
     Case("one fiftieth of the exposure", "exposure", exposed(0.02)),
     Case("exposed to two codes", "exposure", exposed(3e-4), "either"),
     Case("all black", "exposure", exposed(0.0), "refuse"),
-    Case("noise of 0.1", "exposure", damaged(images=captures.noisy, cameras=("left", "right"))),
+    Case("noise of 0.1", "exposure", damaged(images=noisy, cameras=("left", "right"))),
     Case("8-bit grey", "exposure", damaged(images=lambda x, rng: x.mean(axis=-1))),
-    Case("black skin", "skin", traced(skin=captures.recoloured(lambda a: 0.05 * a))),
-    Case("white skin", "skin", traced(skin=captures.recoloured(lambda a: 0.95 + 0.0 * a))),
-    Case("mirror-like skin", "skin", traced(skin=captures.recoloured(lambda a: a, specular=1.0, roughness=0.05))),
-    Case("millimetres", "numbers", damaged(world=lambda x: 10 * x, document=captures.with_units("mm"))),
-    Case("metres", "numbers", damaged(world=lambda x: x / 100, document=captures.with_units("m"))),
-    Case(
-        "centimetres declared as metres", "numbers", damaged(document=captures.with_units("m")), "either", warning=UNITS
-    ),
+    Case("black skin", "skin", traced(skin=recoloured(lambda a: 0.05 * a))),
+    Case("white skin", "skin", traced(skin=recoloured(lambda a: 0.95 + 0.0 * a))),
+    Case("mirror-like skin", "skin", traced(skin=recoloured(lambda a: a, specular=1.0, roughness=0.05))),
+    Case("millimetres", "numbers", damaged(world=lambda x: 10 * x, document=with_units("mm"))),
+    Case("metres", "numbers", damaged(world=lambda x: x / 100, document=with_units("m"))),
+    Case("centimetres declared as metres", "numbers", damaged(document=with_units("m")), "either", warning=UNITS),
     Case("world origin 100 m away", "numbers", damaged(world=lambda x: x + 1e4)),
     Case("world origin 10 km away", "numbers", damaged(world=lambda x: x + 1e6), "either"),
     Case("world origin 1000 km away", "numbers", damaged(world=lambda x: x + 1e8), "either"),
-    Case("NaN pixels in EXR", "numbers", captures.spoilt_exr(np.nan), until="normals"),
-    Case("infinite pixels in EXR", "numbers", captures.spoilt_exr(np.inf)),
-    Case("pixels of 1e30 in EXR", "numbers", captures.spoilt_exr(1e30)),
-    Case("negative pixels in EXR", "numbers", captures.spoilt_exr(-1.0)),
+    Case("NaN pixels in EXR", "numbers", spoilt_exr(np.nan), until="normals"),
+    Case("infinite pixels in EXR", "numbers", spoilt_exr(np.inf)),
+    Case("pixels of 1e30 in EXR", "numbers", spoilt_exr(1e30)),
+    Case("negative pixels in EXR", "numbers", spoilt_exr(-1.0)),
     Case("landmarks 4 pixels to the right", "landmarks", moved(lambda p, rng: p + np.array([4.0, 0.0]))),
     Case("landmarks 30 pixels to the right", "landmarks", moved(lambda p, rng: p + np.array([30.0, 0.0])), "either"),
-    Case("left taken for right", "landmarks", moved(lambda p, rng: p[captures.MIRRORED]), "either", warning=MARKS),
-    Case("eight landmarks 35 pixels off", "landmarks", moved(captures.outliers)),
-    Case("half of the landmarks hidden", "landmarks", damaged(landmarks=captures.half_hidden)),
-    Case("all landmarks anywhere", "landmarks", moved(captures.anywhere), "either", warning=MARKS),
+    Case("left taken for right", "landmarks", moved(lambda p, rng: p[MIRRORED]), "either", warning=MARKS),
+    Case("eight landmarks 35 pixels off", "landmarks", moved(outliers)),
+    Case("half of the landmarks hidden", "landmarks", damaged(landmarks=half_hidden)),
+    Case("all landmarks anywhere", "landmarks", moved(anywhere), "either", warning=MARKS),
     Case("all landmarks in one point", "landmarks", moved(lambda p, rng: 0 * p + 70.0), "either", warning=MARKS),
     Case("NaN landmarks", "landmarks", moved(lambda p, rng: p * np.nan), "either"),
-    Case("no landmarks in one camera", "landmarks", damaged(document=captures.without_landmarks("right"))),
-    Case("no landmarks", "landmarks", damaged(document=captures.without_landmarks()), "refuse"),
+    Case("no landmarks in one camera", "landmarks", damaged(document=without_landmarks("right"))),
+    Case("no landmarks", "landmarks", damaged(document=without_landmarks()), "refuse"),
     Case("image missing", "data", file_changed(Path.unlink), "refuse"),
     Case("image cut off", "data", file_changed(lambda p: p.write_bytes(p.read_bytes()[:2000])), "refuse"),
     Case("image of another size", "data", file_changed(lambda p: write_image(p, np.ones((50, 60, 3)))), "refuse"),
     Case("landmarks missing", "data", file_changed(Path.unlink, "landmarks/left/0001.json"), "refuse"),
-    Case("right half masked", "data", captures.masked(lambda x: x > 0.5)),
-    Case("everything masked", "data", captures.masked(lambda x: x >= 0), "refuse"),
+    Case("right half masked", "data", masked(lambda x: x > 0.5)),
+    Case("everything masked", "data", masked(lambda x: x >= 0), "refuse"),
     Case("head rolled by 90 degrees", "pose", traced(turn=(0, 0, 90))),
     Case("head upside down", "pose", traced(turn=(0, 0, 180))),
     Case("head turned by 60 degrees", "pose", traced(turn=(0, 60, 0)), "either"),
     Case("head nodding by 40 degrees", "pose", traced(turn=(40, 0, 0))),
     Case("back of the head", "pose", traced(turn=(0, 180, 0)), "refuse"),
-    Case("frames shuffled in the file", "order", damaged(document=captures.shuffled), same=True),
+    Case("frames shuffled in the file", "order", damaged(document=shuffled), same=True),
     Case("cameras named in reverse", "order", damaged(), cameras=("right", "left"), same=True),
     Case("timesteps named in reverse", "order", damaged(), timesteps=(1, 0), same=True),
 )
 
 
-# -- running them -----------------------------------------------------------------------------------------------------
+# -- running them ------------------------------------------------------------
 
 
 def run_case(case: Case, work: Path, reference: NDArray | None) -> tuple[dict[str, Any], NDArray | None]:

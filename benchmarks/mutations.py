@@ -2,30 +2,31 @@
 
     python -m benchmarks.mutations [--only WORDS] [--jobs 1] [--list]
 
-Copies package, benchmarks and tests to a temporary folder, makes one change at a time (`benchmarks.mutation_list`) and
-runs the few tests that should notice. A change *survives* when they pass; it is *lost* when its pattern doesn't match
-exactly once any more, because the code was rewritten: both fail the run. A change counts as noticed only when a test
+Copies package, benchmarks and tests to a temporary folder, makes one change of `MUTATIONS` at a time and runs the few
+tests that should notice. A change is found by the name of its function, wherever that is in the package, and by an
+expression or statement in it, however it is laid out. A change *survives* when the tests pass; it is *lost* when the
+function doesn't hold the code exactly once any more: both fail the run. A change counts as noticed only when a test
 fails, not when the code can't be imported. Writes ``benchmarks/results/mutations.json`` and ``mutations.md``.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import os
-import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measure import conditions
-from benchmarks.record import RESULTS, record
+from benchmarks.record import RESULTS, conditions, record
 from mifit.core.files import write_text
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,31 +43,131 @@ class Mutation:
     ----------
     name : str
         What the change does, in words.
-    files : str
-        Glob below the root; wide enough that the code may move.
-    pattern, replacement : str
-        Regular expression, multi-line, that must match exactly once in all files together, and what takes its place.
+    function : str
+        ``module.function`` or ``module.Class.method``, the module by its last name; or ``module`` for its own lines.
+    old, new : str
+        An expression or statement of the function, and what takes its place.
     tests : str
         Arguments of pytest: the tests that should notice.
     """
 
     name: str
-    files: str
-    pattern: str
-    replacement: str
+    function: str
+    old: str
+    new: str
     tests: str
 
     def find(self, root: Path) -> tuple[Path, str, str] | None:
-        """The file that holds the pattern, its text and the changed text; None where there isn't exactly one place."""
+        """The file that holds the code, its text and the changed text; None where there isn't exactly one place."""
+        module, _, qualified = self.function.partition(".")
         places = []
-        for path in sorted(root.glob(self.files)):
+        for path in sorted((root / "mifit").rglob(f"{module}.py")):
             text = path.read_text(encoding="utf-8")
-            count = len(re.findall(self.pattern, text, flags=re.MULTILINE))
-            places += [(path, text)] * count
+            places += [(path, text, span) for span in _spans(text, qualified, self.old)]
         if len(places) != 1:
             return None
-        path, text = places[0]
-        return path, text, re.sub(self.pattern, self.replacement, text, flags=re.MULTILINE)
+        path, text, (first, last) = places[0]
+        return path, text, text[:first] + self.new + text[last:]
+
+
+def _spans(text: str, function: str, old: str) -> Iterator[tuple[int, int]]:
+    """Places of some code in a function of a text, as positions of its first and past its last character."""
+    wanted = ast.parse(old).body[0]
+    expression = wanted.value if isinstance(wanted, ast.Expr) else None
+    sought, starts = ast.dump(expression or wanted), [0]
+    for line in text.splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+    lines = text.splitlines()
+
+    def at(line: int, column: int) -> int:  # the parser counts bytes
+        return starts[line - 1] + len(lines[line - 1].encode()[:column].decode())
+
+    for name, node in _functions(ast.parse(text), ""):
+        if name == function:
+            for part in ast.walk(node):
+                if isinstance(part, (ast.expr, ast.stmt)) and ast.dump(part) == sought:
+                    assert part.end_lineno is not None and part.end_col_offset is not None
+                    yield at(part.lineno, part.col_offset), at(part.end_lineno, part.end_col_offset)
+
+
+def _functions(node: ast.AST, prefix: str) -> Iterator[tuple[str, ast.AST]]:
+    """Functions and methods by their qualified names; a module itself has none."""
+    if isinstance(node, ast.Module):
+        own = [part for part in node.body if not isinstance(part, (ast.FunctionDef, ast.ClassDef))]
+        yield "", ast.Module(own, [])
+    for part in ast.iter_child_nodes(node):
+        if isinstance(part, (ast.FunctionDef, ast.ClassDef)):
+            name = f"{prefix}{part.name}"
+            yield name, part
+            if isinstance(part, ast.ClassDef):
+                yield from _functions(part, f"{name}.")
+
+
+M = Mutation
+MUTATIONS = (
+    # Conventions.
+    M("pixel centres at integers", "camera.Camera.pixel_centres", "x + 0.5", "x", "tests/core/test_camera.py"),
+    M("camera axes of OpenGL not turned", "camera", "np.diag([1.0, -1.0, -1.0, 1.0])", "np.diag([1.0, 1.0, 1.0, 1.0])",
+      "tests/core/test_camera.py"),
+    M("maps read upside down", "uv.sample_map", "1.0 - uv[:, 1]", "uv[:, 1]", "tests/core/test_uv.py"),
+    M("the basis without the Condon-Shortley phase", "sh._evaluate",
+      "q_mm *= -math.sqrt((2.0 * m + 3.0) / (2.0 * m + 2.0))",
+      "q_mm *= math.sqrt((2.0 * m + 3.0) / (2.0 * m + 2.0))", "tests/core/test_sh.py"),
+    M("clipped pixels count as measured", "capture.Capture._read", "clipped = found.clipped",
+      "clipped = found.clipped & False", "tests/capture/test_capture.py"),
+    # Measures.
+    M("PSNR of powers", "metrics.psnr_from_rmse", "20.0", "10.0", "tests/core/test_metrics.py"),
+    M("the evaluated region isn't eroded", "evaluate", "EROSION = 2", "EROSION = 0",
+      "tests/output/test_render_evaluate.py"),
+    M("relit views compared without their factors", "compare.scaled_psnr", "_channel_scale(a, b) * a", "a",
+      "tests/test_foreign.py"),
+    M("separation with the whole image for the specular one", "evaluate.separation_of",
+      "full[..., :3] - diffuse[..., :3]", "full[..., :3]", "tests/output/test_render_evaluate.py"),
+    M("the photograph's exposure left out of the passes", "truth._image", '_meta(folder).get("exposure", 1.0)', "1.0",
+      "tests/score"),
+    M("distances to the farthest of the near faces", "truth.nearest_points", "distance.argmin(1)",
+      "distance.argmax(1)", "tests/test_foreign.py"),
+    M("the baseline takes views that are hidden", "image_based.image_based",
+      "there.visible_from(point, view.position)", "True", "tests/test_foreign.py"),
+    M("the nearest view is the farthest", "image_based._weight", "2.0 + nearness", "2.0 - nearness",
+      "tests/test_foreign.py"),
+    # Light, shadow and skin.
+    M("shadowed normals see what the mesh's see", "shadowed.ShadowedModel.about", "blocked - passed * open_sky",
+      "blocked - open_sky", "tests/appearance/test_models.py"),
+    M("the lobe's energy not normalised", "lobe.normalization", "8.0 * np.pi", "4.0 * np.pi",
+      "tests/appearance/test_lobe.py"),
+    M("lighting turned the wrong way", "sh.SHLighting.rotate", "rotation_matrix(rotation, self.order)",
+      "rotation_matrix(np.transpose(rotation), self.order)", "tests/core/test_sh.py"),
+    # Observations.
+    M("observations weigh alike, whatever other cameras see", "observations.Surface._observe",
+      "weight *= np.minimum(right, 1.0 - wrong)", "pass", "tests/stages/test_observations.py"),
+    M("texels seen at a slant are of as good a quality", "observations.Surface.quality", "np.clip(cosine, 0.0, 1.0)",
+      "1.0", "tests/stages/test_observations.py"),
+    M("distances to the outline in pixels, not in millimetres", "surface_image.Placed.read",
+      "bilinear(image.outline, x, y) * depth / camera.fx", "bilinear(image.outline, x, y)",
+      "tests/stages/test_observations.py"),
+    M("a coarser camera is half a pixel off", "prediction_between_views.every", "0.5 * (step - 1)", "0.0",
+      "tests/stages/test_prediction_between_views.py"),
+    M("refined normals turned the wrong way for the residual", "find_residual._difference", "rotation.T", "rotation",
+      "tests/stages/test_find_residual.py"),
+    # Solvers.
+    M("a step that raises the energy is taken", "acceptance.TrustRatio.judge", "self.minimum_ratio", "-10.0",
+      "tests/solve/test_solve.py"),
+    M("Geman and McClure's weight not squared", "robust.geman_mcclure", "q * q", "q", "tests/solve/test_solve.py"),
+    # Paper.
+    M("1 / |F_view| dropped", "refine.paper_problem", "max(len(view.index), 1)", "1", "tests/test_paper.py"),
+    M("Adam's exponent 10", "paper_solver", "PAPER_EXPONENT = 5.0", "PAPER_EXPONENT = 10.0", "tests/test_paper.py"),
+    M("lambda_H for values of 0..1", "config.FitConfig.paper", "0.001 / 255.0", "0.001", "tests/test_paper.py"),
+    M("preset with w2 ten times the paper's", "config.FitConfig.paper", "0.3", "3.0", "tests/test_paper.py"),
+    # What is kept.
+    M("the cache's key without what a step is given", "fitting.keys", "{part: current[part] for part in step.inputs}",
+      "{}", "tests/test_fitting.py tests/test_pipeline.py"),
+    M("residual shown under another light", "record.Result.with_illumination",
+      "replace(self, reflectance=reflectance, residual=None, environment=None, environment_rotation=None)",
+      "replace(self, reflectance=reflectance, environment=None, environment_rotation=None)",
+      "tests/output/test_residual_shown.py"),
+)  # fmt: skip
+"""Every change, with the tests that should notice."""
 
 
 def copy_project(folder: Path) -> Path:
@@ -127,7 +228,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def run(mutations: list[Mutation], jobs: int) -> list[dict[str, Any]]:
+def run(mutations: Sequence[Mutation], jobs: int) -> list[dict[str, Any]]:
     """Judge all changes, each job in a copy of its own; tests that fail in an unchanged copy notice nothing."""
     with tempfile.TemporaryDirectory(prefix="mifit-mutations-") as temporary:
         folders = [copy_project(Path(temporary) / str(i)) for i in range(jobs)]
@@ -157,8 +258,6 @@ def run(mutations: list[Mutation], jobs: int) -> list[dict[str, Any]]:
 
 
 def main() -> int:
-    from benchmarks.mutation_list import MUTATIONS
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", help="changes whose name holds this text; nothing is recorded")
     parser.add_argument("--jobs", type=int, default=1)

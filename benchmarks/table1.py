@@ -1,13 +1,14 @@
 """The paper's Table 1 on data that can be made: subjects, three views, the third one held out.
 
-    python -m benchmarks.table1 [--subjects 15] [--jobs 1] [--no-paper] [--work out/table1]
+    python -m benchmarks.table1 [--subjects 15] [--jobs 1] [--no-paper] [--reduced] [--relight] [--work out/table1]
 
 Each subject is a random identity with its own skin, path traced with detail that the fitted model doesn't have, under
 one of three set-ups of light; every third head leaves the model's span by well over half a millimetre. Landmarks are
 those of a model of a detector: a bias per landmark and head, and noise (`mifit.synth.detector`); the row with perfect
 landmarks says what that costs. Cameras ``left`` and ``right`` are fitted, ``third`` is only compared with, over the
 face area of the true mesh, so on the same pixels for all rows. A finished subject is not run again, so that a stopped
-benchmark goes on; its figures stay in the work folder.
+benchmark goes on; its figures stay in the work folder. With ``--relight`` the heads are path traced again, in the same
+poses, under the next of the environments, and their fitted results are relit by it and compared with ``third``.
 """
 
 from __future__ import annotations
@@ -18,27 +19,33 @@ import shutil
 import statistics
 import subprocess
 import sys
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.measure import conditions
-from benchmarks.record import RESULTS, SHARED, record
+import mifit
+from benchmarks.foreign import replace_size, without_specular
+from benchmarks.heads import DEVELOPMENT_SUBJECTS
+from benchmarks.record import RESULTS, SHARED, conditions, machine, record
+from benchmarks.truth import truth_errors
+from mifit import Capture, FitConfig, MorphableModel, Reconstruction
 from mifit.core.files import write_text
+from mifit.output.evaluate import evaluate
+from mifit.output.relight import evaluate_relit
 
 ENVIRONMENTS = ("apartment", "studio", "softbox")
 TONES = (0.0, 0.25, 0.5, 0.75, 1.0)  # fair to deep; three lights and five tones meet once in fifteen subjects
 SEED = 100
 """Of subject 0; the others follow."""
-METHODS = ("pca", "diffuse", "full")
-"""What `mifit evaluate` measures; its ``diffuse`` is the full fit with the specular part dropped."""
 ROWS = {
     "pca": "stage 1's model",
+    "image_based": "image-based rendering on our mesh, the best of three blends",
     "diffuse": "without specular reflection, refitted",
     "full": "everything",
-    "dropped": "`full` without its specular part, nothing refitted",
+    "dropped": "`full` without its specular part and residual, nothing refitted",
     "paper": "the paper as written (`--preset paper`)",
     "perfect": "`full` from perfect landmarks",
 }
@@ -61,10 +68,13 @@ PAPER = {"pca": (24.6, 15.0), "diffuse": (26.8, 11.6), "full": (28.3, 9.8)}
 FULL_SIZE = {"timesteps": 4, "width": 680, "height": 480, "spp": 64}
 REDUCED = {"timesteps": 3, "width": 340, "height": 240, "spp": 32}
 TEXELS = 256
-"""As in `benchmarks.foreign`: more show little at these pictures' sizes."""
+"""More show little at these pictures' sizes."""
+BUMP_UNIT = 0.1
+"""Centimetres per unit of the painted bump."""
+RELIT_TIMESTEPS = 2
 
 
-def mifit(*arguments: object) -> None:
+def command(*arguments: object) -> None:
     """Run the command line in a process of its own; its last line of stderr is the error."""
     done = subprocess.run(
         [sys.executable, "-m", "mifit", *map(str, arguments), "--quiet"], capture_output=True, text=True, check=False
@@ -85,24 +95,73 @@ def run_subject(subject: int, work: Path, size: dict[str, int], model: str, texe
                 perfect_landmarks(folder / "capture", folder / name, size, model, subject)
                 continue
             options = [part for key, value in size.items() for part in (f"--{key}", value)]
-            mifit("synth", "--out", folder / name, "--seed", SEED + subject, "--model", model, "--force",
+            command("synth", "--out", folder / name, "--seed", SEED + subject, "--model", model, "--force",
                   "--tone", TONES[subject % len(TONES)], "--outside", outside(subject), "--landmark-bias", bias,
                   *options, *light)  # fmt: skip
     if not figures.exists():
         done = subprocess.run(
-            [sys.executable, "-m", "benchmarks.table1_subject", str(folder), model, str(texels),
-             "paper" if paper else "no-paper"],
+            [sys.executable, "-m", "benchmarks.table1", "--subject", str(folder), "--model", model, "--texels",
+             str(texels), *([] if paper else ["--no-paper"])],
             capture_output=True, text=True, check=False,
         )  # fmt: skip
         if done.returncode:
             raise RuntimeError((done.stderr.strip() or "no message").splitlines()[-1])
     return {
         "subject": subject,
+        "set": "development" if subject < DEVELOPMENT_SUBJECTS else "locked",
         "light": environment.stem if light else "procedural",
         "tone": TONES[subject % len(TONES)],
         "outside_mm": outside(subject),
         **json.loads(figures.read_text()),
     }
+
+
+def fits(
+    folder: Path, model: MorphableModel, config: FitConfig, paper: bool
+) -> dict[str, tuple[Reconstruction, Capture]]:
+    """The reconstructions of a subject: in full, without specular reflection, by the paper, from perfect landmarks."""
+    capture, perfect = Capture.load(folder / "capture"), Capture.load(folder / "perfect")
+    full = mifit.fit(capture, model, CAMERAS, capture.timesteps, config)
+    found = {
+        "full": (full, capture),
+        "diffuse": (without_specular(full, capture, CAMERAS, config), capture),
+        "perfect": (mifit.fit(perfect, model, CAMERAS, perfect.timesteps, config), perfect),
+    }
+    if paper:
+        written = replace_size(FitConfig.paper(), config.reflectance.texture_size)
+        found["paper"] = (mifit.fit(capture, model, CAMERAS, capture.timesteps, written), capture)
+    return found
+
+
+def judge(folder: Path, found: dict[str, tuple[Reconstruction, Capture]]) -> dict[str, Any]:
+    """Figures of all rows, over the face area of the true mesh."""
+    methods: dict[str, Any] = {}
+    for name, (result, capture) in found.items():
+        measured = evaluate(result, capture, "third", region="truth", baseline=name == "full")
+        if name == "full":
+            methods |= {"pca": measured["methods"]["pca"], "dropped": measured["methods"]["diffuse"]}
+            based = [v for k, v in measured["baseline"]["methods"].items() if k.startswith("image_based")]
+            methods["image_based"] = max(based, key=lambda found: found["psnr"])
+        methods[name] = measured["methods"]["full"]
+    return {
+        "methods": methods,
+        "truth": {name: truth_errors(result, folder / "capture", BUMP_UNIT) for name, (result, _) in found.items()},
+        "unconverged": {
+            name: [stage for stage, report in result.reports.items() if report.outcome != "converged"]
+            for name, (result, _) in found.items()
+        },
+        "seconds": {name: round(result.seconds, 1) for name, (result, _) in found.items()},
+        "warnings": {name: [one.text for one in result.diagnostics] for name, (result, _) in found.items()},
+        "commit": machine()["commit"],
+    }
+
+
+def fit_subject(folder: Path, model: str, texels: int, paper: bool) -> None:
+    """Fit and judge one subject in this process; write its figures and its full result."""
+    mifit.set_variant("auto")
+    found = fits(folder, MorphableModel.load(model), replace_size(FitConfig(), texels), paper)
+    found["full"][0].save(folder / "result", force=True)  # to be put under another light
+    write_text(folder / "figures.json", json.dumps(judge(folder, found), indent=2) + "\n")
 
 
 def outside(subject: int) -> float:
@@ -112,7 +171,6 @@ def outside(subject: int) -> float:
 
 def perfect_landmarks(capture: Path, out: Path, size: dict[str, int], model: str, subject: int) -> None:
     """The same capture with landmarks at the true vertices, a detector's noise on top."""
-    from mifit import Capture, MorphableModel
     from mifit.capture.landmark_files import Landmarks, write_landmarks
     from mifit.synth.detector import NOISE
 
@@ -161,11 +219,12 @@ def markdown(rows: list[dict[str, Any]], failures: dict[int, str]) -> str:
             + " | paper PSNR | paper RMSE | unconverged |",
             "|---|" + "---|" * (len(MEASURES) + 3),
         ]
+        row_fits = rows[0]["unconverged"]
         for name, text in ROWS.items():
             if name in table:
                 cells = [_mean(table[name], key, digits) for key, (_, digits) in MEASURES.items()]
                 theirs = PAPER.get(name, ("", ""))
-                fit = {"pca": "full", "dropped": "full"}.get(name, name)
+                fit = name if name in row_fits else "full"
                 stopped = sum(bool(row["unconverged"][fit]) for row in rows)
                 lines.append(
                     f"| `{name}`: {text} | {' | '.join(cells)} | {theirs[0]} | {theirs[1]} | {stopped} of {len(rows)} |"
@@ -178,16 +237,16 @@ def markdown(rows: list[dict[str, Any]], failures: dict[int, str]) -> str:
             lines.append(f"| {text} | {' | '.join(cells)} |")
         shown = [name for name in ROWS if name in table]
         lines += ["", "| mean dB of | subjects | " + " | ".join(shown) + " |", "|---|---|" + "---|" * len(shown)]
-        for kind in ("light", "tone", "outside_mm"):
+        for kind in ("set", "light", "tone", "outside_mm"):
             for value in dict.fromkeys(sorted(row[kind] for row in rows)):
                 of = [row for row in rows if row[kind] == value]
                 means = (statistics.fmean(row["methods"][m]["psnr"] for row in of) for m in shown)
                 lines.append(f"| {kind} {value} | {len(of)} | " + " | ".join(f"{x:.2f}" for x in means) + " |")
-        titles = ["subject", "light", "tone", "outside mm", *shown]
+        titles = ["subject", "set", "light", "tone", "outside mm", *shown]
         titles += [short for short, _, _ in TRUTHS.values()] + ["unconverged", "seconds"]
         lines += ["", "| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
         for row in rows:
-            cells = [str(row["subject"]), row["light"], f"{row['tone']:g}", f"{row['outside_mm']:g}"]
+            cells = [str(row["subject"]), row["set"], row["light"], f"{row['tone']:g}", f"{row['outside_mm']:g}"]
             cells += [f"{row['methods'][m]['psnr']:.2f}" for m in shown]
             cells += [f"{row['truth']['full'][key]:.{digits}f}" for key, (_, _, digits) in TRUTHS.items()]
             cells += [", ".join(row["unconverged"]["full"]) or "none", f"{row['seconds']['full']:.0f}"]
@@ -246,6 +305,43 @@ def run(
     return figures
 
 
+def relight(subjects: Iterable[int], work: Path, model: str, size: dict[str, int]) -> list[dict[str, Any]]:
+    """Finished subjects path traced under another light, and their relit results beside it."""
+    mifit.set_variant("auto")
+    rows = []
+    for subject in subjects:
+        environment = SHARED / "hdri" / f"{ENVIRONMENTS[(subject + 1) % len(ENVIRONMENTS)]}.hdr"
+        folder = work / f"subject_{subject:02d}"
+        if not (folder / "relit" / "transforms.json").exists():
+            command("synth", "--out", folder / "relit", "--seed", SEED + subject, "--model", model,
+                    "--env", environment, "--tone", TONES[subject % len(TONES)], "--outside", outside(subject),
+                    "--timesteps", RELIT_TIMESTEPS, "--width", size["width"], "--height", size["height"],
+                    "--spp", size["spp"], "--force")  # fmt: skip
+        result, capture = Reconstruction.load(folder / "result"), Capture.load(folder / "relit")
+        judged = {
+            integrator: evaluate_relit(result, environment, capture, "third", integrator=integrator)["methods"]
+            for integrator in ("local", "path")
+        }
+        kinds = {"fitted_under": ENVIRONMENTS[subject % len(ENVIRONMENTS)], "relit_by": environment.stem}
+        rows.append({"subject": subject, **kinds, **judged})
+    return rows
+
+
+def relit_markdown(rows: list[dict[str, Any]]) -> str:
+    """One line per head, then the mean."""
+    kinds = [(integrator, method) for integrator in ("local", "path") for method in ("diffuse", "full")]
+    table = [[row[i][m]["psnr"] for i, m in kinds] for row in rows]
+    lines = [
+        "| subject | fitted under | relit by | " + " | ".join(f"{m}, {i} dB" for i, m in kinds) + " |",
+        "|---|---|---|" + "---|" * len(kinds),
+    ]
+    for row, figures in zip(rows, table, strict=True):
+        cells = " | ".join(f"{f:.2f}" for f in figures)
+        lines.append(f"| {row['subject']} | {row['fitted_under']} | {row['relit_by']} | {cells} |")
+    means = " | ".join(f"{statistics.fmean(column):.2f}" for column in zip(*table, strict=True))
+    return "\n".join([*lines, f"| mean | | | {means} |"]) + "\n"
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--subjects", type=int, default=15)
@@ -254,10 +350,20 @@ def main() -> int:
     parser.add_argument("--model", default="builtin")
     parser.add_argument("--no-paper", action="store_true", help="leave out the paper as written, most of the time")
     parser.add_argument("--reduced", action="store_true", help="small images and maps, for a quick look")
+    parser.add_argument("--relight", action="store_true", help="put the fitted heads under another light as well")
+    parser.add_argument("--texels", type=int, default=TEXELS)
+    parser.add_argument("--subject", type=Path, help="fit and judge the subject of this folder alone, in this process")
     a = parser.parse_args()
+    if a.subject:
+        fit_subject(a.subject, a.model, a.texels, not a.no_paper)
+        return 0
     size, name = (REDUCED, "table1_reduced") if a.reduced else (FULL_SIZE, "table1")
-    figures = run(a.subjects, a.jobs, a.work, size, a.model, TEXELS, name, not a.no_paper)
+    figures = run(a.subjects, a.jobs, a.work, size, a.model, a.texels, name, not a.no_paper)
     print((RESULTS / f"{name}.md").read_text())
+    if a.relight:
+        rows = relight([row["subject"] for row in figures["subjects"]], a.work, a.model, size)
+        record("relight", {"subjects": rows, "reduced": a.reduced}, seeds=[SEED + row["subject"] for row in rows])
+        write_text(RESULTS / "relight.md", relit_markdown(rows))
     return 1 if figures["failures"] else 0
 
 

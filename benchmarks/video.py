@@ -21,17 +21,17 @@ from typing import Any
 import numpy as np
 
 import mifit as mi
-from benchmarks.judge import judge_mesh, judge_surface, judge_views
+from benchmarks.heads import Case
+from benchmarks.judge import Row, judge_mesh, judge_surface, judge_views
 from benchmarks.record import SHARED, record
-from benchmarks.scan import nearest
-from benchmarks.table1 import ENVIRONMENTS, LANDMARK_BIAS, SEED, TONES, mifit, outside
-from benchmarks.table1_subject import BUMP_UNIT
+from benchmarks.table1 import BUMP_UNIT, ENVIRONMENTS, LANDMARK_BIAS, SEED, TONES, command, outside
 from benchmarks.truth import truth_errors
 from mifit import Capture, FitConfig, MorphableModel, Reconstruction
 from mifit.core.files import write_text
 from mifit.extras.refine import refine
 from mifit.fitting import fit_into
 from mifit.output.evaluate import evaluate
+from mifit.output.truth import nearest_points
 
 CAMERAS = ("left", "right")
 FITTED = 4
@@ -53,7 +53,7 @@ def video(subject: int, frames: int, work: Path) -> Path:
         environment = SHARED / "hdri" / f"{ENVIRONMENTS[subject % len(ENVIRONMENTS)]}.hdr"
         light = ["--env", environment] if environment.exists() else []
         options = [part for key, value in SIZE.items() for part in (f"--{key}", value)]
-        mifit("synth", "--out", folder, "--seed", SEED + subject, "--force", "--tone", TONES[subject % len(TONES)],
+        command("synth", "--out", folder, "--seed", SEED + subject, "--force", "--tone", TONES[subject % len(TONES)],
               "--outside", outside(subject), "--landmark-bias", LANDMARK_BIAS, "--timesteps", frames, *options,
               *light)  # fmt: skip
     return folder
@@ -65,10 +65,10 @@ def scan_video(frames: int, work: Path) -> Path:
     if not (folder / "landmarks").exists():
         options = [part for key, value in SIZE.items() for part in (f"--{key}", value)]
         maps = [f"{name}={source / file}" for name, file in SCAN_MAPS.items()]
-        mifit("synth", "--out", folder, "--head", source / "LeePerrySmith.glb", "--unit-mm", SCAN_UNIT_MM, "--flip-v",
+        command("synth", "--out", folder, "--head", source / "LeePerrySmith.glb", "--unit-mm", SCAN_UNIT_MM, "--flip-v",
               "--maps", *maps, "--env", SHARED / "hdri" / "city.hdr", "--timesteps", frames, "--force",
               *options)  # fmt: skip
-        mifit("landmarks", folder)
+        command("landmarks", folder)
     return folder
 
 
@@ -105,18 +105,19 @@ def surface_error(result: Reconstruction, folder: Path) -> float:
             true = stored["vertices"].astype(np.float64)
         area = np.unique(model.faces[model.face_mask])
         points = true[area[area < len(true)]]  # eyes that a fit added come after
-        found.append(nearest(points, result.geometry.vertices[i], model.faces)[0].mean())
+        found.append(nearest_points(points, result.geometry.vertices[i], model.faces)[0].mean())
     return round(float(np.mean(found)) * result.unit_mm, 4)
 
 
 def judge_scan(result: Reconstruction, capture: Capture) -> dict[str, float]:
     """Errors against the scan at the points that all fitted views see, and of the held-out view's skin."""
     assert result.reflectance is not None
-    view = judge_views({"full": (result, "full")}, capture, ("third",), range(FITTED), CAMERAS)["full"]["skin"]
+    case, row = Case(str(capture.path), timesteps=tuple(range(FITTED))), Row.of(result)
+    view = judge_views(case, capture, {"full": row}, case.held_out)["full"]["skin"]
     confidence = result.reflectance.confidence[result.reflectance.diffuse.any(-1)]
     return {
-        **judge_surface(result, capture, CAMERAS),
-        "surface_mm": judge_mesh(result, capture, CAMERAS)["mean_mm"],
+        **judge_surface(case, capture, row),
+        "surface_mm": judge_mesh(case, capture, row)["mean_mm"],
         "third_full_db": round(view["psnr"], 3),
         "confidence": round(float(confidence.mean()), 4),
     }

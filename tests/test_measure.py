@@ -1,17 +1,12 @@
-"""What the benchmarks measure with: costs, growth, the held-out view, and their plots."""
+"""What the benchmarks measure with: costs, growth, and their plots."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from benchmarks.measure import exponent, measured
-from benchmarks.speed_plots import draw, markdown
-from benchmarks.third_view import Error, ThirdView, pooled_psnr
-from mifit.core.image import srgb_to_linear
-from mifit.output.evaluate import evaluate
-from tests.output.conftest import ball_camera, ball_result
-from tests.output.test_render_evaluate import FakeCapture
+from benchmarks.record import exponent, measured
+from benchmarks.speed import draw, markdown
 
 
 @pytest.mark.parametrize("power", [0.5, 1.0, 1.5])
@@ -41,30 +36,18 @@ def test_costs_tell_memory_and_kernels(variant):
     assert 0 <= large.compile_seconds <= large.seconds + 1e-3
 
 
-def test_the_held_out_view_has_evaluates_error(variant):
-    ball, camera = ball_result(), ball_camera("third", 25.0)
-
-    def image(camera, timestep):
-        values = np.random.default_rng(timestep).integers(40, 200, (camera.height, camera.width, 3))
-        return srgb_to_linear(values.astype(np.uint8))
-
-    capture = FakeCapture((camera,), image)
-    expected = evaluate(ball, capture, "third", region="model")
-    view = ThirdView(capture, region="model", oversampling=2)
-    for method in ("diffuse", "full"):
-        errors = view.errors(ball, method=method)
-        assert sum(e.pixels for e in errors.values()) == expected["region_pixels"]
-        assert pooled_psnr(errors.values()) == pytest.approx(expected["methods"][method]["psnr"], abs=1e-9)
-
-
-def test_errors_are_pooled_over_pixels():
-    assert pooled_psnr([Error(255.0**2, 1), Error(0.0, 99)]) == pytest.approx(20.0)
-
-
-def test_growth_is_drawn_and_tabled(tmp_path):
-    cost = {"seconds": 1.0, "steady_seconds": 0.9, "compile_seconds": 0.1, "peak_mb": 100.0}
-    rows = [{"pixels": n, "processor_seconds": 1e-3 * n, **cost} for n in (100, 400)]
-    figures = {"growth": {"shading over pixels": {"rows": rows, "exponent": 0.0, "processor_exponent": 1.0}}}
-    (path,) = draw(figures, tmp_path)
-    assert "shading over pixels: 1.00" in path.read_text()
-    assert "| shading over pixels | 100 to 400 | 0.00 | 1.00 | 0.90 | 100 |" in markdown(figures)
+def test_growth_and_errors_are_drawn_and_tabled(tmp_path):
+    cost = {"processor_seconds": 3.0, "steady_seconds": 2.0, "peak_mb": 100.0}
+    rows = [{"timesteps": n, **cost, "steps": {"surface": 1.0 * n}} for n in (1, 2)]
+    texels = [{"texels": n, **cost, "steps": {"surface": 1.0}} for n in (64, 256)]
+    error = [{"iterations": n, "mesh_mm": 1.0 / n, **cost} for n in (1, 4)]
+    figures = {
+        "growth": {"timesteps": {"rows": rows, "exponent": 0.5}, "texels": {"rows": texels, "exponent": 0.0}},
+        "error": {"stage 1": error, "stage 2": [{"iterations": 1, "third_db": 30.0, **cost}]},
+        "first": {"first": cost, "second": cost},
+    }
+    assert [path.name for path in draw(figures, tmp_path)] == ["speed_growth.svg", "speed_error.svg"]
+    assert all("<svg" in path.read_text() for path in tmp_path.iterdir())
+    text = markdown(figures)
+    assert "| timesteps (exponent 0.50) |" in text and "| 2 | 3.0 | 2.0 | 100.0 | surface 2.0 |" in text
+    assert "| 4 | 3.0 | 2.0 | 100.0 | 0.25 |" in text and "first fit of a process" in text

@@ -108,6 +108,7 @@ def test_failed_subjects_stay_in_the_table():
     figures = dict.fromkeys(table1.MEASURES, 1.0)
     row = {
         "subject": 0,
+        "set": "locked",
         "light": "studio",
         "tone": 0.25,
         "outside_mm": 0.5,

@@ -86,9 +86,9 @@ def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> int
 
 
 def _print_measures(methods: dict[str, dict[str, float]]) -> None:
-    print(f"{'method':<12}{'PSNR dB':>9}{'RMSE':>8}{'SSIM':>8}{'FLIP':>8}")
+    print(f"{'method':<20}{'PSNR dB':>9}{'RMSE':>8}{'SSIM':>8}{'FLIP':>8}")
     for method, f in methods.items():
-        print(f"{method:<12}{f['psnr']:>9.2f}{f['rmse']:>8.2f}{f['ssim']:>8.4f}{f['flip']:>8.4f}")
+        print(f"{method:<20}{f['psnr']:>9.2f}{f['rmse']:>8.2f}{f['ssim']:>8.4f}{f['flip']:>8.4f}")
 
 
 @writes("json")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -21,7 +21,7 @@ from mifit.output.pose import pose_head
 from mifit.output.resect import needs_resection, resect
 from mifit.output.truth import landmarks_of, true_mesh, true_passes
 from mifit.progress import Progress, silent
-from mifit.render.image_based import image_based
+from mifit.render.image_based import BLENDS, image_based
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -43,8 +43,9 @@ class Comparison:
         Pixels that count, the same for all methods.
     renders : dict of method to (H, W, 4) uint8
         Colour and coverage; colour is 0 where the model covers nothing.
-    baseline : (H, W, 3) uint8, optional
-        Image-based rendering from the fitted views on the fitted mesh (`render.image_based`), where asked for.
+    baseline : dict of name to (H, W, 3) uint8
+        Image-based rendering from the fitted views on the fitted mesh (`render.image_based`) by several blends, the
+        first one ``image_based``; empty where it isn't asked for.
     seen : (H, W) bool, optional
         Pixels of the region whose point a fitted view sees: those that the baseline is compared on.
     landmark_pixels : float, optional
@@ -55,7 +56,7 @@ class Comparison:
     photograph: NDArray[np.uint8]
     region: NDArray[np.bool_]
     renders: dict[Method, NDArray[np.uint8]]
-    baseline: NDArray[np.uint8] | None = None
+    baseline: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
     seen: NDArray[np.bool_] | None = None
     landmark_pixels: float | None = None
 
@@ -94,7 +95,7 @@ def evaluate(
         ``model``: face area of the fitted model; ``truth``: face area of the capture's ground-truth mesh.
     progress : Progress
     baseline : bool
-        Compare image-based rendering on the fitted mesh as well (`render.image_based`).
+        Compare image-based rendering on the fitted mesh as well, by three blends (`render.image_based`).
     watch : callable, optional
         Given the comparison of each timestep.
     passes : bool
@@ -106,7 +107,8 @@ def evaluate(
         ``{"camera", "timesteps", "region", "region_pixels", "methods": {method: {"psnr", "rmse", "ssim",
         "flip"}}, "per_timestep": [{"timestep", "region_pixels", "methods"}]}``; PSNR in dB, RMSE 0..255, FLIP 0..1.
         With ``baseline`` also ``"baseline": {"region_pixels", "methods"}``, over the pixels of the region that a
-        fitted view sees, with ``"image_based"`` among the methods; for a camera that had to be placed,
+        fitted view sees, with ``"image_based"`` (squared cosine), ``"image_based_nearest"`` and
+        ``"image_based_angle"`` among the methods; for a camera that had to be placed,
         ``"resected": {"landmark_pixels", "focal_pixels"}``, and for timesteps that had no head
         ``"posed": {timestep: {"landmark_pixels"}}``; with ``passes`` also ``"passes"``, what
         `output.compare.separation` gives.
@@ -129,8 +131,8 @@ def evaluate(
         found = compare(reconstruction, capture, camera, timestep, region, baseline=baseline)
         renders = {str(method): render[..., :3] for method, render in found.renders.items()}
         figures = whole.add(renders, found.photograph, found.region)
-        if found.baseline is not None and found.seen is not None:
-            seen.add({"image_based": found.baseline, **renders}, found.photograph, found.seen)
+        if found.seen is not None:
+            seen.add({**found.baseline, **renders}, found.photograph, found.seen)
         per_timestep.append({"timestep": timestep, "region_pixels": int(found.region.sum()), "methods": figures})
         if found.landmark_pixels is not None:
             posed[str(timestep)] = {"landmark_pixels": found.landmark_pixels}
@@ -255,9 +257,11 @@ def compare(
     photograph = to_8_bit(frame.image)
     if not baseline:
         return Comparison(timestep, photograph, area, renders, landmark_pixels=off)
-    cameras = shown.cameras
-    base = image_based(capture, cameras, view, timestep, vertices, model.faces, moments=moments)
-    return Comparison(timestep, photograph, area, renders, to_8_bit(base.colour), area & base.seen, off)
+    given = capture, shown.cameras, view, timestep, vertices, model.faces
+    base = image_based(*given, moments=moments, blends=BLENDS, oversampling=oversampling)
+    names = {blend: "image_based" if blend == BLENDS[0] else f"image_based_{blend}" for blend in BLENDS}
+    blended = {names[blend]: to_8_bit(image) for blend, image in base.colours.items()}
+    return Comparison(timestep, photograph, area, renders, blended, area & base.seen, off)
 
 
 def held_out(reconstruction: Result, found: Mapping[str, Any]) -> bool:

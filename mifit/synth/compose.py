@@ -252,6 +252,8 @@ def _write_capture(
     tracer = PathTracer(_materials(subject), environment, lamps=lamps)
     exposure = _exposure(tracer, subject, cameras[0])
     _write_maps(folder / "truth" / "maps.npz", subject.skin["face"])
+    with replacing(folder / "truth" / "mesh.npz") as temporary:
+        np.savez_compressed(temporary, faces=subject.model.faces, face_mask=subject.model.face_mask)
     visibility = SurfaceScene(subject.neutral, subject.model.faces)
     bias = detector.draw_bias(subject.seed, subject.landmark_bias / 10.0)  # mm -> cm
     shots = []

@@ -9,9 +9,10 @@ from mifit.appearance import reference
 from mifit.appearance.formation import diffuse_matrix
 from mifit.appearance.lobe import normalization
 from mifit.appearance.models.paper import GUARD
+from mifit.appearance.occlusion import Occlusion
 from mifit.core import sh
 from mifit.errors import InputError
-from tests.shaded import shade_points, specular_matrix
+from tests.shaded import appearance, shade_points, specular_matrix
 
 MODELS = ("paper", "prefiltered", "shadowed")
 
@@ -145,3 +146,18 @@ def test_bad_input_is_named(variant: str) -> None:
     with pytest.raises(InputError, match=r"exponent: found -1\.0"):
         shade_points(n, v, white, gloss, c, 0.0, -1.0, "prefiltered")
     assert shade_points(n[:0], v[:0], white[:0], gloss[:0], c, 0.0, 5.0, "paper")[0].shape == (0, 3)
+
+
+def test_a_bent_normal_in_half_shade_sees_half_of_what_it_would_see_open(variant: str) -> None:
+    """Where half of all light is blocked, so is half of the change that bending brings."""
+    n, v, c = scene()
+    c = np.abs(c) * np.eye(9, 1) * 3.0 + 0.2 * c
+    bent = n + 0.3 * np.random.default_rng(4).standard_normal(n.shape)
+    bent /= np.linalg.norm(bent, axis=1, keepdims=True)
+    look = appearance(c, 20.0, "shadowed")
+    half, whole = (look.shade_bent(bent, n, v, Occlusion(part * diffuse_matrix(n, 3)))[0] for part in (0.5, 1.0))
+    free, _ = appearance(c, 20.0, "prefiltered").shade(bent, v)
+    lit = (np.abs(free) > 0.1).all(1) & (diffuse_matrix(n, 3) @ c > 0.1).all(1)
+    assert lit.sum() > 100
+    np.testing.assert_allclose(whole[lit], free[lit], rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(half[lit], 0.5 * free[lit], rtol=1e-3, atol=1e-4)

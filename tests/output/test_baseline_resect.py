@@ -35,18 +35,19 @@ def test_baseline_and_our_methods_are_measured_on_the_same_pixels(ball, photogra
     found = evaluate(ball, photographs, "third", timesteps=[0], baseline=True)
     plain = evaluate(ball, photographs, "third", timesteps=[0])
     assert {k: v for k, v in found.items() if k != "baseline"} == plain
-    base = found["baseline"]
-    assert set(base["methods"]) == {"image_based", "pca", "diffuse", "full"}
+    base, each = found["baseline"], compare(ball, photographs, "third", 0, baseline=True)
+    blends = {"image_based", "image_based_nearest", "image_based_angle"}
+    assert set(base["methods"]) == blends | {"pca", "diffuse", "full"} and set(each.baseline) == blends
     assert 0 < base["region_pixels"] <= found["region_pixels"]
-    each = compare(ball, photographs, "third", 0, baseline=True)
     assert each.seen.sum() == base["region_pixels"] and not (each.seen & ~each.region).any()
-    for name, image in (("image_based", each.baseline), ("full", each.renders["full"][..., :3])):
+    images = {**each.baseline, "full": each.renders["full"][..., :3]}
+    for name, image in images.items():
         error = (image.astype(float) - each.photograph)[each.seen]
         assert base["methods"][name]["rmse"] == pytest.approx(np.sqrt((error**2).mean()))
     # The views agree but for the highlight, which no fitted view shows.
     away = each.seen.copy()
     away[26:38, 26:38] = False
-    assert np.abs(each.baseline.astype(float) - each.photograph)[away].mean() < 4
+    assert np.abs(each.baseline["image_based"].astype(float) - each.photograph)[away].mean() < 4
     assert base["methods"]["image_based"]["psnr"] > base["methods"]["full"]["psnr"] + 3
 
 

@@ -235,3 +235,34 @@ def test_nothing_to_observe_is_an_error_with_a_reason(variant):
     surface = Surface(capture((np.pi,)), quad(), geometry(), ["left"], SIZE)
     with pytest.raises(InputError, match="no image shows"):
         surface.sample(10, np.random.default_rng(0))
+
+
+def test_a_twin_of_a_view_adds_nothing_to_what_it_is_believed(variant):
+    """Two cameras at one grazing place agree, whatever they show: each counts by its own probability alone."""
+    _, plain = observe(capture((1.2,)))
+    _, one = observe(capture((1.2,)), trust=True)
+    _, two = observe(capture((1.2, 1.2)), cameras=("left", "right"), trust=True)
+    both = plain.weight[:, 0] > 0
+    np.testing.assert_allclose(two.weight[both, 0], one.weight[both, 0], rtol=1e-5)
+    assert (two.right[both, 0] > one.right[both, 0] + 0.05).mean() > 0.5  # though they are believed more
+
+
+def test_the_outlines_reach_is_in_millimetres_whatever_the_pixels(variant):
+    """Twice as many pixels of the same square see its edge with the same probability."""
+    fine = replace(camera(), width=96, height=96, fx=128.0, fy=128.0, cx=48.0, cy=48.0)
+    grey = capture(image=np.full((48, 48, 3), 0.5, np.float32))
+    large = capture(image=np.full((96, 96, 3), 0.5, np.float32))
+    large._cameras["left"] = fine
+    model, beside = quad(), geometry(0.3 * VERTICES)  # 6 millimetres wide: all of it is near the outline
+    share = []
+    for shot in (grey, large):
+        (_, plain), (_, seen) = (observe(shot, model, geo=beside, trust=trust) for trust in (False, True))
+        middle = np.linalg.norm(plain.point[:, 0, :2], axis=1) < 0.1
+        share.append((seen.weight[middle, 0] / plain.weight[middle, 0]).mean())
+    assert 0.5 < share[0] < 0.95 and share[1] == pytest.approx(share[0], abs=0.04)
+
+
+def test_quality_falls_with_the_cosine(variant):
+    middle = [SIZE * SIZE // 2 + SIZE // 2 + k for k in (-1, 0)]
+    found = [observe(capture((angle,), distance=100.0))[0].quality()[middle].mean() for angle in (0.0, 0.9)]
+    assert found[0] == pytest.approx(1.0, abs=0.01) and found[1] == pytest.approx(np.cos(0.9), abs=0.03)

@@ -7,7 +7,7 @@ import pytest
 from memory_capture import make_capture
 
 from mifit.morphable import MorphableModel
-from mifit.stages.surface.prediction_between_views import errors_between_views
+from mifit.stages.surface.prediction_between_views import errors_between_views, every
 
 CAMERAS = ("left", "right")
 
@@ -50,3 +50,11 @@ def test_every_candidate_is_judged_on_the_same_pixels(model, capture):
 def test_nothing_in_common_is_infinite(model, capture):
     truth = nearer(capture, 0.0)
     assert errors(model, capture, [truth, truth + 1e4]) == [np.inf, np.inf]
+
+
+def test_a_coarser_view_shows_the_centres_of_the_pixels_that_it_keeps(capture):
+    camera = capture.camera("left")
+    coarse = every(camera, 4)
+    points = np.array([[0.3, -0.2, 0.1], [2.0, 1.0, -1.0]])
+    fine, kept = camera.project(points), coarse.project(points)
+    assert kept == pytest.approx((fine - 0.5) / 4 + 0.5)  # pixel 4 i is pixel i: both have their centres there

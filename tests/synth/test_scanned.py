@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks import scan
+from benchmarks import judge
 from mifit.capture import Capture
 from mifit.cli import main
 from mifit.core.image import read_image, write_image
+from mifit.core.uv import sample_map
 from mifit.errors import InputError
 from mifit.extras.digital_emily import import_digital_emily, read_camera
 from mifit.morphable import MorphableModel
+from mifit.output.truth import relit_truths, true_mesh
 from mifit.synth import head as heads
 from mifit.synth.scanned import ScannedHead, rigid_motion
 
@@ -52,10 +54,10 @@ def test_a_scan_is_placed_in_centimetres_with_its_maps_the_right_way_up(files):
     assert np.ptp(found.vertices[:, 1]) == pytest.approx(24, abs=0.1)
     nose = found.vertices[np.argmax(found.vertices[:, 2])]
     assert nose[2] == pytest.approx(9.0) and abs(nose[1]) < 1e-9
-    top = scan.sample_map(found.maps["albedo"], found.uv[[np.argmax(found.vertices[:, 1])]])[0]
+    top = sample_map(found.maps["albedo"], found.uv[[np.argmax(found.vertices[:, 1])]])[0]
     assert top[0] > 4 * top[2]
     turned = ScannedHead.load(mesh, {"albedo": folder / "albedo.png"}, unit_mm=100.0, flip_v=True)
-    top = scan.sample_map(turned.maps["albedo"], turned.uv[[np.argmax(turned.vertices[:, 1])]])[0]
+    top = sample_map(turned.maps["albedo"], turned.uv[[np.argmax(turned.vertices[:, 1])]])[0]
     assert top[2] > 4 * top[0]
     assert set(found.maps) == {"albedo", "specular", "roughness", "displacement"}
 
@@ -91,8 +93,9 @@ def test_a_scan_becomes_a_capture_with_truth(files, variant):
     assert main([str(a) for a in arguments]) == 0
     capture = Capture.load(out)
     assert capture.cameras == ("left", "right", "third") and capture.timesteps == (0, 1)
-    truth = [scan.read_scan(capture, t) for t in (0, 1)]
-    assert truth[0].uv is not None and truth[0].maps["albedo"].shape == (MAP, MAP, 3)
+    truth = [true_mesh(capture, t) for t in (0, 1)]
+    maps, uv = judge.scan_maps(capture)
+    assert len(uv) == len(truth[0].vertices) and maps["albedo"].shape == (MAP, MAP, 3)
     gap = [np.linalg.norm(t.vertices[7] - t.vertices[-1]) for t in truth]
     assert gap[0] == pytest.approx(gap[1], rel=1e-5) and np.abs(truth[0].vertices - truth[1].vertices).max() > 0.3
     # The upper half is red, the lower one blue, and the truth says so of the same pixels.
@@ -103,10 +106,9 @@ def test_a_scan_becomes_a_capture_with_truth(files, variant):
             pixel = camera.project(truth[t].vertices[front & part].mean(0)).astype(int)
             colour = capture.frame("third", t).image[pixel[1], pixel[0]]
             assert colour[channel] > 2 * colour[2 - channel]
-    ((view, light, exposure),) = scan.relit_truths(capture).values()
-    relit = read_image(view) * exposure
-    assert 0.5 < np.percentile(relit.max(axis=-1)[relit.sum(-1) > 0], 95) < 0.9
-    assert light.name == "environment_other.exr"
+    (relit,) = relit_truths(capture).values()
+    assert 0.5 < np.percentile(relit.image.max(axis=-1)[relit.image.sum(-1) > 0], 95) < 0.9
+    assert relit.environment.name == "environment_other.exr"
     full, diffuse = (read_image(out / "truth" / f"{name}_third.exr") for name in ("full", "diffuse"))
     photograph = capture.frame("third", 0).image
     exposure = json.loads((out / "truth" / "meta.json").read_text())["exposure"]
@@ -187,7 +189,7 @@ def test_digital_emily_becomes_a_capture_with_its_mesh_as_truth(tmp_path, capsys
         assert camera.project(np.array([0.0, 1.0, 0.0]))[1] < 45  # up is up
     assert capture.camera("c1").position == pytest.approx((-30, 0, 90))
     assert capture.camera("c1").project(np.array([1.0, 0, 0]))[0] > 30  # and right is right
-    truth = scan.read_scan(capture, 0)
+    truth = true_mesh(capture, 0)
     assert np.linalg.norm(truth.vertices, axis=1) == pytest.approx(9.0)
     assert (tmp_path / "out" / "LICENSE").exists()
 

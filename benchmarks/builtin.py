@@ -1,0 +1,162 @@
+"""Files that are fitted or drawn with the built-in model, and how well it fits heads of another.
+
+    python -m benchmarks.builtin sheets                      # the model's sheets in docs/images
+    python -m benchmarks.builtin register [--heads 20]       # benchmarks/results/register_builtin.json
+    python -m benchmarks.builtin face-mesh --out mifit/capture/face_mesh_68.json [--subjects 40]
+
+``register`` fits the model to random ICT-FaceKit heads by landmarks and closest points. ``face-mesh`` fits the table
+that turns MediaPipe's 478 Face Mesh points into 68 iBUG landmarks: heads with known landmarks are synthesised,
+MediaPipe looks at them, and every landmark becomes the affine combination of its nearest mesh points that predicts it
+best.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import mifit
+from benchmarks.heads import ICT
+from benchmarks.record import record
+from mifit.capture import Capture
+from mifit.core.files import write_text
+from mifit.core.image import load_image, to_8_bit
+from mifit.morphable import MorphableModel
+from mifit.morphable.describe import save_png
+from mifit.morphable.register import distance_to_surface, register
+from mifit.morphable.sketch import sketch
+from mifit.synth import synthesize
+
+IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
+EXPRESSIONS = (
+    ("jawOpen",), ("smile_L", "smile_R", "cheekSquint_L", "cheekSquint_R"),
+    ("frown_L", "frown_R", "browInnerUp_L", "browInnerUp_R"), ("pucker",),
+    ("funnel", "browOuterUp_L", "browOuterUp_R"), ("browDown_L", "browDown_R", "sneer_L", "sneer_R"), ("blink_L",),
+    ("cheekPuff_L", "cheekPuff_R"),
+)  # fmt: skip
+POINTS = 64
+"""Mesh points that a landmark is combined of."""
+RIDGE = 1e-3
+"""Penalty on the weights, relative to squared eye distances."""
+
+
+def draw_sheets() -> None:
+    """The mean from three sides, random heads and expressions."""
+    model = MorphableModel.load("builtin")
+    save_png(np.concatenate([sketch(model, yaw=y, size=340) for y in (0, 45, 90)], axis=1), IMAGES / "builtin_mean.png")
+    columns = []
+    for seed in range(1, 6):
+        identity, _, albedo = model.sample(seed)
+        columns.append(np.concatenate([sketch(model, identity, None, albedo, y, 220) for y in (0, 50)], axis=0))
+    save_png(np.concatenate(columns, axis=1), IMAGES / "builtin_subjects.png")
+    tiles = []
+    for names in EXPRESSIONS:
+        coefficients = np.zeros(model.n_expression)
+        coefficients[[model.expression_names.index(n) for n in names]] = 2.0
+        tiles.append(sketch(model, None, coefficients, yaw=15, size=240))
+    rows = [np.concatenate(tiles[k : k + 4], axis=1) for k in (0, 4)]
+    save_png(np.concatenate(rows, axis=0), IMAGES / "builtin_expressions.png")
+
+
+def distances(model: MorphableModel, ict: MorphableModel, seed: int) -> dict[str, float]:
+    """Fit the model to one random head; distances in mm, both ways, over the area that both surfaces share."""
+    head = ict.unit_mm * ict.shape(ict.sample(seed)[0]).astype(np.float64)
+    start = time.perf_counter()
+    fit = register(model, head, ict.faces, ict.landmarks)
+    seconds = time.perf_counter() - start
+    there = distance_to_surface(fit.vertices[np.unique(model.faces[model.face_mask])], head, ict.faces)
+    # Back: the head's face between its contour landmarks, forehead included, without ears and neck.
+    p = head[ict.landmarks]
+    brow, chin = p[17:27, 1].max(), p[8, 1]
+    inside = (head[:, 1] > chin) & (head[:, 1] < brow + 35) & (head[:, 2] > p[[0, 16], 2].mean())
+    region = np.intersect1d(np.unique(ict.faces[ict.face_mask]), np.flatnonzero(inside))
+    back = distance_to_surface(head[region], fit.vertices, model.faces[model.face_mask])
+    return {
+        "model_to_head_mean_mm": float(there.mean()),
+        "head_to_model_mean_mm": float(back.mean()),
+        "head_to_model_p95_mm": float(np.percentile(back, 95)),
+        "coefficients_rms": float(np.sqrt((fit.identity**2).mean())),
+        "seconds": seconds,
+    }
+
+
+def measure_registration(heads: int, name: str) -> None:
+    """Mean and worst distances over some heads."""
+    model, ict = MorphableModel.load(name), MorphableModel.load(ICT)
+    rows = [distances(model, ict, seed) for seed in range(heads)]
+    summary = {
+        kind: {key: float(of([row[key] for row in rows])) for key in rows[0]}
+        for kind, of in (("mean", np.mean), ("worst", np.max))
+    }
+    record("register_builtin", {"model": name, "heads": heads, **summary, "per_head": rows}, seeds=list(range(heads)))
+    print(json.dumps(summary, indent=1))
+
+
+def fit_table(seen: list[tuple[NDArray, NDArray, NDArray]]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Indices and weights (68, POINTS) of the affine combinations; weights sum to 1.
+
+    ``seen``: mesh points (478, 2), true landmarks (68, 2) and their visibility (68,) of every image.
+    """
+    mesh, truth, visible = (np.stack(values) for values in zip(*seen, strict=True))
+    scale = np.linalg.norm(mesh[:, 33] - mesh[:, 263], axis=1)  # outer corners of the eyes
+    index, weight = np.zeros((68, POINTS), dtype=np.int64), np.zeros((68, POINTS))
+    for j in range(68):
+        v = visible[:, j]
+        offset = (mesh[v] - truth[v, j][:, None]) / scale[v, None, None]
+        index[j] = np.argsort(np.linalg.norm(offset, axis=2).mean(axis=0))[:POINTS]
+        chosen = offset[:, index[j]]
+        gram = np.einsum("nkc,nlc->kl", chosen, chosen) / v.sum() + RIDGE * np.eye(POINTS)
+        weight[j] = np.linalg.solve(gram, np.ones(POINTS))
+        weight[j] /= weight[j].sum()
+    return index, weight
+
+
+def fit_face_mesh(name: str, subjects: int, seed: int, out: Path) -> None:
+    """Synthesise, detect, fit, write."""
+    from mifit.capture.face_mesh import FaceMesh, mirrored_points
+
+    mifit.set_variant("auto")
+    model, detector, seen = MorphableModel.load(name), FaceMesh(), []
+    with tempfile.TemporaryDirectory() as work:
+        for i in range(subjects):
+            folder = Path(work) / str(i)
+            synthesize(folder, timesteps=2, model=name, seed=seed + i, width=340, height=240, spp=9)
+            capture = Capture.load(folder)
+            for (camera, timestep), shot in capture.shots.items():
+                face = detector.face(to_8_bit(load_image(shot.image).pixels))
+                marks = capture.landmarks(camera, timestep)
+                if face is not None and marks is not None:
+                    vertices = np.load(folder / "truth" / f"{timestep:04d}.npz")["vertices"]
+                    true = capture.camera(camera).project(vertices[model.landmarks])
+                    seen.append((face.points[:, :2], true, marks.visible))
+            print(f"{i + 1} of {subjects} subjects, {len(seen)} images", flush=True)
+    index, weight = fit_table(seen)
+    table = {"index": index.tolist(), "weight": np.round(weight, 5).tolist(), "mirror": mirrored_points().tolist()}
+    write_text(out, json.dumps(table) + "\n")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["sheets", "register", "face-mesh"])
+    parser.add_argument("--heads", type=int, default=20)
+    parser.add_argument("--model", help="default: builtin:coarse to register, the ICT model to synthesise")
+    parser.add_argument("--subjects", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=5000)
+    parser.add_argument("--out", type=Path, default=Path("face_mesh_68.json"))
+    a = parser.parse_args()
+    if a.what == "sheets":
+        draw_sheets()
+    elif a.what == "register":
+        measure_registration(a.heads, a.model or "builtin:coarse")
+    else:
+        fit_face_mesh(a.model or ICT, a.subjects, a.seed, a.out)
+
+
+if __name__ == "__main__":
+    main()
