@@ -151,9 +151,9 @@ MUTATIONS = (
     M("refined normals turned the wrong way for the residual", "find_residual._difference", "rotation.T", "rotation",
       "tests/stages/test_find_residual.py"),
     # Solvers.
-    M("a step that raises the energy is taken", "acceptance.TrustRatio.judge", "self.minimum_ratio", "-10.0",
-      "tests/solve/test_solve.py"),
-    M("Geman and McClure's weight not squared", "robust.geman_mcclure", "q * q", "q", "tests/solve/test_solve.py"),
+    M("a step that raises the energy is taken", "minimize.TrustRatio.judge", "self.minimum_ratio", "-10.0",
+      "tests/optim/test_solve.py"),
+    M("Geman and McClure's weight not squared", "robust.geman_mcclure", "q * q", "q", "tests/optim/test_solve.py"),
     # Paper.
     M("1 / |F_view| dropped", "refine.paper_problem", "max(len(view.index), 1)", "1", "tests/test_paper.py"),
     M("Adam's exponent 10", "paper_solver", "PAPER_EXPONENT = 5.0", "PAPER_EXPONENT = 10.0", "tests/test_paper.py"),

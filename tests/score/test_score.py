@@ -51,7 +51,7 @@ def folder(variant, tmp_path_factory):
 
 def scored(folder, images, *options):
     """What the command writes."""
-    target = images.parent / "score.json"
+    target = images.parent / f"{images.name}.json"
     assert main(["score", str(folder), "--images", str(images), "--json", str(target), "--quiet", *options]) == 0
     return json.loads(target.read_text())
 
@@ -147,7 +147,8 @@ def test_damaged_meshes_and_missing_folders_are_named(folder, tmp_path, capsys):
 def test_a_truth_of_vertices_alone_needs_the_model_for_meshes_only(folder, tmp_path):
     other = shutil.copytree(folder, tmp_path / "other")
     mesh = trimesh.load(other / "truth" / "0000.ply", process=False)
-    (other / "truth" / "0000.ply").unlink()
+    for name in ("0000.ply", "mesh.npz"):
+        (other / "truth" / name).unlink()
     np.savez(other / "truth" / "0000.npz", vertices=np.asarray(mesh.vertices))
     images = run("nearest_view.py", other, tmp_path / "near")
     assert score(Capture.load(other), images)["views"]["third"]["skin"]["psnr"] > 15
