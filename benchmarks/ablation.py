@@ -57,7 +57,7 @@ class Part:
     without : tuple of str
         Steps that are left out.
     photometry : bool
-        Whether it is tried on changed photographs of two timesteps too, and only there if it does nothing elsewhere.
+        Whether it is tried on changed photographs too; with two timesteps alone.
     """
 
     label: str
@@ -128,10 +128,7 @@ PARTS = (
     Part("stage 3: off", without=("normals", "mesh", "residual")),
     Part("stage 3: robust weights", {"normals.robust": False}),
     Part("residual", {"residual.enabled": False}),
-    Part("photometry: falloff", {"geometry.falloff": False}, photometry=True),
-    Part("photometry: contrast", {"geometry.contrast": False}, photometry=True),
-    Part("photometry: gains", {"geometry.camera_gains": "never"}, photometry=True),
-    Part("photometry: exposures", {"geometry.exposures": False}, photometry=True),
+    Part("photometry: gains and exposures", {"photometry.enabled": False}, photometry=True),
 )
 """Every part, switched off alone."""
 
@@ -285,7 +282,7 @@ def run(
         one |= {"set": case.set, "changed": case.changed, "label": case.label}
         fits, photographed = Fits(case), name in PHOTOGRAPHED
         for part in PARTS:
-            useless = part.photometry and "camera" in part.label and len(case.timesteps) == 1
+            useless = part.photometry and len(case.timesteps) == 1  # a head that stands still tells nothing of it
             if (photographed and part.label != BASE and not part.photometry) or useless:
                 continue
             if part.label != BASE and not wanted(part.label):

@@ -134,22 +134,9 @@ def _exposure(image: NDArray, camera: int, timestep: int) -> NDArray:
     return image * 0.7 if timestep == 1 else image
 
 
-def _contrast(image: NDArray, camera: int, timestep: int) -> NDArray:
-    return image**1.2 if camera == 1 else image
-
-
-def _falloff(image: NDArray, camera: int, timestep: int) -> NDArray:
-    height, width = image.shape[:2]
-    y, x = np.mgrid[:height, :width] + 0.5
-    radius = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / ((width / 2) ** 2 + (height / 2) ** 2)
-    return image * np.exp(-0.5 * radius)[..., None]
-
-
 CHANGES: dict[str, Callable[[NDArray, int, int], NDArray]] = {
     "one camera darker and redder": _gain,
     "one timestep darker": _exposure,
-    "one camera of more contrast": _contrast,
-    "corners darkened": _falloff,
 }
 """Linear image, number of its camera and timestep -> the image that is fitted; the held-out photographs stay."""
 
