@@ -25,6 +25,7 @@ from mifit.stages.find_surface import find_surface
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.normals.mesh_refinement import refine_mesh
 from mifit.stages.normals.normal_refinement import refine_normals
+from mifit.stages.photometry import find_photometry
 from mifit.tracking import Follower
 
 if TYPE_CHECKING:
@@ -79,7 +80,8 @@ def refine(
     if unknown := [t for t in wanted if t not in capture.timesteps]:
         raise InputError(f"timestep {unknown[0]}: not in the capture; it has {', '.join(map(str, capture.timesteps))}")
     config = settings_of(result)
-    model, names, capture = result.model, [camera.name for camera in result.cameras], result.seen(capture)
+    model, names = result.model, [camera.name for camera in result.cameras]
+    plain, capture = capture.with_fitted(result.cameras), result.seen(capture)
     fitted = result.fitted
     further = [t for t in wanted if t not in fitted]
     chosen = choose_frames(capture, names, MOST - len(fitted), further, fitted) if further else None
@@ -88,6 +90,9 @@ def refine(
     if geometry.displacement is not None:
         found = find_surface(capture, model, geometry, names, config.surface, progress, config.geometry)
         geometry = behind_lids(model, found)
+    if config.photometry.enabled:
+        photometry = find_photometry(plain, model, geometry, names, config.photometry, seed, progress)
+        geometry, capture = replace(geometry, photometry=photometry), plain.with_photometry(photometry)
     reflectance = infer_reflectance(capture, model, geometry, names, config.reflectance, seed, progress)
     refined = {
         "timesteps": list(geometry.timesteps),
@@ -151,18 +156,19 @@ def _followed(
     names_of = ("expression", "rotation", "translation", "vertices")
     rows: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in found]) for name in names_of}
     timesteps = tuple(t for one in found for t in one.timesteps)
-    joined = replace(home, timesteps=timesteps, **rows)
-    return joined.at(sorted(timesteps)), failed
+    return replace(home, timesteps=timesteps, **rows).at(sorted(timesteps)), failed
 
 
 def _difference(result: Reconstruction, capture: Capture, geometry: GeometryEstimate) -> float:
-    """Median difference of a frame from what maps and lighting predict, linear colour; the largest of the views."""
+    """Median difference of a frame, at one exposure, from what maps and lighting predict; the largest of the views."""
     predicted = replace(result, geometry=geometry, normals=None, mesh=None, residual=None)
     found = []
     for camera in result.cameras:
         frame = capture.frame(camera.name, geometry.timesteps[0])
         shown = predicted.render(camera, geometry.timesteps[0])
         usable = frame.valid & ~frame.clipped & (shown[..., 3] > 0.5)
-        off = np.abs(frame.image - shown[..., :3]).mean(axis=2)
-        found.append(float(np.median(off[usable])) if usable.any() else np.inf)
+        image, shown = frame.image[usable], shown[usable, :3]
+        exposure = np.median(image) / max(float(np.median(shown)), 1e-6) if usable.any() else 1.0
+        off = np.abs(image - exposure * shown).mean(axis=1) / max(exposure, 1e-6)
+        found.append(float(np.median(off)) if usable.any() else np.inf)
     return max(found)

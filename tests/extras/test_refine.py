@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from mifit.core.estimate import NormalsEstimate, Report
+from mifit.core.photometry import Photometry
 from mifit.errors import ConvergenceError, InputError
 from mifit.extras import refine as module
 from mifit.extras.refine import MOST, refine
@@ -19,6 +20,7 @@ FRAMES = 6
 CONFIG = {
     "reflectance": {"texture_size": 96, "shading": "prefiltered", "bands": 3, "exponent": 8.0, "segment": False},
     "residual": {"enabled": False},
+    "photometry": {"enabled": False},
     "seed": 0,
 }
 
@@ -145,6 +147,20 @@ def test_the_surface_is_found_from_all_frames_where_the_fit_has_one(scene, resul
     found = refine(replace(result, geometry=beyond), scene)
     assert (found.geometry.displacement == np.float32(0.1)).all() and found.timesteps == (0, 1)
     assert quick["reflectance"].displacement is quick["normals"].displacement is found.geometry.displacement
+
+
+def test_exposures_are_those_of_all_frames(scene, result, quick, monkeypatch):
+    found = Photometry(exposure={("left", 4): 2.0})
+    seen = []
+
+    def photometry(capture, model, geometry, names, config, seed, progress):
+        assert geometry.timesteps == tuple(range(FRAMES))
+        return found
+
+    monkeypatch.setattr(module, "find_photometry", photometry)
+    monkeypatch.setattr(type(scene), "with_photometry", lambda self, given: seen.append(given) or self, raising=False)
+    refined = refine(replace(result, config={**CONFIG, "photometry": {"enabled": True}}), scene)
+    assert seen == [found] and refined.geometry.photometry is quick["reflectance"].photometry is found
 
 
 def test_the_choice_is_of_what_is_asked_for_and_says_what_it_left_out(scene, result, quick, asked, monkeypatch):
