@@ -294,9 +294,6 @@ class NormalsConfig:
     The paper has w2 = 0.3; with ten times that, path-traced captures keep the accuracy of the model's normals.
     """
 
-    solver: Literal["gauss_newton", "adam"] = one_of(
-        "gauss_newton", "adam is the paper's; both minimise the same energy"
-    )
     laplacian_weight: float = number(
         1e-3, "the paper's w1, for images and normal maps in 8-bit steps", least=0, most=WEIGHT
     )
@@ -382,7 +379,7 @@ class FitConfig:
                 specular_smoothness=1.0,
                 max_iterations=60,
             ),
-            normals=NormalsConfig(solver="adam", magnitude_weight=0.3, robust=False),
+            normals=NormalsConfig(magnitude_weight=0.3, robust=False),
             residual=ResidualConfig(enabled=False),
         )
 

@@ -24,8 +24,9 @@ from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, from_mapping
 from mifit.core.arrays import Rows
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
+from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.process import one_blas_thread
-from mifit.core.uv import TexelMap, bend, rasterize_uv, tangent_plane, unbend
+from mifit.core.uv import TexelMap, bend, rasterize_uv, tangent_plane, transport, unbend
 from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
 from mifit.result.ownership import locked
@@ -33,9 +34,8 @@ from mifit.result.record import R
 from mifit.result.writing import add_timestep, write_remarks
 from mifit.stages.fit_geometry import fit_pose_expression
 from mifit.stages.geometry.refine import texture_reference
-from mifit.stages.normals.carried import CarriedTangents
-from mifit.stages.normals.mesh_refinement import MeshRefiner
-from mifit.stages.normals.normal_refinement import check_maps, refine_frame
+from mifit.stages.normals.refine_mesh import MeshRefiner
+from mifit.stages.normals.refine_normals import check_maps, refine_frame
 from mifit.stages.surface.frame_offsets import OUT_OF_STEP, frame_offset_warnings, frame_offsets
 from mifit.stages.surface.kept_texture import KeptTexture
 from mifit.stages.surface.model_fit import landmarks_are_biased
@@ -519,3 +519,27 @@ def _without(result: R, dropped: Sequence[int]) -> R:
         ),
         mesh=mesh,
     )
+
+
+class CarriedTangents:
+    """Tangents of the model's mean face, carried to other poses and expressions by the smallest rotations."""
+
+    def __init__(self, model: MorphableModel, texels: TexelMap) -> None:
+        self._faces, self._texels = model.faces, texels
+        self.home = self._base(model.mean)
+        self._tangents = tangent_plane(self.home)
+
+    def frame(
+        self, geometry: GeometryEstimate, rows: NDArray | slice = slice(None)
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Base normals (N, 3) and tangents (N, 2, 3) of the first timestep of a geometry, object space.
+
+        ``rows`` are the texels that are wanted; all by default.
+        """
+        base = self._base(geometry.vertices[0].astype(np.float64) @ geometry.rotation[0], rows)
+        return base, transport(self.home[rows], self._tangents[rows], base)
+
+    def _base(self, vertices: NDArray, rows: NDArray | slice = slice(None)) -> NDArray[np.float64]:
+        texels = self._texels
+        normals = vertex_normals(vertices, self._faces)
+        return normalize(interpolate(normals, self._faces, texels.face[rows], texels.weights[rows]))

@@ -37,7 +37,7 @@ NEVER = {"result": {"render"}, "output": {"stages"}}
 KERNELS = {"render", "appearance"}
 """Parts whose functions may import Mitsuba and Dr.Jit."""
 KERNEL_FILES = {
-    f"stages/{name}.py" for name in ("normals/chart", "normals/problem", "normals/solvers", "reflectance/adam")
+    f"stages/{name}.py" for name in ("normals/problem", "normals/refine_normals", "reflectance/adam")
 } | {"extras/absorb/linear.py"}
 """Further files that may, relative to the package: solvers of stages."""
 

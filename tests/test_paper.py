@@ -35,7 +35,7 @@ def test_the_preset_has_the_papers_settings():
     assert (r.solver, r.shading, r.robust, r.specular_difference_weight) == ("adam", "printed", False, 0.1)
     # lambda_H = 0.001 for maps and images of 0..255, the same for both maps
     assert r.smoothness_weight == pytest.approx(0.001 * 255 / 255**2) and r.specular_smoothness == 1.0
-    assert (n.solver, n.laplacian_weight, n.magnitude_weight, n.robust) == ("adam", 1e-3, 0.3, False)
+    assert (n.laplacian_weight, n.magnitude_weight, n.robust) == (1e-3, 0.3, False)
     assert not paper.surface.enabled
     assert PRESETS["paper"]() == paper and PRESETS["default"]() == default != paper
 
@@ -287,7 +287,7 @@ def test_the_printed_highlight_is_the_quotient(variant):
 @pytest.mark.parametrize("robust", [True, False])
 def test_weights_of_stage_3_are_for_images_and_normal_maps_of_8_bits(variant, robust):
     from mifit.core.uv import rasterize_uv
-    from mifit.stages.normals.normal_refinement import frame_problem
+    from mifit.stages.normals.refine_normals import frame_problem
     from tests.stages.normal_scene import build
 
     small = build("paper")

@@ -23,8 +23,8 @@ from mifit.stages.eyes import behind_lids
 from mifit.stages.find_residual import find_residual
 from mifit.stages.find_surface import find_surface
 from mifit.stages.infer_reflectance import infer_reflectance
-from mifit.stages.normals.mesh_refinement import refine_mesh
-from mifit.stages.normals.normal_refinement import refine_normals
+from mifit.stages.normals.refine_mesh import refine_mesh
+from mifit.stages.normals.refine_normals import refine_normals
 from mifit.stages.photometry import find_photometry
 from mifit.tracking import Follower
 

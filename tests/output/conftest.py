@@ -18,7 +18,7 @@ from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
 from mifit.reconstruction import Reconstruction
-from mifit.stages.normals.mesh_refinement import refine_mesh
+from mifit.stages.normals.refine_mesh import refine_mesh
 
 RADIUS = 9.0
 

@@ -13,7 +13,7 @@ from mifit.core.estimate import GeometryEstimate, NormalsEstimate, Report
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.mesh_solve import interior_vertices
 from mifit.core.uv import rasterize_uv
-from mifit.stages.normals.mesh_refinement import refine_mesh
+from mifit.stages.normals.refine_mesh import refine_mesh
 
 SIZE = 192
 DONE = Report("converged")
@@ -111,5 +111,5 @@ def test_the_normals_of_the_mesh_itself_change_nothing(problem):
 def test_the_outcome_tells_whether_the_vertices_stand(problem, monkeypatch):
     model, geometry, normals, _ = problem
     assert refine_mesh(model, geometry, normals).report.outcome == "converged"
-    monkeypatch.setattr("mifit.stages.normals.mesh_refinement.MAX_ITERATIONS", 1)
+    monkeypatch.setattr("mifit.stages.normals.refine_mesh.MAX_ITERATIONS", 1)
     assert refine_mesh(model, geometry, normals).report.outcome == "max_iterations"

@@ -172,7 +172,7 @@ def test_landmark_error_is_in_pixels(scene):
 def saved(scene, tmp_path):
     """A result with timestep 0 in a folder, and its reload."""
     from mifit.reconstruction import Reconstruction
-    from mifit.stages.normals.mesh_refinement import refine_mesh
+    from mifit.stages.normals.refine_mesh import refine_mesh
 
     scene.model.save(tmp_path / "dome.npz")
     mask = np.linalg.norm(scene.normal_map, axis=-1) > 0
@@ -235,7 +235,7 @@ def test_cameras_out_of_step_are_named_once(scene, fit_truth, saved, monkeypatch
 
 
 def test_meshes_of_tracked_frames_are_refined_as_those_of_the_fit(scene, fit_truth, saved):
-    from mifit.stages.normals.mesh_refinement import refine_mesh
+    from mifit.stages.normals.refine_mesh import refine_mesh
     from mifit.tracking import track_into
 
     found = track_into(saved, reload(saved), scene, (1,), CONFIG)
