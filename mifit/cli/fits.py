@@ -164,8 +164,8 @@ def fit(arguments: Namespace) -> int:
         from mifit.extras.live_view import serve
 
         view.watch(result)  # where nothing had to be fitted it is the first
-        assert view.live is not None
-        serve(view.live)
+        if view.live:
+            serve(view.live)
     return code
 
 

@@ -9,14 +9,21 @@ from __future__ import annotations
 
 import contextlib
 import io
+import ipaddress
+import logging
+import socket
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+import warnings
+import weakref
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +32,7 @@ from scipy.spatial.transform import Rotation
 from mifit.core.camera import Camera
 from mifit.core.image import to_8_bit
 from mifit.core.mesh import normalize
-from mifit.errors import InputError, MifitError
+from mifit.errors import InputError
 from mifit.output.deferred import render_local
 from mifit.output.relight import relit
 from mifit.output.views import on_backdrop, orbit_camera
@@ -36,6 +43,12 @@ ROWS = (160, 600)
 """Rows of a picture while something moves, and when it rests."""
 REST = 0.3
 """Seconds without a change after which the full picture is rendered."""
+MAX_UPLOAD_BYTES = 256 * 2**20
+"""An environment that a browser sends: 16384 x 8192 pixels in a Radiance file, half of that in an EXR."""
+MAX_CLIENTS = 8
+"""Browsers that are answered at once."""
+SHARE = 0.2
+"""Of a fit's time, what its view may take at most."""
 LABELS = {"pca": "morphable model", "diffuse": "without specular", "full": "everything"}
 
 
@@ -110,12 +123,85 @@ def browser_camera(wxyz: NDArray, position: NDArray, fov: float, aspect: float, 
     rows : int
         Height of the picture in pixels.
     """
-    columns = int(np.clip(round(rows * aspect), 16, 8 * rows))
+    numbers = np.array([*wxyz, *position, fov, aspect], dtype=np.float64)
+    within = np.abs(numbers) < 1e9  # False for NaN
+    if len(numbers) != 9 or not (within.all() and np.any(wxyz) and 1e-3 < fov < np.pi and aspect > 0):
+        raise InputError(f"camera: found {numbers.tolist()}, expected a rotation, a position, an angle and an aspect")
+    columns = int(np.clip(rows * min(aspect, 8.0), 16, 8 * rows).round())
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix().T
     pose[:3, 3] = -pose[:3, :3] @ position
     focal = 0.5 * rows / np.tan(0.5 * fov)
     return Camera("browser", columns, rows, focal, focal, columns / 2, rows / 2, pose)
+
+
+def check_address(host: str, port: int) -> None:
+    """Refuse an address at which no server can listen; InputError names it."""
+    try:
+        if not host:
+            raise OSError("an empty name stands for every network")
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        socket.create_server((host, port), family=family).close()
+    except (OSError, UnicodeError) as error:
+        where = f"--host {host!r} --port {port}"
+        raise InputError(f"{where}: can't listen there: {getattr(error, 'strerror', None) or error}") from None
+
+
+def is_of_our_page(host: str, origin: str | None, given: str) -> bool:
+    """Whether a request comes from a page of this server, by its headers ``Host`` and ``Origin``.
+
+    A page of elsewhere that a browser here shows has another origin; one whose name was made to lead here (DNS
+    rebinding) has that name for a host. Names of this machine and addresses are ours.
+
+    Parameters
+    ----------
+    host : str
+    origin : str or None
+        None where there is none: no browser leaves it out of what opens a socket.
+    given : str
+        The host that the server listens at.
+    """
+    name = (urlsplit(f"//{host}").hostname or "").rstrip(".")
+    own = {"localhost", given.lower(), socket.gethostname().lower()}
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        if name not in own:
+            return False
+    return origin is None or urlsplit(origin).netloc == host
+
+
+@contextlib.contextmanager
+def _guarded(host: str) -> Iterator[None]:
+    """Make servers that viser starts in the block answer their own pages alone, and `MAX_CLIENTS` at once."""
+    from websockets.asyncio import server as websockets
+
+    serve_any = websockets.serve
+    sockets: weakref.WeakSet[Any] = weakref.WeakSet()
+
+    def serve(*arguments: Any, process_request: Any, **options: Any) -> Any:
+        def answer(connection: Any, request: Any) -> Any:
+            hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+            try:
+                ours = len(hosts) == 1 and len(origins) < 2 and is_of_our_page(hosts[0], (*origins, None)[0], host)
+            except ValueError:  # no address
+                ours = False
+            if not ours:
+                return connection.respond(HTTPStatus.FORBIDDEN, "This view answers its own page alone.\n")
+            if request.headers.get("Upgrade", "").lower() == "websocket":
+                if sum(s.state.name in ("CONNECTING", "OPEN") for s in sockets) >= MAX_CLIENTS:
+                    return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "Too many pages show this view.\n")
+                sockets.add(connection)
+            return process_request(connection, request)
+
+        return serve_any(*arguments, process_request=answer, **options)
+
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # a message that is none is no news
+    websockets.serve = serve  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        websockets.serve = serve_any  # type: ignore[misc]
 
 
 class LiveView:
@@ -131,9 +217,7 @@ class LiveView:
     Raises
     ------
     InputError
-        The result has no cameras, or viser isn't installed.
-    MifitError
-        The port is taken.
+        The result has no cameras, viser isn't installed, or nothing can listen at the address.
     """
 
     def __init__(self, result: Result, host: str = "127.0.0.1", port: int = 8080) -> None:
@@ -141,6 +225,7 @@ class LiveView:
             import viser
         except ImportError:
             raise InputError('the live view needs viser; install it with: pip install "mifit[view]"') from None
+        check_address(host, port)
         self._start = orbit_camera(result, result.timesteps[0], 0.0)
         self._up = vertical(result)
         face = result.geometry.vertices[0][np.unique(result.model.faces[result.model.face_mask])]
@@ -154,11 +239,8 @@ class LiveView:
         self._coarse: set[int] = set()  # clients whose last picture was a small one
         self._woken = threading.Event()
         self._folder = tempfile.TemporaryDirectory(prefix="mifit-view-")
-        try:
-            with contextlib.redirect_stdout(io.StringIO()):  # it prints a table of its own
-                self._server = viser.ViserServer(host=host, port=port, label="mifit", verbose=False)
-        except OSError as error:
-            raise MifitError(f"port {port}: taken or forbidden ({error.strerror}); choose another by --port") from None
+        with contextlib.redirect_stdout(io.StringIO()), _guarded(host):  # it prints a table of its own
+            self._server = viser.ViserServer(host=host, port=port, label="mifit", verbose=False)
         self._server.scene.set_up_direction(self._up)
         self._server.scene.world_axes.visible = False
         self._server.gui.configure_theme(control_width="small", show_logo=False, show_share_button=False)
@@ -240,7 +322,7 @@ class LiveView:
     def _light_controls(self) -> None:
         gui = self._server.gui
         turn = gui.add_slider("Turn light", -180.0, 180.0, 5.0, 0.0)
-        turn.on_update(lambda _: self._show(turn=float(turn.value)))
+        turn.on_update(lambda _: self._show(turn=float(np.clip(np.nan_to_num(turn.value), -180.0, 180.0))))
         load = gui.add_upload_button("Load environment (.hdr, .exr)")
         load.on_upload(lambda _: self._upload(load.value.name, load.value.content))
         gui.add_button("Recovered light").on_click(lambda _: self._show(environment=None))
@@ -255,9 +337,15 @@ class LiveView:
         self._woken.set()
 
     def _upload(self, name: str, content: bytes) -> None:
+        if Path(name).suffix.lower() not in (".hdr", ".exr") or len(content) > MAX_UPLOAD_BYTES:
+            self.say(f"**expected a file .hdr or .exr of at most {MAX_UPLOAD_BYTES >> 20} MiB**")
+            return
         path = Path(self._folder.name) / f"{time.monotonic_ns()}{Path(name).suffix.lower()}"
         path.write_bytes(content)
+        before = self._shown.environment
         self._show(environment=path)
+        if before is not None:
+            before.unlink(missing_ok=True)
 
     def _connected(self, client: Any) -> None:
         self._place(client)
@@ -276,15 +364,21 @@ class LiveView:
         camera.fov = 2 * np.arctan(0.5 * self._start.height / self._start.fy)
 
     def _send(self, client: Any, rows: int) -> None:
-        seen = client.camera
-        camera = browser_camera(seen.wxyz, seen.position, seen.fov, seen.aspect, rows)
+        try:
+            seen = client.camera
+            camera = browser_camera(seen.wxyz, seen.position, seen.fov, seen.aspect, rows)
+        except (InputError, ArithmeticError, TypeError, ValueError, AssertionError):  # what a browser sends is anything
+            return
         try:
             image = self._picture.render(self._shown, camera)
         except InputError as error:
-            self._message.content = f"**{error}**"
-            self._show(environment=None)
+            self.say(f"**{error}**")
+            if self._shown.environment is not None:
+                self._show(environment=None)
             return
-        client.scene.set_background_image(image, format="jpeg", jpeg_quality=90)
+        with warnings.catch_warnings():  # the page may have gone meanwhile
+            warnings.simplefilter("ignore", UserWarning)
+            client.scene.set_background_image(image, format="jpeg", jpeg_quality=90)
 
 
 class FitView:
@@ -303,28 +397,34 @@ class FitView:
     """
 
     def __init__(self, progress: Progress, opened: Callable[[str], None], host: str, port: int) -> None:
+        check_address(host, port)
         self.live: LiveView | None = None
         self._progress, self._opened, self._where = progress, opened, (host, port)
         self._thread = threading.get_ident()
-        self._polled = 0.0
+        self._next = 0.0
 
     def progress(self, label: str, done: int, total: int) -> None:
-        """As `mifit.progress.Progress`; renders what browsers wait for, ten times a second at most."""
+        """As `mifit.progress.Progress`; renders what browsers wait for, ten times a second and for `SHARE` at most."""
         self._progress(label, done, total)
         now = time.monotonic()
-        if self.live is None or threading.get_ident() != self._thread or now - self._polled < 0.1:
+        if self.live is None or threading.get_ident() != self._thread or now < self._next:
             return
         self.live.say(f"{label}: {done} of {total}")
         self.live.poll()
-        self._polled = time.monotonic()
+        after = time.monotonic()
+        self._next = after + max(0.1, (after - now) * (1.0 / SHARE - 1.0))
 
     def watch(self, result: Result) -> None:
         """Show the result so far."""
-        if self.live is None:
-            self.live = LiveView(result, *self._where)
-            self._opened(self.live.address)
-        else:
+        if self.live is not None:
             self.live.replace(result)
+        else:
+            try:
+                self.live = LiveView(result, *self._where)
+            except InputError as error:  # the address was free when the fit began
+                print(f"mifit: warning: no view: {error}", file=sys.stderr)
+                return
+            self._opened(self.live.address)
         self.live.poll()
 
 
