@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
-from mifit.errors import InputError
 from mifit.morphable import MorphableModel
-from mifit.result import METHODS, Method, Result
+from mifit.result import Method, Result
 
 if TYPE_CHECKING:
     from mifit.output.relight import Exposure, Lighting
@@ -94,17 +93,9 @@ class Reconstruction(Result):
         InputError
             Timestep not fitted, unknown method or integrator, or a method whose stage did not run.
         """
-        self.index(timestep)
-        self._check(method)
-        if integrator == "local":
-            from mifit.output.deferred import render_local
+        from mifit.output.scene import render_view
 
-            return render_local(self, camera, timestep, method, samples or 2)
-        if integrator == "path":
-            from mifit.output.scene import render_path
-
-            return render_path(self, camera, timestep, method, samples or 64, seed)
-        raise InputError(f"integrator: found {integrator!r}, expected 'local' or 'path'")
+        return render_view(self, camera, timestep, method, integrator, samples, seed)
 
     def scene(
         self,
@@ -153,8 +144,6 @@ class Reconstruction(Result):
         from mifit.output.scene import load_result_scene
 
         timestep = self.timesteps[0] if timestep is None else timestep
-        self.index(timestep)
-        self._check(method)
         return load_result_scene(
             self, timestep, integrator, self.cameras if cameras is None else cameras, method, samples, skin
         )
@@ -231,13 +220,3 @@ class Reconstruction(Result):
 
         lit = relit(self, lighting, [rotate] if rotations is None else rotations, exposure)
         return lit[0] if rotations is None else lit
-
-    def _check(self, method: Method) -> None:
-        """InputError for a method that there isn't, or that this result can't show."""
-        if method not in METHODS:
-            raise InputError(f"method: found {method!r}, expected one of {', '.join(METHODS)}")
-        if method not in self.methods:
-            raise InputError(
-                f"method {method!r} needs reflectance, but this fit ended after the geometry stage; "
-                "use 'pca', or fit with --until reflectance"
-            )

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -335,7 +335,8 @@ def track_into(
     going on later gives what an uninterrupted run gives. Meshes and normals of a long sequence lie in a file that is
     mapped (`core.arrays`), so that memory doesn't grow with the frames.
     """
-    if result.reflectance is None:
+    reflectance = result.reflectance
+    if reflectance is None:
         raise InputError(f"{folder}: found a result without reflectance, expected one of 'mifit fit' with all stages")
     tracked, fitted = result.tracked, result.fitted
     names = [camera.name for camera in result.cameras]
@@ -351,7 +352,7 @@ def track_into(
             result.seen(capture),
             result.model,
             result.geometry,
-            result.reflectance,
+            reflectance,
             result.normals,
             names,
             timesteps,
@@ -407,12 +408,12 @@ def _not_yet(result: Result, timesteps: Sequence[int], digests: Mapping[int, str
 
 @dataclass(frozen=True)
 class _Room:
-    """Where the large arrays of further timesteps are written; None for those of a mesh that a result lacks."""
+    """Where the large arrays of further timesteps are written; None for those that have no place of their own."""
 
-    vertices: Rows
-    normals: Rows
-    refined: Rows | None
-    displacement: Rows | None
+    vertices: Rows | None = None
+    normals: Rows | None = None
+    refined: Rows | None = None
+    displacement: Rows | None = None
 
 
 def _with_room(result: R, count: int) -> tuple[R, _Room]:
@@ -446,6 +447,8 @@ def extend(
     With a refiner its refined mesh is made too. With ``room``, in which the result's arrays lie, they aren't copied.
     """
 
+    room = room or _Room()
+
     def longer(array: NDArray, row: NDArray, rows: Rows | None) -> NDArray:
         return np.concatenate([array, row[None]]) if rows is None else rows.add(row)
 
@@ -453,11 +456,10 @@ def extend(
     geometry = replace(
         a,
         timesteps=(*a.timesteps, frame.timestep),
-        vertices=longer(a.vertices, b.vertices[0], room and room.vertices),
-        **{
-            name: np.concatenate([getattr(a, name), getattr(b, name)])
-            for name in ("expression", "rotation", "translation")
-        },
+        vertices=longer(a.vertices, b.vertices[0], room.vertices),
+        expression=np.concatenate([a.expression, b.expression]),
+        rotation=np.concatenate([a.rotation, b.rotation]),
+        translation=np.concatenate([a.translation, b.translation]),
     )
     before = result.normals or NormalsEstimate((), frame.normal_object[None][:0], Report("converged"))
     report = replace(
@@ -467,7 +469,7 @@ def extend(
     )
     normals = NormalsEstimate(
         (*before.timesteps, frame.timestep),
-        longer(before.normal_object, frame.normal_object, room and room.normals),
+        longer(before.normal_object, frame.normal_object, room.normals),
         report,
         {**before.tracked, frame.timestep: digest},
     )
@@ -477,8 +479,8 @@ def extend(
         mesh = replace(
             mesh,
             timesteps=(*mesh.timesteps, frame.timestep),
-            vertices=longer(mesh.vertices, vertices, room and room.refined),
-            displacement=longer(mesh.displacement, height, room and room.displacement),
+            vertices=longer(mesh.vertices, vertices, room.refined),
+            displacement=longer(mesh.displacement, height, room.displacement),
         )
     return replace(result, geometry=geometry, normals=normals, mesh=mesh)
 
@@ -503,14 +505,13 @@ def _without(result: R, dropped: Sequence[int]) -> R:
             vertices=kept(mesh.vertices, mesh.timesteps),
             displacement=kept(mesh.displacement, mesh.timesteps),
         )
-    parts = ("expression", "rotation", "translation", "vertices")
+    parts: dict[str, Any] = {
+        name: kept(getattr(geometry, name), geometry.timesteps)
+        for name in ("expression", "rotation", "translation", "vertices")
+    }
     return replace(
         result,
-        geometry=replace(
-            geometry,
-            timesteps=left(geometry.timesteps),
-            **{name: kept(getattr(geometry, name), geometry.timesteps) for name in parts},
-        ),
+        geometry=replace(geometry, timesteps=left(geometry.timesteps), **parts),
         normals=NormalsEstimate(
             left(normals.timesteps),
             kept(normals.normal_object, normals.timesteps),

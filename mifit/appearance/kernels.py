@@ -106,8 +106,8 @@ def prepare(lobe: Lobe, order: int) -> PreparedLobe:
     polynomials = [[dr.opaque(mi.Float, float(a)) for a in row] for row in values]
     ratio = normalization_of(exponent, lobe.normalized) / normalization_of(exponent)
     peak = float(normalization_of(exponent, lobe.normalized))
-    own = (dr.opaque(mi.Float, float(value)) for value in (ratio, exponent, peak))
-    return PreparedLobe(order, polynomials, *own, lobe.fresnel)
+    scale, width, top = (dr.opaque(mi.Float, float(value)) for value in (ratio, exponent, peak))
+    return PreparedLobe(order, polynomials, scale, width, top, lobe.fresnel)
 
 
 def prepare_exponent(exponent: Any, order: int, normalized: bool = True, fresnel: Any = None) -> PreparedLobe:

@@ -287,7 +287,7 @@ def _trace(
     n = on_device(mi.Vector3f, np.asarray(normals, dtype=np.float32))
     origin = on_device(mi.Vector3f, np.asarray(points + offset * normals, dtype=np.float32))
     frame = mi.Frame3f(n)
-    shift = mi.PCG32(size=count, initstate=seed)
+    shift = mi.PCG32(size=count, initstate=seed)  # type: ignore[operator]
     shift_u, shift_v = shift.next_float32(), shift.next_float32()
     point = dr.arange(mi.UInt, count)
 

@@ -101,7 +101,7 @@ def read_camera(path: Path, name: str, width: int, height: int) -> Camera:
         raise InputError(f"{path}: found no {'LookAt' if look is None else 'float fov'}, expected a pbrt v3 scene")
     eye, target, up = np.array(list(map(float, look.groups()))).reshape(3, 3)
     focal = 0.5 * min(width, height) / math.tan(math.radians(0.5 * float(field[1])))
-    pose = np.linalg.inv(_camera_to_world(eye, target, up) @ OPENGL_FROM_OPENCV)
+    pose = np.asarray(np.linalg.inv(_camera_to_world(eye, target, up) @ OPENGL_FROM_OPENCV), dtype=np.float64)
     return Camera(name, width, height, focal, focal, width / 2, height / 2, pose)
 
 

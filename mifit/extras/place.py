@@ -84,7 +84,8 @@ def place_camera(
             f"camera {name!r}: found fewer than {MIN_VISIBLE} landmarks that the others see too, expected enough to "
             "place it; run mifit landmarks, or leave the camera uncalibrated with --cameras"
         )
-    return resect_camera(capture.views[name], *map(np.concatenate, (points, pixels, weights)), focal, same)
+    marks_of = np.concatenate(points), np.concatenate(pixels), np.concatenate(weights)
+    return resect_camera(capture.views[name], *marks_of, focal, same)
 
 
 def calibrate_others(

@@ -165,9 +165,9 @@ def separation(
 
     def likeness(found: NDArray, true: NDArray) -> tuple[float, float]:
         a, b = found[region] @ weights, true[region] @ weights
-        factor = (a @ b) / max(a @ a, 1e-12)
+        factor = float(a @ b) / max(float(a @ a), 1e-12)
         flat = np.ptp(a) == 0 or np.ptp(b) == 0
-        error = np.sqrt(((factor * a - b) ** 2).mean() / max((b**2).mean(), 1e-20))
+        error = np.sqrt(((factor * a - b) ** 2).mean() / max(float((b**2).mean()), 1e-20))
         return 0.0 if flat else float(np.corrcoef(a, b)[0, 1]), float(error)
 
     def share(part: NDArray, rest: NDArray) -> float:

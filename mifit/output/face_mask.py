@@ -85,7 +85,9 @@ def face_mask(
     capture = reconstruction.seen(capture)
     view, frame = capture.camera(camera), capture.frame(camera, timestep)
     if render is None:
-        render = reconstruction.render(view, timestep, reconstruction.methods[-1])
+        from mifit.output.scene import render_view
+
+        render = render_view(reconstruction, view, timestep, reconstruction.methods[-1])
     model, i = reconstruction.model, reconstruction.index(timestep)
     area = face_area(reconstruction.geometry.vertices[i], model.faces, model.face_mask, view)
     area &= frame.valid & (render[..., 3] > 0.999)

@@ -20,6 +20,7 @@ from mifit.core.sh import LUMINANCE, SHLighting
 from mifit.errors import InputError
 from mifit.output.deferred import SampledMaterial, VisibleSurface, shade_methods, surface_material, visible_surface
 from mifit.output.evaluate import face_area
+from mifit.output.scene import render_view
 from mifit.output.views import check_moving, sheet, write_moving
 from mifit.progress import Progress, silent
 from mifit.result.record import R
@@ -57,8 +58,11 @@ def relit(
             raise InputError("exposure: found 'auto', expected a number: this lighting has a level of its own")
         lit, middle = lighting.scaled(exposure), reconstruction.geometry.middle
         return [reconstruction.with_illumination(lit.rotated(turn, middle)) for turn in turns]
-    image = None if isinstance(lighting, SHLighting) else _environment(lighting)
-    smooth = SHLighting.from_envmap(image, reconstruction.lighting.order) if image is not None else lighting
+    if isinstance(lighting, SHLighting):
+        image, smooth = None, lighting
+    else:
+        image = _environment(lighting)
+        smooth = SHLighting.from_envmap(image, reconstruction.lighting.order)
     level = _level(reconstruction.lighting) / _level(smooth)
     factor = level if exposure == "auto" else float(exposure)
     # The ambient term stands for light that the model leaves out, such as interreflection: it grows with the light.
@@ -92,7 +96,7 @@ def _environment(source: str | Path | NDArray) -> NDArray[np.float32]:
         raise InputError(f"{name}: found negative or only black pixels, expected linear radiance")
     if image.shape[0] > MAP_ROWS:
         width = round(image.shape[1] * MAP_ROWS / image.shape[0])
-        image = cv2.resize(image, (width, MAP_ROWS), interpolation=cv2.INTER_AREA)
+        image = np.asarray(cv2.resize(image, (width, MAP_ROWS), interpolation=cv2.INTER_AREA), np.float32)
     return image
 
 
@@ -184,7 +188,7 @@ def write_relit(
                 surface, material = shared[c]
                 image = shade_methods(lits[k], surface, timestep, ("full",), material)["full"]
             else:
-                image = lits[k].render(camera, timestep, integrator=integrator, samples=samples, seed=seed)
+                image = render_view(lits[k], camera, timestep, integrator=integrator, samples=samples, seed=seed)
             images.append(image)
             if video is None:
                 number = f"_{k:03d}" if len(lits) > 1 else ""
@@ -218,8 +222,8 @@ def write_relit(
 
 def _check(lit: Result, camera: Camera, timestep: int, samples: int, seed: int) -> dict[str, float]:
     """Error of a fast view against the path-traced one, over the pixels that the head covers."""
-    fast = lit.render(camera, timestep)
-    path = lit.render(camera, timestep, integrator="path", samples=samples, seed=seed)
+    fast = render_view(lit, camera, timestep)
+    path = render_view(lit, camera, timestep, integrator="path", samples=samples, seed=seed)
     covered = (fast[..., 3] == 1) & (path[..., 3] > 0.99)
     a, b = to_8_bit(fast[..., :3])[covered][None], to_8_bit(path[..., :3])[covered][None]
     return {"psnr": psnr(a, b), "rmse": rmse(a, b)}
@@ -280,9 +284,9 @@ def evaluate_relit(
             frame = capture.frame(name, t)
             vertices = lit.geometry.vertices[lit.index(t)]
             area = face_area(vertices, lit.model.faces, lit.model.face_mask, view) & frame.valid
-            render = lit.render(view, t, method, integrator, samples if integrator == "path" else None, seed)
+            shown = render_view(lit, view, t, method, integrator, samples if integrator == "path" else None, seed)
             photographs.append(frame.image[area])
-            renders.append(render[area][:, :3])
+            renders.append(shown[area][:, :3])
         return np.concatenate(photographs), np.concatenate(renders)
 
     methods = {}

@@ -33,6 +33,7 @@ from mifit.output.figures import (
     tint,
 )
 from mifit.output.map_figures import figure, picture_maps
+from mifit.output.scene import render_view
 from mifit.output.viewer import viewer_data
 
 if TYPE_CHECKING:
@@ -229,7 +230,7 @@ def _inputs(result: Result, capture: Capture, timesteps: tuple[int, ...]) -> str
         for camera in (c.name for c in result.cameras):
             view, frame = capture.camera(camera), capture.frame(camera, timestep)
             photograph = to_8_bit(frame.image)
-            linear = result.render(view, timestep, result.methods[-1], samples=1)
+            linear = render_view(result, view, timestep, result.methods[-1], samples=1)
             render = rgba_8_bit(linear)
             box = bounding_box(render[..., 3] > 0)
             marked = draw_landmarks(photograph, view, frame.landmarks, frame.visible, points)

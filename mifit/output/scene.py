@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,12 @@ from mifit.core.image import write_image
 from mifit.core.mesh import SplitMesh, interpolate, normalize, part_of, split_at_seams, vertex_normals
 from mifit.core.sh import SHLighting
 from mifit.core.uv import rasterize_uv
-from mifit.output.deferred import visible_surface
+from mifit.errors import InputError
+from mifit.output.deferred import render_local, visible_surface
 from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials
 from mifit.render.description import Parameter, to_mitsuba, to_xml
 from mifit.render.sensor import sensor_description
+from mifit.result import METHODS
 
 if TYPE_CHECKING:
     from mifit.result import Method, Result
@@ -89,6 +91,36 @@ def write_scene(
     _write_files(reconstruction, files, timestep, method)
     for name, scene, needs in scenes:
         write_text(name, to_xml(scene, f"Written by mifit. {needs}"))
+
+
+def render_view(
+    result: Result,
+    camera: Camera,
+    timestep: int = 0,
+    method: Method = "full",
+    integrator: Literal["local", "path"] = "local",
+    samples: int | None = None,
+    seed: int = 0,
+) -> NDArray[np.float32]:
+    """(H, W, 4) one view of a result; see `Reconstruction.render`."""
+    check_shown(result, timestep, method)
+    if integrator == "local":
+        return render_local(result, camera, timestep, method, samples or 2)
+    if integrator == "path":
+        return render_path(result, camera, timestep, method, samples or 64, seed)
+    raise InputError(f"integrator: found {integrator!r}, expected 'local' or 'path'")
+
+
+def check_shown(result: Result, timestep: int, method: Method) -> None:
+    """InputError for a timestep or a method that a result can't show."""
+    result.index(timestep)
+    if method not in METHODS:
+        raise InputError(f"method: found {method!r}, expected one of {', '.join(METHODS)}")
+    if method not in result.methods:
+        raise InputError(
+            f"method {method!r} needs reflectance, but this fit ended after the geometry stage; "
+            "use 'pca', or fit with --until reflectance"
+        )
 
 
 def render_path(
@@ -198,6 +230,7 @@ def load_result_scene(
     """A loaded ``mi.Scene`` of one timestep; see `Reconstruction.scene`."""
     from mifit.render.scene import load_scene
 
+    check_shown(reconstruction, timestep, method)
     chosen = {"type": integrator} if isinstance(integrator, str) else dict(integrator)
     if chosen.get("type") == "shdirect":
         # What it shades is the smooth light, whatever an environment has beside it.

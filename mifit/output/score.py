@@ -246,8 +246,8 @@ def _passes(paths: dict[str, Path], camera: str, capture: Capture) -> dict[str, 
         raise InputError(f"{paths['diffuse']}: the capture's truth has no passes of camera {camera!r}")
     view, marks = capture.camera(camera), landmarks_of(capture, camera, capture.timesteps[0])
     region = pass_region(marks, view)
-    images = (_read(paths[kind], region.shape) for kind in ("diffuse", "specular"))
-    return separation(*images, truth.diffuse, truth.specular, region)
+    diffuse, specular = (_read(paths[kind], region.shape) for kind in ("diffuse", "specular"))
+    return separation(diffuse, specular, truth.diffuse, truth.specular, region)
 
 
 def _meshes(files: dict[int, Path], truth: _Truths) -> dict[str, float]:

@@ -115,14 +115,14 @@ def true_mesh(capture: Capture, timestep: int, model: MorphableModel | None = No
             f"{path}: found {len(vertices)} vertices, but {given}, so the faces are unknown; expected {stored} with "
             "the truth's faces, or the model that the capture was made with"
         )
-    return TrueMesh(vertices.astype(np.float64), model.faces[own], model.face_mask[own])
+    return TrueMesh(vertices.astype(np.float64), model.faces[own].astype(np.int64), model.face_mask[own])
 
 
 def read_mesh(path: Path) -> TrueMesh:
     """Vertices and triangles of any PLY or OBJ file; InputError where it has none."""
     data = read_bytes(path, MAX_MODEL_BYTES, "mesh")
     try:
-        mesh = trimesh.load(io.BytesIO(data), file_type=path.suffix[1:].lower(), process=False, force="mesh")
+        mesh = trimesh.load_mesh(io.BytesIO(data), file_type=path.suffix[1:].lower(), process=False)
         vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     except Exception as error:  # whatever a damaged file makes the readers raise
         raise InputError(f"{path}: not a readable mesh ({error}), expected PLY or OBJ with triangles") from None

@@ -20,6 +20,7 @@ from mifit.output.deferred import shade_methods, visible_surface
 from mifit.output.evaluate import rgba_8_bit
 from mifit.output.figures import overlay
 from mifit.output.gltf import write_glb
+from mifit.output.scene import render_view
 from mifit.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -194,9 +195,8 @@ def write_overlay(
         for k, timestep in enumerate(steps):
             progress(f"overlay {camera}", k, len(steps))
             photograph = to_8_bit(capture.frame(camera, timestep).image)
-            linear = reconstruction.render(view, timestep, reconstruction.methods[-1], samples=1)
-            render = rgba_8_bit(linear)
-            yield np.concatenate([photograph, overlay(photograph, render)], axis=1)
+            linear = render_view(reconstruction, view, timestep, reconstruction.methods[-1], samples=1)
+            yield np.concatenate([photograph, overlay(photograph, rgba_8_bit(linear))], axis=1)
         progress(f"overlay {camera}", len(steps), len(steps))
 
     write_video(path, frames(), fps)

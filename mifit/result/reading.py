@@ -132,7 +132,8 @@ def _camera(entry: dict[str, Any]) -> Camera:
         raise ValueError(f"camera: found size {size.tolist()}, focal lengths {focal.tolist()}, expected positive ones")
     centre = _array([entry["cx"], entry["cy"]], (2,), "camera")
     pose = _array(entry["world_to_camera"], (4, 4), "world_to_camera")
-    return Camera(str(entry["name"]), int(size[0]), int(size[1]), *focal.tolist(), *centre.tolist(), pose)
+    (fx, fy), (cx, cy) = focal.tolist(), centre.tolist()
+    return Camera(str(entry["name"]), int(size[0]), int(size[1]), fx, fy, cx, cy, pose)
 
 
 def _report(document: dict[str, Any], stage: str) -> Report:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -152,7 +152,8 @@ class Result:
                 f"expected {before.shape} with reflectances 0 to 1"
             )
         lit_eyes = None if name == "diffuse" else self.reflectance.lit_eyes
-        edited = replace(self.reflectance, **{name: array}, lit_eyes=lit_eyes)
+        changes: dict[str, Any] = {name: array, "lit_eyes": lit_eyes}
+        edited = replace(self.reflectance, **changes)
         return replace(self, reflectance=edited, residual=None)
 
     def with_illumination(self: R, illumination: Illumination) -> R:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +90,7 @@ class Observations:
     @classmethod
     def join(cls, parts: Sequence[Observations]) -> Observations:
         """The observations of several sets of texels by the same images."""
-        shared = {"step": parts[0].step, "camera": parts[0].camera}
+        shared: dict[str, Any] = {"step": parts[0].step, "camera": parts[0].camera}
         names = [f.name for f in fields(cls) if f.name not in shared]
         return cls(**shared, **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 

@@ -58,7 +58,9 @@ def outline_distance(depth: NDArray[np.float32], step: float) -> NDArray[np.floa
     jump = np.maximum(*(np.abs(cv2.filter2D(far, -1, k)) for k in (second, second.T))) > step
     inside = (hit & ~jump).astype(np.uint8)
     # A camera that sees nothing but surface has no outline.
-    return cv2.distanceTransform(inside, cv2.DIST_L2, 5) if not inside.all() else np.full(depth.shape, 1e6, np.float32)
+    if inside.all():
+        return np.full(depth.shape, 1e6, dtype=np.float32)
+    return np.asarray(cv2.distanceTransform(inside, cv2.DIST_L2, 5), dtype=np.float32)
 
 
 def background(image: NDArray, hit: NDArray[np.bool_], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:

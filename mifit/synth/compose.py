@@ -148,9 +148,13 @@ def synthesize(
             light,
             lamp,
             spp,
-            lambda done, start=start: progress("Rendering", start + done, total),
+            _shifted(progress, start, total),
         )
     return out
+
+
+def _shifted(progress: Progress, start: int, total: int) -> Callable[[int], None]:
+    return lambda done: progress("Rendering", start + done, total)
 
 
 def read_environment(path: str | Path) -> NDArray[np.float32]:

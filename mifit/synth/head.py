@@ -77,7 +77,7 @@ def draw_motion(
     phase, speed = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.5, 1.1, 6)
     swing = np.array([9.0, 5.0, 3.0, 0.8, 0.5, 0.5])  # degrees of yaw, pitch, roll; centimetres
     bounds = np.asarray(model.expression_bounds, dtype=np.float64)
-    free = np.isinf(bounds).any(axis=1)
+    free = np.isinf(bounds).max(axis=1)
     active = rng.permutation(model.n_expression)[:6]
     strength = np.where(free[active], rng.uniform(-0.9, 0.9, len(active)), rng.uniform(0.15, 0.55, len(active)))
     poses = []
@@ -111,7 +111,7 @@ def _sequence(
         wave = 0.5 - 0.5 * np.cos(phase[1, : len(talking)] + 2 * np.pi * np.outer(seconds, rate))
         breath = np.clip(1.5 * np.sin(2 * np.pi * seconds / 1.7 + phase[1, 0]) + 0.9, 0.0, 1.0)  # words and pauses
         bounds = np.asarray(model.expression_bounds, dtype=np.float64)
-        free = np.isinf(bounds).any(axis=1)[talking]
+        free = np.isinf(bounds).max(axis=1)[talking]
         strength = np.where(free, rng.choice([-1.0, 1.0], len(talking)) * 0.9, rng.uniform(0.2, 0.5, len(talking)))
         expression[:, talking] = strength * wave * breath[:, None]
         expression = np.clip(expression, bounds[:, 0], bounds[:, 1])
@@ -165,7 +165,7 @@ def split_eyeball(model: MorphableModel, chosen: NDArray[np.bool_]) -> SplitMesh
     centre = np.linalg.lstsq(system, (points**2).sum(axis=1), rcond=None)[0][:3]
     x, y, z = (points - centre).T
     uv = np.stack([np.arctan2(y, x) / (2 * np.pi) % 1.0, 1 - np.arctan2(np.hypot(x, y), z) / np.pi], axis=1)
-    return SplitMesh(source, uv.astype(np.float32), faces.reshape(-1, 3).astype(np.int32))
+    return SplitMesh(source.astype(np.int64), uv.astype(np.float32), faces.reshape(-1, 3).astype(np.int32))
 
 
 def eye_openings(vertices: NDArray, faces: NDArray, landmarks: NDArray) -> list[NDArray[np.int64]]:

@@ -10,6 +10,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -82,7 +83,7 @@ class ScannedHead:
             No mesh, no texture coordinates, an unknown or unreadable map.
         """
         try:
-            mesh = trimesh.load(path, process=False, force="mesh")
+            mesh = trimesh.load_mesh(path, process=False)
         except Exception as error:  # trimesh raises whatever its readers do
             raise InputError(f"{path}: not a readable mesh ({error})") from None
         uv = getattr(mesh.visual, "uv", None)
@@ -109,7 +110,7 @@ class ScannedHead:
         vertices -= (middle, nose[1], nose[2] - NOSE_DEPTH)
         uv = np.asarray(uv, np.float32)
         if flip_v:
-            uv = uv * np.float32((1, -1)) + np.float32((0, 1))
+            uv = uv * np.array((1, -1), np.float32) + np.array((0, 1), np.float32)
         return cls(vertices, np.asarray(mesh.faces), uv, _read_maps(maps))
 
     def posed(self, pose: tuple[NDArray, NDArray]) -> NDArray[np.float64]:
@@ -139,7 +140,8 @@ def _read_maps(files: Mapping[str, str | Path]) -> dict[str, NDArray[np.float32]
         maps[name] = _resized(image, size)
     size = len(maps["albedo"])
     maps = {
-        k: cv2.resize(v, (size, size), interpolation=cv2.INTER_AREA) if len(v) != size else v for k, v in maps.items()
+        k: np.asarray(cv2.resize(v, (size, size), interpolation=cv2.INTER_AREA), np.float32) if len(v) != size else v
+        for k, v in maps.items()
     }
     gloss = maps.get("specular", np.full((size, size), 0.4, np.float32))
     if "roughness" not in maps:
@@ -249,7 +251,8 @@ def synthesize_scan(
         write_ply(out / "truth" / f"{t:04d}.ply", placed.vertices, head.faces, placed.normals, head.uv, grey)
         progress("Rendering", t + 1, total)
     with replacing(out / "truth" / "maps.npz") as temporary:
-        np.savez_compressed(temporary, **{name: value.astype(np.float16) for name, value in maps.items()})
+        halves: dict[str, Any] = {name: value.astype(np.float16) for name, value in maps.items()}
+        np.savez_compressed(temporary, **halves)
     for i, (name, light) in enumerate(relit.items()):
         light = _reduced(light)
         image = PathTracer({"head": material}, light).render([surface(poses[0])], cameras[-1:], spp, seed=seed + i)[0]

@@ -48,7 +48,7 @@ class SmoothImage:
         h, w = self.valid.shape
         dtype = self.values.dtype
         position = np.asarray(pixels, dtype=np.float64) - 0.5
-        finite = np.isfinite(position).all(1)
+        finite = np.asarray(np.isfinite(position).all(1))
         position = np.clip(np.where(finite[:, None], position, -10.0), -10.0, max(h, w) + 10.0)
         corner = np.floor(position).astype(np.int64)
         f = position - corner

@@ -103,7 +103,7 @@ class Visibility:
             self._measured[at] = frame.valid & ~frame.clipped & (frame.image.max(axis=2) > DARKEST)
         on = (self._buffers[at].face >= 0).astype(np.uint8)
         if border:
-            on = cv2.erode(on, np.ones((2 * border + 1,) * 2, np.uint8), borderValue=0)
+            on = np.asarray(cv2.erode(on, np.ones((2 * border + 1,) * 2, np.uint8), borderValue=0), np.uint8)
         return (on > 0) & self._measured[at]
 
     def _level(self, step: int, camera: Camera, sigma: float) -> SmoothImage:

@@ -77,8 +77,9 @@ def feature_image(camera: Camera, image: NDArray, valid: NDArray[np.bool_], fact
     weight = valid.astype(np.float32)
     luminance = np.where(valid, image @ np.array([0.3, 0.5, 0.2], np.float32), np.float32(0))
     if factor < 1.0:
-        weight = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
-        luminance = cv2.resize(luminance, size, interpolation=cv2.INTER_AREA) / np.maximum(weight, 1e-3)
+        weight = np.asarray(cv2.resize(weight, size, interpolation=cv2.INTER_AREA), np.float32)
+        sharp = np.asarray(cv2.resize(luminance, size, interpolation=cv2.INTER_AREA), np.float32)
+        luminance = sharp / np.maximum(weight, 1e-3)
     usable = (weight > 0.9).astype(np.float32)
     # Blurs reach four deviations far; nothing is read where nothing is usable.
     part = box(usable > 0, int(np.ceil(4.0 * WINDOW)) + 1)
@@ -104,4 +105,5 @@ def look_up(values: NDArray, pixels: NDArray, columns: int = 4096) -> NDArray[np
 
 def _remapped(values: NDArray, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
     """The same at (rows, columns, 2) positions, of not more columns than OpenCV takes."""
-    return cv2.remap(values, pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": 0}
+    return cv2.remap(values, pixels, None, cv2.INTER_LINEAR, **border)  # type: ignore[call-overload]
