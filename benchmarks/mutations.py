@@ -139,8 +139,8 @@ MUTATIONS = (
     M("lighting turned the wrong way", "sh.SHLighting.rotate", "rotation_matrix(rotation, self.order)",
       "rotation_matrix(np.transpose(rotation), self.order)", "tests/core/test_sh.py"),
     # Observations.
-    M("observations weigh alike, whatever other cameras see", "observations.Surface._observe",
-      "weight *= np.minimum(right, 1.0 - wrong)", "pass", "tests/stages/test_observations.py"),
+    M("a twin of a view adds to what it is believed", "observations.Surface._observe",
+      "weight *= np.minimum(right, 1.0 - wrong)", "weight *= right", "tests/stages/test_observations.py"),
     M("texels seen at a slant are of as good a quality", "observations.Surface.quality", "np.clip(cosine, 0.0, 1.0)",
       "1.0", "tests/stages/test_observations.py"),
     M("distances to the outline in pixels, not in millimetres", "surface_image.Placed.read",

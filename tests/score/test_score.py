@@ -82,6 +82,8 @@ def test_the_truth_itself_scores_best_in_everything(folder, tmp_path, capsys):
     shutil.copy(folder / "truth" / "0000.ply", images / "0000.ply")
     write_image(images / "relit_blue.exr", 7.0 * relit_truths(capture)["blue"].image)  # in any exposure
     passes = true_passes(capture, "third")
+    photograph = capture.frame("third", 0).image
+    np.testing.assert_allclose(passes.diffuse + passes.specular, photograph, atol=1e-3)  # in its exposure
     for name in ("diffuse", "specular"):
         write_image(images / f"{name}_third.exr", getattr(passes, name))
     (images / "notes.txt").write_text("not scored")
