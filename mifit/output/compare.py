@@ -171,7 +171,7 @@ def separation(
         return 0.0 if flat else float(np.corrcoef(a, b)[0, 1]), float(error)
 
     def share(part: NDArray, rest: NDArray) -> float:
-        both = ((part + rest)[region] @ weights).mean()
+        both = float(((part + rest)[region] @ weights).mean())
         return float((part[region] @ weights).mean() / max(both, 1e-12))
 
     specular, true_specular = np.asarray(specular, np.float64), np.asarray(true_specular, np.float64)

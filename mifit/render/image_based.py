@@ -106,9 +106,7 @@ def image_based(
 
     scene = scene or SurfaceScene(vertices, faces)
     k = oversampling
-    size = {"width": camera.width * k, "height": camera.height * k}
-    lens = {name: getattr(camera, name) * k for name in ("fx", "fy", "cx", "cy")}
-    buffer = scene.gbuffer(camera if k == 1 else replace(camera, **size, **lens))
+    buffer = scene.gbuffer(camera if k == 1 else _finer(camera, k))
     index = np.flatnonzero(buffer.face.ravel() >= 0)
     face = buffer.face.ravel()[index]
     normal = normalize(face_cross(vertices, faces)[face])
@@ -161,6 +159,13 @@ def image_based(
     shown[count < k * k] = -1
     covered = np.bincount(pixel, seen, minlength=len(count)) == k * k
     return ImageBased(images, shown.reshape(shape), covered.reshape(shape))
+
+
+def _finer(camera: Camera, k: int) -> Camera:
+    """The same view with k times the pixels along each side."""
+    width, height = camera.width * k, camera.height * k
+    fx, fy, cx, cy = (value * k for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
 
 def _weight(blend: Blend, cosine: NDArray, nearness: NDArray) -> NDArray[np.float64]:
