@@ -20,6 +20,7 @@ help:
 demo:
 	@.ci/setup
 	$(BIN)/mifit demo --out $(OUT)
+	@echo "The command is $(BIN)/mifit; two clips of a face: $(BIN)/mifit fit left.mp4 right.mp4 --out me"
 
 test:
 	@.ci/setup test cluster view bench

@@ -292,7 +292,6 @@ class _Memory:
         return unbend(base, tangent_plane(base), wanted)
 
 
-
 def track_into(
     folder: str | Path,
     result: R,

@@ -19,10 +19,20 @@ from mifit.core.files import FULL
 from mifit.core.process import keep_freed_memory
 from mifit.errors import InputError, MifitError
 
+EXAMPLES = """examples:
+  mifit demo                                               a face from a capture made on the spot
+  mifit fit left.mp4 right.mp4 --out me                    a face from two clips of it
+  mifit relight me --env studio.hdr --out relit --turn 36  that face under a turning light"""
+
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands; ``run`` of what it parses is the command."""
-    parser = Parser(prog="mifit", description="Facial reflectance and geometry from two views.")
+    parser = Parser(
+        prog="mifit",
+        description="Facial reflectance and geometry from two views.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("--version", action="version", version=f"mifit {mifit.__version__}")
     commands = parser.add_subparsers(
         dest="command", required=True, metavar="COMMAND", parser_class=Parser, title="commands"
@@ -48,6 +58,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     for word in sys.argv[1:] if argv is None else argv:
         if word.startswith("--") and word.endswith("=--"):  # argparse would make an empty list of it
             parser.error(f"argument {word[:-3]}: found '--', expected a value")
+    if not (sys.argv[1:] if argv is None else argv):
+        parser.print_help()
+        return 0
     arguments = parser.parse_args(argv)
     if argv is None:
         keep_freed_memory()

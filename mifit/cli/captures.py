@@ -294,7 +294,7 @@ def add_commands(add: types.Add) -> None:
     )
     p.add_argument("--names", type=types.listed, help="of a board: names of the cameras; default: those of the files")
     p.add_argument("--units", default="cm", help="unit of length of the calibration: mm, cm or m (default: cm)")
-    p.add_argument("--model", default="builtin", help="of a capture: morphable model, a path or builtin (default)")
+    p.add_argument("--model", default="auto", help="of a capture: a path, builtin or auto (default)")
     p.add_argument("--cameras", type=types.listed, help="of a capture: cameras that decide; default: the first two")
     p.add_argument("--timesteps", type=types.timesteps, help="of a capture: timesteps to use; default: the first four")
     p.add_argument(

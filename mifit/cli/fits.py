@@ -126,6 +126,10 @@ def fit(arguments: Namespace) -> int:
         )
     config = FitConfig.load(arguments.config) if arguments.config else PRESETS[arguments.preset or "default"]()
     model = mifit.MorphableModel.load(arguments.model)
+    better = (
+        "; mifit model fetch ict fetches a better one" if (arguments.model, model.source) == ("auto", "builtin") else ""
+    )
+    say(arguments, f"Model: {model.name}, {model.source}{better}")
     folder = capture_of(arguments)
     capture = mifit.Capture.load(folder)
     use_variant(arguments)
@@ -276,7 +280,12 @@ def add_commands(add: types.Add) -> None:
         "--config", type=types.path, help="TOML file with tables geometry, reflectance, shape, normals, mesh"
     )
     p.add_argument("--preset", choices=["default", "paper"], help="paper: the paper as written")
-    p.add_argument("--model", default="builtin", help="morphable model: a path or builtin (default)")
+    p.add_argument(
+        "--model",
+        default="auto",
+        help="morphable model: a path, builtin, or auto (default): the one that mifit model fetch has fetched, else "
+        "builtin",
+    )
     p.add_argument("--cameras", type=types.listed, help="cameras to use, e.g. left,right; default: the first two")
     p.add_argument(
         "--timesteps",

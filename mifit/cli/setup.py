@@ -7,6 +7,7 @@ from argparse import Namespace
 from typing import Any
 
 from mifit.cli import arguments as types
+from mifit.cli.console import console_progress
 
 
 def doctor(arguments: Namespace) -> int:
@@ -33,12 +34,16 @@ def doctor(arguments: Namespace) -> int:
 
 @types.writes("preview", "out")
 def model(arguments: Namespace) -> None:
-    """Inspect or convert a morphable model."""
+    """Inspect, convert or fetch a morphable model."""
     import mifit
+    from mifit.extras.fetch_model import ADDRESS, fetch_ict
     from mifit.morphable import describe
     from mifit.morphable.openings import with_eyes
 
-    if arguments.action == "info":
+    if arguments.action == "fetch":
+        path = fetch_ict(arguments.address or ADDRESS, console_progress(arguments.quiet))
+        print(f"Model: {path}; --model auto, the default, takes it from now on")
+    elif arguments.action == "info":
         loaded = mifit.MorphableModel.load(arguments.model)
         print(describe.model_info(loaded))
         if arguments.preview:
@@ -57,11 +62,11 @@ def add_commands(add: types.Add) -> None:
     p.add_argument("--json", action="store_true", help="print JSON")
     p.add_argument("--install", choices=["landmarks"], help="fetch the networks that find landmarks, then check")
 
-    p = add("model", model, "inspect and convert morphable models")
+    p = add("model", model, "inspect, convert and fetch morphable models")
     actions = p.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=types.Parser)
     common = types.common_options()
     q = actions.add_parser("info", help="print a table", parents=[common])
-    q.add_argument("model", help="a path or builtin")
+    q.add_argument("model", help="a path, builtin or auto")
     q.add_argument("--preview", type=types.path, help="also write a sheet of the mean and the first modes")
     types.add_force(q)
     q = actions.add_parser("convert", help="write a model in mifit's own format", parents=[common])
@@ -70,3 +75,7 @@ def add_commands(add: types.Add) -> None:
     types.add_force(q)
     q.add_argument("--kind", help="format of SOURCE; default: recognised by content")
     q.add_argument("--eyes", action="store_true", help="put simple eyes and a mouth's inside where the model has holes")
+    q = actions.add_parser("fetch", help="fetch a public model, once, for --model auto", parents=[common])
+    q.add_argument("name", choices=["ict"], help="ict: ICT-FaceKit Light (MIT licence), 400 MB to fetch, 30 to keep")
+    q.add_argument("--from", dest="address", help="address of its folder FaceXModel; default: its public repository")
+    types.add_force(q)

@@ -361,8 +361,9 @@ class MorphableModel:
         Parameters
         ----------
         path : str or Path
-            ``"builtin"`` (about 30 000 vertices), ``"builtin:coarse"`` (about 7 000), or a file or folder of
-            a known format, recognised by content.
+            ``"builtin"`` (about 30 000 vertices), ``"builtin:coarse"`` (about 7 000), ``"auto"`` (the model that
+            ``mifit model fetch ict`` has fetched, else ``"builtin"``), or a file or folder of a known format,
+            recognised by content; with ``+eyes`` behind it eyes are added.
         kind : str, optional
             The format, where it is to be set rather than recognised: a key of ``recognise.KINDS``.
 
@@ -371,6 +372,8 @@ class MorphableModel:
         InputError
             The file is missing, damaged or of no known kind; the message says what was found.
         """
+        if isinstance(path, str) and path.partition("+")[0] == "auto":
+            path = path.replace("auto", _PROVIDED["automatic"](), 1)
         model = _PROVIDED["load"](path, kind)
         # Not a field: a model that is made from this one by `replace` is no longer the file's.
         named = isinstance(path, str) and path.partition(":")[0] == "builtin"

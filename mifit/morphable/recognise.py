@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 
 from mifit.core.arrays import npz_keys
-from mifit.core.files import check_file
+from mifit.core.files import cache_folder, check_file
 from mifit.core.limits import MAX_MODEL_BYTES
 from mifit.errors import InputError
 from mifit.morphable.builtin import builtin_model
@@ -49,9 +49,21 @@ FLATTEST = 0.02
 """Depth of a face's landmarks relative to their height, root mean squares; heads have 0.3 and more."""
 
 
+def fetched_model(name: str) -> Path:
+    """Where ``mifit model fetch`` puts a model, whether it is there or not."""
+    return cache_folder() / "models" / f"{name}.npz"
+
+
+@provides("automatic")
+def automatic_model() -> str:
+    """What ``auto`` stands for: the fetched ICT-FaceKit where it is there, else ``builtin``."""
+    path = fetched_model("ict")
+    return str(path) if path.is_file() else "builtin"
+
+
 @provides("load")
 def load_model(path: str | Path, kind: str | None = None) -> MorphableModel:
-    """Load ``"builtin"``, ``"builtin:coarse"``, or a file or folder of a known kind, with ``+eyes`` behind or without.
+    """Load ``"builtin"``, ``"builtin:coarse"``, or a file or folder of a known kind; see `MorphableModel.load`.
 
     Parameters
     ----------
