@@ -48,6 +48,8 @@ def capture_of(arguments: Namespace) -> Path:
     if not any(available().values()):
         raise InputError(missing())
     out, folder = arguments.out, arguments.out / "capture"
+    if (out / "result.json").exists() and not (arguments.resume or arguments.force):
+        raise InputError(f"--out {out}: holds a result already; --resume goes on with it, --force replaces it")
     origin = _origin(arguments)
     if os.path.lexists(folder):
         file = folder / ORIGIN
