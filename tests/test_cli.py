@@ -155,6 +155,14 @@ def test_from_capture_to_figures(capsys, tiny_capture, tmp_path):
     # of about 27 dB, so that a perfect fit would gain little more here; the benchmarks hold clean captures to more.
     assert full > 20 and full > pca + 0.5
     assert "full" in table
+    report = (out / "report.html").read_text()
+    assert "image based nearest" in report and "baseline" not in figures
+    judged = ["evaluate", out, "--capture", tiny_capture, "--quiet", "--timesteps", "0", "--camera"]
+    assert "was fitted, so this is no held-out error; name another one, or --fitted" in refused(capsys, *judged, "left")
+    assert run(capsys, *judged, "left", "--fitted")[0] == 0
+    assert (out / "report.html").read_text() == report  # which keeps the held-out view
+    code, table, err = run(capsys, *judged, "third", "--region", "skin", "--baseline")
+    assert code == 0 and "image_based_nearest" in table, err
     code, _, err = run(
         capsys, "render", out, "--capture", tiny_capture, "--camera", "third", "--timestep", "0",
         "--out", tmp_path / "x.png", "--quiet",

@@ -36,9 +36,9 @@ NEVER = {"result": {"render"}, "output": {"stages"}}
 """Lower parts that a part has no business with: a result renders nothing, what is written fits nothing."""
 KERNELS = {"render", "appearance"}
 """Parts whose functions may import Mitsuba and Dr.Jit."""
-KERNEL_FILES = {
-    f"stages/{name}.py" for name in ("normals/problem", "normals/refine_normals", "reflectance/adam")
-} | {"extras/absorb/linear.py"}
+KERNEL_FILES = {f"stages/{name}.py" for name in ("normals/problem", "normals/refine_normals", "reflectance/adam")} | {
+    "extras/absorb/linear.py"
+}
 """Further files that may, relative to the package: solvers of stages."""
 
 FILES = {str(path.relative_to(PACKAGE)): path for path in sorted(PACKAGE.rglob("*.py"))}

@@ -86,7 +86,14 @@ def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> No
         watch=show,
     )
     remember(out, [path.name for path in first])  # after the fit, which clears away what a result before it left
-    judged = {"camera": "third", "timesteps": None, "region": "model", "baseline": True, "passes": False}
+    judged = {
+        "camera": "third",
+        "timesteps": None,
+        "region": "face",
+        "baseline": True,
+        "passes": False,
+        "fitted": False,
+    }
     given = Namespace(
         quiet=arguments.quiet, strict=False, result=out, capture=folder, json=out / "third.json", **judged
     )

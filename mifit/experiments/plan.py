@@ -71,7 +71,7 @@ class EvaluateRun:
     """Judge the fit on a view; the settings of ``mifit evaluate``."""
 
     camera: str = text(..., "camera that is not fitted")
-    region: Literal["model", "truth"] = one_of("model", "whose face area counts")
+    region: Literal["face", "skin", "truth"] = one_of("face", "which pixels count")
     timesteps: tuple[Index, ...] | None = several(None, "timesteps to judge; none: all of the fit")
 
 

@@ -15,18 +15,20 @@ from mifit.core.camera import Camera
 from mifit.core.image import to_8_bit
 from mifit.core.metrics import flip, mean_squared_error, psnr_from_rmse, ssim
 from mifit.errors import InputError
-from mifit.output.compare import pass_region, separation
+from mifit.output.compare import pass_region, separation, skin_region
 from mifit.output.deferred import shade_methods, trace_mesh, visible_surface
 from mifit.output.pose import pose_head
 from mifit.output.resect import needs_resection, resect
-from mifit.output.truth import landmarks_of, true_mesh, true_passes
+from mifit.output.truth import TrueMesh, landmarks_of, true_mesh, true_passes
 from mifit.progress import Progress, silent
 from mifit.render.image_based import BLENDS, image_based
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
     from mifit.result import Method, Result
 
+Region = Literal["face", "skin", "truth"]
 EROSION = 2
 """Pixels by which the face area shrinks before errors are measured in it."""
 
@@ -66,7 +68,7 @@ def evaluate(
     capture: Capture,
     camera: str,
     timesteps: Sequence[int] | None = None,
-    region: Literal["model", "truth"] = "model",
+    region: Region = "face",
     progress: Progress = silent,
     baseline: bool = False,
     watch: Callable[[Comparison], None] | None = None,
@@ -91,8 +93,10 @@ def evaluate(
         A camera of the capture.
     timesteps : sequence of int, optional
         Default: the timesteps that were fitted.
-    region : {"model", "truth"}
-        ``model``: face area of the fitted model; ``truth``: face area of the capture's ground-truth mesh.
+    region : {"face", "skin", "truth"}
+        ``face``: face area of the fitted model; ``truth``: face area of the capture's ground-truth mesh; ``skin``: the
+        hull of the photograph's landmarks without eyes and inner mouth (`output.compare.skin_region`), where a fitted
+        view sees the true mesh, or the fitted one where there is none.
     progress : Progress
     baseline : bool
         Compare image-based rendering on the fitted mesh as well, by three blends (`render.image_based`).
@@ -220,7 +224,7 @@ def compare(
     capture: Capture,
     camera: str,
     timestep: int,
-    region: Literal["model", "truth"] = "model",
+    region: Region = "face",
     methods: tuple[Method, ...] | None = None,
     oversampling: int = 2,
     baseline: bool = False,
@@ -238,18 +242,26 @@ def compare(
     surface = visible_surface(shown, view, timestep, oversampling)
     linear = shade_methods(shown, surface, timestep, methods or shown.methods)
     model, vertices = shown.model, shown.geometry.vertices[shown.index(timestep)]
-    if region == "model":
+    if region == "face":
         area = face_area(vertices, model.faces, model.face_mask, view)
+    elif region == "skin":
+        true = _true_mesh_or_none(capture, timestep, model)
+        points, corners = (vertices, model.faces) if true is None else (true.vertices, true.faces)
+        fitted = moments if true is None else None
+        sight = image_based(
+            capture, shown.cameras, view, timestep, points, corners, moments=fitted, oversampling=oversampling
+        )
+        area = skin_region(landmarks_of(capture, camera, timestep), view) & sight.seen
     elif region == "truth":
         truth = true_mesh(capture, timestep, reconstruction.model)
         if truth is None:
             raise InputError(
                 f"{capture.path}: has no true mesh of timestep {timestep} (truth/{timestep:04d}.npz); --region truth "
-                "needs the capture's ground truth, or use --region model"
+                "needs the capture's ground truth, or use --region face"
             )
         area = face_area(truth.vertices, truth.faces, truth.face_mask, view)
     else:
-        raise InputError(f"region: found {region!r}, expected 'model' or 'truth'")
+        raise InputError(f"region: found {region!r}, expected 'face', 'skin' or 'truth'")
     area &= frame.valid
     if not area.any():
         raise InputError(f"camera {camera}, timestep {timestep}: the face area is not visible, nothing to evaluate")
@@ -262,6 +274,14 @@ def compare(
     names = {blend: "image_based" if blend == BLENDS[0] else f"image_based_{blend}" for blend in BLENDS}
     blended = {names[blend]: to_8_bit(image) for blend, image in base.colours.items()}
     return Comparison(timestep, photograph, area, renders, blended, area & base.seen, off)
+
+
+def _true_mesh_or_none(capture: Capture, timestep: int, model: MorphableModel) -> TrueMesh | None:
+    """The true mesh; None where there is none, or none whose faces are known."""
+    try:
+        return true_mesh(capture, timestep, model)
+    except InputError:
+        return None
 
 
 def held_out(reconstruction: Result, found: Mapping[str, Any]) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -136,19 +136,17 @@ def _summary(result: Result, evaluation: dict[str, Any] | None) -> str:
     parts = []
     if evaluation is not None:
         kind = "held out, never fitted" if held_out(result, evaluation) else "this camera was fitted, so it is no test"
-        rows = "".join(
-            f"<tr><td>{NAMES[m]}</td><td>{f['psnr']:.2f}</td><td>{f['rmse']:.2f}</td><td>{f['ssim']:.4f}</td>"
-            f"<td>{f['flip']:.4f}</td></tr>"
-            for m, f in evaluation["methods"].items()
-        )
-        area = "fitted model" if evaluation["region"] == "model" else "ground-truth mesh"
+        area = {"face": "the fitted model's face area", "skin": "skin"}.get(evaluation["region"], "the true face area")
         parts.append(
             f"<p>Error on camera <b>{html.escape(evaluation['camera'])}</b> ({kind}), over "
-            f"{evaluation['region_pixels']:,} pixels of the {area}'s face area.</p>"
-            '<div class="wide"><table><tr><th>Method</th><th>PSNR, dB</th><th>RMSE of 255</th><th>SSIM</th>'
-            "<th>FLIP</th></tr>"
-            f"{rows}</table></div>"
+            f"{evaluation['region_pixels']:,} pixels of {area}.</p>{_measures(evaluation['methods'])}"
         )
+        if "baseline" in evaluation:
+            found = evaluation["baseline"]
+            parts.append(
+                f"<p>Beside image-based rendering on the same mesh, over {found['region_pixels']:,} pixels that a "
+                f"fitted view sees.</p>{_measures(found['methods'])}"
+            )
     else:
         parts.append("<p>No held-out view was evaluated; <code>mifit evaluate</code> adds one to this page.</p>")
     found = result.diagnostics
@@ -156,6 +154,17 @@ def _summary(result: Result, evaluation: dict[str, Any] | None) -> str:
     if not found:
         parts.append('<p class="soft">No warnings.</p>')
     return "".join(parts)
+
+
+def _measures(methods: Mapping[str, Mapping[str, float]]) -> str:
+    """Table of errors."""
+    heads = "".join(f"<th>{text}</th>" for text in ("Method", "PSNR, dB", "RMSE of 255", "SSIM", "FLIP"))
+    rows = "".join(
+        f"<tr><td>{NAMES.get(m, m.replace('_', ' '))}</td><td>{f['psnr']:.2f}</td><td>{f['rmse']:.2f}</td>"
+        f"<td>{f['ssim']:.4f}</td><td>{f['flip']:.4f}</td></tr>"
+        for m, f in methods.items()
+    )
+    return f'<div class="wide"><table><tr>{heads}</tr>{rows}</table></div>'
 
 
 def _view3d(result: Result, timestep: int) -> str:

@@ -168,8 +168,8 @@ COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "fit model": (("fit", "capture", "--out", "out", "--model", "X"), ("capture",)),
     "track capture": (("track", "X", "--result", "result"), ("result",)),
     "track result": (("track", "capture", "--result", "X"), ("capture",)),
-    "evaluate result": (("evaluate", "X", "--capture", "capture", "--camera", "left"), ("capture",)),
-    "evaluate capture": (("evaluate", "result", "--capture", "X", "--camera", "left"), ("result",)),
+    "evaluate result": (("evaluate", "X", "--capture", "capture", "--camera", "left", "--fitted"), ("capture",)),
+    "evaluate capture": (("evaluate", "result", "--capture", "X", "--camera", "left", "--fitted"), ("result",)),
     "render result": (
         ("render", "X", "--capture", "capture", "--camera", "left", "--timestep", "0", "--out", "out.png"), ("capture",)
     ),

@@ -169,7 +169,18 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 OUTPUTS = {
     "render": ("render", "result", "--capture", "capture", "--camera", "left", "--timestep", "0", "--out"),
-    "evaluate": ("evaluate", "result", "--capture", "capture", "--camera", "left", "--timesteps", "0", "--json"),
+    "evaluate": (
+        "evaluate",
+        "result",
+        "--capture",
+        "capture",
+        "--camera",
+        "left",
+        "--fitted",
+        "--timesteps",
+        "0",
+        "--json",
+    ),
     "export": ("export", "result", "--format", "ply", "--out"),
     "convert": ("model", "convert", "ball.npz"),
     "preview": ("model", "info", "ball.npz", "--preview"),

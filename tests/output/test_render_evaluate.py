@@ -165,6 +165,31 @@ def test_region_is_the_face_area_eroded_and_valid(ball, variant):
     assert not compare(ball, half, "third", 0).region[:32].any()
 
 
+def test_skin_is_within_the_landmarks_without_eyes_and_mouth_where_a_fitted_view_sees_it(ball, variant, tmp_path):
+    camera = ball_camera("third", 5.0)
+    turn = np.linspace(0, 2 * np.pi, 17)
+    marks = np.zeros((68, 2))
+    marks[:17] = 32 + 18 * np.stack([np.cos(turn), np.sin(turn)], 1)
+    marks[17:] = 32
+    for first, last, middle in ((36, 42, (24, 26)), (42, 48, (40, 26)), (60, 68, (32, 42))):
+        turn = np.linspace(0, 2 * np.pi, last - first, endpoint=False)
+        marks[first:last] = middle + 3 * np.stack([np.cos(turn), np.sin(turn)], 1)
+
+    class Marked(FakeCapture):
+        def landmarks(self, name, t):
+            return SimpleNamespace(points=marks)
+
+    capture = Marked(
+        (*ball.cameras, ball_camera("side", -60), camera), lambda c, t: ball.render(c, t)[..., :3], tmp_path
+    )
+    region = compare(ball, capture, "third", 0, region="skin").region
+    rows, columns = np.nonzero(region)
+    assert np.hypot(columns + 0.5 - 32, rows + 0.5 - 32).max() < 18 - 3
+    assert not region[26, 24] and not region[26, 40] and not region[42, 32] and region[32, 32] and region.sum() > 200
+    blind = replace(ball, cameras=(ball_camera("side", -60),))
+    assert compare(blind, capture, "third", 0, region="skin").region.sum() < 0.8 * region.sum()
+
+
 def test_truth_region_counts_uncovered_pixels_as_black(ball, variant, tmp_path):
     camera = ball_camera("third", 5.0)
     (tmp_path / "truth").mkdir()
