@@ -51,6 +51,8 @@ from mifit.progress import Progress, silent
 from mifit.reconstruction import Reconstruction
 from mifit.result.ownership import CHECKPOINTS, check_ours, locked
 from mifit.result.reading import read_document
+from mifit.stages.checks.capture_checks import check_capture
+from mifit.stages.checks.fit_checks import check_fit, judged
 from mifit.stages.eyes import behind_lids
 from mifit.stages.find_residual import find_residual
 from mifit.stages.find_surface import find_surface
@@ -228,6 +230,7 @@ def fit(
     if until not in STAGES:
         raise InputError(f"until: found {until!r}, expected one of {', '.join(STAGES)}")
     check_images(capture, cameras, timesteps)
+    checked = check_capture(capture, model, cameras, timesteps)
     capture_digest = capture.digest(cameras, timesteps)
     given, model = model, fitted_model(model, config)
     estimated: tuple[Diagnostic, ...] = ()
@@ -240,9 +243,11 @@ def fit(
     source = Source(capture, capture_digest, model, cameras, timesteps, seed)
 
     def result(estimates: Mapping[Part, Any], seconds: float = 0.0) -> Reconstruction:
+        geometry = estimates["geometry"]
+        found = [*checked, *check_fit(capture, model, geometry, cameras)]
         return Reconstruction(
             model=model,
-            **cast(dict, estimates),
+            **cast(dict, {**estimates, "geometry": judged(geometry, found)}),
             config={**dataclasses.asdict(config), "seed": seed},
             cameras=tuple(capture.camera(name) for name in cameras),
             capture_digest=capture_digest,
@@ -251,7 +256,8 @@ def fit(
             unit_mm=capture.unit_mm,
             warnings=(
                 *estimated,
-                *one_place(capture, cameras, estimates["geometry"]),
+                *found,
+                *one_place(capture, cameras, geometry),
                 *eyes_note(given, model),
             ),
             seconds=seconds,

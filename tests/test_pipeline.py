@@ -165,6 +165,8 @@ class Stages:
             "refine_normals": "normals", "refine_mesh": "mesh", "find_residual": "residual",
         }.items():  # fmt: skip
             monkeypatch.setattr(f"mifit.fitting.{name}", self.stand_in(name, getattr(result, part)))
+        for name in ("check_capture", "check_fit"):
+            monkeypatch.setattr(f"mifit.fitting.{name}", lambda *_: [])
         monkeypatch.setattr(
             "mifit.fitting.find_photometry",
             lambda capture, *_: self.stand_in("find_photometry", Photometry())(capture),

@@ -29,7 +29,8 @@ class Report:
     Attributes
     ----------
     outcome : str
-        ``"converged"``, ``"max_iterations"``, ``"diverged"`` or another value of ``optim.Outcome``.
+        ``"converged"``, ``"max_iterations"``, ``"diverged"`` or another value of ``optim.Outcome``; ``"inconsistent"``
+        where the images contradict one another or the capture has a named fault.
     energies : dict of str to list of float
         Energy per term over the iterations (same length each).
     seconds : float

@@ -204,7 +204,7 @@ class Result:
         for name, report in self.reports.items():
             found += report.warnings
             said = any(one.code == "not-converged" for one in report.warnings)
-            if report.outcome != "converged" and not said:
+            if report.outcome not in ("converged", "inconsistent") and not said:
                 words = report.outcome.replace("_", " ")
                 found.append(Diagnostic("not-converged", f"stage {name} ended without convergence ({words})"))
         return worst_first(found)

@@ -19,13 +19,12 @@ from mifit.optim import Solution
 from mifit.progress import Progress, silent
 from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.displaced import displaced
-from mifit.stages.geometry.faults import calibration_warnings, unseen_warnings
 from mifit.stages.geometry.landmarks import LandmarkView
 from mifit.stages.geometry.parameters import Frames, Layout
 from mifit.stages.geometry.refine import Reference, priors_of, refine_by_rendering, refine_by_texture, texture_reference
 from mifit.stages.geometry.start import FEWEST_LANDMARKS, State, fit_landmarks, initial_state, landmark_views
 from mifit.stages.geometry.summary import Journal, pack
-from mifit.stages.geometry.visibility import Visibility, spread_points
+from mifit.stages.geometry.visibility import Visibility, spread_points, unseen_warnings
 
 __all__ = ["fit_geometry", "fit_pose_expression", "texture_reference"]
 
@@ -87,9 +86,6 @@ def fit_geometry(
     journal.phase("landmarks", _usable(start.solution, "landmarks"))
     config = replace(config, landmark_noise=start.noise)
     used = views if config.as_written else start.views  # the paper's landmarks are fixed vertices
-    for message in calibration_warnings(views, model, state.frames.scale, start.noise):
-        journal.warn(message)
-
     return _refine_and_pack(capture, model, cameras, timesteps, config, seed, journal, start.state, used, None, None)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -174,3 +174,30 @@ class Visibility:
                 face, weights = buffer.face.reshape(-1)[facial], buffer.weights.reshape(-1, 3)[facial]
                 out.append(PixelView(step, camera, self._level(step, camera, sigma), face, weights))
         return tuple(out)
+
+
+def unseen_warnings(
+    blind: Collection[tuple[str, int]], cameras: Sequence[str], steps: int, unit_mm: float
+) -> list[Diagnostic]:
+    """What to say of cameras that show nothing of the fitted face in any of the timesteps.
+
+    Parameters
+    ----------
+    blind : collection of (camera, step)
+        Images that showed nothing of the face.
+    cameras, steps
+        The cameras fitted, and the number of timesteps.
+    unit_mm : float
+        The capture's unit of length in millimetres.
+    """
+    return [
+        Diagnostic(
+            "face-unseen",
+            f"camera {name} shows the front of the fitted face at no timestep. If its images do show the face: is the "
+            f"unit of length right (found one of {unit_mm:g} mm), is the order of the landmarks (left taken for right "
+            "turns a head around), are the cameras' poses?",
+            camera=name,
+        )
+        for name in cameras
+        if all((name, step) in blind for step in range(steps))
+    ]

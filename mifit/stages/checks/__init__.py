@@ -1,0 +1,1 @@
+"""What is wrong with a capture, before it is fitted and after."""

@@ -1,0 +1,64 @@
+"""What a fit says of its capture: whether landmarks and images, and the views among one another, agree on one face."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mifit.capture import Capture
+from mifit.core.diagnostics import Diagnostic
+from mifit.core.estimate import GeometryEstimate
+from mifit.morphable import MorphableModel
+from mifit.stages.checks.capture_checks import landmark_shots
+from mifit.stages.checks.landmark_model import INNER, noise_of
+
+SHIFT = 1.0
+"""Common shift of the landmarks of a camera from the face that its images show, in deviations of one landmark, beyond
+which it is no detector's: the median of 51 points errs by a fifth of that."""
+CONTRADICTIONS = ("views-disagree", "landmarks-shifted")
+"""Codes of what a fit that explains its images doesn't have."""
+INCONSISTENT = "inconsistent"
+"""Outcome of a stage whose search has ended where the views, or images and landmarks, contradict one another."""
+
+
+def check_fit(
+    capture: Capture, model: MorphableModel, geometry: GeometryEstimate, cameras: Sequence[str]
+) -> list[Diagnostic]:
+    """Contradictions between a fitted face and the landmarks of the images that it was fitted to.
+
+    Parameters
+    ----------
+    capture, model, geometry
+    cameras : sequence of str
+        The cameras fitted; no other is read.
+    """
+    shots = landmark_shots(capture, cameras, geometry.timesteps)
+    if not shots:
+        return []
+    noise, found = noise_of(shots), []
+    for name in cameras:
+        off = [
+            shot.pixels[INNER] - shot.camera.project(geometry.vertices[shot.step][model.landmarks[INNER]])
+            for shot in shots
+            if shot.camera.name == name
+        ]
+        if not off:
+            continue
+        x, y = np.nanmedian(np.concatenate(off), axis=0)
+        if np.hypot(x, y) > SHIFT * noise:
+            text = (
+                f"camera {name}: its landmarks lie ({x:.1f}, {y:.1f}) pixels from the face that the images show, "
+                f"expected within {SHIFT * noise:.1f}; run `mifit landmarks`, and check where pixel coordinates begin "
+                "and the principal point"
+            )
+            found.append(Diagnostic("landmarks-shifted", text, camera=name))
+    return found
+
+
+def judged(geometry: GeometryEstimate, found: Sequence[Diagnostic]) -> GeometryEstimate:
+    """The fit, its outcome `INCONSISTENT` where the capture has a named fault or the fit contradicts its images."""
+    report = geometry.report
+    bad = any(one.severity == "fault" or one.code in CONTRADICTIONS for one in (*found, *report.warnings))
+    return replace(geometry, report=replace(report, outcome=INCONSISTENT)) if bad else geometry
