@@ -28,9 +28,8 @@ from mifit.capture import Capture
 from mifit.core.files import write_text
 from mifit.core.image import load_image, to_8_bit
 from mifit.morphable import MorphableModel
-from mifit.morphable.describe import save_png
+from mifit.morphable.describe import save_png, sketch
 from mifit.morphable.register import distance_to_surface, register
-from mifit.morphable.sketch import sketch
 from mifit.synth import synthesize
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"

@@ -26,20 +26,6 @@ def is_distorted(camera: Camera) -> bool:
     return any(k != 0.0 for k in camera.distortion)
 
 
-def project_distorted(camera: Camera, points: NDArray) -> NDArray[np.float64]:
-    """World points (N, 3) -> pixel coordinates (N, 2) in the image as stored, distortion included."""
-    rotation, _ = cv2.Rodrigues(np.asarray(camera.rotation, dtype=np.float64))
-    coefficients = np.array(camera.distortion or (0.0,) * 4, dtype=np.float64)
-    pixels, _ = cv2.projectPoints(
-        np.asarray(points, dtype=np.float64).reshape(-1, 1, 3),
-        rotation,
-        np.asarray(camera.translation, dtype=np.float64),
-        opencv_matrix(camera),
-        coefficients,
-    )
-    return np.asarray(pixels.reshape(-1, 2) + 0.5, dtype=np.float64)
-
-
 def undistort_points(camera: Camera, pixels: NDArray) -> NDArray[np.float64]:
     """Pixel coordinates (N, 2) in the image as stored -> in the undistorted image of the same intrinsics."""
     pixels = np.asarray(pixels, dtype=np.float64)

@@ -38,11 +38,43 @@ class Sightings:
 
 
 @dataclass(frozen=True)
-class Intrinsics:
-    """What is known of the focal lengths."""
+class Freedom:
+    """How C cameras may move: by ``design @ z``, with a Gaussian prior on z (R,).
 
-    group: NDArray[np.int64]  # (C,) cameras of one number share an unknown focal length; -1 where it is known
-    prior: tuple[NDArray[np.float64], float]  # mean (G,) and deviation of its logarithm
+    Attributes
+    ----------
+    design : (P, R)
+        P are the C logarithms of focal lengths, then turn and shift of each camera but the first, camera axes.
+    mean, precision : (R,)
+        Of the prior; precision 0 where nothing is known.
+    focals : int
+        How many of z, the first ones, are logarithms of unknown focal lengths.
+    """
+
+    design: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    precision: NDArray[np.float64]
+    focals: int = 0
+
+    @classmethod
+    def of(cls, ways: NDArray) -> Freedom:
+        """Ways (P, R) of moving, each by one deviation of the prior."""
+        return cls(ways, np.zeros(ways.shape[1]), np.ones(ways.shape[1]))
+
+    @classmethod
+    def of_focals(cls, group: NDArray, focal: NDArray, expected: NDArray, deviation: float) -> Freedom:
+        """Free poses, and focal lengths (C,) that cameras of one ``group`` share; -1 where a camera's is known.
+
+        ``expected`` (G,) are the groups' focal lengths beforehand, with this deviation of their logarithms.
+        """
+        cameras, count, poses = len(group), len(expected), 6 * (len(group) - 1)
+        design, mean, precision = np.zeros((cameras + poses, count + poses)), *np.zeros((2, count + poses))
+        for g in range(count):
+            design[:cameras, g] = group == g
+            mean[g] = np.log(expected[g] / focal[group == g][0])
+        design[cameras:, count:] = np.eye(poses)
+        precision[:count] = deviation**-2.0
+        return cls(design, mean, precision, count)
 
 
 @dataclass(frozen=True)
@@ -62,7 +94,7 @@ class Bundle:
     expression : (T, K)
         Coefficients relative to timestep 0.
     moved : (R,)
-        How far calibrated cameras have moved in the ways that are open to them, deviations.
+        How far cameras have moved, `Freedom`'s z.
     """
 
     focal: NDArray[np.float64]
@@ -102,37 +134,31 @@ class _Projected:
     residual: NDArray[np.float64]  # (M, 2) pixels
 
 
-def adjust_bundle(
-    start: Bundle, seen: Sightings, intrinsics: Intrinsics, modes: NDArray, ways: NDArray | None = None
-) -> AdjustedBundle:
+def adjust_bundle(start: Bundle, seen: Sightings, freedom: Freedom, modes: NDArray) -> AdjustedBundle:
     """Bring projections onto matches.
 
     Parameters
     ----------
     start : Bundle
     seen : Sightings
-    intrinsics : Intrinsics
+    freedom : Freedom
     modes : (N, 3, K)
         How expressions move the points; K may be 0.
-    ways : (P, R), optional
-        Columns that the movements of calibrated cameras are made of, each by one deviation of a Gaussian prior about
-        the start; P are the logarithms of the unknown focal lengths, whose own prior doesn't count then, and turn and
-        shift of each camera but the first.
 
     Returns
     -------
     AdjustedBundle
     """
     damping, settled = 1e-4, False
-    bundle = replace(start, moved=np.zeros(0 if ways is None else ways.shape[1]))
+    bundle = replace(start, moved=np.zeros(freedom.design.shape[1]))
     projected = _project(bundle, seen, modes)
-    energy = _energy(bundle, projected, seen, intrinsics, ways)
+    energy = _energy(bundle, projected, seen, freedom)
     for _ in range(STEPS):
-        system = _System.of(bundle, projected, seen, intrinsics, modes, ways)
+        system = _System.of(bundle, projected, seen, freedom, modes)
         while damping < 1e6:
-            trial = _moved(bundle, *system.step(damping), intrinsics, ways)
+            trial = _moved(bundle, *system.step(damping), freedom)
             shown = _project(trial, seen, modes)
-            value = _energy(trial, shown, seen, intrinsics, ways)
+            value = _energy(trial, shown, seen, freedom)
             if value < energy:
                 break
             damping *= 4.0
@@ -143,22 +169,22 @@ def adjust_bundle(
         bundle, projected, energy, damping = trial, shown, value, max(damping / 5.0, 1e-9)
         if settled:
             break
-    system = _System.of(bundle, projected, seen, intrinsics, modes, ways)
+    system = _System.of(bundle, projected, seen, freedom, modes)
     lengths = np.linalg.norm(projected.residual, axis=1)
     return AdjustedBundle(bundle, system.deviation(projected.residual), float(np.median(lengths)), settled)
 
 
-def camera_information(bundle: Bundle, seen: Sightings, intrinsics: Intrinsics) -> NDArray[np.float64]:
+def camera_information(bundle: Bundle, seen: Sightings) -> NDArray[np.float64]:
     """(P, P) mean square by which movements of the cameras change what a still head's matches show, pixels.
 
-    Points have followed the movement where they can. P as for the ways of `adjust_bundle`.
+    Points have followed the movement where they can. P as in `Freedom`.
     """
-    modes = np.zeros((len(bundle.points), 3, 0))
+    modes, movements = np.zeros((len(bundle.points), 3, 0)), 7 * len(bundle.cameras) - 6
     projected = _project(bundle, seen, modes)
-    shown = replace(
-        projected, residual=np.zeros_like(projected.residual)
-    )  # before a large movement all look like outliers
-    system = _System.of(bundle, shown, seen, intrinsics, modes, None)
+    # before a large movement all look like outliers
+    small = replace(projected, residual=np.zeros_like(projected.residual))
+    every = Freedom(np.eye(movements), np.zeros(movements), np.zeros(movements))
+    system = _System.of(replace(bundle, moved=np.zeros(movements)), small, seen, every, modes)
     reduced, _ = system._reduced(system._inverse(0.0), 0.0)
     return np.asarray(reduced * seen.deviation**2 / len(seen.point))
 
@@ -181,20 +207,12 @@ def _weights(residual: NDArray, seen: Sightings) -> tuple[NDArray, NDArray]:
     return 0.5 * CAUCHY**2 * np.log1p(squared), 1.0 / (seen.deviation**2 * (1.0 + squared))
 
 
-def _off(bundle: Bundle, intrinsics: Intrinsics) -> NDArray[np.float64]:
-    """(G,) logarithms of the unknown focal lengths minus their prior means."""
-    mean = intrinsics.prior[0]
-    return np.array([np.log(bundle.focal[intrinsics.group == g][0]) - mean[g] for g in range(len(mean))])
-
-
-def _energy(
-    bundle: Bundle, projected: _Projected, seen: Sightings, intrinsics: Intrinsics, ways: NDArray | None
-) -> float:
+def _energy(bundle: Bundle, projected: _Projected, seen: Sightings, freedom: Freedom) -> float:
     """Infinite where a point comes to lie behind a camera."""
     loss = float(_weights(projected.residual, seen)[0].sum())
-    prior = np.sum(bundle.moved**2 if ways is not None else (_off(bundle, intrinsics) / intrinsics.prior[1]) ** 2)
-    prior += np.sum((bundle.expression / EXPRESSION_DEVIATION) ** 2)
-    return loss + 0.5 * float(prior) if np.isfinite(loss) else np.inf
+    prior = float(freedom.precision @ (bundle.moved - freedom.mean) ** 2)
+    prior += float(np.sum((bundle.expression / EXPRESSION_DEVIATION) ** 2))
+    return loss + 0.5 * prior if np.isfinite(loss) else np.inf
 
 
 def _cross(v: NDArray) -> NDArray[np.float64]:
@@ -218,18 +236,9 @@ class _System:
     focals: int
 
     @classmethod
-    def of(
-        cls,
-        bundle: Bundle,
-        projected: _Projected,
-        seen: Sightings,
-        intrinsics: Intrinsics,
-        modes: NDArray,
-        ways: NDArray | None,
-    ) -> _System:
+    def of(cls, bundle: Bundle, projected: _Projected, seen: Sightings, freedom: Freedom, modes: NDArray) -> _System:
         cameras, steps, k = len(bundle.cameras), len(bundle.heads), modes.shape[2]
-        focals = len(intrinsics.prior[0])
-        head_at = focals + 6 * (cameras - 1)
+        head_at = 7 * cameras - 6
         face_at = head_at + 6 * (steps - 1)
         jacobian = np.zeros((len(seen.point), 2, face_at + k * (steps - 1)))
         at, residual = projected.seen, projected.residual
@@ -239,11 +248,11 @@ class _System:
         slope[:, :, 2] = -focal[:, None] * at[:, :2] / at[:, 2:] ** 2
         turned = slope @ bundle.cameras[seen.camera, :3, :3]
         by_point = turned @ bundle.heads[seen.timestep, :3, :3]
-        for g in range(focals):
-            of = intrinsics.group[seen.camera] == g
-            jacobian[of, :, g] = focal[of, None] * at[of, :2] / at[of, 2:]
-        for c in range(1, cameras):
-            of, first = seen.camera == c, focals + 6 * (c - 1)
+        for c in range(cameras):
+            of, first = seen.camera == c, cameras + 6 * (c - 1)
+            jacobian[of, :, c] = focal[of, None] * at[of, :2] / at[of, 2:]
+            if c == 0:
+                continue
             jacobian[of, :, first : first + 3] = slope[of] @ _cross(projected.swung[of])
             jacobian[of, :, first + 3 : first + 6] = slope[of]
         for t in range(1, steps):
@@ -252,30 +261,25 @@ class _System:
             jacobian[of, :, first + 3 : first + 6] = turned[of]
             first = face_at + k * (t - 1)
             jacobian[of, :, first : first + k] = by_point[of] @ modes[seen.point[of]]
-        before = np.zeros(face_at)  # movement from the prior's mean, and its inverse variance
-        stiff = np.zeros(face_at)
-        before[:focals], stiff[:focals] = _off(bundle, intrinsics), intrinsics.prior[1] ** -2.0
-        if ways is not None:
-            jacobian = np.concatenate([jacobian[..., :head_at] @ ways, jacobian[..., head_at:]], axis=2)
-            before = np.concatenate([bundle.moved, np.zeros(face_at - head_at)])
-            stiff = np.concatenate([np.ones(ways.shape[1]), np.zeros(face_at - head_at)])
+        jacobian = np.concatenate([jacobian[..., :head_at] @ freedom.design, jacobian[..., head_at:]], axis=2)
         weight = _weights(residual, seen)[1]
         weighted = jacobian * weight[:, None, None]
         columns = jacobian.shape[2]
         block = weighted.reshape(2 * len(at), columns).T @ jacobian.reshape(2 * len(at), columns)
         right = weighted.reshape(2 * len(at), columns).T @ residual.ravel()
-        diagonal = np.concatenate([stiff, np.full(columns - len(stiff), EXPRESSION_DEVIATION**-2.0)])
-        right += diagonal * np.concatenate([before, bundle.expression[1:].ravel()])
+        rest = np.zeros(6 * (steps - 1))
+        stiff = np.concatenate([freedom.precision, rest, np.full(k * (steps - 1), EXPRESSION_DEVIATION**-2.0)])
+        right += stiff * np.concatenate([bundle.moved - freedom.mean, rest, bundle.expression[1:].ravel()])
         starts = np.flatnonzero(np.diff(seen.point, prepend=-1))
         by_weight = by_point * weight[:, None, None]
         return cls(
-            block + np.diag(diagonal),
+            block + np.diag(stiff),
             right,
             np.add.reduceat(weighted.transpose(0, 2, 1) @ by_point, starts),
             np.add.reduceat(by_weight.transpose(0, 2, 1) @ by_point, starts),
             np.add.reduceat(np.einsum("mkp,mk->mp", by_weight, residual), starts),
             weight,
-            focals if ways is None else 0,
+            freedom.focals,
         )
 
     def _inverse(self, damping: float) -> NDArray[np.float64]:
@@ -307,27 +311,20 @@ class _System:
         return float(np.sqrt(variance.max() * scale)) if freedom > 0 and variance.min() > 0 else np.inf
 
 
-def _moved(bundle: Bundle, change: NDArray, points: NDArray, intrinsics: Intrinsics, ways: NDArray | None) -> Bundle:
-    cameras, steps, focals = len(bundle.cameras), len(bundle.heads), len(intrinsics.prior[0])
-    moved = bundle.moved
-    if ways is not None:
-        moved, rest = moved + change[: len(moved)], change[len(moved) :]
-        change = np.concatenate([ways @ change[: len(moved)], rest])
-    free = intrinsics.group >= 0
-    focal = bundle.focal.copy()
-    focal[free] *= np.exp(np.clip(change[intrinsics.group[free]], -0.5, 0.5))
-    head_at = focals + 6 * (cameras - 1)
-    face_at = head_at + 6 * (steps - 1)
+def _moved(bundle: Bundle, change: NDArray, points: NDArray, freedom: Freedom) -> Bundle:
+    cameras, steps, opened = len(bundle.cameras), len(bundle.heads), len(bundle.moved)
+    movement, rest = freedom.design @ change[:opened], change[opened:]
+    face_at = 6 * (steps - 1)
     expression = bundle.expression.copy()
-    expression[1:] += change[face_at:].reshape(expression[1:].shape)
+    expression[1:] += rest[face_at:].reshape(expression[1:].shape)
     return replace(
         bundle,
-        focal=focal,
-        cameras=_turned(bundle.cameras, change[focals:head_at]),
-        heads=_turned(bundle.heads, change[head_at:face_at]),
+        focal=bundle.focal * np.exp(np.clip(movement[:cameras], -0.5, 0.5)),
+        cameras=_turned(bundle.cameras, movement[cameras:]),
+        heads=_turned(bundle.heads, rest[:face_at]),
         points=bundle.points + points,
         expression=expression,
-        moved=moved,
+        moved=bundle.moved + change[:opened],
     )
 
 

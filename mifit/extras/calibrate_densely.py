@@ -19,7 +19,7 @@ from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.core.mesh import interpolate
 from mifit.core.process import one_blas_thread
 from mifit.core.uv import TexelMap, rasterize_uv
-from mifit.extras.bundle import AdjustedBundle, Bundle, Intrinsics, Sightings, adjust_bundle
+from mifit.extras.bundle import AdjustedBundle, Bundle, Freedom, Sightings, adjust_bundle
 from mifit.extras.calibrate_heads import FOCAL_PRIOR, HeadCalibration, calibrate_heads
 from mifit.extras.tracks import FEWEST_IMAGES, Tracks, follow_points, unwrap_image
 from mifit.progress import Progress, silent
@@ -193,11 +193,11 @@ def _adjust(
     _, group = np.unique(side[unknown], return_inverse=True)
     numbers = np.full(len(views), -1)
     numbers[unknown] = group
-    mean = np.array([math.log(FOCAL_PRIOR[0] * side[numbers == g][0]) for g in range(group.max() + 1)])
+    count = group.max() + 1
     focal = np.array([math.sqrt(view.fx * view.fy) for view in views])
     centre = np.array([(view.cx, view.cy) for view in views])
     square = np.array([(f / view.fx, f / view.fy) for f, view in zip(focal, views, strict=True)])
-    for g in range(len(mean)):
+    for g in range(count):
         focal[numbers == g] = focal[numbers == g].mean()
     seen = Sightings(
         (tracks.pixels - centre[place[:, 0]]) * square[place[:, 0]],
@@ -217,7 +217,8 @@ def _adjust(
         np.asarray(interpolate(vertices, model.faces, texels.face[at], texels.weights[at]), dtype=np.float64),
         np.zeros((len(start.heads), modes.shape[2])),
     )
-    return adjust_bundle(bundle, seen, Intrinsics(numbers, (mean, FOCAL_PRIOR[1])), modes)
+    expected = np.array([FOCAL_PRIOR[0] * side[numbers == g][0] for g in range(count)])
+    return adjust_bundle(bundle, seen, Freedom.of_focals(numbers, focal, expected, FOCAL_PRIOR[1]), modes)
 
 
 def _calibration(

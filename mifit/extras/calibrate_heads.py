@@ -74,24 +74,6 @@ class _Problem:
         return bool(np.ptp(self.side) == 0)
 
 
-def calibrate(
-    capture: Capture,
-    landmarks3d: NDArray,
-    modes: NDArray | None = None,
-    cameras: Sequence[str] | None = None,
-    timesteps: Sequence[int] | None = None,
-    noise: float = 0.004,
-) -> Capture:
-    """Estimate the cameras of a capture that came without calibration; parameters and errors of `calibrate_heads`.
-
-    Returns
-    -------
-    Capture
-        The same capture whose `camera` now answers for the named cameras; `calibrated` stays False.
-    """
-    return calibrate_heads(capture, landmarks3d, modes, cameras, timesteps, noise).capture
-
-
 def calibrate_heads(
     capture: Capture,
     landmarks3d: NDArray,

@@ -24,7 +24,7 @@ from mifit.core.uv import rasterize_uv
 from mifit.extras.bundle import (
     AdjustedBundle,
     Bundle,
-    Intrinsics,
+    Freedom,
     Sightings,
     adjust_bundle,
     camera_information,
@@ -165,9 +165,9 @@ def refine_cameras(
     precisions = pose_precisions(poses, np.array([np.linalg.norm(view.position - centre) for view in views]))
     calibrated = Bundle(focal, poses, np.eye(4)[None], taken.points, np.zeros((1, 0)))
     before = _triangulated(taken, calibrated)
-    told = camera_information(before.bundle, taken.seen, _free(focal))
+    told = camera_information(before.bundle, taken.seen)
     ways = told_ways(told, rig_precision(poses, precisions), TOLD_PIXELS * scale)
-    adjusted = adjust_bundle(before.bundle, taken.seen, _free(focal), _rigid(taken), ways)
+    adjusted = adjust_bundle(before.bundle, taken.seen, Freedom.of(ways), _rigid(taken))
     rig = replace(adjusted.bundle, cameras=settled_rig(poses, adjusted.bundle.cameras, precisions))
     moved = [_moved(view, float(f), pose) for view, f, pose in zip(views, rig.focal, rig.cameras, strict=True)]
     judged = [_triangulated(left, one).residual for one in (calibrated, rig)]
@@ -195,11 +195,6 @@ def refine_cameras(
     return RefinedCameras(tuple(moved), finding, False, details)
 
 
-def _free(focal: NDArray) -> Intrinsics:
-    """Every camera has its own focal length, about which ways of moving say all."""
-    return Intrinsics(np.arange(len(focal)), (np.log(focal), math.inf))
-
-
 def _rigid(matches: _Matches) -> NDArray[np.float64]:
     """No expressions: points of different timesteps are different points."""
     return np.zeros((len(matches.points), 3, 0))
@@ -208,8 +203,8 @@ def _rigid(matches: _Matches) -> NDArray[np.float64]:
 def _triangulated(matches: _Matches, rig: Bundle) -> AdjustedBundle:
     """Points where cameras that stay see them best; least squares, so that two views share a residual."""
     seen = replace(matches.seen, deviation=PLAIN * matches.seen.deviation)
-    still = np.zeros((7 * len(rig.cameras) - 6, 0))
-    return adjust_bundle(replace(rig, points=matches.points), seen, _free(rig.focal), _rigid(matches), still)
+    still = Freedom.of(np.zeros((7 * len(rig.cameras) - 6, 0)))
+    return adjust_bundle(replace(rig, points=matches.points), seen, still, _rigid(matches))
 
 
 def _kept(why: str, figures: dict[str, Any], doubtful: bool = True) -> RefinedCameras:

@@ -1,4 +1,4 @@
-"""Maps between landmark sets."""
+"""The iBUG points of models."""
 
 from __future__ import annotations
 
@@ -11,18 +11,6 @@ from numpy.typing import NDArray
 from mifit.core.files import read_text
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
-
-MEDIAPIPE_TO_IBUG68 = np.array(
-    [
-        *(127, 234, 93, 132, 58, 136, 150, 176, 152, 400, 379, 365, 288, 361, 323, 454, 356),  # jaw
-        *(70, 63, 105, 66, 107, 336, 296, 334, 293, 300),  # brows
-        *(168, 197, 5, 4, 240, 97, 2, 326, 460),  # nose
-        *(33, 160, 158, 133, 153, 144, 362, 385, 387, 263, 373, 380),  # eyes
-        *(61, 39, 37, 0, 267, 269, 291, 405, 314, 17, 84, 181),  # outer lips
-        *(78, 82, 13, 312, 308, 317, 14, 87),  # inner lips
-    ]
-)
-"""The MediaPipe face-mesh point (of 468 or 478) nearest to each of the 68 iBUG points."""
 
 IBUG_MIRROR = np.array(
     [

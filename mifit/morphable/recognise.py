@@ -13,7 +13,7 @@ from mifit.core.files import cache_folder, check_file
 from mifit.core.limits import MAX_MODEL_BYTES
 from mifit.errors import InputError
 from mifit.morphable.builtin import builtin_model
-from mifit.morphable.formats import bfm2009, deep3d, threeddfa
+from mifit.morphable.formats import bfm_mat
 from mifit.morphable.formats.bfm_h5 import load_bfm_h5
 from mifit.morphable.formats.eos import load_eos, looks_like_eos
 from mifit.morphable.formats.flame import KEYS as FLAME_KEYS
@@ -36,9 +36,9 @@ KINDS: dict[str, Callable[[Path], MorphableModel]] = {
     "flame-npz": load_flame_npz,
     "gnm": load_gnm,
     "flame-pickle": load_flame_pickle,
-    "bfm2009": bfm2009.load_bfm2009,
-    "3ddfa": threeddfa.load_3ddfa,
-    "deep3d": deep3d.load_deep3d,
+    "bfm2009": bfm_mat.load_bfm2009,
+    "3ddfa": bfm_mat.load_3ddfa,
+    "deep3d": bfm_mat.load_deep3d,
     "bfm-h5": load_bfm_h5,
     "eos": load_eos,
 }
@@ -122,7 +122,11 @@ def recognise(path: Path) -> str:
         raise InputError(f"{path}: .npz with keys {', '.join(sorted(keys)[:8])}, expected those of a known model")
     if is_mat5(path):
         names = set(mat_names(path))
-        for kind, needed in (("bfm2009", bfm2009.KEYS), ("3ddfa", threeddfa.KEYS), ("deep3d", deep3d.KEYS)):
+        for kind, needed in (
+            ("bfm2009", bfm_mat.BFM_KEYS),
+            ("3ddfa", bfm_mat.DDFA_KEYS),
+            ("deep3d", bfm_mat.DEEP3D_KEYS),
+        ):
             if len(names & set(needed)) * 2 > len(needed):  # most keys: the loader names those that are missing
                 return kind
         raise InputError(f"{path}: MATLAB file with {', '.join(sorted(names)[:8])}, expected keys of a known model")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mifit.capture.lens import Undistortion, project_distorted, undistort_points
+from mifit.capture.lens import Undistortion, opencv_matrix, undistort_points
 from mifit.capture.stereo import read_stereo, write_stereo
 from mifit.capture.transforms import Shot, View, read_transforms, write_transforms
 from mifit.core.camera import Camera
@@ -23,6 +24,20 @@ LENSES = [
     (-0.21, 0.08, 0.001, -0.002, 0.03),
     (0.1, 0.2, 0.001, 0, 0.1, 0.3, 0.1, 0.02),
 ]
+
+
+def project_distorted(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """World points (N, 3) -> pixel coordinates (N, 2) in the image as stored, distortion included."""
+    rotation, _ = cv2.Rodrigues(np.asarray(camera.rotation, dtype=np.float64))
+    coefficients = np.array(camera.distortion or (0.0,) * 4, dtype=np.float64)
+    pixels, _ = cv2.projectPoints(
+        np.asarray(points, dtype=np.float64).reshape(-1, 1, 3),
+        rotation,
+        np.asarray(camera.translation, dtype=np.float64),
+        opencv_matrix(camera),
+        coefficients,
+    )
+    return np.asarray(pixels.reshape(-1, 2) + 0.5, dtype=np.float64)
 
 
 def make_camera(name: str, degrees: float, lens: tuple[float, ...] = ()) -> Camera:

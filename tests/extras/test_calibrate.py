@@ -15,7 +15,7 @@ from mifit.capture.transforms import Shot, View, write_transforms
 from mifit.core.camera import Camera
 from mifit.core.image import write_image
 from mifit.errors import InputError
-from mifit.extras.calibrate_heads import calibrate
+from mifit.extras.calibrate_heads import calibrate_heads
 from mifit.synth.compose import place_cameras
 
 
@@ -55,7 +55,7 @@ def test_exact_landmarks_give_the_cameras_back(tmp_path: Path, intrinsics: bool)
     truth = write_uncalibrated(tmp_path, intrinsics)
     capture = Capture.load(tmp_path)
     assert not capture.calibrated
-    estimate = calibrate(capture, make_head(), noise=1e-4)
+    estimate = calibrate_heads(capture, make_head(), noise=1e-4).capture
     assert not estimate.calibrated  # an estimate never passes for a calibration
     found = [estimate.camera(name) for name in estimate.cameras]
     for camera, expected in zip(found, truth, strict=True):
@@ -67,7 +67,7 @@ def test_exact_landmarks_give_the_cameras_back(tmp_path: Path, intrinsics: bool)
 
 def test_one_camera_is_enough(tmp_path: Path) -> None:
     truth = write_uncalibrated(tmp_path, intrinsics=False, noise=0.05)
-    estimate = calibrate(Capture.load(tmp_path), make_head(), cameras=["right"], noise=1e-3)
+    estimate = calibrate_heads(Capture.load(tmp_path), make_head(), cameras=["right"], noise=1e-3).capture
     assert estimate.camera("right").fx == pytest.approx(truth[1].fx, rel=0.05)
     with pytest.raises(InputError, match="camera 'left' has no intrinsics"):
         estimate.camera("left")
@@ -77,9 +77,9 @@ def test_too_few_landmarks_are_counted(tmp_path: Path) -> None:
     write_uncalibrated(tmp_path, intrinsics=False)
     write_landmarks(tmp_path / "left2.json", Landmarks(np.zeros((68, 2)), np.arange(68) < 5))
     with pytest.raises(InputError, match=r"camera 'left', timestep 2: found 5 visible landmarks, expected at least 6"):
-        calibrate(Capture.load(tmp_path), make_head())
+        calibrate_heads(Capture.load(tmp_path), make_head())
     with pytest.raises(InputError, match=r"landmarks3d: found shape \(5, 3\)"):
-        calibrate(Capture.load(tmp_path), np.zeros((5, 3)))
+        calibrate_heads(Capture.load(tmp_path), np.zeros((5, 3)))
 
 
 @pytest.mark.slow
@@ -91,13 +91,13 @@ def test_known_intrinsics_and_the_model_give_poses_of_a_real_pair(shared: Path, 
     views = {name: dataclasses.replace(view, world_to_camera=None) for name, view in reference.views.items()}
     capture = dataclasses.replace(reference, views=views)
     scale = model.unit_mm / capture.unit_mm
-    estimate = calibrate(
+    estimate = calibrate_heads(
         capture,
         model.mean[model.landmarks] * scale,
         model.identity[model.landmarks][:, :, :15] * scale,
         cameras=["left", "right"],
         timesteps=[0, 1, 2],
-    )
+    ).capture
     found, truth = (relative(c.camera("left"), c.camera("right")) for c in (estimate, reference))
     angle = np.degrees(Rotation.from_matrix(found[:3, :3] @ truth[:3, :3].T).magnitude())
     assert angle < 2.0

@@ -13,7 +13,7 @@ from mifit.capture import Capture
 from mifit.capture.landmark_files import Landmarks, write_landmarks
 from mifit.capture.transforms import Shot, View, write_transforms
 from mifit.core.image import write_image
-from mifit.extras.bundle import Bundle, Intrinsics, Sightings, adjust_bundle
+from mifit.extras.bundle import Bundle, Freedom, Sightings, adjust_bundle
 from mifit.extras.calibrate_densely import calibrate_capture
 from mifit.morphable import MorphableModel
 from tests.stages.memory_capture import make_capture
@@ -21,7 +21,7 @@ from tests.stages.memory_capture import make_capture
 BOTH = ("left", "right")
 TURNS = [(0, 0, 0), (-8, 14, 3), (9, -12, -4)]
 FOCAL = 680.0
-PRIOR = (np.array([np.log(1.8 * 340)]), 0.7)
+PRIOR = (np.array([1.8 * 340]), 0.7)
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +46,10 @@ def uncalibrated(model, tmp_path_factory) -> Capture:
 
 
 def test_matches_give_the_focal_length_that_biased_landmarks_miss(model, uncalibrated) -> None:
-    from mifit.extras.calibrate_heads import calibrate
+    from mifit.extras.calibrate_heads import calibrate_heads
 
     marks, modes = model.mean[model.landmarks], model.identity[model.landmarks]
-    by_landmarks = calibrate(uncalibrated, marks, modes).camera("left").fx
+    by_landmarks = calibrate_heads(uncalibrated, marks, modes).capture.camera("left").fx
     assert abs(by_landmarks / FOCAL - 1) > 0.1
     found = calibrate_capture(uncalibrated, model, BOTH, (0, 1, 2))
     left, right = (found.capture.camera(name) for name in BOTH)
@@ -64,10 +64,10 @@ def test_matches_give_the_focal_length_that_biased_landmarks_miss(model, uncalib
 
 
 def test_two_images_leave_the_landmarks_value_and_say_so(model, uncalibrated) -> None:
-    from mifit.extras.calibrate_heads import calibrate
+    from mifit.extras.calibrate_heads import calibrate_heads
 
     marks, modes = model.mean[model.landmarks], model.identity[model.landmarks]
-    by_landmarks = calibrate(uncalibrated, marks, modes, timesteps=[0])
+    by_landmarks = calibrate_heads(uncalibrated, marks, modes, timesteps=[0]).capture
     found = calibrate_capture(uncalibrated, model, BOTH, (0,))
     assert found.deviation is None and found.residual is None
     assert found.capture.camera("left").fx == pytest.approx(by_landmarks.camera("left").fx)
@@ -119,6 +119,11 @@ def exact(turns, expressions=0.0, points=400):
     return truth, Sightings(FOCAL * seen[:, :2] / seen[:, 2:], point, camera, step, 0.3), modes
 
 
+def freedom(start: Bundle, group=(0, 0)) -> Freedom:
+    """One focal length, loosely known; -1: a camera's own."""
+    return Freedom.of_focals(np.array(group), start.focal, *PRIOR)
+
+
 def shaken(truth: Bundle) -> Bundle:
     """A start as landmarks give it: a focal length that is 25 per cent short, poses and points that are off."""
     rng = np.random.default_rng(2)
@@ -131,7 +136,8 @@ def shaken(truth: Bundle) -> Bundle:
 @pytest.mark.parametrize("expressions", [0.0, 0.2])
 def test_exact_matches_give_the_focal_length_whatever_the_face_does(expressions: float) -> None:
     truth, seen, modes = exact(TURNS, expressions)
-    found = adjust_bundle(shaken(truth), seen, Intrinsics(np.zeros(2, int), PRIOR), modes)
+    start = shaken(truth)
+    found = adjust_bundle(start, seen, freedom(start), modes)
     assert found.settled
     assert found.bundle.focal == pytest.approx(FOCAL, rel=2e-3)
     assert found.residual < 0.02
@@ -144,7 +150,7 @@ def test_the_deviation_is_that_of_repeated_noise() -> None:
     rng, logs, told = np.random.default_rng(3), [], []
     for _ in range(12):
         noisy = replace(seen, pixels=seen.pixels + 0.3 * rng.normal(size=seen.pixels.shape))
-        found = adjust_bundle(truth, noisy, Intrinsics(np.zeros(2, int), PRIOR), modes)
+        found = adjust_bundle(truth, noisy, freedom(truth), modes)
         logs.append(np.log(found.bundle.focal[0]))
         told.append(found.deviation)
     assert np.mean(told) == pytest.approx(np.std(logs, ddof=1), rel=0.6)  # twelve samples give it to 20 %
@@ -153,14 +159,13 @@ def test_the_deviation_is_that_of_repeated_noise() -> None:
 def test_two_views_of_a_head_that_keeps_still_determine_no_focal_length() -> None:
     truth, seen, modes = exact(TURNS[:1])
     noisy = replace(seen, pixels=seen.pixels + 0.3 * np.random.default_rng(3).normal(size=seen.pixels.shape))
-    found = adjust_bundle(truth, noisy, Intrinsics(np.zeros(2, int), PRIOR), modes)
+    found = adjust_bundle(truth, noisy, freedom(truth), modes)
     assert found.deviation > 0.1
 
 
 def test_known_focal_lengths_stay() -> None:
     truth, seen, modes = exact(TURNS)
     start = replace(shaken(truth), focal=truth.focal * (1.0, 0.8))
-    mixed = Intrinsics(np.array([-1, 0]), PRIOR)
-    found = adjust_bundle(start, seen, mixed, modes)
+    found = adjust_bundle(start, seen, freedom(start, (-1, 0)), modes)
     assert found.bundle.focal[0] == FOCAL
     assert found.bundle.focal[1] == pytest.approx(FOCAL, rel=2e-3)

@@ -8,8 +8,7 @@ import pytest
 
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
-from mifit.morphable.formats.bfm2009 import load_bfm2009
-from mifit.morphable.formats.bfm_h5 import read_specular_albedo
+from mifit.morphable.formats.bfm_mat import load_bfm2009
 from mifit.morphable.formats.gnm import STRIP
 from mifit.morphable.openings import SCLERA_ALBEDO, eyeballs, lacks_eyes
 from mifit.morphable.recognise import recognise
@@ -92,9 +91,6 @@ def test_albedomm_beside_bfm(tmp_path, source):
     m = MorphableModel.load(tmp_path / "model2017.h5")
     np.testing.assert_allclose(m.mean_albedo, source.mean_albedo, atol=1e-6)
     np.testing.assert_allclose(m.albedo_modes, source.albedo_modes, atol=1e-6)  # linear: no decoding
-    mean, modes = read_specular_albedo(tmp_path / "albedoModel2020.h5")
-    np.testing.assert_allclose(mean, source.mean_albedo, atol=1e-6)
-    np.testing.assert_allclose(modes, source.albedo_modes, atol=1e-6)
 
 
 def test_flame_pickle(tmp_path, source):

@@ -215,7 +215,7 @@ def plain_array(value: Any, where: str) -> np.ndarray:
 
 
 class _Machine:
-    """Stack and memo; one method a kind of instruction."""
+    """Stack and memo."""
 
     def __init__(self) -> None:
         self.stack: list[Any] = []
@@ -225,19 +225,100 @@ class _Machine:
         for step, (op, argument, _) in enumerate(instructions):
             if step > MAX_STEPS:
                 raise InputError(f"found more than {MAX_STEPS} instructions, expected a dictionary of arrays")
+            if op.name == "STOP":
+                return self.stack.pop()
             if op.name in _VALUES:
                 self.stack.append(_CONSTANTS.get(op.name, argument))
-            elif op.name == "STOP":
-                return self.stack.pop()
-            elif op.name in ("GLOBAL", "INST"):
-                self.name(*str(argument).split(" ", 1))
-                if op.name == "INST":
-                    raise InputError("uses INST, which is refused; expected arrays only")
-            elif (do := getattr(self, f"do_{op.name.lower()}", None)) is not None:
-                do() if argument is None else do(argument)
-            else:
-                raise InputError(f"uses {op.name}, which is refused; expected arrays only")
+            elif not self.collect(op.name) and not self.remember(op.name, argument):
+                self.make(op.name, argument)
         raise ValueError("no end")
+
+    def collect(self, op: str) -> bool:
+        """Containers, and what moves values of the stack; False for another instruction."""
+        stack = self.stack
+        match op:
+            case "MARK":
+                stack.append(_MARK)
+            case "POP":
+                stack.pop()
+            case "POP_MARK":
+                self.marked()
+            case "DUP":
+                stack.append(stack[-1])
+            case "EMPTY_TUPLE" | "EMPTY_LIST" | "EMPTY_DICT":
+                stack.append({"EMPTY_TUPLE": tuple, "EMPTY_LIST": list, "EMPTY_DICT": dict}[op]())
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                values = tuple(stack[-int(op[-1]) :])
+                del stack[-int(op[-1]) :]
+                stack.append(values)
+            case "TUPLE":
+                stack.append(tuple(self.marked()))
+            case "LIST":
+                stack.append(self.marked())
+            case "DICT":
+                items = self.marked()
+                stack.append({})
+                self.set_items(items)
+            case "APPEND":
+                value = stack.pop()
+                self.extend([value])
+            case "APPENDS":
+                self.extend(self.marked())
+            case "SETITEM":
+                value, key = stack.pop(), stack.pop()
+                self.set_items([key, value])
+            case "SETITEMS":
+                self.set_items(self.marked())
+            case _:
+                return False
+        return True
+
+    def remember(self, op: str, argument: Any) -> bool:
+        """The memo, and what says nothing of the values; False for another instruction."""
+        match op:
+            case "PROTO" | "FRAME":
+                pass
+            case "MEMOIZE":
+                self.memo[len(self.memo)] = self.stack[-1]
+            case "PUT" | "BINPUT" | "LONG_BINPUT":
+                if argument > 2**32:  # larger ones could be chosen to collide
+                    raise InputError(f"memo index {_short(argument)}, expected at most {2**32}")
+                self.memo[argument] = self.stack[-1]
+            case "GET" | "BINGET" | "LONG_BINGET":
+                self.stack.append(self.memo[argument])
+            case _:
+                return False
+        return True
+
+    def make(self, op: str, argument: Any) -> None:
+        """Names, and what they are used for: all that could do harm."""
+        match op:
+            case "GLOBAL":
+                self.name(*str(argument).split(" ", 1))
+            case "STACK_GLOBAL":
+                name, module = self.stack.pop(), self.stack.pop()
+                if type(name) is not str or type(module) is not str:
+                    raise ValueError("a name that isn't text")
+                self.name(module, name)
+            case "REDUCE":
+                arguments, function = self.stack.pop(), self.stack.pop()
+                if type(function) is not Name or function not in _RECIPES or type(arguments) is not tuple:
+                    raise InputError(f"wants to run {_short(function)}, which is refused; expected arrays only")
+                self.stack.append(_RECIPES[function](*arguments))
+            case "NEWOBJ":
+                _, kind = self.stack.pop(), self.stack.pop()
+                self.stack.append(_object(kind))
+            case "BUILD":
+                state, target = self.stack.pop(), self.stack[-1]
+                if not isinstance(target, (Array, Dtype, Instance)):
+                    kind = type(target).__name__
+                    raise InputError(f"sets the state of a {kind}, which is refused; expected arrays only")
+                target.build(state)
+            case "INST":
+                self.name(*str(argument).split(" ", 1))  # says which, where it is one that is never admitted
+                raise InputError("uses INST, which is refused; expected arrays only")
+            case _:
+                raise InputError(f"uses {op}, which is refused; expected arrays only")
 
     def name(self, module: str, name: str) -> None:
         if Name(module, name) not in _ADMITTED:
@@ -270,103 +351,3 @@ class _Machine:
         if type(self.stack[-1]) is not list:
             raise ValueError("values without a list")
         self.stack[-1].extend(values)
-
-    def call(self, function: Any, arguments: Any) -> None:
-        if type(function) is not Name or function not in _RECIPES or type(arguments) is not tuple:
-            raise InputError(f"wants to run {_short(function)}, which is refused; expected arrays only")
-        self.stack.append(_RECIPES[function](*arguments))
-
-    def do_proto(self, version: int) -> None: ...
-    def do_frame(self, size: int) -> None: ...
-
-    def do_mark(self) -> None:
-        self.stack.append(_MARK)
-
-    def do_pop(self) -> None:
-        self.stack.pop()
-
-    def do_pop_mark(self) -> None:
-        self.marked()
-
-    def do_dup(self) -> None:
-        self.stack.append(self.stack[-1])
-
-    def do_memoize(self) -> None:
-        self.memo[len(self.memo)] = self.stack[-1]
-
-    def do_put(self, index: int) -> None:
-        if index > 2**32:  # larger ones could be chosen to collide
-            raise InputError(f"memo index {_short(index)}, expected at most {2**32}")
-        self.memo[index] = self.stack[-1]
-
-    def do_get(self, index: int) -> None:
-        self.stack.append(self.memo[index])
-
-    do_binput = do_long_binput = do_put
-    do_binget = do_long_binget = do_get
-
-    def do_empty_tuple(self) -> None:
-        self.stack.append(())
-
-    def do_empty_list(self) -> None:
-        self.stack.append([])
-
-    def do_empty_dict(self) -> None:
-        self.stack.append({})
-
-    def do_tuple(self) -> None:
-        self.stack.append(tuple(self.marked()))
-
-    def do_tuple1(self, count: int = 1) -> None:
-        values = self.stack[-count:]
-        del self.stack[-count:]
-        self.stack.append(tuple(values))
-
-    def do_tuple2(self) -> None:
-        self.do_tuple1(2)
-
-    def do_tuple3(self) -> None:
-        self.do_tuple1(3)
-
-    def do_list(self) -> None:
-        self.stack.append(self.marked())
-
-    def do_dict(self) -> None:
-        values = self.marked()
-        self.stack.append({})
-        self.set_items(values)
-
-    def do_append(self) -> None:
-        value = self.stack.pop()
-        self.extend([value])
-
-    def do_appends(self) -> None:
-        self.extend(self.marked())
-
-    def do_setitem(self) -> None:
-        value, key = self.stack.pop(), self.stack.pop()
-        self.set_items([key, value])
-
-    def do_setitems(self) -> None:
-        self.set_items(self.marked())
-
-    def do_stack_global(self) -> None:
-        name, module = self.stack.pop(), self.stack.pop()
-        if type(name) is not str or type(module) is not str:
-            raise ValueError("a name that isn't text")
-        self.name(module, name)
-
-    def do_reduce(self) -> None:
-        arguments, function = self.stack.pop(), self.stack.pop()
-        self.call(function, arguments)
-
-    def do_newobj(self) -> None:
-        _, kind = self.stack.pop(), self.stack.pop()
-        self.stack.append(_object(kind))
-
-    def do_build(self) -> None:
-        state = self.stack.pop()
-        target = self.stack[-1]
-        if not isinstance(target, (Array, Dtype, Instance)):
-            raise InputError(f"sets the state of a {type(target).__name__}, which is refused; expected arrays only")
-        target.build(state)

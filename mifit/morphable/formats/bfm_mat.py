@@ -1,4 +1,9 @@
-"""Basel Face Model 2009 (``01_MorphableModel.mat``), with FaceWarehouse expressions where they lie beside it."""
+"""Basel Face Model 2009 and what was cut from it, in MATLAB files.
+
+``01_MorphableModel.mat`` itself, with FaceWarehouse expressions where they lie beside it; 3DDFA's ``Model_Shape.mat``
+with ``Model_Expression.mat`` beside it, in micrometres; Deep3DFaceRecon's ``BFM_model_front.mat``, in decimetres, modes
+scaled by their deviations, colours 0..255.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +15,14 @@ from numpy.typing import NDArray
 from mifit.core.files import opened, read_text
 from mifit.core.limits import MAX_MODEL_BYTES, MAX_SETTINGS_BYTES
 from mifit.errors import InputError
-from mifit.morphable.assemble import complete, interleaved, single, srgb_albedo
+from mifit.morphable.assemble import complete, find_face_mask, interleaved, single, srgb_albedo
 from mifit.morphable.formats.mat5 import read_mat
 from mifit.morphable.model import MorphableModel
+from mifit.morphable.topology import oriented_outwards
 
-KEYS = ("shapeMU", "shapePC", "shapeEV", "texMU", "texPC", "texEV", "tl")
+BFM_KEYS = ("shapeMU", "shapePC", "shapeEV", "texMU", "texPC", "texEV", "tl")
+DDFA_KEYS = ("mu_shape", "w", "sigma", "tri", "keypoints")
+DEEP3D_KEYS = ("meanshape", "meantex", "idBase", "exBase", "texBase", "tri", "keypoints")
 
 
 def load_bfm2009(path: Path, add_expression_mean: bool = False) -> MorphableModel:
@@ -24,7 +32,7 @@ def load_bfm2009(path: Path, add_expression_mean: bool = False) -> MorphableMode
     them the model has none. Their stored mean isn't zero: readers differ, here it is dropped unless
     ``add_expression_mean`` is set.
     """
-    data = read_mat(path, KEYS)
+    data = read_mat(path, BFM_KEYS)
     n3, k = check_modes(path, data["shapePC"], "shapePC")
     mean = vector(path, data["shapeMU"], "shapeMU", n3)
     sigma = vector(path, data["shapeEV"], "shapeEV", k)
@@ -106,3 +114,69 @@ def triangles(path: Path, values: NDArray, key: str, n: int) -> NDArray[np.int64
     if not np.isfinite(t).all() or t.min() < 1 or t.max() > n:
         raise InputError(f"{path}: {key} holds {t.min()}..{t.max()}, expected 1-based indices up to {n}")
     return t.astype(np.int64) - 1
+
+
+def load_3ddfa(path: Path) -> MorphableModel:
+    """Read shape and expressions; keypoints are the 68 landmarks. The albedo is the pigment model's."""
+    data = read_mat(path, DDFA_KEYS)
+    n3, k = check_modes(path, data["w"], "w")
+    mean = vector(path, data["mu_shape"], "mu_shape", n3)
+    identity = interleaved(data["w"] * (vector(path, data["sigma"], "sigma", k) / 1000.0))
+    faces = triangles(path, data["tri"], "tri", n3 // 3)
+    beside = path.parent / "Model_Expression.mat"
+    expression = np.zeros((n3 // 3, 3, 0), dtype=np.float32)
+    if beside.is_file():
+        extra = read_mat(beside, ("mu_exp", "w_exp", "sigma_exp"))
+        _, ke = check_modes(beside, extra["w_exp"], "w_exp", n3)
+        expression = interleaved(extra["w_exp"] * (vector(beside, extra["sigma_exp"], "sigma_exp", ke) / 1000.0))
+        mean = mean + vector(beside, extra["mu_exp"], "mu_exp", n3)
+    return complete(
+        "3ddfa",
+        single(mean / 1000.0).reshape(-1, 3),
+        oriented_outwards(mean.reshape(-1, 3), faces),
+        identity,
+        expression,
+        1.0,
+        landmarks=_keypoints(path, data["keypoints"], n3 // 3),
+        source=path,
+    )
+
+
+def _keypoints(path: Path, values: NDArray, n: int) -> NDArray:
+    """68 vertex indices from 1-based vertices, or from 1-based positions of coordinates (x, y, z of each)."""
+    k = values.ravel().astype(np.int64)
+    if k.size == 204:
+        k = (k[::3] - 1) // 3 + 1
+    if k.size != 68 or k.min() < 1 or k.max() > n:
+        raise InputError(f"{path}: keypoints has {k.size} values up to {k.max()}, expected 68 vertices of {n}, 1-based")
+    return k - 1
+
+
+def load_deep3d(path: Path) -> MorphableModel:
+    """Read the model; where ``skinmask`` is present it narrows the face area."""
+    data = read_mat(path, DEEP3D_KEYS, ("skinmask",))
+    n3, _ = check_modes(path, data["idBase"], "idBase")
+    check_modes(path, data["exBase"], "exBase", n3)
+    check_modes(path, data["texBase"], "texBase", n3)
+    mean = vector(path, data["meanshape"], "meanshape", n3).reshape(-1, 3)
+    faces = oriented_outwards(mean, triangles(path, data["tri"], "tri", n3 // 3))
+    keypoints = data["keypoints"].ravel().astype(np.int64) - 1
+    if keypoints.size != 68 or keypoints.min() < 0 or keypoints.max() >= n3 // 3:
+        raise InputError(f"{path}: keypoints has shape {data['keypoints'].shape}, expected 68 1-based vertices")
+    mask = find_face_mask(mean, faces, keypoints)
+    if "skinmask" in data:
+        skin = vector(path, data["skinmask"], "skinmask", n3 // 3) > 0.5
+        mask &= skin[faces].all(1)
+    texture = vector(path, data["meantex"], "meantex", n3).reshape(-1, 3) / 255.0
+    return complete(
+        "deep3dfacerecon",
+        single(mean),
+        faces,
+        interleaved(data["idBase"]),
+        interleaved(data["exBase"]),
+        100.0,
+        albedo=srgb_albedo(texture, interleaved(data["texBase"]) / np.float32(255.0)),
+        landmarks=keypoints,
+        face_mask=mask,
+        source=path,
+    )
