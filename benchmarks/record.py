@@ -134,14 +134,14 @@ def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float | None:
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores, memory, operating system, versions and commit."""
+    """Processor, cores, memory, operating system, versions, and the last commit that changed the package."""
     cpu = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
         cpu = next((line.split(":", 1)[1].strip() for line in info.open() if line.startswith("model name")), cpu)
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=Path(__file__).parent, check=False
-    ).stdout.strip()
+    log = ["git", "log", "-1", "--format=%h", "--", "mifit"]
+    root = Path(__file__).resolve().parents[1]
+    commit = subprocess.run(log, capture_output=True, text=True, cwd=root, check=False).stdout.strip()
     return {
         "cpu": cpu,
         "cores": os.cpu_count(),

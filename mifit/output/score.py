@@ -56,7 +56,6 @@ if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
 
 MESHES = (".ply", ".obj")
-REGIONS = ("skin", "face", "whole")
 
 
 def score(
