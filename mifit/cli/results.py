@@ -242,6 +242,7 @@ def export(arguments: Namespace) -> None:
         mesh=arguments.mesh,
         animate=arguments.animate,
         fps=arguments.fps,
+        units=arguments.units,
     )
     print(f"Export: {arguments.out}")
 
@@ -348,6 +349,7 @@ def add_commands(add: types.Add) -> None:
     p.add_argument("--out", type=types.path, required=True, help="file to write")
     add_force(p)
     p.add_argument("--timestep", type=types.at_least(0), help="default: the first of the result")
+    p.add_argument("--units", choices=["m", "cm", "mm"], help="of obj and ply; default: the result's")
     p.add_argument("--animate", action="store_true", help="glb: play all timesteps, from --timestep's maps")
     types.add_rate(p)
     p.add_argument(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -9,11 +10,11 @@ import numpy as np
 
 from mifit.appearance.cornea import CORNEA, REFLECTANCE
 from mifit.core.arrays import write_ply
-from mifit.core.files import replacing, write_text
-from mifit.core.image import encode_png, linear_to_srgb, to_8_bit, write_image
+from mifit.core.files import write_bytes, write_text
+from mifit.core.image import encode_png, to_8_bit, write_image
 from mifit.core.mesh import part_of, split_at_seams, tangent_space_map, vertex_normals
 from mifit.errors import InputError
-from mifit.output.gltf import write_glb
+from mifit.output.gltf import CORNEA_ROUGHNESS, write_glb
 from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
@@ -23,6 +24,10 @@ Format = Literal["glb", "obj", "ply", "mitsuba"]
 SUFFIXES = {"glb": ".glb", "obj": ".obj", "ply": ".ply", "mitsuba": ".xml"}
 
 
+PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
+"""Millimetres."""
+OBJ_SPECULAR = 0.08
+"""Reflectance along the normal where an OBJ's specular map, linear as Blender reads it, is white."""
 Mesh = Literal["fitted", "refined"]
 
 
@@ -34,6 +39,7 @@ def export(
     mesh: Mesh = "fitted",
     animate: bool = False,
     fps: float = 12.0,
+    units: str | None = None,
 ) -> None:
     """Write one timestep for another program.
 
@@ -55,6 +61,8 @@ def export(
         ``glb`` plays all timesteps; maps, and a refined mesh's shape, stay those of ``timestep``.
     fps : float
         Timesteps per second of that animation.
+    units : {"m", "cm", "mm"}, optional
+        Of ``obj`` and ``ply``; default: the result's. ``glb`` is in metres, as glTF has it.
 
     Raises
     ------
@@ -73,6 +81,9 @@ def export(
     reconstruction.index(timestep)
     if animate and format != "glb":
         raise InputError(f"animate: found format {format!r}, expected 'glb', the only one that holds an animation")
+    if units is not None and (format not in ("obj", "ply") or units not in PER_UNIT):
+        raise InputError(f"units: found {units!r} for {format}, expected m, cm or mm for obj or ply")
+    factor = 1.0 if units is None else reconstruction.unit_mm / PER_UNIT[units]
     if mesh == "refined":
         displacement = reconstruction.displacement(timestep)
         reconstruction = reconstruction.with_refined_mesh()
@@ -80,20 +91,20 @@ def export(
     if format == "glb":
         write_glb(reconstruction, path, timestep, sorted(reconstruction.timesteps) if animate else None, fps)
     elif format == "obj":
-        _write_obj(reconstruction, path, timestep)
+        _write_obj(reconstruction, path, timestep, factor, units or reconstruction.units)
     elif format == "ply":
         split = split_at_seams(reconstruction.model)
         vertices = reconstruction.geometry.vertices[reconstruction.index(timestep)]
         normals = vertex_normals(vertices, reconstruction.model.faces)[split.origin]
         albedo = reconstruction.geometry.vertex_albedo[split.origin]
-        write_ply(path, vertices[split.origin], split.faces, normals, split.uv, albedo)
+        write_ply(path, factor * vertices[split.origin], split.faces, normals, split.uv, albedo)
     else:
         from mifit.output.scene import write_scene
 
         write_scene(reconstruction, path, timestep)
 
 
-def _write_obj(reconstruction: Result, path: Path, timestep: int) -> None:
+def _write_obj(reconstruction: Result, path: Path, timestep: int, factor: float, units: str) -> None:
     """OBJ with ``vt`` and ``vn``; what has maps, eyes and the rest are groups with a material each."""
     model, i = reconstruction.model, reconstruction.index(timestep)
     vertices = reconstruction.geometry.vertices[i]
@@ -106,26 +117,30 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int) -> None:
     )
     stem = path.stem
     write_image(path.with_name(f"{stem}_diffuse.png"), maps.diffuse)
-    write_image(path.with_name(f"{stem}_specular.png"), maps.specular)
-    with replacing(path.with_name(f"{stem}_normal.png")) as temporary:
-        temporary.write_bytes(encode_png(np.round(127.5 * (bent + 1)).astype(np.uint8)))
+    reflectance = np.clip(reconstruction.lobe.factor() * maps.specular / OBJ_SPECULAR, 0.0, 1.0)
+    for name, codes in (("specular", 255 * reflectance), ("normal", 127.5 * (bent + 1))):
+        write_bytes(path.with_name(f"{stem}_{name}.png"), encode_png(np.round(codes).astype(np.uint8)))
     albedo = vertex_materials(reconstruction, skin=True)[:, :3]
     rest = part_of(mesh, ~mapped) if not mapped.all() else None
     grey = albedo[rest.origin].mean(0) if rest else np.full(3, 0.5)
-    colour = " ".join(f"{c:.5f}" for c in linear_to_srgb(np.clip(grey, 0, 1)))
+    colour = " ".join(f"{c:.5f}" for c in np.clip(grey, 0, 1))
+    specular = " ".join([f"{OBJ_SPECULAR:g}"] * 3)
     film, eyes = " ".join([f"{REFLECTANCE:.5f}"] * 3), eye_faces(reconstruction, skin=True)
     write_text(
         path.with_suffix(".mtl"),
-        f"newmtl skin\nillum 2\nKd 1 1 1\nKs 1 1 1\nNs {reconstruction.lobe.typical:.6g}\n"
-        f"map_Kd {stem}_diffuse.png\nmap_Ks {stem}_specular.png\nnorm {stem}_normal.png\n\n"
-        f"newmtl eyes\nillum 2\nKd 1 1 1\nKs {film}\nNs {CORNEA.typical:.6g}\nmap_Kd {stem}_diffuse.png\n\n"
+        # Pr, of physically based programs, is glTF's roughness; Blender reads a normal map from map_Bump, others norm.
+        f"newmtl skin\nillum 2\nKd 1 1 1\nKs {specular}\nNs {reconstruction.lobe.typical:.6g}\n"
+        f"Pr {math.sqrt(reconstruction.lobe.roughness):.4f}\nmap_Kd {stem}_diffuse.png\nmap_Ks {stem}_specular.png\n"
+        f"norm {stem}_normal.png\nmap_Bump -bm 1.0 {stem}_normal.png\n\n"
+        f"newmtl eyes\nillum 2\nKd 1 1 1\nKs {film}\nNs {CORNEA.typical:.6g}\nPr {CORNEA_ROUGHNESS}\n"
+        f"map_Kd {stem}_diffuse.png\n\n"
         f"newmtl rest\nillum 1\nKd {colour}\nKs 0 0 0\n",
     )
     codes = to_8_bit(albedo) / 255.0
-    lines = [f"# written by mifit; units {reconstruction.units}", f"mtllib {stem}.mtl"]
+    lines = [f"# written by mifit; units {units}", f"mtllib {stem}.mtl"]
     lines += [
         f"v {x:.7g} {y:.7g} {z:.7g} {r:.4f} {g:.4f} {b:.4f}"
-        for (x, y, z), (r, g, b) in zip(vertices.tolist(), codes.tolist(), strict=True)
+        for (x, y, z), (r, g, b) in zip((factor * vertices).tolist(), codes.tolist(), strict=True)
     ]
     lines += [f"vt {u:.7g} {v:.7g}" for u, v in model.uv.tolist()]
     lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in normals.tolist()]

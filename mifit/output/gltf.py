@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,6 +33,8 @@ DIELECTRIC_F0 = 0.04
 """Reflectance at normal incidence of glTF's dielectric, which KHR_materials_specular scales."""
 CORNEA_ROUGHNESS = 0.05
 """Of the film of tears on an eye, in glTF's terms: as smooth as viewers bear."""
+STILL = 1e-4
+"""Metres at full weight by which a vertex moves so little that a morph target leaves it out."""
 SKIN, REST, EYES = range(3)
 """Materials, in their order."""
 
@@ -67,6 +70,26 @@ class _Buffer:
         self.accessors.append(entry)
         return len(self.accessors) - 1
 
+    def sparse(self, values: NDArray) -> int:
+        """Append an array (N, 3) of which only the rows that aren't 0 are stored; returns the accessor's index."""
+        array = np.ascontiguousarray(values, dtype="<f4")
+        rows = np.flatnonzero(array.any(axis=1))
+        rows = rows if len(rows) else np.zeros(1, dtype=int)
+        kind = np.dtype("<u2" if len(array) <= 2**16 else "<u4")
+        bounds = {name: f(array, axis=0).tolist() for name, f in (("min", np.min), ("max", np.max))}
+        stored = {
+            "count": len(rows),
+            "indices": {"bufferView": self.view(rows.astype(kind).tobytes()), "componentType": _KINDS[kind]},
+            "values": {"bufferView": self.view(array[rows].tobytes())},
+        }
+        self.accessors.append({"componentType": 5126, "count": len(array), "type": "VEC3", "sparse": stored} | bounds)
+        return len(self.accessors) - 1
+
+
+def shape_name(name: str) -> str:
+    """The name that ARKit has for a blend shape of ICT-FaceKit: ``mouthSmile_L`` is ``mouthSmileLeft``."""
+    return re.sub("_L$", "Left", re.sub("_R$", "Right", name))
+
 
 def write_glb(
     reconstruction: Result,
@@ -83,7 +106,9 @@ def write_glb(
     usual relation, and roughness = sqrt(alpha). Eyeballs have a material of their own, which is that of the skin under
     the clear coat of a cornea (KHR_materials_clearcoat). The other faces have vertex colours. The model's expressions
     are morph targets, with the timestep's coefficients as weights. Recovered lighting is in the scene's ``extras``:
-    glTF has no spherical harmonics.
+    glTF has no spherical harmonics. Node and mesh are called as the file. Morph targets have ARKit's names where the
+    model has its shapes; where a coefficient runs from 0 to a bound, the weight runs from 0 to 1. They hold only the
+    vertices that they move.
 
     Parameters
     ----------
@@ -103,8 +128,11 @@ def write_glb(
     rotation, scale = geometry.rotation[i], float(geometry.scale)
     posed = (geometry.vertices[i] - geometry.translation[i]) @ rotation * metre
     normals = vertex_normals(posed, model.faces)
-    weights = np.asarray(geometry.expression[i], dtype=np.float64)
-    targets = model.expression * (scale * metre)
+    low, high = np.asarray(model.expression_bounds, dtype=np.float64).T
+    full = np.where((low == 0) & np.isfinite(high) & (high > 0), high, 1.0)  # coefficient of a weight of 1
+    weights = np.asarray(geometry.expression[i], dtype=np.float64) / full
+    targets = (model.expression * (scale * metre * full)).astype(np.float32)
+    targets *= (np.linalg.norm(targets, axis=1, keepdims=True) > STILL).astype(np.float32)
     # Base plus weighted targets is the fitted shape, to rounding.
     base = posed - targets @ weights if len(weights) else posed
 
@@ -120,7 +148,8 @@ def write_glb(
             part = part_of(mesh, selected)
             primitives.append(_primitive(out, part, base, normals, targets, material, albedo))
     images, textures, skin = _skin(out, reconstruction, timestep, mesh, posed, normals)
-    head: dict[str, Any] = {"name": "head", "mesh": 0}
+    subject = Path(path).stem
+    head: dict[str, Any] = {"name": subject, "mesh": 0}
     animations = []
     if animate:
         # A node that is animated may have no matrix.
@@ -129,7 +158,7 @@ def write_glb(
             "translation": (geometry.translation[i] * metre).tolist(),
         }
         rows = [reconstruction.index(t) for t in animate]
-        animations.append(_animation(out, geometry, rows, np.subtract(animate, animate[0]) / fps, metre))
+        animations.append(_animation(out, geometry, rows, np.subtract(animate, animate[0]) / fps, metre, full))
     else:
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation, geometry.translation[i] * metre
@@ -160,7 +189,7 @@ def write_glb(
             }
         ],
         "nodes": nodes,
-        "meshes": [{"name": model.name, "primitives": primitives}],
+        "meshes": [{"name": subject, "primitives": primitives}],
         "materials": materials,
         "textures": textures,
         "images": images,
@@ -169,7 +198,8 @@ def write_glb(
         "bufferViews": out.views,
     }
     if len(weights):
-        document["meshes"][0] |= {"weights": weights.tolist(), "extras": {"targetNames": list(model.expression_names)}}
+        names = [shape_name(name) for name in model.expression_names]
+        document["meshes"][0] |= {"weights": weights.tolist(), "extras": {"targetNames": names}}
     if cameras:
         document["cameras"] = cameras
     if animations:
@@ -201,13 +231,11 @@ def _primitive(
         attributes["COLOR_0"] = out.accessor(albedo[part.origin], "<f4")
     primitive: dict[str, Any] = {
         "attributes": attributes,
-        "indices": out.accessor(part.faces.ravel(), "<u4", target=34963),
+        "indices": out.accessor(part.faces.ravel(), "<u2" if len(part.origin) <= 2**16 else "<u4", target=34963),
         "material": material,
     }
     if targets.shape[2]:
-        primitive["targets"] = [
-            {"POSITION": out.accessor(targets[part.origin, :, k], "<f4", bounds=True)} for k in range(targets.shape[2])
-        ]
+        primitive["targets"] = [{"POSITION": out.sparse(targets[part.origin, :, k])} for k in range(targets.shape[2])]
     return primitive
 
 
@@ -264,7 +292,7 @@ def _eyes(skin: dict[str, Any]) -> dict[str, Any]:
 
 
 def _animation(
-    out: _Buffer, geometry: GeometryEstimate, rows: Sequence[int], seconds: NDArray, metre: float
+    out: _Buffer, geometry: GeometryEstimate, rows: Sequence[int], seconds: NDArray, metre: float, full: NDArray
 ) -> dict[str, Any]:
     """Pose and expression of node 0 over time, linear between timesteps."""
     times = out.accessor(seconds, "<f4", target=None, bounds=True)
@@ -273,7 +301,7 @@ def _animation(
         "rotation": _quaternions(geometry.rotation[rows]),
     }
     if geometry.expression.shape[1]:
-        values["weights"] = geometry.expression[rows].ravel()
+        values["weights"] = (geometry.expression[rows] / full).ravel()
     return {
         "name": "sequence",
         "samplers": [

@@ -37,8 +37,18 @@ def read_glb(path):
 
     def read(index):
         a = document["accessors"][index]
+        if "sparse" in a:
+            rows, values = a["sparse"]["indices"], a["sparse"]["values"]
+            count, out = a["sparse"]["count"], np.zeros((a["count"], 3), np.float32)
+            views = [document["bufferViews"][part["bufferView"]] for part in (rows, values)]
+            kind = {5123: "<u2", 5125: "<u4"}[rows["componentType"]]
+            index = np.frombuffer(binary, kind, count, views[0]["byteOffset"])
+            assert (np.diff(index.astype(int)) > 0).all()
+            out[index] = np.frombuffer(binary, "<f4", 3 * count, views[1]["byteOffset"]).reshape(-1, 3)
+            assert out.min(0).tolist() == a["min"] and out.max(0).tolist() == a["max"]
+            return out
         view = document["bufferViews"][a["bufferView"]]
-        kind = {5126: "<f4", 5125: "<u4"}[a["componentType"]]
+        kind = {5126: "<f4", 5125: "<u4", 5123: "<u2"}[a["componentType"]]
         width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[a["type"]]
         assert view["byteOffset"] % 4 == 0
         values = np.frombuffer(binary, kind, a["count"] * width, view["byteOffset"]).reshape(-1, width)
@@ -222,3 +232,53 @@ def test_bad_requests_are_named(ball, tmp_path):
         export(ball, "fbx", tmp_path / "x.fbx")
     with pytest.raises(InputError, match="timestep 5 is not in this result"):
         export(ball, "ply", tmp_path / "x.ply", timestep=5)
+
+
+def test_gltf_has_arkits_names_and_weights_and_leaves_out_what_stays_still(ball, tmp_path):
+    moved = np.zeros((*ball.model.mean.shape, 2), np.float32)
+    moved[:40, 1, 0] = np.linspace(0, 0.5, 40)  # centimetres at a third of the way
+    model = replace(
+        ball.model,
+        expression=moved,
+        expression_names=("mouthSmile_L", "browInnerUp_R"),
+        expression_bounds=np.array([[0, 10 / 3], [0, 10 / 3]]),
+    )
+    geometry = replace(ball.geometry, expression=np.array([[1.0, 0.0], [10 / 3, 0.5]]))
+    result = replace(ball, model=model, geometry=geometry, normals=None, mesh=None)
+    export(result, "glb", tmp_path / "anna.glb", timestep=3)
+    document, read, _ = read_glb(tmp_path / "anna.glb")
+    mesh = document["meshes"][0]
+    assert mesh["name"] == document["nodes"][0]["name"] == "anna"
+    assert mesh["extras"]["targetNames"] == ["mouthSmileLeft", "browInnerUpRight"]
+    np.testing.assert_allclose(mesh["weights"], [1.0, 0.15])
+    split = split_at_seams(model)
+    for primitive, selected in zip(mesh["primitives"], (model.face_mask, ~model.face_mask), strict=True):
+        origin = part_of(split, selected).origin
+        found = read(primitive["targets"][0]["POSITION"])
+        expected = moved[origin, :, 0] * 1.02 / 100 * 10 / 3
+        np.testing.assert_allclose(found, expected, atol=1e-4)
+        stored = document["accessors"][primitive["targets"][0]["POSITION"]]["sparse"]["count"]
+        assert stored == max((np.abs(expected[:, 1]) > 1e-4).sum(), 1)
+
+
+@pytest.mark.parametrize("format", ["obj", "ply"])
+def test_units_of_length_scale_the_mesh(ball, tmp_path, format):
+    sizes = {}
+    for units in (None, "m", "mm"):
+        path = tmp_path / f"{units}{SUFFIXES[format]}"
+        export(ball, format, path, units=units)
+        sizes[units] = np.ptp(trimesh.load(path, process=False, force="mesh").vertices, axis=0)
+    np.testing.assert_allclose(sizes["m"] * 100, sizes[None], rtol=1e-4)
+    np.testing.assert_allclose(sizes["mm"] / 10, sizes[None], rtol=1e-4)
+    with pytest.raises(InputError, match="units: found 'mm' for glb, expected m, cm or mm for obj or ply"):
+        export(ball, "glb", tmp_path / "a.glb", units="mm")
+
+
+def test_obj_has_gltfs_roughness_and_links_its_normal_map(ball, glb, tmp_path):
+    export(ball, "obj", tmp_path / "a.obj")
+    skin = (tmp_path / "a.mtl").read_text().split("newmtl")[1]
+    roughness = read_glb(glb)[0]["materials"][0]["pbrMetallicRoughness"]["roughnessFactor"]
+    assert float(skin.split("Pr ")[1].split()[0]) == pytest.approx(roughness, abs=1e-4)
+    assert "Ks 0.08 0.08 0.08" in skin and "norm a_normal.png" in skin and "map_Bump -bm 1.0 a_normal.png" in skin
+    shown = cv2.imread(str(tmp_path / "a_specular.png"), cv2.IMREAD_UNCHANGED).max() / 255 * 0.08
+    assert shown == pytest.approx(min(ball.lobe.factor() * 0.15, 0.08), abs=1e-3)
