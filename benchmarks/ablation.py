@@ -188,24 +188,23 @@ class Fits:
 
 
 def figures(case: Case, result: Reconstruction) -> dict[str, Any]:
-    """Errors of one result; photographs and truth are the unchanged capture's."""
-    plain = replace(case, changed="")
-    capture = Capture.load(plain.path)
+    """Errors of one result; held-out photographs and truth are never changed."""
+    capture = Capture.load(case.path)
     rows = {"full": Row.of(result), "alone": Row.of(replace(result, residual=None))}
-    views = judge.judge_views(plain, capture, rows, plain.held_out)
+    views = judge.judge_views(case, capture, rows, case.held_out)
     out: dict[str, Any] = {
         "skin": views["full"]["skin"]["psnr"],
         "whole": views["full"]["whole"]["psnr"],
         "alone": views["alone"]["skin"]["psnr"],
         "based": views[f"image-based, our mesh, {judge.best_blend(views, 'our mesh')}"]["skin"]["psnr"],
     }
-    if judge.scan_of(plain, capture, plain.timesteps[0]) is not None:
-        out["mm"] = judge.judge_mesh(plain, capture, rows["full"])["mean_mm"]
+    if judge.scan_of(case, capture, case.timesteps[0]) is not None:
+        out["mm"] = judge.judge_mesh(case, capture, rows["full"])["mean_mm"]
     if relit_truths(capture) and not case.changed:
-        relit = judge.judge_relit(plain, capture, {"full": rows["full"]}, ("local",), 1, LIGHTS)
+        relit = judge.judge_relit(case, capture, {"full": rows["full"]}, ("local",), 1, LIGHTS)
         out["relit"] = relit["full, local"]["mean"]
-    if true_passes(capture, plain.held_out[0]) is not None:
-        found = separation_of(result, capture, plain.held_out[0])
+    if true_passes(capture, case.held_out[0]) is not None:
+        found = separation_of(result, capture, case.held_out[0])
         out["separation"] = found["correlation_smooth"]
     return out
 

@@ -90,6 +90,8 @@ def without_specular(
 
 def lambertian(config: ReflectanceConfig) -> ReflectanceConfig:
     """Settings of stage 2 without specular reflection."""
+    if hasattr(config, "specular"):
+        return replace(config, specular=False)
     return replace(config, shading="matt")
 
 
