@@ -243,7 +243,7 @@ def test_a_study_over_a_folder_of_captures_shares_stages_and_gives_intervals(var
     path.write_text(FITS)
     text = run_experiment(path, out=tmp_path / "out", variant=VARIANT)
     kept = [p.name.partition("_")[0] for p in (tmp_path / "out" / "stages").glob("*.npz")]
-    counts = {"geometry": 2, "falloff": 2, "reflectance": 4, "normals": 4, "mesh": 4, "residual": 4}
+    counts = {"geometry": 2, "photometry": 2, "reflectance": 4, "normals": 4, "mesh": 4, "residual": 4}
     assert {name: kept.count(name) for name in kept} == counts
     document = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert [group["settings"] for group in document["over_subjects"]] == [
