@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mifit.appearance.near_light import RAYS, NearLight
+from mifit.core.limits import MAX_NUMBER
 from mifit.core.sh import SHLighting, basis, order_of
 from mifit.errors import InputError
 
@@ -163,8 +164,10 @@ def light_from(document: dict[str, Any]) -> Light:
         return NearLight.of(document)
     direction, colour = (np.array(document[name], dtype=np.float64) for name in ("direction", "irradiance"))
     radius = float(document["radius"])
-    if direction.shape != (3,) or colour.shape != (3,) or not np.isfinite([*direction, *colour, radius]).all():
+    if direction.shape != (3,) or colour.shape != (3,) or not (np.abs(colour) <= MAX_NUMBER).all():
         raise ValueError(f"compact light: found {document}, expected three finite numbers for direction and irradiance")
+    if not (abs(np.linalg.norm(direction) - 1.0) < 1e-3 and 0.0 <= radius <= math.pi):
+        raise ValueError(f"compact light: found {document}, expected a unit direction and a radius from 0 to pi")
     return DistantLight(direction, radius, colour)
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mifit.core.limits import MAX_NUMBER
 from mifit.core.sh import basis
 from mifit.errors import InputError
 
@@ -108,11 +109,13 @@ class NearLight:
         )
         radius = float(document["radius"])
         shapes = {position.shape, intensity.shape, centre.shape}
-        if shapes != {(3,)} or not np.isfinite([*position, *intensity, *centre, radius]).all():
+        if shapes != {(3,)} or not (np.abs([*position, *intensity, *centre, radius]) <= MAX_NUMBER).all():
             raise ValueError(
                 f"near light: found {document}, expected three finite numbers for position, intensity and centre"
             )
         light = cls(position, radius, intensity, centre)
+        if not (radius >= 0.0 and light.distance > 0.0):
+            raise ValueError(f"near light: found {document}, expected a radius from 0 and a place beside its centre")
         return light.with_colour(intensity / light.distance**2)
 
     def emitter(self) -> dict[str, Any]:

@@ -21,11 +21,13 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.core.files import read_text, write_text
-from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_PIXELS, MAX_TIMESTEP
+from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_NUMBER, MAX_PIXELS, MAX_TIMESTEP
 from mifit.errors import InputError
 
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0}
 MIN_SIDE = 16
+MAX_DISTORTION = 1e4
+"""Magnitude of a lens coefficient: those of rational models reach tens."""
 MASK_KEYS = ("mask_path", "fg_mask_path")
 """Ours and nerfstudio's, VHAP's."""
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -243,14 +245,14 @@ class _Entry:
             number = float(value)
         except OverflowError:  # an integer of hundreds of digits
             number = math.inf
-        if not math.isfinite(number):
-            raise self.fail(key, expected)
+        if not abs(number) <= MAX_NUMBER:
+            raise self.fail(key, expected if math.isinf(number) else f"{expected} within {MAX_NUMBER:g}")
         return number
 
     def positive(self, key: str) -> float:
         expected = "a positive number of pixels"
         value = self.number(key, expected)
-        if value <= 0:
+        if value < 1e-3:
             raise self.fail(key, expected)
         return value
 
@@ -323,6 +325,9 @@ def _view(entry: _Entry, name: str) -> View:
 
 def _distortion(entry: _Entry) -> tuple[float, ...]:
     values = [entry.number(key) if key in entry else 0.0 for key in DISTORTION_KEYS]
+    for key, value in zip(DISTORTION_KEYS, values, strict=True):
+        if abs(value) > MAX_DISTORTION:
+            raise entry.fail(key, f"a coefficient within {MAX_DISTORTION:g}")
     if not any(values):
         return ()
     used = 8 if any(values[5:]) else 5 if values[4] else 4
@@ -337,8 +342,8 @@ def _gain(entry: _Entry) -> tuple[float, float, float]:
         r, g, b = (float(v) for v in (value if isinstance(value, list) else [value] * 3))
     except (TypeError, ValueError, OverflowError):
         raise entry.fail("gain", "a positive number or three of them") from None
-    if not (0 < min(r, g, b) and max(r, g, b) < math.inf):
-        raise entry.fail("gain", "a positive number or three of them")
+    if not (1e-6 <= min(r, g, b) and max(r, g, b) <= 1e6):
+        raise entry.fail("gain", "a positive number or three of them, from 1e-6 to 1e6")
     return (r, g, b)
 
 
@@ -353,8 +358,8 @@ def _world_to_camera(entry: _Entry) -> NDArray[np.float64]:
     key = f"{entry.where}: transform_matrix"
     if matrix.shape != (4, 4):
         raise InputError(f"{key}: found shape {matrix.shape}, expected 4 x 4 numbers")
-    if not np.isfinite(matrix).all():
-        raise InputError(f"{key}: found a NaN or infinite value, expected finite numbers")
+    if not (np.abs(matrix) <= MAX_NUMBER).all():
+        raise InputError(f"{key}: found a NaN or infinite value or a huge one, expected numbers within {MAX_NUMBER:g}")
     if not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
         raise InputError(f"{key}: found last row {matrix[3].tolist()}, expected [0, 0, 0, 1]")
     return invert_pose(matrix @ OPENGL_FROM_OPENCV, key)

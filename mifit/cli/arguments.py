@@ -12,7 +12,7 @@ from typing import NoReturn
 
 from mifit.core.diagnostics import Diagnostic, worst_first
 from mifit.core.files import check_overwriting, overwriting
-from mifit.core.limits import MAX_SEED, MAX_TIMESTEPS
+from mifit.core.limits import MAX_NUMBER, MAX_SEED, MAX_TIMESTEPS
 from mifit.errors import InputError
 
 STRICT = 3
@@ -209,22 +209,30 @@ def real(text: str) -> float:
         value = float(text)
     except ValueError:
         value = float("nan")
-    if not abs(value) < float("inf"):
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a finite number")
+    if not abs(value) <= MAX_NUMBER:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a finite number within {MAX_NUMBER:g}")
+    return value
+
+
+def positive(text: str) -> float:
+    """A number above 0."""
+    value = real(text)
+    if value < 1.0 / MAX_NUMBER:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number above 0")
     return value
 
 
 def rate(text: str) -> float:
-    """A number above 0."""
-    value = real(text)
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number above 0")
+    """Frames per second."""
+    value = positive(text)
+    if not 1e-3 <= value <= 1e3:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected frames per second from 0.001 to 1000")
     return value
 
 
 def exposure(text: str) -> float | str:
     """``auto``, or a number above 0."""
-    return text if text == "auto" else rate(text)
+    return text if text == "auto" else positive(text)
 
 
 def offsets(text: str) -> list[float] | str:

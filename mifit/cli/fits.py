@@ -136,9 +136,9 @@ def fit(arguments: Namespace) -> int:
     better = (
         "; mifit model fetch ict fetches a better one" if (arguments.model, model.source) == ("auto", "builtin") else ""
     )
-    say(arguments, f"Model: {model.name}, {model.source}{better}")
     folder = capture_of(arguments)
     capture = mifit.Capture.load(folder)
+    say(arguments, f"Model: {model.name}, {model.source}{better}")
     use_variant(arguments)
     from mifit.fitting import fit_into
     from mifit.output.report import write_report

@@ -295,7 +295,7 @@ def add_commands(add: types.Add) -> None:
     p.add_argument("--yaw", type=types.real, help="degrees about the vertical; 0 is the front")
     p.add_argument("--pitch", type=types.real, help="degrees upwards")
     p.add_argument(
-        "--distance", type=types.rate, help="from the face, the result's units; default: the fitted cameras'"
+        "--distance", type=types.positive, help="from the face, the result's units; default: the fitted cameras'"
     )
     p.add_argument("--timestep", type=types.at_least(0), help="default: the first of the result")
     p.add_argument("--out", type=types.path, required=True, help="image to write: .png (8-bit sRGB) or .exr (linear)")

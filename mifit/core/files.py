@@ -144,10 +144,9 @@ def file_name(text: str) -> str:
     as it is. Anything else is replaced and a digest of the text appended, so that different texts have different
     names. The name is never empty, hidden, a path, one that Windows reserves, or longer than `MAX_NAME_BYTES`.
     """
-    plain = unicodedata.normalize("NFC", text)
+    plain = unicodedata.normalize("NFC", text[: 4 * MAX_NAME_BYTES])
     plain = "".join(c if c.isalnum() or c in ".-_+=" else "-" for c in plain).strip(".-")
-    while len(plain.encode("utf-8", "replace")) > MAX_NAME_BYTES:
-        plain = plain[:-1]
+    plain = plain.encode("utf-8")[:MAX_NAME_BYTES].decode("utf-8", "ignore")
     reserved = plain.split(".")[0].upper() in _RESERVED
     if plain == text and plain and not reserved:
         return plain

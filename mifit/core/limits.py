@@ -40,6 +40,10 @@ MAX_RUNS = 10**4
 """Runs of one experiment's sweep."""
 MAX_SAMPLES = 2**20
 """Samples per pixel."""
+MAX_NUMBER = 1e9
+"""Magnitude of lengths, coefficients, colours and angles in files and options: what is larger is damage."""
+MAX_LIGHTS = 16
+"""Compact lights of one result: each is traced to every point that is shown."""
 MAX_SEED = 2**31 - 1
 """What both NumPy and Mitsuba take."""
 MAX_NAME_BYTES = 100

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
+from mifit.core.limits import MAX_NUMBER
 from mifit.core.mesh import face_cross
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
@@ -397,9 +398,10 @@ def _checked(name: str, key: str, value: ArrayLike, shape: tuple, dtype: type) -
         raise InputError(f"{name}: {key} holds {array.max()}, expected 32-bit indices")
     with np.errstate(over="ignore"):
         array = np.ascontiguousarray(array, dtype=dtype)
-    if dtype is np.float32 and key != "expression_bounds" and not np.isfinite(array).all():
-        bad = np.argwhere(~np.isfinite(array))[0]
-        raise InputError(f"{name}: {key}[{', '.join(map(str, bad))}] is {array[tuple(bad)]}, expected finite values")
+    if dtype is np.float32 and key != "expression_bounds" and not (within := np.abs(array) <= MAX_NUMBER).all():
+        bad = np.argwhere(~within)[0]
+        expected = f"finite values within {MAX_NUMBER:g}"
+        raise InputError(f"{name}: {key}[{', '.join(map(str, bad))}] is {array[tuple(bad)]}, expected {expected}")
     if key == "expression_bounds" and np.isnan(array).any():
         raise InputError(f"{name}: expression_bounds holds NaN")
     view = array.view()

@@ -10,7 +10,7 @@ import numpy as np
 
 from mifit.appearance.cornea import CORNEA, REFLECTANCE
 from mifit.core.arrays import write_ply
-from mifit.core.files import write_bytes, write_text
+from mifit.core.files import check_overwriting, write_bytes, write_text
 from mifit.core.image import encode_png, to_8_bit, write_image
 from mifit.core.mesh import part_of, split_at_seams, tangent_space_map, vertex_normals
 from mifit.errors import InputError
@@ -79,6 +79,9 @@ def export(
         raise InputError(f"mesh: found {mesh!r}, expected 'fitted' or 'refined'")
     timestep = reconstruction.timesteps[0] if timestep is None else timestep
     reconstruction.index(timestep)
+    beside = ("_diffuse.png", "_specular.png", "_normal.png", ".mtl") if format == "obj" else ()
+    for end in ("_displacement.exr", *beside) if mesh == "refined" else beside:
+        check_overwriting(path.with_name(path.stem + end))
     if animate and format != "glb":
         raise InputError(f"animate: found format {format!r}, expected 'glb', the only one that holds an animation")
     if units is not None and (format not in ("obj", "ply") or units not in PER_UNIT):

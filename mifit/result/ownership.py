@@ -77,6 +77,7 @@ def locked(folder: Path, force: bool = False) -> Iterator[None]:
     """
     from filelock import FileLock, Timeout
 
+    new = [place for place in (folder / MARK, folder, *folder.parents) if not os.path.lexists(place)]
     claim(folder, force)
     lock = FileLock(folder.resolve() / MARK / _LOCK, is_singleton=True)
     try:
@@ -89,6 +90,14 @@ def locked(folder: Path, force: bool = False) -> Iterator[None]:
         with overwriting(None):  # these rules hold here
             _finish(folder)
             yield
+    except Exception:
+        if new and sorted(os.listdir(folder / MARK)) == sorted((_FILES, _LOCK)) and not written(folder):
+            for name in (_FILES, _LOCK):  # refused before anything was made
+                (folder / MARK / name).unlink()
+            for place in new:
+                with suppress(OSError):
+                    place.rmdir()
+        raise
     finally:
         lock.release()
 
@@ -139,6 +148,12 @@ def written(folder: Path) -> dict[str, str]:
     except (InputError, ValueError, RecursionError):
         return {}
     return {str(k): str(v) for k, v in known.items()} if isinstance(known, dict) else {}
+
+
+def changed(folder: Path) -> list[str]:
+    """Meshes and maps of a result that are there and no longer as mifit wrote them."""
+    known = {k: v for k, v in written(folder).items() if k.endswith((".ply", ".exr", ".npz")) and "/" in k}
+    return [name for name in known if _inside(name) and _digest_inside(folder, name) not in (known[name], None)]
 
 
 def files_in(folder: Path) -> list[str]:

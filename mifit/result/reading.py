@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,13 +29,13 @@ from mifit.core.estimate import (
 )
 from mifit.core.files import read_text
 from mifit.core.image import read_image, to_8_bit
-from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_PIXELS
+from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_LIGHTS, MAX_NUMBER, MAX_PIXELS
 from mifit.core.mesh import SplitMesh, split_at_seams, split_faces
 from mifit.core.photometry import Photometry
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import lacks_eyes, with_eyes
-from mifit.result.ownership import unchanging
+from mifit.result.ownership import changed, unchanging
 from mifit.result.record import R
 from mifit.result.writing import FORMAT_VERSION, label_file
 
@@ -42,7 +43,10 @@ from mifit.result.writing import FORMAT_VERSION, label_file
 def load(cls: type[R], folder: Path, model: MorphableModel | None = None) -> R:
     """Read a result folder as a `Result` or a class made from it; see `Reconstruction.load`."""
     with unchanging(folder):
-        return _load(cls, folder, model)
+        result = _load(cls, folder, model)
+        for name in changed(folder):
+            warnings.warn(f"{folder / name}: has changed since mifit wrote it", stacklevel=3)
+    return result
 
 
 def _load(cls: type[R], folder: Path, model: MorphableModel | None) -> R:
@@ -75,7 +79,7 @@ def _load(cls: type[R], folder: Path, model: MorphableModel | None) -> R:
             cameras=tuple(_camera(entry) for entry in capture["cameras"]),
             capture_digest=capture["digest"],
             units=capture["units"],
-            unit_mm=float(capture["unit_mm"]),
+            unit_mm=_positive(capture["unit_mm"], "unit_mm"),
             seconds=float(document["seconds"]),
             peak_memory=int(document["peak_memory"]),
             warnings=_diagnostics(document["warnings"]),
@@ -147,10 +151,26 @@ def _diagnostics(entries: Any) -> tuple[Diagnostic, ...]:
 
 
 def _array(value: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float64]:
-    """A float64 array of a given shape, all finite."""
+    """A float64 array of a given shape, all finite and within bounds."""
     out = np.array(value, dtype=np.float64)
-    if out.shape != shape or not np.isfinite(out).all():
-        raise ValueError(f"{name}: found shape {out.shape}, expected {shape} of finite numbers")
+    if out.shape != shape or not (np.abs(out) <= MAX_NUMBER).all():
+        raise ValueError(f"{name}: found shape {out.shape}, expected {shape} of numbers within {MAX_NUMBER:g}")
+    return out
+
+
+def _positive(value: Any, name: str) -> float:
+    """A number from 1e-9 to 1e9."""
+    number = float(value)
+    if not 1.0 / MAX_NUMBER <= number <= MAX_NUMBER:
+        raise ValueError(f"{name}: found {number:g}, expected a number from {1.0 / MAX_NUMBER:g} to {MAX_NUMBER:g}")
+    return number
+
+
+def _rotations(value: Any, count: int) -> NDArray[np.float64]:
+    """(N, 3, 3) rotations."""
+    out = _array(value, (count, 3, 3), "rotation")
+    if not (np.allclose(out @ out.transpose(0, 2, 1), np.eye(3), atol=1e-3) and (np.linalg.det(out) > 0).all()):
+        raise ValueError("rotation: found a matrix that is no rotation, expected orthonormal ones of determinant 1")
     return out
 
 
@@ -163,12 +183,13 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
     mesh = split_at_seams(model)
     vertices = Rows(n, (len(model.mean), 3), np.float32)
     vertex_albedo = model.albedo(albedo).astype(np.float32)
+    scale, rotations = _positive(entry["scale"], "scale"), _rotations([s["rotation"] for s in steps], n)
+    translations = _array([s["translation"] for s in steps], (n, 3), "translation")
     for i, step in enumerate(steps):
         # Vertices that no face uses are in no mesh file: they follow from the coefficients.
-        rotation, translation = np.array(step["rotation"]), np.array(step["translation"])
         shape = model.shape(identity, expression[i])
         with np.errstate(over="ignore"):
-            posed = (entry["scale"] * shape @ rotation.T + translation).astype(np.float32)
+            posed = (scale * shape @ rotations[i].T + translations[i]).astype(np.float32)
         if not np.isfinite(posed).all():
             raise ValueError(f"timestep {step['timestep']}: found a pose that is out of all bounds")
         stored = _read_mesh(folder / "geometry" / f"{step['timestep']:04d}.ply", mesh)
@@ -180,13 +201,13 @@ def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> 
         identity=identity,
         albedo=albedo,
         expression=expression,
-        rotation=_array([s["rotation"] for s in steps], (n, 3, 3), "rotation"),
-        translation=_array([s["translation"] for s in steps], (n, 3), "translation"),
-        scale=float(entry["scale"]),
+        rotation=rotations,
+        translation=translations,
+        scale=scale,
         vertices=vertices.all,
         vertex_albedo=vertex_albedo,
         shading=_array(lighting["shading"], (9, 3), "shading"),
-        ambient=float(lighting["shading_ambient"]),
+        ambient=float(_array(lighting["shading_ambient"], (), "shading_ambient")),
         report=_report(document, "geometry"),
         photometry=Photometry.from_document(document["capture"].get("photometry", {})),
         displacement=_displacement(folder, len(model.mean)) if entry.get("displaced") else None,
@@ -245,14 +266,17 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
     order = int(lighting["order"])
     # Results of older versions have one light or none, and a lobe whose kind follows from the model.
     lights = lighting["lights"] if "lights" in lighting else [lighting["key"]] if lighting.get("key") else []
+    if len(lights) > MAX_LIGHTS:
+        raise ValueError(f"lights: found {len(lights)}, expected at most {MAX_LIGHTS}")
     model = models.get(str(lighting["shading_model"]))
     fresnel = lighting.get("fresnel")
     lobe = Lobe(
-        float(lighting["exponent"]),
-        None if fresnel is None else float(fresnel),
+        _positive(lighting["exponent"], "exponent"),
+        None if fresnel is None else float(_array(fresnel, (), "fresnel")),
         bool(lighting.get("normalized", model.normalized)),
     )
     radiance = _array(lighting["radiance"], (order * order, 3), "radiance")
+    ambient = float(_array(lighting["ambient"], (), "ambient"))
     diffuse = _read_map(folder / "maps" / "diffuse.exr", 3)
     labels = _labels(folder, document)
 
@@ -264,7 +288,7 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
         diffuse=diffuse,
         specular=_read_map(folder / "maps" / "specular.exr", 1, len(diffuse)),
         confidence=_read_map(folder / "maps" / "confidence.exr", 1, len(diffuse)),
-        illumination=Illumination(radiance, tuple(light_from(x) for x in lights), float(lighting["ambient"])),
+        illumination=Illumination(radiance, tuple(light_from(x) for x in lights), ambient),
         lobe=lobe,
         shading_model=model.name,
         report=_report(document, "reflectance"),

@@ -175,6 +175,7 @@ def test_result_document(saved: tuple[Path, MorphableModel], data: st.DataObject
         path.write_text(whole)
 
 
+@pytest.mark.filterwarnings("ignore:.*has changed since")
 @bounded(100)
 @given(st.data())
 def test_result_files(saved: tuple[Path, MorphableModel], data: st.DataObject) -> None:

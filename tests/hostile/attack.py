@@ -104,7 +104,8 @@ def run_case(case: Case, base: Path, folder: Path) -> tuple[str, str]:
     code = os.WEXITSTATUS(status)
     problems = []
     error = (folder / "stderr").read_text(errors="replace")
-    lines = [line for line in error.splitlines() if not re.match(r"[A-Za-z ]+: \d+/\d+, [\d.]+ s$", line)]  # progress
+    progress = re.compile(r"[A-Za-z ]+: \d+/\d+, [\d.]+ s$|Model: ")
+    lines = [line for line in error.splitlines() if not progress.match(line)]
     if code == 2:
         if len(lines) != 1 or not lines[0].startswith("mifit") or len(lines[0]) > 1500 or "internal error" in error:
             problems.append(f"exit 2 with {len(lines)} lines: {error[-400:]!r}")

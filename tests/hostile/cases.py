@@ -132,7 +132,7 @@ def all_cases(base: Path) -> Iterator[Case]:
     """Every case; the order is the same in every run."""
     for group in (
         places, numbers, words, transforms, documents, images, landmarks, calibrations, colmap, photogrammetry,
-        videos, models, results, result_files, experiments, names, links,
+        videos, models, results, result_files, experiments, names, links, planted, outputs, extremes, colours,
     ):  # fmt: skip
         yield from group(base)
 
@@ -990,3 +990,237 @@ def links(base: Path) -> Iterator[Case]:
                 ("capture",),
                 prepare,
             )
+
+
+# -- results from strangers, and outputs over what is there ---------------------------------------------------------
+
+READERS: dict[str, tuple[str, ...]] = {
+    "evaluate": ("evaluate", "result", "--capture", "capture", "--camera", "left"),
+    "render": ("render", "result", "--out", "out.png"),
+    "turntable": ("turntable", "result", "--out", "out"),
+    "relight": ("relight", "result", "--env", "env.hdr", "--out", "out"),
+    "export": ("export", "result", "--format", "obj", "--out", "out.obj"),
+    "view": ("view", "result", "--port", "0"),
+}
+WRITERS: dict[str, tuple[str, ...]] = {
+    "fit": ("fit", "capture", "--out", "result", "--model", "ball.npz", "--force"),
+    "resume": ("fit", "capture", "--out", "result", "--model", "ball.npz", "--resume"),
+    "track": ("track", "capture", "--result", "result"),
+}
+
+
+def planted(base: Path) -> Iterator[Case]:
+    """A result whose own folder leads out of it: what is of the user there must neither move nor change."""
+
+    def victims(work: Path) -> Path:
+        (work.parent / ".ssh").mkdir()
+        for name in (".ssh/id_rsa", "victim", "new", "checkpoints", "maps"):
+            path = work.parent / name
+            if name in ("new", "checkpoints", "maps"):
+                path.mkdir()
+                path = path / "victim"
+            path.write_text("mine")
+        return work.parent
+
+    def interrupted(link: str) -> Callable[[Path], None]:
+        def prepare(work: Path) -> None:
+            home, mark = victims(work), work / "result" / ".mifit"
+            names = [".ssh/id_rsa", "victim", "../../victim", str(home / "victim"), "link/victim"]
+            (work / "result" / "link").symlink_to(home)
+            if link == "new":
+                (mark / "new").symlink_to(home)
+            else:
+                (mark / "new").mkdir()
+                (mark / "new" / link).symlink_to(home / link)
+            (mark / "commit.json").write_text(json.dumps({"made": dict.fromkeys(names, ""), "stale": names}))
+
+        return prepare
+
+    def linked(place: str) -> Callable[[Path], None]:
+        def prepare(work: Path) -> None:
+            home, path = victims(work), work / "result" / place
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+            path.symlink_to(home / "maps" if place == "maps" else home)
+
+        return prepare
+
+    needs = ("result", "capture", "ball.npz", "env.hdr")
+    for link in ("new", ".ssh", "victim"):
+        for name, arguments in {**READERS, **WRITERS}.items():
+            if link != "victim" or name in READERS:  # a link in place of a file is refused when its turn comes
+                yield Case(f"planted:{link}:{name}", arguments, needs, interrupted(link))
+    for place in (".mifit", "maps", "geometry", ".mifit/new", ".mifit/checkpoints", ".mifit/lock", ".mifit/files.json"):
+        for name, arguments in WRITERS.items():
+            yield Case(f"planted:{place}:{name}", arguments, needs, linked(place))
+
+
+def outputs(base: Path) -> Iterator[Case]:
+    """Outputs over files of the user, and with --force over those that the command reads."""
+    needs = ("result", "capture", "ball.npz", "env.hdr")
+    view = ("render", "result", "--capture", "capture", "--camera", "left", "--timestep", "0")
+    judged = ("evaluate", "result", "--capture", "capture", "--camera", "left")
+    obj = ("export", "result", "--format", "obj")
+    for name, arguments, out in (
+        ("render", (*view, "--out"), "capture/images/left/0000.png"), ("evaluate", (*judged, "--json"), "capture/transforms.json"),
+        ("json", (*judged, "--json"), "result/result.json"), ("ply", ("export", "result", "--format", "ply", "--out"), "result/geometry/0000.ply"),
+        ("convert", ("model", "convert", "ball.npz"), "ball.npz"), ("preview", ("model", "info", "ball.npz", "--preview"), "ball.npz"),
+        ("device", ("model", "convert", "ball.npz"), "/dev/null"), ("lock", (*view, "--out"), "capture/images/right/0001.png"),
+    ):  # fmt: skip
+        yield Case(f"outputs:{name}", (*arguments, out), needs)
+        yield Case(f"outputs:{name} forced", (*arguments, out, "--force"), needs)
+    for name, arguments, mine in (
+        ("mtl", (*obj, "--out", "x.obj"), "x.mtl"), ("map", (*obj, "--out", "x.obj"), "x_diffuse.png"),
+        ("turntable", ("turntable", "result", "--out", "x"), "x/notes.txt"), ("relight", ("relight", "result", "--env", "env.hdr", "--out", "x"), "x/left.png"),
+        ("video", ("relight", "result", "--env", "env.hdr", "--out", "out", "--turn", "2", "--video", "x.mp4"), "x.mp4"),
+        ("fit", ("fit", "capture", "--out", "x", "--model", "ball.npz"), "x/notes.txt"), ("import", ("import", "--transforms", "capture/transforms.json", "--out", "x"), "x/notes.txt"),
+        ("board", ("calibrate", "--board", "charuco:9x6:30:22", "--out", "x"), "x/notes.txt"),
+    ):  # fmt: skip
+
+        def occupied(work: Path, mine: str = mine) -> None:
+            (work / mine).parent.mkdir(exist_ok=True)
+            (work / mine).write_text("mine")
+
+        yield Case(f"outputs:{name}", arguments, needs, occupied)
+
+
+# -- numbers beyond all bounds --------------------------------------------------------------------------------------
+
+
+def extremes(base: Path) -> Iterator[Case]:
+    """Numbers that are numbers, and no capture, model or result has."""
+    transforms = json.loads((base / "capture" / "transforms.json").read_text())
+    result = json.loads((base / "result" / "result.json").read_text())
+    imported = ("import", "--transforms", "capture/transforms.json", "--out", "out")
+    fitted = ("fit", "capture", "--out", "out", "--model", "ball.npz", "--until", "geometry")
+    rendered = ("render", "result", "--capture", "capture", "--camera", "left", "--out", "out.png")
+    needs = ("capture", "result", "ball.npz")
+    for key, values in {
+        "gain": ([1e300] * 3, [1e-300] * 3, [1e30, 1, 1]), "fl_x": (1e300, 1e30, 1e-300), "fl_y": (1e300,), "cx": (1e300, -1e300),
+        "k1": (1e300, -1e30), "transform_matrix": (np.diag([1e300, 1e300, 1e300, 1]).tolist(), [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+    }.items():  # fmt: skip
+        for i, value in enumerate(values):
+            changed = copy.deepcopy(transforms)
+            for frame in changed["frames"]:
+                frame[key] = value
+
+            def edited(work: Path, d: Any = changed) -> None:
+                _write_json(work / "capture" / "transforms.json", d)
+
+            for name, command in (("import", imported), ("fit", fitted), ("render", rendered)):
+                sound = name == "render" and key == "gain"  # which a render doesn't need
+                yield Case(f"extremes:{key}:{i}:{name}", command, needs, edited, may_pass=sound)
+    inside = copy.deepcopy(transforms)
+    for frame in inside["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] = 0.0
+
+    def within(work: Path) -> None:
+        _write_json(work / "capture" / "transforms.json", inside)
+
+    yield Case("extremes:inside:fit", fitted, needs, within, may_pass=True)
+    yield Case("extremes:inside:render", rendered, needs, within, may_pass=True)
+    for place, value in (
+        (("capture", "unit_mm"), 1e300), (("capture", "unit_mm"), 0), (("capture", "unit_mm"), -1), (("model", "scale"), 1e300), (("model", "scale"), 0),
+        (("model", "scale"), -1.0), (("timesteps", 0, "rotation"), np.zeros((3, 3)).tolist()), (("timesteps", 0, "rotation"), (3 * np.eye(3)).tolist()),
+        (("timesteps", 0, "rotation"), np.diag([1, 1, -1]).tolist()), (("lighting", "exponent"), 1e300), (("lighting", "exponent"), -1), (("lighting", "ambient"), 1e300),
+        (("timesteps", 0, "translation"), [1e300] * 3), (("lighting", "radiance"), np.full((9, 3), 1e300).tolist()), (("capture", "cameras", 0, "fx"), 1e300),
+        (("model", "identity"), [1e30]), (("model", "albedo"), [1e300]), (("lighting", "lights"), [{"direction": [0, 0, 1], "radius": 0.1, "irradiance": [1, 1, 1]}] * 100),
+        (("lighting", "lights"), [{"direction": [0, 0, 0], "radius": 0.1, "irradiance": [1, 1, 1]}]), (("lighting", "lights"), [{"direction": [0, 0, 1], "radius": 1e300, "irradiance": [1e300] * 3}]),
+    ):  # fmt: skip
+        changed = _edit(result, place, value)
+
+        def spoilt(work: Path, d: Any = changed) -> None:
+            _write_json(work / "result" / "result.json", d)
+
+        for name, command in (("export", ("export", "result", "--format", "glb", "--out", "out.glb")), ("turntable", ("turntable", "result", "--steps", "1", "--out", "out"))):  # fmt: skip
+            yield Case(f"extremes:result {place[-1]}:{value if np.ndim(value) == 0 else np.shape(value)}:{name}", command, needs, spoilt)  # fmt: skip
+    for option in ("1e300", "1e9", "1e-300"):
+        for name, command in (
+            ("glb", ("export", "result", "--format", "glb", "--animate", "--out", "out.glb")), ("turntable", ("turntable", "result", "--sequence", "--out", "out")),
+            ("relight", ("relight", "result", "--env", "env.hdr", "--turn", "2", "--video", "out.mp4", "--out", "out")),
+        ):  # fmt: skip
+            yield Case(f"extremes:fps:{option}:{name}", (*command, "--fps", option), (*needs, "env.hdr"))
+    for option in ("--yaw=1e300", "--pitch=1e300", "--distance=1e-300", "--distance=1e300", "--distance=0.5"):
+        command = ("render", "result", "--out", "out.png", option)
+        yield Case(f"extremes:{option}", command, needs, may_pass=option != "--distance=1e300")
+    with np.load(base / "ball.npz") as stored:
+        model = dict(stored)
+    for key in ("mean", "identity", "expression", "albedo_modes", "mean_albedo", "uv"):
+        for value in (1e30, np.nan, -1e38):
+
+            def grown(work: Path, key: str = key, value: float = value) -> None:
+                changed = {**model, key: model[key].copy()}
+                changed[key].flat[0] = value
+                np.savez(work / "bad.npz", **changed)
+
+            small = ("--width", "32", "--height", "32", "--spp", "1", "--timesteps", "1")
+            for name, command in (
+                ("info", ("model", "info", "bad.npz", "--preview", "out.png")), ("synth", ("synth", "--out", "out", "--model", "bad.npz", *small)),
+                ("fit", ("fit", "capture", "--out", "out", "--model", "bad.npz")),
+            ):  # fmt: skip
+                yield Case(f"extremes:model {key}:{value}:{name}", command, ("capture",), grown)
+
+
+# -- colours ---------------------------------------------------------------------------------------------------------
+
+
+def colours(base: Path) -> Iterator[Case]:
+    """Images whose numbers are no linear Rec. 709, and environments that are none."""
+    import OpenEXR
+
+    rng = np.random.default_rng(0)
+
+    def exr(names: str, folder: str = ".", **header: Any) -> Callable[[Path], None]:
+        def prepare(work: Path) -> None:
+            shape = {n: (8, 16) if n in ("RY", "BY") else (16, 32) for n in names.split(",")}
+            channels = {n: OpenEXR.Channel(rng.random(s).astype(np.float32), *((2, 2) if n in ("RY", "BY") else ())) for n, s in shape.items()}  # fmt: skip
+            fields = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+            with OpenEXR.File(fields, channels) as file:
+                file.write(str(work / "e.exr"))
+
+        return prepare
+
+    def radiance(text: bytes, size: bytes = b"-Y 16 +X 32") -> Callable[[Path], None]:
+        def prepare(work: Path) -> None:
+            (work / "e.hdr").write_bytes(b"#?RADIANCE\n" + text + b"\n" + size + b"\n" + rng.bytes(16 * 32 * 4))
+
+        return prepare
+
+    def lit(name: str) -> tuple[str, ...]:
+        return ("synth", "--env", name, "--out", "out", "--width", "32", "--height", "32", "--spp", "1", "--timesteps", "1", "--model", "ball.npz")  # fmt: skip
+
+    for name, prepare in {
+        "luminance and chroma": exr("Y,RY,BY"), "xyz": exr("X,Y,Z"), "aces": exr("R,G,B", chromaticities=(0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)),
+        "wrong primaries": exr("R,G,B", chromaticities=(0.0,) * 8),
+    }.items():  # fmt: skip
+        yield Case(f"colours:exr {name}", lit("e.exr"), ("ball.npz",), prepare, may_pass=name == "aces")
+    for name, prepare in {
+        "xyze": radiance(b"FORMAT=32-bit_rle_xyze\n"), "format": radiance(b"FORMAT=something\n"), "exposure 0": radiance(b"FORMAT=32-bit_rle_rgbe\nEXPOSURE=0\n"),
+        "exposure nan": radiance(b"FORMAT=32-bit_rle_rgbe\nEXPOSURE=nan\n"), "exposure text": radiance(b"FORMAT=32-bit_rle_rgbe\nEXPOSURE=x\n"),
+        "exposure huge": radiance(b"FORMAT=32-bit_rle_rgbe\nEXPOSURE=1e-300\n"), "square": radiance(b"FORMAT=32-bit_rle_rgbe\n", b"-Y 16 +X 16"),
+    }.items():  # fmt: skip
+        yield Case(f"colours:hdr {name}", ("relight", "result", "--env", "e.hdr", "--out", "out"), ("result", "ball.npz"), prepare)
+
+    def eight_bits(work: Path) -> None:
+        write_image(work / "e.png", rng.random((16, 32, 3)))
+
+    yield Case("colours:8-bit environment", ("relight", "result", "--env", "e.png", "--out", "out"), ("result",), eight_bits)  # fmt: skip
+    yield Case("colours:8-bit light", lit("e.png"), ("ball.npz",), eight_bits)
+
+    def gamma(chunk: bytes, content: bytes) -> Callable[[Path], None]:
+        def prepare(work: Path) -> None:
+            for path in (work / "capture" / "images").rglob("*.png"):
+                data = path.read_bytes()
+                block = struct.pack(">I", len(content)) + chunk + content
+                path.write_bytes(data[:33] + block + struct.pack(">I", zlib.crc32(chunk + content)) + data[33:])
+
+        return prepare
+
+    fitted = ("fit", "capture", "--out", "out", "--model", "ball.npz", "--until", "geometry")
+    for name, chunk, content in (
+        ("linear", b"gAMA", struct.pack(">I", 100000)), ("0", b"gAMA", struct.pack(">I", 0)), ("huge", b"gAMA", struct.pack(">I", 2**32 - 1)),
+    ):  # fmt: skip
+        yield Case(f"colours:png gamma {name}", fitted, ("capture", "ball.npz"), gamma(chunk, content))

@@ -8,6 +8,7 @@ import resource
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -289,6 +290,38 @@ def test_a_full_disk_behind_standard_output(unbuffered: str) -> None:
             [sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True, check=False, env=surroundings
         )
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and "No space left" in done.stderr
+
+
+@pytest.mark.parametrize(("limit", "said"), [(400_000, "not enough memory"), (800_000, "not enough memory")])
+def test_no_room_for_addresses_is_one_line(limit: int, said: str) -> None:
+    code = "import sys; from mifit.cli import main; sys.exit(main())"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "model", "info", "builtin:coarse"],
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit << 10, limit << 10)),
+    )
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and said in done.stderr, done.stderr
+
+
+def test_a_closed_standard_output_is_one_line(tmp_path: Path) -> None:
+    code = "import sys; from mifit.cli import main; sys.exit(main())"
+    shell = f"exec '{sys.executable}' -c '{code}' model info builtin:coarse"
+    for closed, said in ((">&-", "standard output is closed"), (">&- <&-", "standard output is closed")):
+        done = subprocess.run(f"{shell} {closed}", shell=True, capture_output=True, text=True, check=False)
+        assert done.returncode == 2 and done.stderr.count("\n") == 1 and said in done.stderr
+    done = subprocess.run(f"{shell} 2>&-", shell=True, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "vertices" in done.stdout
+
+
+def test_a_long_name_takes_no_time() -> None:
+    from mifit.core.files import file_name
+
+    start = time.monotonic()
+    for text in ("x" * 10**7, "\u0301\u0323" * 10**6):
+        assert len(file_name(text).encode()) <= 100
+    assert time.monotonic() - start < 2.0
 
 
 # -- the cache folder -----------------------------------------------------------------------------------------------

@@ -221,6 +221,24 @@ def test_a_link_in_place_of_a_folder_of_ours_is_refused(ball, tmp_path, place):
     assert everything(tmp_path) == before
 
 
+def test_a_map_that_was_changed_is_said(ball, tmp_path):
+    ball.save(tmp_path)
+    write_image(tmp_path / "maps" / "diffuse.exr", 0.5 * ball.reflectance.diffuse)
+    with pytest.warns(UserWarning, match=r"maps/diffuse\.exr: has changed since mifit wrote it"):
+        Reconstruction.load(tmp_path, ball.model)
+
+
+def test_a_lock_that_is_left_at_once_leaves_no_folder(tmp_path):
+    with pytest.raises(InputError), ownership.locked(tmp_path / "a" / "b"):
+        raise InputError("refused")
+    assert not any(tmp_path.iterdir())
+    with pytest.raises(InputError), ownership.locked(tmp_path / "c"):
+        ownership.remember(tmp_path / "c", [])
+        (tmp_path / "c" / ownership.MARK / "checkpoints").mkdir()
+        raise InputError("later")
+    assert (tmp_path / "c" / ownership.MARK / "checkpoints").is_dir()
+
+
 def test_a_result_that_changes_while_it_is_read_is_refused(ball, other, tmp_path, monkeypatch):
     from mifit.result import reading
 
