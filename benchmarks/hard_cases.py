@@ -38,8 +38,8 @@ from mifit.core.image import read_image, write_image
 from mifit.errors import InputError, MifitError
 from mifit.output.evaluate import evaluate
 from mifit.synth import compose, head
+from mifit.synth.procedural import studio_environment
 from mifit.synth.skin import SkinMaps, SkinStyle
-from mifit.synth.studio import studio_environment
 
 SEED = 7
 WIDTH, HEIGHT, TIMESTEPS, SPP = 192, 144, 2, 16

@@ -56,8 +56,8 @@ def _synth_scan(arguments: Namespace) -> None:
             option = name.replace("_", "-")
             raise InputError(f"--{option}: found with --head, whose shape and skin are the scan's; leave it out")
     from mifit.synth.compose import place_cameras, read_environment
+    from mifit.synth.procedural import studio_environment
     from mifit.synth.scanned import ScannedHead, maps_of, synthesize_scan
-    from mifit.synth.studio import studio_environment
 
     head = ScannedHead.load(arguments.head, maps_of(arguments.maps), arguments.unit_mm, arguments.flip_v)
     environment = read_environment(arguments.env) if arguments.env else studio_environment(arguments.seed)

@@ -128,17 +128,6 @@ def _damaged(path: str | Path, error: Exception | None = None) -> InputError:
     return InputError(f"{path}: damaged or truncated image{text}; expected a whole file: export or copy it again")
 
 
-def image_size(path: str | Path) -> tuple[int, int]:
-    """(width, height) of an image file from its header, without decoding pixels; InputError when unreadable."""
-    data = read_bytes(path, MAX_IMAGE_BYTES, "image file")
-    measure = {"exr": _exr_size, "hdr": _hdr_size, "raster": _raster_size}[_kind(data, path)]
-    try:
-        with decoding():
-            return measure(data)
-    except Exception as error:
-        raise _damaged(path, error) from None
-
-
 def _check_size(size: tuple[int, int], path: str | Path) -> None:
     width, height = size
     if width < 1 or height < 1 or width * height > MAX_PIXELS:

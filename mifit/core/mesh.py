@@ -38,12 +38,6 @@ def _sides(faces: NDArray) -> NDArray:
     return np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
 
 
-def vertex_sum_matrix(faces: NDArray, n_vertices: int) -> sp.csr_matrix:
-    """(V, F) 0/1 matrix that sums face values over the faces around each vertex."""
-    f = np.repeat(np.arange(len(faces)), 3)
-    return sp.csr_matrix((np.ones(3 * len(faces)), (faces.ravel(), f)), shape=(n_vertices, len(faces)))
-
-
 def vertex_normals(vertices: NDArray, faces: NDArray) -> NDArray:
     """(V, 3) unit normals, area weighted; a vertex without area gets (0, 0, 1)."""
     cross = face_cross(np.asarray(vertices, dtype=np.float64), faces)

@@ -142,23 +142,6 @@ def radiance_of_shading(shading: ArrayLike) -> Array:
     return np.asarray(shading, dtype=np.float64) * (np.pi / cosine_coefficients(3)[bands(3)])[:, None]
 
 
-def lobe_coefficients(exponent: float, order: int) -> Array:
-    """(B,) factors by which Blinn-Phong's lobe scales each band when it is convolved about the mirror direction.
-
-    At the angle alpha from the mirror direction, in the plane of incidence, the half vector is alpha / 2 off the
-    normal, so the lobe is ``cos(alpha / 2)^m = ((1 + cos alpha) / 2)^(m / 2)``. Taking this all around the mirror
-    direction is exact for a view along the normal and the approximation elsewhere (the true lobe is narrower across
-    the plane of incidence by the cosine of the angle). Near the peak it is the Phong lobe with a quarter of the
-    exponent. Its Legendre projection has the closed form ``prod_{i<l} (m/2 - i) / (m/2 + 2 + i)``, relative to l = 0.
-    """
-    check_order(order)
-    if not exponent > 0:
-        raise InputError(f"exponent: found {exponent!r}, expected a positive number")
-    a = 0.5 * float(exponent)
-    i = np.arange(order - 1)
-    return np.concatenate([[1.0], np.cumprod((a - i) / (a + 2.0 + i))])
-
-
 def window(kind: str, order: int, width: float | None = None) -> Array:
     """(B,) factors that fade the high bands to damp ringing.
 
@@ -324,27 +307,6 @@ class SHLighting:
         if length <= 1e-12 * max(float(np.abs(self.coefficients[0]).max()), 1e-300):
             return np.array([0.0, 0.0, 1.0])
         return d / length
-
-    def linear_light(self) -> tuple[Array, Array, Array]:
-        """Replace the lighting by one directional light and a constant surrounding (Sloan 2008).
-
-        Returns
-        -------
-        direction : (3,)
-            The dominant direction.
-        intensity : (3,)
-            Irradiance of the light on a surface that faces it.
-        ambient : (3,)
-            Constant radiance from everywhere; both minimise the squared error of irradiance over all normals.
-        """
-        direction = self.dominant_direction()
-        factors = cosine_coefficients(self.order)[bands(self.order)]
-        light = factors * basis(direction, self.order)
-        constant = np.zeros_like(light)
-        constant[0] = factors[0] * math.sqrt(4.0 * math.pi)
-        columns = np.stack([light, constant], axis=1)
-        solution = np.linalg.lstsq(columns, factors[:, None] * self.coefficients, rcond=None)[0]
-        return direction, solution[0], solution[1]
 
     def to_latlong(self, height: int = 128, width: int = 256) -> Array:
         """Radiance as a lat-long image (H, W, 3)."""

@@ -245,7 +245,7 @@ def _execute_render(e: Experiment, folder: Path, experiment_folder: Path, varian
     """Render a scene and compare it with its reference; returns the figures of the table."""
     from mifit.core.image import write_image
     from mifit.core.metrics import psnr, rmse
-    from mifit.render.scene_image import render_scene
+    from mifit.render.scene import render_scene
 
     run = e.render
     assert run is not None

@@ -16,10 +16,9 @@ from scipy.spatial import cKDTree
 
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
-from mifit.morphable.landmarks import read_landmark_file
 from mifit.morphable.model import MorphableModel
 from mifit.morphable.pigment import skin_model
-from mifit.morphable.topology import adjacency, mirror_map, opening_faces
+from mifit.morphable.topology import adjacency, mirror_map, opening_faces, read_landmark_file
 from mifit.morphable.unwrap import unwrap
 
 _HERE = Path(__file__).parent

@@ -1,6 +1,11 @@
-"""What can be learned from a face mesh alone: boundary loops, openings, mirror images, spread-out points."""
+"""What can be learned from a face mesh alone: loops, openings, mirror images, spread-out points; finer models."""
 
 from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
@@ -8,10 +13,39 @@ from numpy.typing import NDArray
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
-from mifit.core.mesh import edges
+from mifit.core.files import read_text
+from mifit.core.limits import MAX_SETTINGS_BYTES
+from mifit.core.mesh import edges, split_faces
+from mifit.errors import InputError
 
 EYES_AND_MOUTH = (range(36, 42), range(42, 48), range(60, 68))
 """iBUG landmarks around the three openings of a face."""
+
+IBUG_MIRROR = np.array(
+    [
+        *range(16, -1, -1),
+        *range(26, 16, -1),
+        *range(27, 31),
+        *range(35, 30, -1),
+        *(45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40),
+        *(54, 53, 52, 51, 50, 49, 48, 59, 58, 57, 56, 55),
+        *(64, 63, 62, 61, 60, 67, 66, 65),
+    ]
+)
+"""The iBUG point that is the mirror image of each iBUG point."""
+
+
+def read_landmark_file(path: Path) -> NDArray[np.int64]:
+    """Read a JSON list of 68 vertex indices, 0-based, in iBUG order."""
+    try:
+        values = json.loads(read_text(path, MAX_SETTINGS_BYTES, "landmark file"))
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not readable as JSON: {error}") from None
+    if not isinstance(values, list) or len(values) != 68 or not all(type(v) is int for v in values):
+        raise InputError(f"{path}: expected a list of 68 vertex indices in iBUG order")
+    return np.array(values)
 
 
 def adjacency(faces: NDArray, n_vertices: int, lengths_of: NDArray | None = None) -> sp.csr_matrix:
@@ -92,3 +126,33 @@ def oriented_outwards(mean: NDArray, faces: NDArray) -> NDArray:
     n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     front = corners[:, :, 2].mean(1) > np.median(mean[:, 2])
     return faces if n[front, 2].sum() >= 0 else faces[:, [1, 0, 2]]
+
+
+if TYPE_CHECKING:
+    from mifit.morphable.model import MorphableModel
+
+
+def finer_model(model: MorphableModel, subdivisions: int) -> MorphableModel:
+    """A model on the split mesh of `split_faces`: shapes and albedos are those of the model, landmarks its vertices."""
+    if not subdivisions:
+        return model
+    topology = split_faces(model, subdivisions)
+
+    def lift(values: NDArray) -> NDArray[np.float32]:
+        flat = topology.matrix @ values.reshape(len(values), -1)
+        return flat.reshape(topology.n_vertices, *values.shape[1:]).astype(np.float32)
+
+    return replace(
+        model,
+        mean=lift(model.mean),
+        identity=lift(model.identity),
+        expression=lift(model.expression),
+        mean_albedo=lift(model.mean_albedo),
+        albedo_modes=lift(model.albedo_modes),
+        faces=topology.faces,
+        faces_uv=topology.faces_uv,
+        uv=topology.uv,
+        face_mask=topology.face_mask,
+        symmetry=None,
+        fingerprint=f"{model.digest}-{subdivisions}" if model.fingerprint else "",
+    )

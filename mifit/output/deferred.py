@@ -21,7 +21,7 @@ from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.sh import basis
 from mifit.core.uv import sample_map
 from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials
-from mifit.render.occluders import occluding_mesh
+from mifit.render.first_hits import occluding_mesh
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel

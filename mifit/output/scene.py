@@ -127,7 +127,7 @@ def render_path(
     reconstruction: Result, camera: Camera, timestep: int, method: Method, samples: int, seed: int
 ) -> NDArray[np.float32]:
     """Path trace one view through the scene file; see `Reconstruction.render`."""
-    from mifit.render.scene_image import render_scene
+    from mifit.render.scene import render_scene
 
     with tempfile.TemporaryDirectory(prefix="mifit-scene-") as folder:
         path = Path(folder) / "scene.xml"

@@ -26,7 +26,7 @@ from mifit.core.mesh import split_faces
 from mifit.core.sh import SHLighting, radiance_of_shading
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
-from mifit.morphable.finer import finer_model
+from mifit.morphable.topology import finer_model
 
 if TYPE_CHECKING:
     from mifit.capture import Capture

@@ -34,8 +34,8 @@ from mifit.progress import Progress, silent
 from mifit.render.gbuffer import SurfaceScene
 from mifit.render.pathtrace import Material, PathTracer, Surface
 from mifit.synth import detector, head
+from mifit.synth.procedural import studio_environment
 from mifit.synth.skin import SkinMaps, SkinStyle, paint
-from mifit.synth.studio import studio_environment
 
 DISTANCE = 72.0
 """Centimetres from the cameras to the head."""

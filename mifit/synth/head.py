@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mifit.core.mesh import SplitMesh, edges, vertex_normals
 from mifit.morphable import MorphableModel
-from mifit.synth.noise import smooth_noise
+from mifit.synth.procedural import smooth_noise
 
 EYE_RADIUS = 12.0
 """Millimetres."""

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from mifit.core.mesh import interpolate, normalize
 from mifit.core.uv import TexelMap
-from mifit.synth.noise import smooth_noise
+from mifit.synth.procedural import smooth_noise
 
 FAIR = np.array([0.58, 0.385, 0.30])
 DEEP = np.array([0.16, 0.088, 0.058])

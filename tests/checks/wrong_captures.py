@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mifit.core.image import write_image
-from mifit.morphable.landmarks import IBUG_MIRROR
+from mifit.morphable.topology import IBUG_MIRROR
 
 CAMERAS = ("left", "right", "third")
 

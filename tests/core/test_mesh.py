@@ -48,12 +48,6 @@ def test_normalize_leaves_its_argument_alone():
     assert not v.any()
 
 
-def test_vertex_sum_matrix_sums_faces_around_vertices():
-    _, faces = tetrahedron()
-    total = mesh.vertex_sum_matrix(faces, 4) @ np.array([1.0, 2.0, 4.0, 8.0])
-    assert_allclose(total, [7, 11, 13, 14])
-
-
 def test_interpolation_is_exact_for_linear_functions():
     vertices, faces = tetrahedron()
     rng = np.random.default_rng(0)

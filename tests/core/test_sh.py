@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.special import eval_legendre
 
 from mifit.core import sh
 from mifit.core.image import read_image
@@ -72,21 +71,6 @@ def test_irradiance_is_the_integral_of_radiance() -> None:
     for n in directions(3, 5):
         expected = (w * np.maximum(d @ n, 0)) @ light.evaluate(d)
         assert np.abs(light.irradiance(n) - expected).max() < 1e-4
-
-
-def test_lobe_coefficients_are_the_legendre_projection() -> None:
-    t, w = np.polynomial.legendre.leggauss(400)
-    for exponent in (1.0, 5.0, 50.0, 1000.0):
-        lobe = (0.5 * (1 + t)) ** (exponent / 2) * w
-        expected = [lobe @ eval_legendre(n, t) / lobe.sum() for n in range(8)]
-        assert np.abs(sh.lobe_coefficients(exponent, 8) - expected).max() < 1e-5
-
-
-def test_a_narrow_lobe_is_a_phong_lobe_of_a_quarter_of_the_exponent() -> None:
-    t, w = np.polynomial.legendre.leggauss(400)
-    phong = np.maximum(t, 0) ** 250.0 * w
-    expected = [phong @ eval_legendre(n, t) / phong.sum() for n in range(4)]
-    assert np.abs(sh.lobe_coefficients(1000.0, 4) - expected).max() < 1e-2
 
 
 @settings(max_examples=20, deadline=None)
@@ -156,24 +140,12 @@ def test_the_dominant_direction_points_at_the_light() -> None:
     d = directions(1, 4)[0]
     light = sh.SHLighting(np.outer(sh.basis(d, 3), [1.0, 0.8, 0.6]))
     assert np.allclose(light.dominant_direction(), d)
-    direction, intensity, ambient = light.linear_light()
-    assert np.allclose(direction, d) and np.allclose(intensity, [1.0, 0.8, 0.6])
-    assert np.allclose(ambient, 0, atol=1e-12)
-
-
-def test_the_linear_light_separates_a_surrounding() -> None:
-    d = directions(1, 9)[0]
-    c = np.outer(sh.basis(d, 3), [2.0, 2.0, 2.0])
-    c[0] += 0.3 * math.sqrt(4 * math.pi)
-    _, intensity, ambient = sh.SHLighting(c).linear_light()
-    assert np.allclose(intensity, 2.0) and np.allclose(ambient, 0.3)
 
 
 def test_lighting_without_a_direction_has_a_stated_one() -> None:
     for c in (np.zeros((9, 3)), np.eye(9, 3) * [[1.0, 0, 0]], np.ones((1, 3))):
         light = sh.SHLighting(c)
         assert light.dominant_direction().tolist() == [0.0, 0.0, 1.0]
-        assert all(np.isfinite(part).all() for part in light.linear_light())
 
 
 def test_windows_damp_ringing() -> None:
@@ -208,7 +180,6 @@ def test_truncation() -> None:
         (lambda: sh.project_latlong(np.zeros((4, 8)), 3), r"expected \(height, width, 3\)"),
         (lambda: sh.project_latlong(np.zeros((4, 8, 3)), 3), "found 4 rows, expected 6 or more"),
         (lambda: sh.project_latlong(np.full((8, 8, 3), np.inf), 3), "not finite"),
-        (lambda: sh.lobe_coefficients(0.0, 3), "exponent: found 0.0"),
     ],
 )
 def test_bad_input_is_named(call, message: str) -> None:

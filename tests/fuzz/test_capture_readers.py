@@ -16,7 +16,7 @@ from mifit.capture import Capture
 from mifit.capture.landmark_files import read_landmarks
 from mifit.capture.stereo import read_stereo, write_stereo
 from mifit.core.camera import Camera
-from mifit.core.image import MAX_PIXELS, encode_png, image_size, load_image, write_image
+from mifit.core.image import MAX_PIXELS, encode_png, load_image, write_image
 from mifit.extras.colmap import read_colmap
 from tests.extras.photogrammetry import write_colmap
 from tests.fuzz.conftest import NASTY, as_json, bounded, read_or_refuse, spoilt_bytes, spoilt_documents
@@ -166,8 +166,6 @@ def check_image(path: Path) -> None:
         assert found.pixels.dtype == np.float32 and found.clipped.shape == (height, width)
         if found.bits < 32:
             assert 0 <= found.pixels.min() and found.pixels.max() <= 1
-    size = read_or_refuse(lambda: image_size(path))
-    assert size is None or all(isinstance(n, int) for n in size)
 
 
 @bounded(300)

@@ -18,8 +18,7 @@ from mifit.morphable import MorphableModel
 from mifit.morphable.builtin import cache, sculpt
 from mifit.morphable.builtin.head import make_head
 from mifit.morphable.builtin.template import EYEBALL, SKIN, make_template
-from mifit.morphable.landmarks import IBUG_MIRROR
-from mifit.morphable.topology import boundary_loops
+from mifit.morphable.topology import IBUG_MIRROR, boundary_loops
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel, describe
-from mifit.morphable.landmarks import IBUG_MIRROR
 from mifit.morphable.register import distance_to_surface, register, rigid_between
-from mifit.morphable.topology import EYES_AND_MOUTH
+from mifit.morphable.topology import EYES_AND_MOUTH, IBUG_MIRROR
 from mifit.morphable.unwrap import unwrap
 
 

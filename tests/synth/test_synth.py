@@ -13,9 +13,8 @@ from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.synth.compose import FULL_WELL, READ_NOISE, expose, place_cameras
 from mifit.synth.head import wrap_uv
-from mifit.synth.noise import smooth_noise
+from mifit.synth.procedural import smooth_noise, studio_environment
 from mifit.synth.skin import SkinStyle
-from mifit.synth.studio import studio_environment
 
 
 @pytest.mark.slow

@@ -56,7 +56,7 @@ def _source_digest() -> str:
     files = sorted(
         [
             *here.glob("*.py"),
-            *(here.parent / f for f in ("gaussian_process.py", "pigment.py", "topology.py", "landmarks.py")),
+            *(here.parent / f for f in ("gaussian_process.py", "pigment.py", "topology.py")),
             here.parents[1] / "core" / "mesh.py",
         ]
     )

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from mifit.morphable.builtin import sculpt
 from mifit.morphable.builtin.template import SKIN, Template
-from mifit.morphable.landmarks import IBUG_MIRROR
+from mifit.morphable.topology import IBUG_MIRROR
 
 # targets on the side x > 0 in mm; mirrored for x < 0
 _JAW = [

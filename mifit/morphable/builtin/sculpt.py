@@ -50,7 +50,6 @@ CANTHI = (15.6, 46.4)
 MOUTH_HALF = 25.5
 _ROLL_ROWS = 2
 
-HALF_COLUMNS = int(_COLUMNS[:, 1].sum())
 ROWS = int(_SLICES[:, 8].sum()) + 1
 
 

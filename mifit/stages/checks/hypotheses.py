@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
-from mifit.morphable.landmarks import IBUG_MIRROR
+from mifit.morphable.topology import IBUG_MIRROR
 from mifit.stages.checks.landmark_model import Shot
 
 Matrix = NDArray[np.float64]

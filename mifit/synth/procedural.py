@@ -1,9 +1,10 @@
-"""A procedural photo studio: dim room, bright ceiling, softboxes; made from a seed, so that nothing is shipped."""
+"""What needs no file: a studio of soft lights, and smooth noise on a surface."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 
 def studio_environment(seed: int = 0, height: int = 128) -> NDArray[np.float32]:
@@ -47,3 +48,25 @@ def _softbox(
         y = np.abs(direction @ np.cross(forward, right)) / depth / np.tan(np.radians(half_height))
     edge = np.clip((1.0 - np.maximum(x, y)) / 0.1, 0.0, 1.0)
     return np.where(depth > 0, edge, 0.0)
+
+
+_SIDE = 48
+
+
+def smooth_noise(points: NDArray, wavelength: float, rng: np.random.Generator, octaves: int = 1) -> NDArray[np.float32]:
+    """Noise with mean 0 and standard deviation about 1 at points (N, 3).
+
+    Parameters
+    ----------
+    points : (N, 3)
+    wavelength : float
+        Feature size of the first octave, in the points' unit; every further octave halves size and amplitude.
+    rng : numpy Generator
+    octaves : int
+    """
+    total = np.zeros(len(points), dtype=np.float32)
+    for octave in range(octaves):
+        grid = rng.standard_normal((_SIDE,) * 3).astype(np.float32)
+        at = np.asarray(points, dtype=np.float32).T * np.float32(2.0**octave * 2.0 / wavelength)
+        total += map_coordinates(grid, at, order=1, mode="grid-wrap") * np.float32(1.8 * 0.5**octave)
+    return total
