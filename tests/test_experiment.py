@@ -187,6 +187,23 @@ fit.until = ["reflectance", "normals"]
         load_plan(path, ["fit.seed"])
 
 
+@pytest.mark.parametrize(
+    ("setting", "where"),
+    [('fit.cameras=["left","up"]', "fit.cameras"), ('evaluate.camera="up"', "evaluate.camera"),
+     ('relight.camera="up"', "relight.camera")],
+)  # fmt: skip
+def test_cameras_of_synthetic_captures_are_checked_before_the_first_run(tmp_path, setting, where):
+    (tmp_path / "studio.hdr").write_bytes(b"light")
+    light = "env = 'studio.hdr'\n"
+    (tmp_path / "e.toml").write_text(
+        f"name = 'e'\n[fit.synth]\ntimesteps = 1\n[evaluate]\ncamera = 'third'\n[relight]\n{light}"
+        f"[relight.synth]\ntimesteps = 1\n{light}"
+    )
+    assert load_plan(tmp_path / "e.toml").runs
+    with pytest.raises(InputError, match=f"{where}: found 'up', expected one of left, right, third"):
+        load_plan(tmp_path / "e.toml", [setting])
+
+
 def test_digests_follow_contents(tmp_path):
     scene = tmp_path / "scene.xml"
     scene.write_text("<scene version='3.0.0'/>")

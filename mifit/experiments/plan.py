@@ -300,6 +300,10 @@ def _flatten(table: dict, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield f"{prefix}{key}", value
 
 
+SYNTHETIC_CAMERAS = ("left", "right", "third")
+"""Those of `synth.compose.place_cameras`."""
+
+
 def _resolved(e: Experiment, folder: Path, where: str) -> Experiment:
     """Check how the parts go together, and make paths absolute (relative ones are from the file's folder)."""
     if (e.fit is None) == (e.render is None):
@@ -315,6 +319,16 @@ def _resolved(e: Experiment, folder: Path, where: str) -> Experiment:
             f"{where}: evaluate.camera: found {e.evaluate.camera!r}, which fit.cameras names too; "
             "expected a camera that is not fitted"
         )
+    named: list[tuple[str, str]] = []
+    if e.fit and e.fit.synth:
+        named += [("fit.cameras", name) for name in e.fit.cameras]
+        named += [("evaluate.camera", e.evaluate.camera)] if e.evaluate else []
+    if e.relight and e.relight.synth:
+        named.append(("relight.camera", e.relight.camera))
+    for key, name in named:
+        if name not in SYNTHETIC_CAMERAS:
+            known = ", ".join(SYNTHETIC_CAMERAS)
+            raise InputError(f"{where}: {key}: found {name!r}, expected one of {known}, as synthetic captures have")
     e = _absolute(e, folder)
     if e.relight and e.relight.synth and (e.relight.capture is not None or e.relight.synth.env != e.relight.env):
         raise InputError(f"{where}: relight.synth: expected its 'env' to be relight.env, and no 'capture'")
@@ -329,7 +343,7 @@ def _absolute(settings: Any, folder: Path) -> Any:
         if isinstance(value, (FitRun, SynthRun, RelightRun, RenderRun)):
             changed[field.name] = _absolute(value, folder)
         elif field.name in ("scene", "env", "capture", "model") and isinstance(value, str):
-            if field.name != "model" or not value.startswith("builtin"):
+            if field.name != "model" or value.partition(":")[0] not in ("builtin", "auto"):
                 changed[field.name] = os.path.abspath(folder / value)  # links stay: following a loop of them raises
     return dataclasses.replace(settings, **changed)
 
@@ -342,7 +356,8 @@ def _inputs(e: Experiment) -> dict[str, tuple[Any, ...]]:
     if e.relight:
         found["env"] = ("file", e.relight.env)
         if e.relight.capture is not None:
-            found["lit_capture"] = ("capture", e.relight.capture)
+            names = (*(e.fit.cameras if e.fit else ()), e.relight.camera)
+            found["lit_capture"] = ("capture", e.relight.capture, None, None, names)
     if e.fit:
         found["model"] = ("model", e.fit.model)
         if e.fit.capture is not None:
@@ -354,7 +369,11 @@ def _inputs(e: Experiment) -> dict[str, tuple[Any, ...]]:
 
 
 def _digest(
-    kind: str, name: str, cameras: tuple[str, ...] | None = None, timesteps: tuple[int, ...] | None = None
+    kind: str,
+    name: str,
+    cameras: tuple[str, ...] | None = None,
+    timesteps: tuple[int, ...] | None = None,
+    needed: tuple[str, ...] = (),
 ) -> str:
     """Digest of the content of an input; InputError where it can't be used."""
     if kind == "file":
@@ -366,6 +385,7 @@ def _digest(
     from mifit.fitting import choose, choose_timesteps
 
     capture = mifit.Capture.load(name)
+    choose("camera", capture.cameras, needed or None, 0)
     if cameras is None:
         return capture.digest()
     return capture.digest(choose("camera", capture.cameras, cameras, 2), choose_timesteps(capture, timesteps))
