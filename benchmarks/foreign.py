@@ -16,9 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -27,21 +25,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
 import mifit
 from benchmarks import heads, judge
 from benchmarks.heads import ICT, Case
 from benchmarks.judge import Row
-from benchmarks.record import RESULTS, SHARED, conditions, record
+from benchmarks.record import RESULTS, conditions, record
 from mifit import Capture, FitConfig, MorphableModel, Reconstruction
 from mifit.config import ReflectanceConfig
 from mifit.core.files import write_text
-from mifit.core.image import write_image
 from mifit.core.process import set_threads, threads
 from mifit.errors import MifitError
 from mifit.output.evaluate import separation_of
-from mifit.output.score import score
 from mifit.output.truth import relit_truths, true_passes
 
 FITS = ("full", "refit", "paper")
@@ -90,9 +85,7 @@ def without_specular(
 
 def lambertian(config: ReflectanceConfig) -> ReflectanceConfig:
     """Settings of stage 2 without specular reflection."""
-    if hasattr(config, "specular"):
-        return replace(config, specular=False)
-    return replace(config, shading="matt")
+    return replace(config, specular=False)
 
 
 def constant_albedo(full: Reconstruction) -> Reconstruction:
@@ -149,38 +142,7 @@ def judge_case(
         found["relit"] = judge.judge_relit(case, capture, lit, integrators, samples, lights)
     if true_passes(capture, case.held_out[0]) is not None and capture.timesteps[0] in case.timesteps:
         found["separation"] = separation_of(full, capture, case.held_out[0])
-        found["scores"] = scores(case, rows)
     found["fits"] = {name: outcome(row.first) for name, row in rows.items() if row.method == "full"}
-    return found
-
-
-def scores(case: Case, rows: Mapping[str, Row]) -> dict[str, Any]:
-    """What `mifit score` says of some rows, and of two programs that know nothing of mifit, from plain files alone."""
-    capture, found = Capture.load(case.path), {}
-    first, camera = case.timesteps[0], case.held_out[0]
-    view, environments = capture.camera(camera), relit_truths(capture)
-    with tempfile.TemporaryDirectory() as work:
-        for label, row in rows.items():
-            if row.method != "full" or label in ("model alone", "refit", "constant albedo"):
-                continue
-            folder, result = Path(work) / label, row.results[first]
-            for t, fit in row.results.items():
-                write_image(folder / f"{camera}_{t:04d}.png", fit.render(view, t)[..., :3])
-                mesh = trimesh.Trimesh(fit.geometry.vertices[fit.index(t)], fit.model.faces, process=False)
-                mesh.export(folder / f"{t:04d}.ply")
-            parts = [replace(result, residual=None).render(view, first, m)[..., :3] for m in ("full", "diffuse")]  # type: ignore[arg-type]
-            write_image(folder / f"diffuse_{camera}.exr", parts[1])
-            write_image(folder / f"specular_{camera}.exr", parts[0] - parts[1])
-            for name, truth in environments.items():
-                light = truth.environment or SHARED / "hdri" / f"{name}.hdr"
-                write_image(folder / f"relit_{name}.exr", result.relight(str(light)).render(view, first)[..., :3])
-            found[label] = score(capture, folder, case.fitted)
-        for program in ("nearest_view", "flat_colour"):
-            script = Path(__file__).resolve().parents[1] / "tests" / "score" / f"{program}.py"
-            steps = [str(t) for t in case.timesteps]
-            given = [str(case.path), str(Path(work) / program), ",".join(case.fitted), camera, *steps]
-            subprocess.run([sys.executable, str(script), *given], check=True)
-            found[program] = score(capture, Path(work) / program, case.fitted)
     return found
 
 
@@ -292,17 +254,6 @@ RELIT: Columns = {
     for title, row in (("`full`", "full"), ("refitted", "refit"), ("one albedo", "constant albedo"), ("paper", "paper"))
     if how == "local" or row in ("full", "refit")
 }
-SCORES: Columns = {
-    "skin dB": lambda c: _figure(c, 1, "views", "held_out", "skin", "psnr"),
-    "SSIM": lambda c: _figure(c, 3, "views", "held_out", "skin", "ssim"),
-    "FLIP": lambda c: _figure(c, 3, "views", "held_out", "skin", "flip"),
-    "face dB": lambda c: _figure(c, 1, "views", "held_out", "face", "psnr"),
-    "whole dB": lambda c: _figure(c, 1, "views", "held_out", "whole", "psnr"),
-    "relit dB": lambda c: _figure(c, 1, "relit", "mean"),
-    "specular corr., smoothed": lambda c: _figure(c, 2, "passes", "third", "correlation_smooth"),
-    "diffuse dB": lambda c: _figure(c, 1, "passes", "third", "diffuse_psnr"),
-    "mesh mm": lambda c: _figure(c, 2, "meshes", "mean_mm"),
-}
 SEPARATION: Columns = {
     "corr., raw / smoothed": lambda c: " / ".join(
         _figure(c, 2, "separation", key) for key in ("correlation", "correlation_smooth")
@@ -382,10 +333,6 @@ def markdown(cases: Sequence[dict[str, Any]], run: Mapping[str, Any] | None = No
     ):
         some = [case for case in cases if case.get(key)]
         lines += ["", title, "", *_table(some, columns)] if some else []
-    for case in cases:
-        if "scores" in case:
-            lines += ["", f"What `mifit score` says of plain files, {case['label']}:", ""]
-            lines += _table([{"label": n, "set": case["set"], **one} for n, one in case["scores"].items()], SCORES)
     return "\n".join(lines) + "\n"
 
 

@@ -185,7 +185,7 @@ class GeometryConfig:
             )
 
 
-SHADINGS = ["auto", "paper", "printed", "prefiltered", "shadowed", "keyed", "near", "matt"]
+SHADINGS = ["auto", "paper", "printed", "prefiltered", "shadowed"]
 """What ``shading`` may be; registering a shading model (``appearance.models``) adds its name."""
 
 
@@ -239,18 +239,17 @@ class ReflectanceConfig:
     )
     shading: Annotated[str, pydantic.AfterValidator(_known_shading)] = one_of(
         "auto",
-        "image-formation model: paper, prefiltered, shadowed, keyed (shadowed with distant compact lights), near "
-        "(with one at a place), matt (shadowed without specular reflection), or another that is registered; auto takes "
-        "the one of the last four that best predicts images that are left out",
+        "image-formation model: paper, printed, prefiltered, shadowed (with distant compact lights where images show "
+        "some), or another that is registered; auto is shadowed, with solver adam paper",
     )
     bands: int = number(10, "bands of the lighting of prefiltered and shadowed; paper has 3", least=3, most=10)
     exponent: float | None = number(
         None,
-        "Blinn-Phong exponent; none: 5 for paper, as in the paper, and otherwise the one that best predicts images "
-        "that are left out",
+        "Blinn-Phong exponent; none: 5 for paper, as in the paper, and otherwise the one that explains the images best",
         least=1,
         most=10_000,
     )
+    specular: bool = flag(True, "find specular reflection; false: all is diffuse")
     specular_difference_weight: float = number(0.1, "the paper's lambda_S", least=0, most=WEIGHT)
     smoothness_weight: float = number(0.001, "the paper's lambda_H", least=0, most=WEIGHT)
     specular_smoothness: float = number(
@@ -278,13 +277,6 @@ class ReflectanceConfig:
     max_iterations: int = number(
         30, "Gauss-Newton iterations (als), or tens of gradient steps (adam)", least=1, most=10_000
     )
-
-    def __post_init__(self) -> None:
-        if self.solver == "adam" and self.shading in ("keyed", "near"):
-            raise ValueError(
-                f"shading: found {self.shading!r} with solver 'adam', which has no search for a light's place; "
-                "use solver 'als', or shading 'shadowed'"
-            )
 
 
 @settings

@@ -45,6 +45,6 @@ def specular_matrix(normals, view, radiance, exponent, model, diffuse_transfer=N
 
 def light_columns(normals, view, visible, light, exponent, fresnel=None):
     """Diffuse and specular radiance (N,) at unit albedo per unit of a light's colour."""
-    look = appearance(np.zeros((1, 3)), exponent, "prefiltered", True, fresnel)
-    matt, glossy = look.light_transfer(normals, view)([light], np.asarray(visible)[None])
-    return matt[0], glossy[0]
+    look = appearance(np.zeros((1, 3)), exponent, "prefiltered", True, fresnel, lights=(light,))
+    diffuse, specular = look.transfers(normals, view, Occlusion(visible=(np.asarray(visible),)))
+    return diffuse[:, -1], specular[:, -1]

@@ -54,7 +54,7 @@ def test_nested_values_and_integers_for_floats():
         ({"reflectance": {"exponent": -1}}, "reflectance.exponent: found -1, expected a finite number from 1 to 10000"),
         ({"reflectance": {"robust": 1}}, "reflectance.robust: found 1, expected true or false"),
         ({"reflectance": {"solver": "sgd"}}, "found 'sgd', expected one of 'als', 'adam'"),
-        ({"reflectance": {"solver": "adam", "shading": "keyed"}}, "reflectance.shading: found 'keyed' with solver"),
+        ({"reflectance": {"shading": "shadow"}}, "reflectance.shading: found 'shadow', expected one of"),
         ({"reflectance": 3}, "reflectance: found 3, expected a table"),
         ({"geometry": {"texture_sigma": 7.0}}, "geometry.texture_sigma: found 7.0, expected below texture_window"),
         ({"mesh": {"subdivisions": -1}}, "mesh.subdivisions: found -1, expected a whole number from 0 to 3"),

@@ -6,7 +6,6 @@ at unit albedo from smooth and from compact lights. `form_image` is the only pla
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -15,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mifit.appearance import models
 from mifit.appearance.arrays import aligned, expect, on_device, stored
-from mifit.appearance.illumination import Illumination, Light, NearLight
+from mifit.appearance.illumination import Illumination, Light
 from mifit.appearance.kernels import PreparedLobe, diffuse_transfer, prepare
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
@@ -24,7 +23,6 @@ from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, Ver
 from mifit.errors import InputError
 
 OPEN = Occlusion()
-LightTransfer = Callable[..., tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 
 def form_image(ambient: Any, albedo: Any, diffuse: Any, specular_albedo: Any, specular: Any) -> Any:
@@ -148,50 +146,37 @@ class Appearance:
         both = stored([*diffuse, *specular], scene.count)
         return both[:, : len(diffuse)], both[:, len(diffuse) :]
 
-    def light_transfer(self, normals: ArrayLike, view: ArrayLike, points: ArrayLike | None = None) -> LightTransfer:
-        """What compact lights, several of one kind at a time, send off points: parameters as in `shade`.
+    def light_transfer(
+        self, normals: ArrayLike, view: ArrayLike, directions: NDArray, visible: NDArray
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Diffuse and specular radiance (M, N) at unit albedo per unit of irradiance from single directions.
 
-        Returns
-        -------
-        callable
-            ``(lights, visible)`` -> diffuse and specular radiance (M, N) at unit albedo and light;
-            ``visible`` (M, N) uint32 tells which of a light's samples each point sees (``Light.visible``).
+        Parameters
+        ----------
+        normals, view : (N, 3)
+            As in `shade`.
+        directions : (M, 3)
+            Unit vectors.
+        visible : (M, N) bool
+            Which of them each point sees.
         """
         import drjit as dr
         import mitsuba as mi
 
         dark = Appearance(self.model, Illumination.dark(1), self.lobe)
-        scene = _Scene(dark, normals, view, Occlusion(), points, shadows=False)
-
-        def transfer(lights: Sequence[Light], visible: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-            shape = len(lights), scene.count
-            if not shape[0] * shape[1]:
-                return np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-            samples = np.stack([light.samples() for light in lights])
-            towards, rays = mi.Float(aligned(samples).ravel()), samples.shape[1]
-            number = dr.arange(mi.UInt32, shape[0] * shape[1])
-            count = dr.opaque(mi.UInt32, scene.count)
-            light, point = number // count, number % count
-
-            def direction(ray: int) -> Any:
-                return mi.Vector3f(*(dr.gather(mi.Float, towards, light * (3 * rays) + 3 * ray + i) for i in range(3)))
-
-            n, v = (dr.gather(mi.Vector3f, x, point) for x in (scene.n, scene.v))
-            directions, strength = [direction(ray) for ray in range(rays)], mi.Float(1.0)
-            near = [each for each in lights if isinstance(each, NearLight)]
-            if near:
-                p = dr.gather(mi.Point3f, scene.points, point)
-                places = mi.Float(aligned(np.stack([each.position for each in near])).ravel())
-                reach = mi.Float(aligned([each.distance**2 for each in near]))
-                place = mi.Point3f(*(dr.gather(mi.Float, places, 3 * light + i) for i in range(3)))
-                strength = dr.gather(mi.Float, reach, light) / dr.squared_norm(place - p)
-                directions = [dr.normalize(mi.Point3f(d) - p) for d in directions]
-            seen = mi.UInt(aligned(visible, np.uint32).ravel())
-            found = self.model.light(n, v, scene.lobe, directions, strength, seen)
-            both = stored(list(found), shape[0] * shape[1])
-            return both[:, 0].reshape(shape), both[:, 1].reshape(shape)
-
-        return transfer
+        scene = _Scene(dark, normals, view, Occlusion(), None, shadows=False)
+        shape = len(directions), scene.count
+        if not shape[0] * shape[1]:
+            return np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        towards = mi.Float(aligned(directions).ravel())
+        number = dr.arange(mi.UInt32, shape[0] * shape[1])
+        count = dr.opaque(mi.UInt32, scene.count)
+        light, point = number // count, number % count
+        n, v = (dr.gather(mi.Vector3f, x, point) for x in (scene.n, scene.v))
+        d = dr.gather(mi.Vector3f, towards, light)
+        seen = mi.UInt(aligned(visible, np.uint32).ravel())
+        both = stored(list(self.model.light(n, v, scene.lobe, [d], mi.Float(1.0), seen)), shape[0] * shape[1])
+        return both[:, 0].reshape(shape), both[:, 1].reshape(shape)
 
     def _smooth(self, scene: _Scene) -> Shade:
         return lambda n, v: self.model.shade(n, v, scene.lobe, scene.coefficients, scene.shadowed)

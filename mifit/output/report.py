@@ -298,24 +298,7 @@ def _lighting(result: Result) -> str:
 {figure(png_uri(mirror), "Mirror ball", "lighting in a mirror ball")}
 {figure(jpeg_uri(codes), "All directions, latitude by longitude", "lighting panorama")}</div>
 <p class="soft">Recovered as spherical harmonics of {lighting.order} bands, so only broad light shows{compact}.
-Ambient term {result.illumination.ambient:.4f}.</p>{_choice(result)}"""
-
-
-def _choice(result: Result) -> str:
-    """How well each way to explain the images predicted those that were left out."""
-    report = result.reports.get("reflectance")
-    shading = {} if report is None else report.details.get("shading", {})
-    tried = shading.get("predicted") or []
-    if not tried:
-        return ""
-    rows = "".join(
-        f"<tr><td>{html.escape(t['shading'])}</td><td>{t.get('lights', '')}</td><td>{t['exponent'] or 'none'}</td>"
-        f"<td>{t['error']:.4f}</td></tr>"
-        for t in tried
-    )
-    return f"""<p class="soft">Chosen: {html.escape(shading["chosen"])}, by how well {html.escape(shading["left_out"])}
-left out in turn are predicted (root mean square error of linear colour).</p>
-<table><tr><th>shading</th><th>compact lights</th><th>exponent</th><th>error</th></tr>{rows}</table>"""
+Ambient term {result.illumination.ambient:.4f}.</p>"""
 
 
 def _convergence(result: Result) -> str:

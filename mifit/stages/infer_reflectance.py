@@ -19,7 +19,7 @@ from mifit.morphable.openings import eyeball_faces
 from mifit.optim import Outcome
 from mifit.progress import Progress, silent
 from mifit.stages.observations import Surface
-from mifit.stages.reflectance.als import fit_als
+from mifit.stages.reflectance.als import find_forward, fit_als
 from mifit.stages.reflectance.beneath_film import beneath_the_film
 from mifit.stages.reflectance.fill import blend_unseen, mirrored_coordinates
 from mifit.stages.reflectance.forward import Forward
@@ -73,7 +73,7 @@ def infer_reflectance(
     Returns
     -------
     ReflectanceEstimate
-        ``report.details`` holds the shading model chosen and why, the gauge, residuals and coverage.
+        ``report.details`` holds the shading model, the gauge, residuals and coverage.
 
     Raises
     ------
@@ -85,15 +85,19 @@ def infer_reflectance(
     started = time.perf_counter()
     config = config or ReflectanceConfig()
     surface = Surface(capture, model, geometry, cameras, config.texture_size, config.robust, whole=config.robust)
-    labels: tuple = ()
-    if config.robust and config.segment:
-        labels = segment(surface, capture, model, seed)
-        surface = surface.without([hidden(image) for image in labels])
     mirrored = mirrored_coordinates(model, surface.texels) if config.symmetric_fill else None
     albedo = interpolate(geometry.vertex_albedo, model.faces, surface.texels.face, surface.texels.weights)
     albedo = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float32)
+    progress("Reflectance lighting", 0, 2)
+    forward, first = find_forward(surface, albedo, config, seed)
+    labels: tuple = ()
+    if first is not None and config.segment:
+        labels = segment(surface, capture, model, forward, first.light)
+        surface = surface.without([hidden(image) for image in labels])
+    progress("Reflectance lighting", 1, 2)
     solve = fit_adam if config.solver == "adam" else fit_als
-    fitted, choice, warnings = solve(surface, albedo, config, seed, progress)
+    fitted = solve(surface, forward, albedo, config, seed, progress)
+    warnings: tuple[Diagnostic, ...] = ()
     illumination = fitted.appearance.illumination
     if not (np.isfinite(fitted.maps).all() and np.isfinite(illumination.unknowns).all()):
         raise ConvergenceError("stage 2 (reflectance): the maps or the lighting are not finite; see the images' range")
@@ -103,7 +107,11 @@ def infer_reflectance(
         text = "the lighting had not converged when the iterations ran out; raise max_iterations"
         warnings = (*warnings, Diagnostic("not-converged", text))
     details: dict = {
-        "shading": choice,
+        "shading": {
+            "model": fitted.appearance.model.name,
+            "exponent": fitted.appearance.lobe.typical,
+            "lights": len(illumination.lights),
+        },
         "gauge": GAUGE,
         "residual": float(fitted.sigma),
         "seen": float((quality[surface.facial] > 0).mean()),

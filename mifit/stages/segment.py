@@ -1,10 +1,10 @@
 """What each image shows: skin, eyes, mouth, hair, cloth, something in front of the face, or the background.
 
-It starts from the fitted head. Every point of the face has one colour, whatever image shows it, times a shading that
-depends on its normal alone: both are found from all images together (`stages.consensus`), and an image that contradicts
-them over an area shows something else there. What is added light alone, such as a highlight, contradicts nothing. What
-covers a point in every image is told by its colour, far from that of the face's skin. GrabCut (Rother et al. 2004),
-started inside what was found and on the skin around it, one object at a time, then finds the objects' outlines.
+It starts from the fitted head under its light, shadows included. Every point of the face has one albedo, the median
+over all images, and an image that contradicts it over an area shows something else there. What is added light alone,
+such as a highlight, contradicts nothing, and neither does a shadow that the mesh throws nearby. What covers a point in
+every image has a colour far from that of the face's skin. GrabCut (Rother et al. 2004), started inside what was found
+and on the skin around it, one object at a time, then finds the objects' outlines.
 
 No network is involved. A capture's own masks (``mask_path``) replace this for the images that have one.
 """
@@ -12,6 +12,7 @@ No network is involved. A capture's own masks (``mask_path``) replace this for t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import cv2
@@ -20,18 +21,22 @@ from numpy.typing import NDArray
 
 from mifit.core.estimate import Label
 from mifit.core.image import to_8_bit
-from mifit.core.mesh import interpolate, normalize
+from mifit.core.mesh import interpolate
 from mifit.core.process import on_all_cores
-from mifit.core.sh import basis
-from mifit.stages.consensus import OPPONENT, Consensus, agreed_colour, consensus, no_skin
 from mifit.stages.trust import DARKEST
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
     from mifit.stages.observations import Seen, Surface
+    from mifit.stages.reflectance.forward import Forward
 
-
+OPPONENT = np.array([[1 / 3, 1 / 3, 1 / 3], [1.0, -1.0, 0.0], [0.5, 0.5, -1.0]])
+"""Logarithms of colour to brightness and two differences, which shading changes little."""
+FLOOR = np.array([0.12, 0.03, 0.03])
+"""Least standard deviations of the three: texture that a fitted mesh shifts, and shading that no light explains."""
+COVERED = (0.9, 0.45)
+"""Difference in brightness and in chroma (logarithms) from the face's skin that no plain skin has."""
 SURE, LIKELY, CLEAN = 4.0, 3.0, 1.0
 """Departures in standard deviations: of what starts an object, may belong to one, and is skin."""
 BLUR = 0.003
@@ -61,7 +66,84 @@ LONGEST = 640
 """Pixels along the longer side of a face at which it is looked at."""
 
 
-def segment(surface: Surface, capture: Capture, model: MorphableModel, seed: int = 0) -> tuple[NDArray[np.uint8], ...]:
+@dataclass(frozen=True)
+class Albedos:
+    """Albedo maps that the images of a face have in common under a light, and what each departs from them.
+
+    Attributes
+    ----------
+    colour : (S, S, 3) float32
+        `OPPONENT` logarithms of the median albedo over the images.
+    known : (S, S) float32
+        1 where some image measures the texel.
+    shading : tuple of (S, S, 3) float32
+        `OPPONENT` logarithms of the diffuse light in each image.
+    deviation : (3,) float64
+        Robust standard deviations of what an image shows.
+    skin : (3,) float64
+        Median colour of the face.
+    """
+
+    colour: NDArray[np.float32]
+    known: NDArray[np.float32]
+    shading: tuple[NDArray[np.float32], ...]
+    deviation: NDArray[np.float64]
+    skin: NDArray[np.float64]
+
+
+def common_albedos(surface: Surface, appearance: Forward, light: NDArray) -> Albedos:
+    """What all images together say about the face's colours under a light (K, 3), per texel their weighted median."""
+    texels, levels, shadings, weights = [], [], [], []
+    for part in surface.chunks():
+        rows = part[surface.facial[part]]
+        seen = surface.observe(rows)
+        texels.append(rows)
+        levels.append(opponent(seen.colour))
+        shadings.append(opponent(appearance.shade(seen, light)[0]))
+        weights.append(seen.measured)
+    level, shading, weight = (np.concatenate(x) for x in (levels, shadings, weights))
+    flat = level - shading
+    centre = np.stack([_median(flat[..., c], weight) for c in range(3)], axis=1)
+    known = (weight > 0).any(axis=1)
+    skin = np.median(centre[known], axis=0).astype(np.float64) if known.any() else np.zeros(3)
+    bare = known & ~no_skin(centre, skin)
+    apart = np.abs(flat - centre[:, None])[(weight > 0) & bare[:, None]]
+    deviation = np.maximum(1.4826 * np.median(apart, axis=0).astype(np.float64), FLOOR) if len(apart) else FLOOR
+    index, size = surface.texels.index[np.concatenate(texels)], surface.texels.size
+
+    def to_map(values: NDArray) -> NDArray[np.float32]:
+        out = np.zeros((size * size, 3), np.float32)
+        out[index[known]] = values[known]
+        return out.reshape(size, size, 3)
+
+    mask = np.zeros(size * size, np.float32)
+    mask[index[known]] = 1.0
+    maps = tuple(to_map(shading[:, j]) for j in range(surface.image_count))
+    return Albedos(to_map(centre), mask.reshape(size, size), maps, deviation, skin)
+
+
+def opponent(colour: NDArray) -> NDArray[np.float32]:
+    """Logarithms of linear colour (..., 3): brightness and two differences, which light changes little."""
+    return np.asarray(np.log(np.maximum(colour, DARKEST)) @ OPPONENT.T.astype(np.float32), np.float32)
+
+
+def no_skin(flat: NDArray, skin: NDArray) -> NDArray[np.bool_]:
+    """Colours without shading, (..., 3) `OPPONENT` logarithms, that are far from those of the face's skin."""
+    unlike = flat - skin
+    return np.asarray((unlike[..., 0] < -COVERED[0]) | (np.hypot(unlike[..., 1], unlike[..., 2]) > COVERED[1]))
+
+
+def _median(values: NDArray, weights: NDArray) -> NDArray:
+    """(N,) weighted median of the rows of (N, J) values."""
+    order = np.argsort(values, axis=1)
+    total = np.cumsum(np.take_along_axis(weights, order, axis=1) + 1e-12, axis=1)
+    middle = (total >= 0.5 * total[:, -1:]).argmax(axis=1)
+    return np.asarray(np.take_along_axis(values, order, axis=1)[np.arange(len(values)), middle])
+
+
+def segment(
+    surface: Surface, capture: Capture, model: MorphableModel, forward: Forward, light: NDArray
+) -> tuple[NDArray[np.uint8], ...]:
     """A label image for every image of a surface.
 
     Parameters
@@ -70,22 +152,27 @@ def segment(surface: Surface, capture: Capture, model: MorphableModel, seed: int
     capture : Capture
         Images are taken from it; those with a mask of their own are labelled by it and the mesh alone.
     model : MorphableModel
-    seed : int
+    forward : Forward
+    light : (K, 3)
+        What lights the face.
 
     Returns
     -------
     tuple of (H, W) uint8
         `Label` values, in the order of the surface's images.
     """
-    agreed = consensus(surface, seed)
+    albedos = common_albedos(surface, forward, light)
 
-    def labelled(view: Seen) -> NDArray[np.uint8]:
-        return _segment_image(view, agreed, capture, model)
+    def labelled(item: tuple[int, Seen]) -> NDArray[np.uint8]:
+        number, view = item
+        return _segment_image(view, albedos, albedos.shading[number], capture, model)
 
-    return tuple(on_all_cores(labelled, list(surface.views())))
+    return tuple(on_all_cores(labelled, list(enumerate(surface.views()))))
 
 
-def _segment_image(view: Seen, agreed: Consensus, capture: Capture, model: MorphableModel) -> NDArray[np.uint8]:
+def _segment_image(
+    view: Seen, albedos: Albedos, shading: NDArray, capture: Capture, model: MorphableModel
+) -> NDArray[np.uint8]:
     frame = capture.frame(view.camera.name, view.timestep)
     number = np.asarray(np.isfinite(frame.image).all(axis=-1))
     image = np.where(number[..., None], frame.image, 0.0).astype(np.float32)
@@ -99,7 +186,9 @@ def _segment_image(view: Seen, agreed: Consensus, capture: Capture, model: Morph
         rows, columns = _box(facial)
         step = -(-max(rows.stop - rows.start, columns.stop - columns.start) // LONGEST)
         grid = slice(rows.start, rows.stop, step), slice(columns.start, columns.stop, step)
-        objects = _objects(view, image[rows, columns], usable, grid, agreed, model, facial, _plain(hit.shape, marks))
+        objects = _objects(
+            view, image[rows, columns], usable, grid, albedos, shading, model, facial, _plain(hit.shape, marks)
+        )
         found = np.zeros(hit.shape, bool)
         shape = columns.stop - columns.start, rows.stop - rows.start
         found[rows, columns] = cv2.resize(objects.astype(np.uint8), shape, interpolation=cv2.INTER_NEAREST) > 0
@@ -116,7 +205,8 @@ def _objects(
     image: NDArray,
     usable: NDArray[np.bool_],
     grid: tuple[slice, slice],
-    agreed: Consensus,
+    albedos: Albedos,
+    shading: NDArray,
     model: MorphableModel,
     facial: NDArray[np.bool_],
     plain: NDArray[np.bool_],
@@ -131,20 +221,26 @@ def _objects(
     blur = max(BLUR * size, 0.7)
     at, shape = (face.ravel(), weights.reshape(-1, 3)), face.shape
     uv = interpolate(model.uv, model.faces_uv, *at).reshape(*shape, 2)
-    normal = normalize(interpolate(view.normals, model.faces, *at)).reshape(*shape, 3)
-    known, colour = agreed_colour(agreed, uv)
+    side = len(albedos.known)
+    place = (uv[..., 0] * side - 0.5).astype(np.float32), ((1.0 - uv[..., 1]) * side - 0.5).astype(np.float32)
+    known = cv2.remap(albedos.known, *place, cv2.INTER_LINEAR)
+    share = np.maximum(known, 1e-3)[..., None]
+    colour, shaded = (cv2.remap(each, *place, cv2.INTER_LINEAR) / share for each in (albedos.colour, shading))
     usable = usable & (known > 0.5)
-    predicted = colour + basis(normal, 3) @ agreed.shading
+    predicted = colour + shaded
     smooth = cv2.GaussianBlur(image, (0, 0), 0.5 * blur)
-    level = np.log(np.maximum(smooth, DARKEST)) @ OPPONENT.T
-    departure = np.sqrt((((level - predicted) / agreed.deviation) ** 2).mean(axis=-1))
+    level = opponent(smooth)
+    # The mesh is a little off, so the edge of a shadow may lie anywhere about there.
+    about = np.ones((2 * max(1, round(RIM * size)) + 1,) * 2, np.uint8)
+    lit = np.clip(level - colour, cv2.erode(shaded, about), cv2.dilate(shaded, about))
+    departure = np.sqrt((((level - colour - lit) / albedos.deviation) ** 2).mean(axis=-1))
     departure[~usable | _highlight(smooth, np.exp(predicted @ np.linalg.inv(OPPONENT).T))] = 0.0
     weight = cv2.GaussianBlur(usable.astype(np.float32), (0, 0), blur)
     departure = cv2.GaussianBlur(departure.astype(np.float32), (0, 0), blur) / np.maximum(weight, 1e-3)
     inner = cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 3) > RIM * size
     # What covers a point in most images needn't in this one, nor end in all of them at the same point.
-    strange = no_skin(level - basis(normal, 3) @ agreed.shading, agreed.skin) & usable
-    covered = no_skin(colour, agreed.skin) & strange
+    strange = no_skin(level - shaded, albedos.skin) & usable
+    covered = no_skin(colour, albedos.skin) & strange
     picture = to_8_bit(image)
     found = _outlines(
         picture,

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mifit.appearance.illumination import DistantLight, NearLight, light_from
+from mifit.appearance.illumination import NearLight, light_from
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.occlusion import Occlusion
 from mifit.appearance.reference import compact_light
@@ -47,18 +47,6 @@ def test_each_point_has_its_own_directions_and_strength(variant, fresnel):
     np.testing.assert_allclose(glossy, np.array(expected)[:, 1], atol=2e-4 * np.max(expected))
 
 
-def test_several_lights_at_a_time_are_each_alone(variant):
-    p, n, v = surface()
-    lights = [FLASH, replace(FLASH, position=np.array([-9.0, 2.0, 8.0])), replace(FLASH, radius=0.0)]
-    seen = np.random.default_rng(2).integers(0, 1 << 16, (3, len(p))).astype(np.uint32)
-    look = appearance(np.zeros((1, 3)), 30.0, "prefiltered")
-    together = look.light_transfer(n, v, p)(lights, seen)
-    for light, bits, matt, glossy in zip(lights, seen, *together, strict=True):
-        alone = replace(look, illumination=replace(look.illumination, lights=(light,)))
-        both = [found[:, -1] for found in alone.transfers(n, v, Occlusion(visible=(bits,)), p)]
-        np.testing.assert_allclose([matt, glossy], both, rtol=1e-4, atol=1e-6)
-
-
 def test_a_surface_that_faces_it_receives_its_intensity_over_the_squared_distance(variant):
     light = replace(FLASH, radius=0.0)
     towards = light.direction
@@ -69,20 +57,6 @@ def test_a_surface_that_faces_it_receives_its_intensity_over_the_squared_distanc
     shaded, _ = look.shade(facing, facing, Occlusion(visible=(np.full(4, ALL),)), points)
     np.testing.assert_allclose(np.pi * shaded, light.intensity / distances[:, None] ** 2, rtol=1e-5)
     np.testing.assert_allclose(light.intensity, light.colour * light.distance**2)
-
-
-def test_far_away_it_is_a_distant_light(variant):
-    p, n, v = surface()
-    direction, angle = normalize(np.array([0.3, 0.5, 0.8])), 0.05
-    near = NearLight(1e5 * direction, 1e5 * np.tan(angle), FLASH.colour, np.zeros(3))
-    far = DistantLight(direction, angle, FLASH.colour)
-    look = appearance(np.zeros((1, 3)), 30.0, "prefiltered")
-    seen = np.full((1, len(p)), ALL)
-    transfer = look.light_transfer(n, v, p)
-    for one, other in zip(transfer([near], seen), transfer([far], seen), strict=True):
-        np.testing.assert_allclose(one, other, atol=2e-3 * other.max())
-    np.testing.assert_allclose(near.coefficients(4), far.coefficients(4), atol=1e-3)
-    np.testing.assert_allclose(near.colour, far.colour)
 
 
 def test_its_shadows_spread_and_end_at_it(variant):

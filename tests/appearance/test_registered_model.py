@@ -52,7 +52,7 @@ def found(dome, sheen):
 
 def test_it_is_fitted(dome, found):
     assert found.shading_model == "sheen" and found.report.outcome == "converged"
-    assert found.report.details["shading"]["chosen"] == "sheen"
+    assert found.report.details["shading"]["model"] == "sheen"
     assert found.lobe.exponent == SheenModel.exponent
     good = found.confidence > 0.9
     gauge = dome.diffuse[good].mean() / found.diffuse[good].mean()

@@ -133,13 +133,15 @@ def test_the_same_seed_gives_the_same_result(dome, found):
     np.testing.assert_array_equal(again.illumination.radiance, found.illumination.radiance)
 
 
-def test_auto_says_what_it_chose_and_why(dome):
+def test_auto_is_the_shadowed_model_without_lights_that_are_not_there(dome):
     estimate = infer(dome, replace(CONFIG, shading="auto"))
-    choice = estimate.report.details["shading"]
-    assert choice["chosen"] == estimate.shading_model == "shadowed"
-    assert set(choice["residuals"]) == {"shadowed", "matt"} and choice["why"]
-    error = {trial["shading"]: trial["error"] for trial in choice["predicted"]}
-    assert choice["left_out"] == "timesteps" and error["shadowed"] < 0.8 * error["matt"]
+    assert estimate.shading_model == "shadowed" and estimate.illumination.lights == ()
+    assert estimate.report.details["shading"] == {"model": "shadowed", "exponent": EXPONENT, "lights": 0}
+
+
+def test_without_specular_reflection_all_is_diffuse(dome):
+    estimate = infer(dome, replace(CONFIG, specular=False))
+    assert not estimate.specular.any() and estimate.diffuse.mean() > 0.05
 
 
 def test_unseen_texels_show_the_models_albedo(dome):
@@ -285,18 +287,6 @@ def test_few_images_leave_the_specular_albedo_to_what_skin_has():
     assert expected_specular(found, np.ones((9, 2), bool)) == SPECULAR_LIMIT
     assert expected_specular(found, np.ones((9, 8), bool)) == pytest.approx(0.2)
     assert expected_specular(found / 20, np.ones((9, 2), bool)) == pytest.approx(0.01)
-    assert expected_specular(found, np.ones((9, 8), bool), told=False) == SPECULAR_LIMIT
-
-
-def test_gloss_that_predicts_nothing_is_that_of_skin(dome, monkeypatch):
-    """The dome's is four times that, and eight images tell; not so where a matt model is taken to predict as well."""
-    config = replace(CONFIG, shading="auto")
-    told = infer(dome, config)
-    monkeypatch.setattr("mifit.stages.reflectance.choice.MARGIN", 0.5)
-    untold = infer(dome, config)
-    assert told.report.details["shading"]["gloss_told"] and not untold.report.details["shading"]["gloss_told"]
-    levels = [np.median(found.specular[found.confidence > 0.5]) for found in (told, untold)]
-    assert levels[0] > 3.0 * SPECULAR_LIMIT and levels[1] < 0.5 * levels[0]
 
 
 def test_noise_decides_how_far_the_specular_albedo_is_told_by_the_images():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -19,12 +20,11 @@ from mifit.core.uv import sample_map
 from mifit.errors import InputError
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface
-from mifit.stages.reflectance import trials
+from mifit.stages.reflectance import lighting
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.lighting import solve_lighting
+from mifit.stages.reflectance.lighting import fit_lighting, lighting_problem, solve_lighting
 from mifit.stages.reflectance.lighting_equations import LightingPriors
 from mifit.stages.reflectance.maps import Smoothness, TexelSystems, laplacian, solve_maps
-from mifit.stages.reflectance.trials import fit_lighting, lighting_problem
 
 SIZE = 24
 CONFIG = ReflectanceConfig(texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
@@ -205,11 +205,9 @@ WEAK = LightingPriors(roughness=1e-10, negative=0.0, albedo=1e-6, specular=1e-6)
 
 def recover(scene, shading, bands, exponent, fresnel, monkeypatch):
     """Lighting and maps from the fast solver's own start, both solved to the end."""
-    weak = {"priors": WEAK, "tolerance": 1e-7}
-    monkeypatch.setattr(trials, "solve_lighting", lambda *a, **k: solve_lighting(*a, **{**k, **weak}))
+    monkeypatch.setattr(lighting, "solve_lighting", functools.partial(lighting.solve_lighting, tolerance=1e-7))
     surface, seen, forward, albedo = problem_of(scene, shading, bands, exponent, fresnel, FINE)
-    config = replace(CONFIG, shading=shading, bands=bands, exponent=exponent)
-    light = fit_lighting(seen, forward, albedo, config, 100)
+    light = fit_lighting(seen, forward, albedo, True, 100, priors=WEAK)
     shade, glint = forward.shade(seen, light.light)
     weight = seen.measured[..., None] * np.ones(3, np.float32)
     colour = seen.colour - np.float32(light.ambient)

@@ -15,6 +15,7 @@ from mifit.core.image import linear_to_srgb, srgb_to_linear
 from mifit.morphable import MorphableModel
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface
+from mifit.stages.reflectance.als import find_forward
 from mifit.stages.segment import segment
 
 CAMERAS = ("left", "right")
@@ -94,7 +95,9 @@ def labels_of(head, capture) -> dict[tuple[str, int], np.ndarray]:
     model, original = head
     surface = Surface(capture, model, geometry_of(model, original), CAMERAS, 128, whole=True)
     keys = [(view.camera.name, view.timestep) for view in surface.views()]
-    return dict(zip(keys, segment(surface, capture, model), strict=True))
+    albedo = np.full((len(surface), 3), 0.3, np.float32)
+    forward, first = find_forward(surface, albedo, ReflectanceConfig(exponent=20.0), 0)
+    return dict(zip(keys, segment(surface, capture, model, forward, first.light), strict=True))
 
 
 def facial(head, key) -> np.ndarray:

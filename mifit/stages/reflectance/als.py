@@ -7,22 +7,22 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance import models
 from mifit.appearance.formation import Appearance, form_image
+from mifit.appearance.lobe import Lobe
 from mifit.config import ReflectanceConfig
-from mifit.core.diagnostics import Diagnostic
 from mifit.core.process import on_all_cores
 from mifit.core.sh import LUMINANCE
 from mifit.optim import Outcome
 from mifit.progress import Progress
 from mifit.stages.observations import Observations, Surface
-from mifit.stages.reflectance.choice import choose_lighting
+from mifit.stages.reflectance.compact_lights import EXPONENT, OBSERVATIONS, best_exponent, find_lights
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.lighting import LightingSolution, active_weight
+from mifit.stages.reflectance.lighting import LightingSolution, active_weight, fit_lighting, noise_weight
 from mifit.stages.reflectance.lighting_equations import specular_pull
 from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, solve_maps
 from mifit.stages.reflectance.objective import energies
 from mifit.stages.reflectance.told import deviations, find_told, robust_deviation, whitened
-from mifit.stages.reflectance.trials import noise_weight
 
 LIGHTING_TEXELS = 6000
 """Texels that determine the lighting; a few hundred unknowns against 24 values of eight images each."""
@@ -34,6 +34,12 @@ saves half of them, but carries over what the last weights took an outlier for (
 instead of less than 0.01 in the albedo under it)."""
 SUMMED = 1 << 13
 """Texels whose observations are summed at a time."""
+PAPER_EXPONENT = 5.0
+"""Exponent of Adam where none is given, as in the paper, whatever the model."""
+FIRST_ITERATIONS = 12
+"""Gauss-Newton iterations of the lighting by which objects in front of the face are found."""
+START_ITERATIONS = 5
+"""Gauss-Newton iterations where they are only a start: the objective over all texels is minimised afterwards."""
 ROUNDS = 20
 """Rounds of `alternate` at the most."""
 
@@ -220,22 +226,46 @@ def fit_maps(
     return SolvedMaps(maps, energy, sigma, splits.outcome, told)
 
 
+def find_forward(
+    surface: Surface, albedo: NDArray, config: ReflectanceConfig, seed: int
+) -> tuple[Forward, LightingSolution | None]:
+    """The model that is fitted, its compact lights and its lobe, and a first lighting of some of the texels.
+
+    That lighting is None where weights aren't robust: nothing is found out then before the fit itself.
+    """
+    name = config.shading
+    if name == "auto":
+        name = "paper" if config.solver == "adam" else "shadowed"
+    model = models.get(name)
+    given = config.exponent or (PAPER_EXPONENT if config.solver == "adam" else model.exponent)
+    forward = Forward.of(
+        model, model.bands or config.bands, Lobe(given or EXPONENT, model.fresnel, model.normalized), surface.meshes
+    )
+    forward = replace(forward, glossy=config.specular)
+    count = max(1, OBSERVATIONS // surface.image_count)
+    some = surface.sample(count, np.random.default_rng(seed))
+    seen, expected = surface.observe(some), albedo[some]
+    if config.robust and config.solver == "als" and model.needs_shadows:
+        forward = forward.with_lights(find_lights(seen, forward, expected))
+    if given is None and config.specular:
+        exponent = best_exponent(seen, forward, expected, config.robust)
+        forward = forward.with_lobe(replace(forward.lobe, exponent=exponent))
+    return forward, fit_lighting(seen, forward, expected, True, FIRST_ITERATIONS) if config.robust else None
+
+
 def fit_als(
     surface: Surface,
+    forward: Forward,
     albedo: NDArray,
     config: ReflectanceConfig,
     seed: int,
     progress: Progress,
-) -> tuple[Fitted, dict, tuple[Diagnostic, ...]]:
-    """Choose the shading model, find the lighting on a subset of the texels, then all maps.
-
-    Returns
-    -------
-    Fitted, and the choice of the shading model with its reasons, and warnings.
-    """
+) -> Fitted:
+    """Find the lighting on a subset of the texels, then all maps."""
     subset = surface.sample(LIGHTING_TEXELS, np.random.default_rng(seed))
-    seen = surface.observe(subset)
-    forward, found, choice = choose_lighting(surface, seen, albedo[subset], config, progress)
+    seen, expected = surface.observe(subset), albedo[subset]
+    iterations = config.max_iterations if config.robust else min(START_ITERATIONS, config.max_iterations)
+    found = fit_lighting(seen, forward, expected, config.robust, iterations)
     prior = np.zeros((surface.texels.size**2, 4), dtype=np.float32)
     prior[surface.texels.index, :3] = albedo
     prior[:, 3] = found.expected
@@ -244,18 +274,14 @@ def fit_als(
     maps, energy = solved.maps, {"lighting": found.energy}
     if not config.robust:
         found, maps, energy = alternate(surface, forward, found, maps, prior, albedo, config, progress)
-    return (
-        Fitted(
-            forward.under(found.light, found.ambient),
-            maps,
-            solved.sigma,
-            energy,
-            found.outcome,
-            solved.outcome,
-            solved.told,
-        ),
-        choice,
-        (),
+    return Fitted(
+        forward.under(found.light, found.ambient),
+        maps,
+        solved.sigma,
+        energy,
+        found.outcome,
+        solved.outcome,
+        solved.told,
     )
 
 

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.formation import Appearance
-from mifit.appearance.illumination import Illumination, Light, NearLight
+from mifit.appearance.illumination import Illumination, Light
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
 from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, VertexTransfer
 from mifit.stages.observations import Observations
 
-LightColumns = Callable[..., tuple[NDArray[np.float32], NDArray[np.float32]]]
 CHUNK = 1 << 19
 """Points shaded at a time: bounds the memory of the basis functions."""
 
@@ -123,46 +121,25 @@ class Forward:
         )
         return Occlusion(transfer, visible)
 
-    def open_towards(self, seen: Observations, directions: NDArray) -> NDArray[np.uint32]:
-        """(N, T) which of some directions the texels see, a bit each."""
-        steps = [
-            m.scene.open_towards(seen.point[:, t], seen.normal[:, t], directions) for t, m in enumerate(self.meshes)
-        ]
-        return np.stack(steps, axis=1)
+    def columns(self, seen: Observations, directions: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Diffuse and specular radiance (N, J, M) at unit albedo per unit of irradiance from single directions.
 
-    def light_columns(self, seen: Observations) -> LightColumns:
-        """Diffuse and specular radiance (M, N, J) at unit albedo per unit of the colours of M compact lights.
-
-        Shadows are traced unless (M, N, T) bits tell which of each light's samples the texels see.
+        Shadows are traced, a ray each.
         """
-        transfer = self.appearance.light_transfer(*_flat(seen), _points(seen))
-
-        def columns(
-            lights: Sequence[Light], visible: NDArray[np.uint32] | None = None
-        ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-            if visible is None:
-                visible = self.visible(seen, lights)
-            shape = len(lights), *seen.weight.shape
-            matt, glossy = transfer(lights, visible[..., seen.step].reshape(len(lights), -1))
-            return matt.reshape(shape), self._gloss(glossy.reshape(shape))
-
-        return columns
-
-    def visible(self, seen: Observations, lights: Sequence[Light]) -> NDArray[np.uint32]:
-        """(M, N, T) which of each light's samples the texels see; a word of bits holds those of two lights."""
-        out = np.empty((len(lights), *seen.point.shape[:2]), np.uint32)
-        if len(lights) and isinstance(lights[0], NearLight):
-            for number, light in enumerate(lights):
-                for t, mesh in enumerate(self.meshes):
-                    out[number, :, t] = light.visible(mesh.scene, seen.point[:, t], seen.normal[:, t])
-            return out
-        for first in range(0, len(lights), 2):
-            pair = [light.samples() for light in lights[first : first + 2]]
-            both = self.open_towards(seen, np.concatenate(pair))
-            out[first] = both & np.uint32((1 << len(pair[0])) - 1)
-            if len(pair) > 1:
-                out[first + 1] = both >> np.uint32(len(pair[0]))
-        return out
+        n, j = seen.weight.shape
+        visible = np.empty((len(directions), n, len(self.meshes)), bool)
+        for first in range(0, len(directions), 32):
+            part = directions[first : first + 32]
+            number = np.arange(len(part), dtype=np.uint32)[:, None]
+            for t, mesh in enumerate(self.meshes):
+                bits = mesh.scene.open_towards(seen.point[:, t], seen.normal[:, t], part)
+                visible[first : first + 32, :, t] = (bits >> number) & 1
+        shown = visible[..., seen.step].reshape(len(directions), -1)
+        diffuse, specular = (
+            each.reshape(-1, n, j).transpose(1, 2, 0)
+            for each in self.appearance.light_transfer(*_flat(seen), directions, shown)
+        )
+        return diffuse, specular
 
 
 def _flat(seen: Observations) -> tuple[NDArray, NDArray]:

@@ -8,7 +8,7 @@ determine a few hundred coefficients, so a random subset is enough; the maps are
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -19,12 +19,15 @@ from mifit.appearance.reception import fibonacci_sphere
 from mifit.core.process import on_all_cores
 from mifit.core.sh import bands, basis
 from mifit.optim import Outcome
+from mifit.stages.observations import Observations
+from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting_equations import (
     PRIORS,
     LightingEquations,
     LightingPriors,
     LightingProblem,
     SeenRows,
+    bounded_step,
     expected_specular,
 )
 
@@ -38,6 +41,10 @@ GROSS = 0.1
 """Linear colour beyond which a residual tells of something that no shading model here explains."""
 WEIGHTED = 1 << 18
 """Residuals that are weighted at a time."""
+NORMAL_REFLECTANCE = 0.028
+"""Specular albedo of skin at normal incidence: ((n - 1) / (n + 1))^2 for its index of refraction n = 1.4."""
+NOISE_FLOOR = 0.03
+"""Read noise over shot noise, as variance in units of linear colour; 8-bit sRGB is coded about so as well."""
 CAUCHY = 3.0
 """Residuals of this many robust standard deviations get half the weight."""
 
@@ -79,6 +86,7 @@ class LightingSolution:
 def solve_lighting(
     problem: LightingProblem,
     start: NDArray | None = None,
+    albedos: tuple[NDArray, NDArray] | None = None,
     specular: float = 0.05,
     priors: LightingPriors = PRIORS,
     robust: bool = True,
@@ -93,6 +101,8 @@ def solve_lighting(
     problem : LightingProblem
     start : (K, 3), optional
         Lighting to start from; by default the best one for the model's albedo and the given specular albedo.
+    albedos : (n, 3) and (n,), optional
+        Diffuse and specular albedos to start from; by default the model's and the given specular albedo.
     specular : float
         Specular albedo to start from. Zero is a stationary point of the bands that only the specular lobe sees.
     priors : LightingPriors
@@ -109,6 +119,8 @@ def solve_lighting(
     prior_weight = problem.weight.sum(axis=1)
     diffuse = problem.albedo.astype(np.float32).copy()
     specular_albedo = np.full(n, specular, dtype=np.float32)
+    if albedos is not None:
+        diffuse, specular_albedo = (np.asarray(each, np.float32) for each in albedos)
     light = _initial(problem, rows, diffuse, specular_albedo) if start is None else np.array(start, dtype=np.float64)
     energy: list[float] = []
     ambient, sigma, unexplained, damping, outcome = 0.0, 0.0, np.inf, 1e-3, Outcome.MAX_ITERATIONS
@@ -152,7 +164,9 @@ def solve_lighting(
                 priors,
                 deviation,
             )
-        step = system.solve(with_ambient, damping)
+        penalty = 0.5 * priors.sparsity * energy[-1] / flux(best[0], problem.order)
+        lowest = np.where(np.arange(len(best[0]))[:, None] < problem.order**2, -np.inf, -best[0])
+        step = system.solve(with_ambient, damping, lowest, penalty)
         light, ambient, diffuse, specular_albedo = best
         light = light + step.light
         ambient = max(ambient + step.ambient, 0.0)
@@ -161,7 +175,7 @@ def solve_lighting(
         gain = gauge(diffuse, problem.albedo, prior_weight)
         state = light * gain, ambient, (diffuse / gain).astype(np.float32), (specular_albedo / gain).astype(np.float32)
     light, ambient, diffuse, specular_albedo = best
-    expected = expected_specular(specular_albedo, problem.seen, priors.gloss_told)
+    expected = expected_specular(specular_albedo, problem.seen)
     return LightingSolution(light, ambient, diffuse, specular_albedo, expected, sigma, unexplained, energy, outcome)
 
 
@@ -186,10 +200,8 @@ def linearize(
     system = LightingEquations.accumulate(
         rows, diffuse, specular_albedo, diffuse_light, specular_light, residual, weight
     )
-    extra = k - order * order  # compact lights are kept from negative values one by one
-    directions = np.pad(_sphere(order), ((0, extra), (0, extra)))
-    directions[NEGATIVE_DIRECTIONS:, order * order :] = np.eye(extra)
-    expected = expected_specular(specular_albedo, problem.seen, priors.gloss_told)
+    directions = np.pad(_sphere(order), ((0, 0), (0, k - order * order)))
+    expected = expected_specular(specular_albedo, problem.seen)
     system.add_priors(
         priors, light, diffuse, specular_albedo, problem.albedo, _stiffness(order, k), directions, sigma, expected
     )
@@ -200,6 +212,11 @@ def linearize(
 def _sphere(order: int) -> NDArray[np.float64]:
     """Basis functions at the directions in which radiance is kept from being negative."""
     return basis(fibonacci_sphere(NEGATIVE_DIRECTIONS), order)
+
+
+def flux(light: NDArray, order: int) -> float:
+    """All light (K, 3), channels summed: over the sphere for the B*B coefficients, and irradiances."""
+    return max(float(np.sqrt(4.0 * np.pi) * light[0].sum() + light[order * order :].sum()), 1e-9)
 
 
 def _stiffness(order: int, count: int) -> NDArray[np.float64]:
@@ -252,11 +269,67 @@ def _initial(
     stiffness = _stiffness(problem.order, k)
     light = np.zeros((k, 3))
     glossy = specular_albedo[rows.texel, None] * rows.specular
+    lowest = np.where(np.arange(k) < problem.order**2, -np.inf, 0.0)
     for c in range(3):
         root = np.sqrt(np.where(rows.clipped, np.float32(0), rows.weight[:, c]))
         slope = (diffuse[rows.texel, c, None] * rows.diffuse + glossy) * root[:, None]
-        h = slope.T @ slope
+        h = (slope.T @ slope).astype(np.float64)
         scale = max(float(np.trace(h)) / k, 1e-12)
-        g = (root * rows.colour[:, c]) @ slope
-        light[:, c] = np.linalg.solve(h.astype(np.float64) + np.diag(scale * (1e-6 + 1e-4 * stiffness)), g)
+        g = ((root * rows.colour[:, c]) @ slope).astype(np.float64)
+        light[:, c] = bounded_step(h + np.diag(scale * (1e-6 + 1e-4 * stiffness)), g, lowest)
     return light
+
+
+def noise_weight(colour: NDArray, robust: bool) -> NDArray[np.float32]:
+    """(..., 3) inverse variance of read and shot noise, 1 at mid-grey; 1 everywhere when not robust."""
+    if not robust:
+        return np.ones_like(colour)
+    return ((NOISE_FLOOR + 0.3) / (NOISE_FLOOR + np.clip(colour, 0.0, 1.0))).astype(np.float32)
+
+
+def lighting_problem(
+    seen: Observations, forward: Forward, light: NDArray, albedo: NDArray, robust: bool
+) -> LightingProblem:
+    """Collect the transfer vectors and weights of some texels."""
+    diffuse, specular = forward.transfers(seen, light)
+    weight = seen.weight[..., None] * noise_weight(seen.colour, robust)
+    return LightingProblem(seen.colour, weight, seen.clipped, diffuse, specular, albedo, forward.order)
+
+
+def fit_lighting(
+    seen: Observations,
+    forward: Forward,
+    albedo: NDArray,
+    robust: bool,
+    iterations: int,
+    specular: float = NORMAL_REFLECTANCE,
+    priors: LightingPriors = PRIORS,
+) -> LightingSolution:
+    """Lighting and the subset's albedos; a model that turns with the lighting is linearised anew."""
+    ambient, specular = forward.model.has_ambient, specular if forward.glossy else 0.0
+    problem = lighting_problem(seen, forward, forward.dark, albedo, robust)
+    if not forward.model.turns:
+        return solve_lighting(
+            problem,
+            specular=specular,
+            priors=priors,
+            robust=robust,
+            with_ambient=ambient,
+            iterations=iterations,
+        )
+    # Without highlights first, so that there is lighting to linearise about.
+    problem = replace(problem, specular=np.zeros_like(problem.specular))
+    found = solve_lighting(problem, priors=priors, robust=robust, with_ambient=ambient, iterations=6)
+    energy = list(found.energy)
+    for _ in range(4):
+        problem = lighting_problem(seen, forward, found.light, albedo, robust)
+        found = solve_lighting(
+            problem,
+            found.light,
+            priors=priors,
+            robust=robust,
+            with_ambient=ambient,
+            iterations=max(2, iterations // 4),
+        )
+        energy += found.energy
+    return replace(found, energy=energy)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg as sl
+import scipy.optimize
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
@@ -134,15 +136,13 @@ def specular_pull(expected: float, sigma: float) -> float:
     return (sigma / (SPECULAR_SPREAD * max(expected, 1e-3))) ** 2
 
 
-def expected_specular(specular: NDArray, seen: NDArray, told: bool = True) -> float:
+def expected_specular(specular: NDArray, seen: NDArray) -> float:
     """Specular albedo to expect of a texel, given those of others (n,) and which images see them (n, J).
 
-    Two or three images of a still head leave it open how much of the broad reflection is specular, and so do images
-    that are predicted as well without any (``told`` is false).
+    Two or three images of a still head leave it open how much of the broad reflection is specular.
     """
     found = float(np.median(specular))
-    images = float(np.median(seen.sum(axis=1)))
-    return found if told and images >= FEW_IMAGES else min(found, SPECULAR_LIMIT)
+    return found if float(np.median(seen.sum(axis=1))) >= FEW_IMAGES else min(found, SPECULAR_LIMIT)
 
 
 @dataclass(frozen=True)
@@ -159,15 +159,15 @@ class LightingPriors:
         Pull of the diffuse albedo to the morphable model's: fixes the gauge between albedo and lighting.
     specular : float
         Pull of each texel's specular albedo to the expected one, at the least; see `SPECULAR_SPREAD`.
-    gloss_told : bool
-        Whether the images tell what is expected of it; `SPECULAR_LIMIT` bounds it otherwise.
+    sparsity : float
+        Part of the data's energy that compact lights have to explain, were they all light.
     """
 
     roughness: float = 1e-7
     negative: float = 0.5
     albedo: float = 1e-2
     specular: float = 2e-2
-    gloss_told: bool = True
+    sparsity: float = 0.0
 
 
 PRIORS = LightingPriors()
@@ -359,10 +359,18 @@ class LightingEquations:
         reduced += np.diag(damping * own_diagonal + 1e-8 * own_diagonal.mean())
         return Eliminated(pivot, slope, last, reduced, right[:count])
 
-    def solve(self, with_ambient: bool, damping: float) -> LightingStep:
-        """Eliminate the texels, solve for lighting and ambient, and substitute back."""
+    def solve(
+        self, with_ambient: bool, damping: float, lowest: NDArray | None = None, penalty: float = 0.0
+    ) -> LightingStep:
+        """Eliminate the texels, solve for lighting and ambient, and substitute back.
+
+        ``lowest`` (K, 3) bounds the light's step from below, and ``penalty`` is that on the sum of what is bounded.
+        """
         remaining = self.eliminate(with_ambient, damping)
-        move = np.linalg.solve(remaining.reduced, remaining.right)
+        least = np.full(len(remaining.right), -np.inf)
+        if lowest is not None:
+            least[: lowest.size] = lowest.T.ravel()
+        move = bounded_step(remaining.reduced, remaining.right, least, penalty)
         size = len(self.right) - 1
         ambient = float(move[size]) if with_ambient else 0.0
         light = np.asarray(move[:size], dtype=np.float64).reshape(3, -1)
@@ -402,3 +410,48 @@ class Eliminated:
     def inverse(self) -> NDArray[np.float64]:
         """(n, 4, 4) inverse blocks of the texels."""
         return np.stack([self.follow(np.broadcast_to(unit, (len(self.last), 4))) for unit in np.eye(4)], axis=2)
+
+
+def bounded_step(system: NDArray, right: NDArray, lowest: NDArray, penalty: float = 0.0) -> NDArray[np.float64]:
+    """Step z (C,), at ``lowest`` or above, that minimises ``z' A z / 2 - b' z + penalty * sum(z with a bound)``.
+
+    Parameters
+    ----------
+    system : (C, C)
+        A, positive definite.
+    right : (C,)
+        b.
+    lowest : (C,)
+        -inf where there is no bound.
+    penalty : float
+    """
+    bounded = np.isfinite(lowest)
+    if not bounded.any():
+        return np.asarray(np.linalg.solve(system, right))
+    free = ~bounded
+    factor = sl.cho_factor(system[np.ix_(free, free)])
+    taken = sl.cho_solve(factor, system[np.ix_(free, bounded)])
+    rest = system[np.ix_(bounded, bounded)] - system[np.ix_(bounded, free)] @ taken
+    move = np.empty_like(right)
+    toward = right[bounded] - taken.T @ right[free] - penalty - rest @ lowest[bounded]
+    move[bounded] = non_negative(rest, toward) + lowest[bounded]
+    move[free] = sl.cho_solve(factor, right[free]) - taken @ move[bounded]
+    return move
+
+
+def non_negative(system: NDArray, right: NDArray) -> NDArray[np.float64]:
+    """u >= 0 (G,) that minimises ``u' A u / 2 - b' u``; those that would grow join in, 32 at a time."""
+    u, active = np.zeros(len(right)), np.zeros(0, np.intp)
+    least = 1e-9 * float(np.abs(right).max(initial=0.0))
+    for _ in range(len(right)):
+        gradient = right - system[:, active] @ u[active]
+        gradient[active] = 0.0
+        joining = np.argsort(-gradient)[:32]
+        joining = joining[gradient[joining] > least]
+        if not len(joining):
+            break
+        active = np.concatenate([active, joining])
+        lower = np.linalg.cholesky(system[np.ix_(active, active)])
+        u[active] = scipy.optimize.nnls(lower.T, sl.solve_triangular(lower, right[active], lower=True))[0]
+        active = active[u[active] > 0]
+    return u

@@ -10,47 +10,41 @@ from numpy.typing import NDArray
 from mifit.appearance import models
 from mifit.appearance.lobe import Lobe
 from mifit.config import ReflectanceConfig
-from mifit.core.diagnostics import Diagnostic
 from mifit.core.sh import radiance_of_shading
 from mifit.optim import Outcome
 from mifit.progress import Progress
 from mifit.stages.observations import Observations, Surface
 from mifit.stages.reflectance.adam import HISTORY, Samples, minimize_by_adam
-from mifit.stages.reflectance.als import Fitted
-from mifit.stages.reflectance.choice import candidate, plain_forward
+from mifit.stages.reflectance.als import PAPER_EXPONENT, Fitted
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.trials import fit_lighting, noise_weight
+from mifit.stages.reflectance.lighting import fit_lighting, noise_weight
 
-PAPER_EXPONENT = 5.0
-"""Exponent where none is given, as in the paper, whatever the model."""
 STEPS_PER_ITERATION = 10
 """Gradient steps that stand for one of ``max_iterations``: a Gauss-Newton step costs and does as much."""
 
 
 def fit_adam(
     surface: Surface,
+    forward: Forward,
     albedo: NDArray,
     config: ReflectanceConfig,
     seed: int,
     progress: Progress,
-) -> tuple[Fitted, dict, tuple[Diagnostic, ...]]:
+) -> Fitted:
     """Minimise the paper's objective by Adam; ``shading = auto`` means the paper's model.
 
     Without robust weights lighting and ambient start from stage 1's, as in the paper; with them from a Lambertian
     least-squares fit with the model's albedo. The specular map starts from zero.
     """
-    name = "paper" if config.shading == "auto" else config.shading
-    model = models.get(candidate(name).model)
-    forward = plain_forward(model, config.exponent or PAPER_EXPONENT, config, surface)
     seen = surface.observe(np.arange(len(surface)))
     radiance, ambient = np.zeros((forward.unknowns, 3)), 0.0
     if config.robust or not surface.geometry.shading.any():
         subset = surface.sample(2000, np.random.default_rng(seed))
         lambert = Forward.of(models.get("prefiltered"), 3, Lobe(PAPER_EXPONENT))
-        radiance[:9] = fit_lighting(seen.take(subset), lambert, albedo[subset], config, 1, specular=0.0).light
+        radiance[:9] = fit_lighting(seen.take(subset), lambert, albedo[subset], config.robust, 1, specular=0.0).light
     else:
         radiance[:9] = radiance_of_shading(surface.geometry.shading)
-        ambient = max(surface.geometry.ambient, 0.0) if model.has_ambient else 0.0
+        ambient = max(surface.geometry.ambient, 0.0) if forward.model.has_ambient else 0.0
     steps = config.max_iterations * STEPS_PER_ITERATION
     result = minimize_by_adam(
         gather_samples(surface, seen, forward, albedo, config),
@@ -65,7 +59,7 @@ def fit_adam(
     total = np.sum([result.history[k] for k in HISTORY], axis=0)
     outcome = Outcome.of_history(total)
     sigma = float(np.sqrt(result.history["data"][-1] / max(3.0 * float(seen.measured.sum()), 1e-12)))
-    fitted = Fitted(
+    return Fitted(
         replace(forward.appearance, illumination=result.illumination),
         maps.reshape(surface.texels.size, surface.texels.size, 4),
         sigma,
@@ -74,8 +68,6 @@ def fit_adam(
         outcome,
         np.ones(len(surface.texels.index), np.float32),
     )
-    why = "as configured" if config.shading != "auto" else "the paper's model: it is the paper's solver"
-    return fitted, {"chosen": name, "why": why, "exponent": forward.lobe.typical}, ()
 
 
 def gather_samples(

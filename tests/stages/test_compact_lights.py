@@ -1,4 +1,4 @@
-"""The compact light: its disc, shadows and lobe, and how stage 2 finds it."""
+"""Compact lights: disc, shadows and lobe, and how stage 2 finds them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from stages.reflectance_scene import EXPONENT, SIZE, TurningDome, turning_dome
 
+from mifit.appearance.formation import OPEN
 from mifit.appearance.illumination import DistantLight, disc
-from mifit.appearance.models import get
 from mifit.appearance.occlusion import trace_transfer
 from mifit.appearance.reference import specular_brdf
 from mifit.config import ReflectanceConfig
@@ -19,13 +19,14 @@ from mifit.errors import InputError
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface
-from mifit.stages.reflectance.choice import plain_forward
-from mifit.stages.reflectance.key import Candidates
-from mifit.stages.reflectance.trials import fit_lighting, lighting_problem
-from tests.shaded import light_columns, shade_points
+from mifit.stages.reflectance.forward import Forward
+from mifit.stages.reflectance.lighting_equations import bounded_step
+from tests.shaded import appearance, light_columns, shade_points
 
-CONFIG = ReflectanceConfig(texture_size=SIZE, shading="keyed", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
+CONFIG = ReflectanceConfig(texture_size=SIZE, bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
 KEY = DistantLight(normalize(np.array([0.75, 0.2, 0.6])), 0.02, np.array([4.0, 3.6, 3.0]))
+FILL = DistantLight(normalize(np.array([-0.7, 0.35, 0.5])), 0.02, np.array([2.0, 2.4, 3.0]))
+CAMERAS = ("left", "right")
 
 
 def test_disc_is_even_and_centred():
@@ -142,73 +143,85 @@ def found(walled):
     return infer_reflectance(walled, walled.model, walled.geometry, ("left", "right"), CONFIG)
 
 
-def test_a_compact_light_is_found(walled, found):
-    assert found.report.details["shading"]["chosen"] == "keyed" and found.shading_model == "shadowed"
+def dome_under(*lights: DistantLight, steps: int = 3) -> TurningDome:
+    """The turning dome with compact lights beside the smooth one."""
+    dome = turning_dome(steps=steps)
+    look = appearance(np.zeros((16, 3)), EXPONENT, "prefiltered", True, dome.fresnel, lights=lights)
+    for (name, t), frame in dome.frames.items():
+        view, v, faces = dome.camera(name), dome.geometry.vertices[t], dome.model.faces
+        scene = SurfaceScene(v, faces)
+        buffer = scene.gbuffer(view)
+        face, weights = buffer.face[buffer.mask], buffer.weights[buffer.mask]
+        point = interpolate(v, faces, face, weights)
+        normal = normalize(interpolate(vertex_normals(v, faces), faces, face, weights))
+        shadows = replace(OPEN, visible=tuple(light.visible(scene, point, normal) for light in lights))
+        diffuse, specular = look.shade(normal, normalize(view.position - point), shadows)
+        uv = interpolate(dome.model.uv, dome.model.faces_uv, face, weights)
+        image = frame.image.copy()
+        image[buffer.mask] += sample_map(dome.diffuse, uv) * diffuse + sample_map(dome.specular, uv)[:, None] * specular
+        dome.frames[name, t] = replace(frame, image=image)
+    return dome
+
+
+def degrees_off(found, *lights: DistantLight) -> float:
+    """Largest angle from a true light to the nearest that was found."""
+    towards = np.array([light.direction for light in found.illumination.lights])
+    return max(float(np.degrees(np.arccos((towards @ light.direction).max()))) for light in lights)
+
+
+def test_a_light_that_throws_a_shadow_is_found(walled, found):
+    assert found.shading_model == "shadowed" and len(found.illumination.lights) == 1
+    assert degrees_off(found, KEY) < 1.0
     (key,) = found.illumination.lights
-    assert np.degrees(np.arccos(key.direction @ KEY.direction)) < 1.0
     good = found.confidence > 0.9
     gauge = walled.diffuse[good].mean() / found.diffuse[good].mean()
     np.testing.assert_allclose(key.colour / gauge, KEY.colour, rtol=0.1)
-    residuals = found.report.details["shading"]["residuals"]
-    assert residuals["keyed"] < 0.3 * residuals["shadowed"]
 
 
-def test_auto_takes_it_where_it_explains_the_images(walled):
-    part = replace(CONFIG, texture_size=24, shading="auto")
-    choice = infer_reflectance(walled, walled.model, walled.geometry, ("left", "right"), part).report.details["shading"]
-    assert choice["chosen"] == "keyed"
+def test_a_light_without_a_shadow_is_found_by_cosine_and_highlight(variant):
+    dome = dome_under(KEY)
+    found = infer_reflectance(dome, dome.model, dome.geometry, CAMERAS, replace(CONFIG, texture_size=24))
+    assert len(found.illumination.lights) == 1 and degrees_off(found, KEY) < 3.0
 
 
-def test_it_is_looked_for_beside_smoother_lighting_too(walled, monkeypatch):
-    from mifit.stages.reflectance import choice
-    from mifit.stages.reflectance.lighting_equations import PRIORS
+def test_the_exponent_is_found_within_an_octave(walled):
+    config = replace(CONFIG, texture_size=24, exponent=None)
+    found = infer_reflectance(walled, walled.model, walled.geometry, CAMERAS, config)
+    assert 0.5 * EXPONENT < found.lobe.exponent < 2.0 * EXPONENT
 
-    search, tried = choice._with_light, []
 
-    def hidden_at_first(trials, chosen, priors, wide):
-        tried.append(priors.roughness / PRIORS.roughness)
-        return None if priors is PRIORS else search(trials, chosen, priors, wide)
-
-    monkeypatch.setattr(choice, "_with_light", hidden_at_first)
-    part = replace(CONFIG, texture_size=24, shading="auto")
-    estimate = infer_reflectance(walled, walled.model, walled.geometry, ("left", "right"), part)
-    assert tried == [1.0, 10.0, 10.0]  # a second light is looked for beside what showed the first
-    assert estimate.report.details["shading"]["chosen"] == "keyed"
-    (key,) = estimate.illumination.lights
-    assert np.degrees(np.arccos(key.direction @ KEY.direction)) < 2.0
+def test_two_lights_are_found_together(variant):
+    dome = dome_under(KEY, FILL)
+    found = infer_reflectance(dome, dome.model, dome.geometry, CAMERAS, replace(CONFIG, texture_size=24))
+    assert len(found.illumination.lights) == 2 and degrees_off(found, KEY, FILL) < 4.0
 
 
 def test_without_a_compact_light_none_is_made_up(variant):
     dome = turning_dome(steps=2)
-    estimate = infer_reflectance(dome, dome.model, dome.geometry, ("left", "right"), replace(CONFIG, texture_size=24))
+    estimate = infer_reflectance(dome, dome.model, dome.geometry, CAMERAS, replace(CONFIG, texture_size=24))
     assert estimate.illumination.lights == ()
-    assert estimate.report.details["shading"]["why"] == "no compact light explains enough"
 
 
-def test_adam_refuses_it(walled):
-    with pytest.raises(InputError, match="use solver 'als'"):
-        replace(CONFIG, solver="adam")
+def test_single_directions_are_columns_of_point_lights(walled):
+    """What the estimate is made of: cosine, lobe and shadow of each direction, as a light there has them."""
+    surface = Surface(walled, walled.model, walled.geometry, CAMERAS, 32)
+    seen = surface.observe(surface.sample(200, np.random.default_rng(0)))
+    look = appearance(np.zeros((16, 3)), EXPONENT, "shadowed", True, walled.fresnel)
+    forward = Forward(look, surface.meshes)
+    towards = normalize(KEY.direction + 0.4 * np.random.default_rng(1).normal(size=(40, 3)))
+    lights = tuple(DistantLight(d, 0.0, np.zeros(3)) for d in towards)
+    expected = forward.with_lights(lights).transfers(seen, np.zeros((16 + len(lights), 3)))
+    for found, known in zip(forward.columns(seen, towards), expected, strict=True):
+        np.testing.assert_allclose(found, known[..., 16:], atol=1e-5)
 
 
-def test_lights_judged_together_are_judged_as_each_alone(walled):
-    surface = Surface(walled, walled.model, walled.geometry, ("left", "right"), 32)
-    seen = surface.observe(surface.sample(300, np.random.default_rng(0)))
-    albedo = np.full((len(seen.texel), 3), 0.4, np.float32)
-    forward = plain_forward(get("shadowed"), 30.0, replace(CONFIG, bands=4), surface)
-    found = fit_lighting(seen, forward, albedo, CONFIG, 4)
-    problem = lighting_problem(seen, forward, found.light, albedo, True)
-    candidates = Candidates.about(seen, forward, problem, found)
-    towards = KEY.direction + 0.4 * np.random.default_rng(1).normal(size=(5, 3))
-    lights = [DistantLight(d / np.linalg.norm(d), 0.05 * (i + 1), np.zeros(3)) for i, d in enumerate(towards)]
-    together = candidates.explained(lights)
-    assert np.ptp(together) > 0.1 * together.max() > 0.0
-    # In double precision to the digit; what the equations leave of sums in single precision is a thousandth of them.
-    names = ("weight", "diffuse_cross", "specular_cross")
-    parts = {name: getattr(candidates, name).astype(np.float64) for name in names}
-    fine = replace(candidates, rows=[rows.astype(np.float64) for rows in candidates.rows], **parts)
-    exact = fine.explained(lights)
-    np.testing.assert_allclose(exact, [fine.explained([light])[0] for light in lights], rtol=1e-9)
-    np.testing.assert_allclose(together, exact, rtol=1e-3)
-    bits = np.stack([np.stack([light.visible(m.scene, seen.point[:, t], seen.normal[:, t])
-                               for t, m in enumerate(forward.meshes)], axis=1) for light in lights])  # fmt: skip
-    np.testing.assert_allclose(candidates.explained(lights, bits), together, rtol=1e-6)
+def test_a_bounded_step_is_the_constrained_minimum():
+    rng = np.random.default_rng(0)
+    rows, target = rng.normal(size=(90, 60)), rng.normal(size=90)
+    system, right = rows.T @ rows + np.eye(60), rows.T @ target
+    lowest = np.where(np.arange(60) < 20, -np.inf, rng.normal(size=60) - 0.2)
+    step = bounded_step(system, right, lowest, 0.3)
+    slope = system @ step - right + 0.3 * np.isfinite(lowest)
+    held = step <= lowest + 1e-9
+    assert 5 < held.sum() < 35 and (step >= lowest - 1e-9).all()
+    assert np.abs(slope[~held]).max() < 1e-6 and slope[held].min() > -1e-6
