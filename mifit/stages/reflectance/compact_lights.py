@@ -12,6 +12,7 @@ neighbourhood is estimated once more on a finer grid.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,13 +27,15 @@ from mifit.stages.observations import Observations
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import (
     NORMAL_REFLECTANCE,
+    LightingSolution,
     active_weight,
     fit_lighting,
     flux,
     lighting_problem,
+    linearize,
     solve_lighting,
 )
-from mifit.stages.reflectance.lighting_equations import PRIORS
+from mifit.stages.reflectance.lighting_equations import PRIORS, LightingProblem
 
 DIRECTIONS = 512
 """Directions of the first grid, 7 degrees apart."""
@@ -56,7 +59,13 @@ LEAN = 0.005
 """Logarithm of the error that an exponent one octave off must gain, fourfold for two: a prior of one octave beside a
 hundred independent measurements, which is about how many patches of a face with their own error there are."""
 ITERATIONS, LAST_ITERATIONS = 2, 8
-"""Gauss-Newton iterations of each round, and of the fit in which faint lights are dropped."""
+"""Gauss-Newton iterations of each round, and of the fits about which lights are moved."""
+SETTLING = 4
+"""Moves of the lights' places."""
+SLOPE = np.radians(1.0)
+"""Angle over which the columns of a light are differentiated: shadows have edges."""
+RADII = np.radians([0.25, 15.0])
+"""Angular radii of a compact light."""
 ROUNDS, LIGHT_ALONE, JOINING = 9, 3, 16
 """Rounds of column generation at the most, those of them with albedos held, and directions that join in each."""
 
@@ -80,11 +89,67 @@ def find_lights(seen: Observations, forward: Forward, albedo: NDArray) -> tuple[
     # Where there is light, the penalty has done its work: it would make lights smaller and weaker than they are.
     directions = np.concatenate([disc(light.direction, REACH, FINER) for light in lights])
     lights = _gathered(directions, *_sparse(seen, forward, directions, albedo, 0.0))
-    found = fit_lighting(seen, forward.with_lights(lights), albedo, True, LAST_ITERATIONS).light
-    least = FAINT * _irradiance(found) @ LUMINANCE
-    return tuple(
-        light for light, colour in zip(lights, found[forward.order**2 :], strict=True) if colour @ LUMINANCE > least
+    return _settled(seen, forward, lights, albedo)
+
+
+def _settled(
+    seen: Observations, forward: Forward, lights: Sequence[DistantLight], albedo: NDArray
+) -> tuple[DistantLight, ...]:
+    """Lights without the faint ones, their directions and radii moved by Gauss-Newton together with all else.
+
+    A light of irradiance c adds ``c_k (t . slopes)`` to the image of channel k, where t are the three parameters of its
+    place, the same for all channels, and the slopes are differences of its columns. The best of all rounds is taken.
+    """
+    smooth, best, least = forward.order**2, tuple(lights), np.inf
+    for _ in range(SETTLING):
+        look = forward.with_lights(tuple(lights))
+        problem = lighting_problem(seen, look, look.dark, albedo, True)
+        found = solve_lighting(problem, specular=NORMAL_REFLECTANCE, iterations=LAST_ITERATIONS)
+        bright = found.light[smooth:] @ LUMINANCE > FAINT * _irradiance(found.light) @ LUMINANCE
+        if not bright.all():
+            kept = [lights[k] for k in np.flatnonzero(bright)]
+            return _settled(seen, forward, kept, albedo) if kept else ()
+        if found.unexplained < least:
+            best, least = tuple(lights), found.unexplained
+        ways = [_moved(light, sign * step) for light in lights for step in np.eye(3) for sign in (1.0, -1.0)]
+        both = forward.with_lights(tuple(ways)).transfers(seen, forward.with_lights(tuple(ways)).dark)
+        slopes = [0.5 * (each[..., smooth::2] - each[..., smooth + 1 :: 2]) for each in both]
+        steps = _place_steps(problem, found, slopes)
+        lights = [_moved(light, np.clip(step, -2.0, 2.0)) for light, step in zip(lights, steps, strict=True)]
+    return best
+
+
+def _moved(light: DistantLight, step: NDArray) -> DistantLight:
+    """A light moved across by multiples of `SLOPE`, in two directions, and widened by a third one's power of 1.5."""
+    across = np.linalg.svd(light.direction[None])[2][1:]
+    radius = float(np.clip(light.radius * 1.5 ** step[2], *RADII))
+    return replace(light, direction=normalize(light.direction + SLOPE * step[:2] @ across), radius=radius)
+
+
+def _place_steps(problem: LightingProblem, found: LightingSolution, slopes: Sequence[NDArray]) -> NDArray[np.float64]:
+    """(L, 3) steps of the places of L lights: ``slopes`` are two of (n, J, 3L), at unit irradiance."""
+    k, m = problem.diffuse.shape[2], slopes[0].shape[2]
+    wider = replace(
+        problem,
+        diffuse=np.concatenate([problem.diffuse, slopes[0]], axis=2),
+        specular=np.concatenate([problem.specular, slopes[1]], axis=2),
     )
+    rows, light = wider.rows(), np.concatenate([found.light, np.zeros((m, 3))])
+    shaded = [each @ light.astype(np.float32) for each in (rows.diffuse, rows.specular)]
+    maps = found.diffuse[rows.texel], found.specular[rows.texel, None]
+    residual = rows.colour - form_image(0.0, maps[0], shaded[0], maps[1], shaded[1])
+    weight, sigma = active_weight(rows.weight, rows.clipped, residual, True)
+    equations = linearize(wider, rows, light, found.diffuse, found.specular, *shaded, residual, weight, sigma=sigma)
+    remaining = equations.eliminate(False, 1e-4)
+    colour = np.repeat(found.light[k - m // 3 :], 3, axis=0)
+    tied = np.zeros((3, k + m, 3 * k + m))
+    for c in range(3):
+        tied[c, :k, c * k : (c + 1) * k] = np.eye(k)
+        tied[c, k:, 3 * k :] = np.diag(colour[:, c])
+    tied = tied.reshape(-1, 3 * k + m)
+    system = tied.T @ remaining.reduced @ tied
+    system += 1e-6 * float(np.diag(system).mean()) * np.eye(len(system))
+    return np.linalg.solve(system, tied.T @ remaining.right)[3 * k :].reshape(-1, 3)
 
 
 def _sparse(
@@ -152,8 +217,8 @@ def _gathered(directions: NDArray, irradiance: NDArray, smooth: NDArray) -> tupl
             break
         # The mean squared angle from the middle of an even disc is half of its squared radius.
         angle = np.arccos(np.clip(directions @ centre, -1.0, 1.0))
-        radius = np.sqrt(2.0 * (part @ angle**2) / part.sum())
-        lights.append(DistantLight(centre, float(radius), np.zeros(3)))
+        radius = float(np.clip(np.sqrt(2.0 * (part @ angle**2) / part.sum()), *RADII))
+        lights.append(DistantLight(centre, radius, np.zeros(3)))
         left = np.where(part > 0, 0.0, left)
     return tuple(lights)
 
