@@ -100,11 +100,14 @@ def _settled(
     A light of irradiance c adds ``c_k (t . slopes)`` to the image of channel k, where t are the three parameters of its
     place, the same for all channels, and the slopes are differences of its columns. The best of all rounds is taken.
     """
-    smooth, best, least = forward.order**2, tuple(lights), np.inf
+    smooth, best, least, found = forward.order**2, tuple(lights), np.inf, None
     for _ in range(SETTLING):
         look = forward.with_lights(tuple(lights))
         problem = lighting_problem(seen, look, look.dark, albedo, True)
-        found = solve_lighting(problem, specular=NORMAL_REFLECTANCE, iterations=LAST_ITERATIONS)
+        if found is None:
+            found = solve_lighting(problem, specular=NORMAL_REFLECTANCE, iterations=LAST_ITERATIONS)
+        else:
+            found = solve_lighting(problem, found.light, (found.diffuse, found.specular), iterations=LAST_ITERATIONS)
         bright = found.light[smooth:] @ LUMINANCE > FAINT * _irradiance(found.light) @ LUMINANCE
         if not bright.all():
             kept = [lights[k] for k in np.flatnonzero(bright)]
