@@ -27,7 +27,7 @@ N_ALBEDO = 60
 """Albedo modes of the pigment model where a file has no albedo."""
 
 
-def complete(
+def complete(  # noqa: PLR0913
     name: str,
     mean: NDArray,
     faces: NDArray,

@@ -113,7 +113,7 @@ def _rotation(value: float | NDArray) -> NDArray[np.float64]:
     return turn
 
 
-def write_relit(
+def write_relit(  # noqa: PLR0913
     reconstruction: Result,
     environment: str | Path,
     folder: str | Path,

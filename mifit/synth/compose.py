@@ -49,7 +49,7 @@ READ_NOISE = 0.0012
 """Standard deviation of the sensor's read noise in linear image units."""
 
 
-def synthesize(
+def synthesize(  # noqa: PLR0913
     out: str | Path,
     subjects: int = 1,
     timesteps: int = 4,
