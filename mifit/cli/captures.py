@@ -140,7 +140,7 @@ def calibrate(arguments: Namespace) -> None:
 def _calibrate_from_heads(arguments: Namespace) -> None:
     import mifit
     from mifit.extras.calibrate_densely import calibrate_capture
-    from mifit.extras.place import calibrate_others, write_cameras
+    from mifit.extras.calibrate_heads import calibrate_others, write_cameras
     from mifit.fitting import choose, choose_timesteps
 
     capture = mifit.Capture.load(arguments.capture)
@@ -175,7 +175,7 @@ def _refine_calibration(
     """Fit the geometry with the calibration as it is, and adjust that where dense matches agree better then."""
     import mifit
     from mifit.core.files import write_bytes
-    from mifit.extras.place import write_cameras
+    from mifit.extras.calibrate_heads import write_cameras
     from mifit.extras.refine_cameras import refine_cameras
 
     folder: Path = arguments.capture

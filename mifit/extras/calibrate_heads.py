@@ -1,4 +1,4 @@
-"""Cameras of an uncalibrated capture, from landmarks and the face model's landmark positions.
+"""Cameras of an uncalibrated capture, from landmarks and the face model's landmark positions, and written into it.
 
 A bundle adjustment over focal lengths, camera poses, one head pose per timestep and the subject's shape, with the
 model's modes as prior. World space is the first camera's frame with OpenGL axes. The result is an estimate that stage 1
@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from mifit.capture.capture import Capture
 from mifit.capture.landmark_files import COUNT, MIN_VISIBLE
+from mifit.capture.resection import landmark_weights, resect_camera
+from mifit.capture.transforms import update_frames
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.errors import InputError
 
@@ -239,3 +243,84 @@ def _residuals(x: NDArray, problem: _Problem) -> NDArray[np.float64]:
     error = (pixels - problem.points) * (np.sqrt(problem.weight)[..., None] / problem.noise)
     prior_focal = (np.log(focal / problem.side) - math.log(FOCAL_PRIOR[0])) / FOCAL_PRIOR[1]
     return np.concatenate([error.ravel(), shape, prior_focal[np.isnan(problem.known)]])
+
+
+def calibrate_others(
+    capture: Capture, decided: Sequence[str], timesteps: Sequence[int]
+) -> dict[str, tuple[Camera, float]]:
+    """All cameras of a capture whose ``decided`` ones are estimated, each with its error in pixels.
+
+    The decided ones give every landmark a place in space; another camera is the one that sees them where its own
+    landmarks are. So a held-out camera moves none of the others.
+
+    Raises
+    ------
+    InputError
+        A single camera has decided, which gives nothing a place; or a camera can't be placed.
+    """
+    places = _places(capture, decided, timesteps)
+    if len(decided) < len(capture.cameras) and not places:
+        raise InputError(
+            f"{capture.path}: {', '.join(decided)} give no landmark a place in space; expected two cameras"
+        )
+    views = [capture.views[name] for name in decided]
+    focal = float(np.median([capture.camera(v.name).fx / max(v.width, v.height) for v in views]))  # in longer sides
+    sizes = {(view.width, view.height) for view in views}
+    found: dict[str, tuple[Camera, float]] = {}
+    for name in capture.cameras:
+        points, pixels, weights = [], [], []
+        for timestep, (seen, world) in places.items():
+            marks = capture.landmarks(name, timestep)
+            if marks is not None:
+                both = marks.visible[seen]
+                points.append(world[both])
+                pixels.append(marks.points[seen[both]])
+                weights.append(landmark_weights(seen[both]))
+        if sum(map(len, points)) < MIN_VISIBLE:
+            raise InputError(
+                f"camera {name!r}: found fewer than {MIN_VISIBLE} landmarks that the others see too, expected enough "
+                "to place it; run mifit landmarks, or leave the camera uncalibrated with --cameras"
+            )
+        view, where, at, weight = capture.views[name], *map(np.concatenate, (points, pixels, weights))
+        size = view.width, view.height
+        camera, error = resect_camera(view, where, at, weight, focal * max(size), size in sizes)
+        found[name] = (capture.camera(name) if name in decided else camera), error
+    return found
+
+
+def _places(
+    capture: Capture, cameras: Sequence[str], timesteps: Sequence[int]
+) -> dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Landmarks in world space by timestep, as (indices, points (N, 3)): those that two of the cameras see."""
+    found: dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]] = {}
+    for timestep in timesteps:
+        rows = np.zeros((COUNT, 4, 4))
+        count = np.zeros(COUNT, dtype=int)
+        for name in cameras:
+            marks, camera = capture.landmarks(name, timestep), capture.camera(name)
+            if marks is None:
+                continue
+            projection = camera.matrix @ camera.world_to_camera[:3]
+            for axis in (0, 1):
+                line = marks.points[:, axis, None] * projection[2] - projection[axis]
+                line = line / np.linalg.norm(line[:, :3], axis=1, keepdims=True) * marks.visible[:, None]
+                rows += line[:, :, None] * line[:, None, :]
+            count += marks.visible
+        seen = np.flatnonzero(count >= 2)
+        if len(seen) >= MIN_VISIBLE:
+            points = np.linalg.solve(rows[seen, :3, :3], -rows[seen, :3, 3:])[..., 0]
+            found[timestep] = seen.astype(np.int64), np.asarray(points, dtype=np.float64)
+    return found
+
+
+def write_cameras(path: str | Path, capture: Capture, cameras: Sequence[Camera]) -> None:
+    """Write intrinsics and poses of some cameras into a capture's ``transforms.json``; all else in it stays."""
+    by_name = {camera.name: camera for camera in cameras}
+    changes: dict[tuple[str, int], dict[str, Any]] = {}
+    for key in (shot for shot in capture.shots if shot[0] in by_name):
+        camera = by_name[key[0]]
+        inverse = np.linalg.inv(camera.world_to_camera) @ OPENGL_FROM_OPENCV
+        numbers = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+        changes[key] = {k: float(v) for k, v in numbers.items()} | {"transform_matrix": inverse.tolist()}
+    file = Path(path) if Path(path).is_file() else Path(path) / "transforms.json"
+    update_frames(file, changes)

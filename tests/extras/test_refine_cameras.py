@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import mifit
+from mifit.capture import Capture
+from mifit.cli import main
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, Report
 from mifit.extras import bundle
-from mifit.extras.refine_cameras import refine_cameras
-from mifit.extras.rig import movements, pose_precisions, rig_precision, settled_rig, told_ways
+from mifit.extras.refine_cameras import (
+    RefinedCameras,
+    movements,
+    pose_precisions,
+    refine_cameras,
+    rig_precision,
+    settled_rig,
+    told_ways,
+)
 from mifit.morphable import MorphableModel
+from tests.capture.conftest import write_capture
 from tests.stages.memory_capture import MemoryCapture, make_capture
 
 BOTH = ("left", "right")
@@ -205,3 +217,40 @@ def test_ways_are_deviations_of_the_prior_that_matches_tell() -> None:
     precision = np.diag([4.0, 1.0, 0.25])  # deviations 0.5, 1 and 2
     ways = told_ways(np.diag([0.36, 0.01, 0.04]), precision, least=0.25)  # 0.3, 0.1 and 0.4 pixels
     assert np.abs(ways) == pytest.approx(np.array([[0.5, 0.0], [0.0, 0.0], [0.0, 2.0]]))
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, variant):
+    """A calibrated capture on disk, and what the command finds of it."""
+    folder = write_capture(tmp_path / "capture")
+    capture = Capture.load(folder)
+    moved = tuple(replace(capture.camera(name), fx=1.01 * capture.camera(name).fx) for name in BOTH)
+    found = [RefinedCameras(moved, "the calibration is off", False, {})]
+    monkeypatch.setattr(mifit, "fit", lambda *_, until, **__: SimpleNamespace(geometry=until))
+    monkeypatch.setattr("mifit.extras.refine_cameras.refine_cameras", lambda *_: found[0])
+    return folder, found
+
+
+def test_the_command_writes_cameras_and_keeps_the_calibration_as_it_was(command, capsys) -> None:
+    folder, _ = command
+    before = (folder / "transforms.json").read_bytes()
+    calibrated = Capture.load(folder)
+    assert main(["calibrate", str(folder), "--refine", "--quiet"]) == 0
+    assert capsys.readouterr().out.startswith("The calibration is off\nCapture: ")
+    after = Capture.load(folder)
+    for name in BOTH:
+        assert after.camera(name).fx == pytest.approx(1.01 * calibrated.camera(name).fx)
+        assert after.landmarks(name, 0) is not None
+    assert (folder / "transforms_before.json").read_bytes() == before
+    assert main(["calibrate", str(folder), "--refine", "--quiet"]) == 2  # it would overwrite what it kept
+    assert "move it away first" in capsys.readouterr().err
+
+
+def test_the_command_leaves_a_calibration_that_stays(command, capsys) -> None:
+    folder, found = command
+    found[0] = RefinedCameras((), "the cameras stay", False, {})
+    before = (folder / "transforms.json").read_bytes()
+    assert main(["calibrate", str(folder), "--refine", "--quiet"]) == 0
+    assert (folder / "transforms.json").read_bytes() == before and not (folder / "transforms_before.json").exists()
+    assert main(["calibrate", str(folder), "--quiet"]) == 2
+    assert "calibrated already; --refine adjusts it" in capsys.readouterr().err
