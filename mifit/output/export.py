@@ -27,7 +27,7 @@ SUFFIXES = {"glb": ".glb", "obj": ".obj", "ply": ".ply", "mitsuba": ".xml"}
 PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
 """Millimetres."""
 OBJ_SPECULAR = 0.08
-"""Reflectance along the normal where an OBJ's specular map, linear as Blender reads it, is white."""
+"""Reflectance along the normal where an OBJ's specular map, sRGB as Blender reads it, is white."""
 Mesh = Literal["fitted", "refined"]
 
 
@@ -79,7 +79,7 @@ def export(
         raise InputError(f"mesh: found {mesh!r}, expected 'fitted' or 'refined'")
     timestep = reconstruction.timesteps[0] if timestep is None else timestep
     reconstruction.index(timestep)
-    beside = ("_diffuse.png", "_specular.png", "_normal.png", ".mtl") if format == "obj" else ()
+    beside = ("_diffuse.png", "_specular.png", "_normal.png", "_normal.exr", ".mtl") if format == "obj" else ()
     for end in ("_displacement.exr", *beside) if mesh == "refined" else beside:
         check_overwriting(path.with_name(path.stem + end))
     if animate and format != "glb":
@@ -121,8 +121,9 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int, factor: float,
     stem = path.stem
     write_image(path.with_name(f"{stem}_diffuse.png"), maps.diffuse)
     reflectance = np.clip(reconstruction.lobe.factor() * maps.specular / OBJ_SPECULAR, 0.0, 1.0)
-    for name, codes in (("specular", 255 * reflectance), ("normal", 127.5 * (bent + 1))):
-        write_bytes(path.with_name(f"{stem}_{name}.png"), encode_png(np.round(codes).astype(np.uint8)))
+    write_image(path.with_name(f"{stem}_specular.png"), reflectance)
+    write_bytes(path.with_name(f"{stem}_normal.png"), encode_png(np.round(127.5 * (bent + 1)).astype(np.uint8)))
+    write_image(path.with_name(f"{stem}_normal.exr"), 0.5 * (bent + 1))
     albedo = vertex_materials(reconstruction, skin=True)[:, :3]
     rest = part_of(mesh, ~mapped) if not mapped.all() else None
     grey = albedo[rest.origin].mean(0) if rest else np.full(3, 0.5)
@@ -131,10 +132,11 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int, factor: float,
     film, eyes = " ".join([f"{REFLECTANCE:.5f}"] * 3), eye_faces(reconstruction, skin=True)
     write_text(
         path.with_suffix(".mtl"),
-        # Pr, of physically based programs, is glTF's roughness; Blender reads a normal map from map_Bump, others norm.
+        # Pr, of physically based programs, is glTF's roughness. Blender reads a normal map from map_Bump, and takes its
+        # values as they are in an .exr alone; other programs read norm.
         f"newmtl skin\nillum 2\nKd 1 1 1\nKs {specular}\nNs {reconstruction.lobe.typical:.6g}\n"
         f"Pr {math.sqrt(reconstruction.lobe.roughness):.4f}\nmap_Kd {stem}_diffuse.png\nmap_Ks {stem}_specular.png\n"
-        f"norm {stem}_normal.png\nmap_Bump -bm 1.0 {stem}_normal.png\n\n"
+        f"norm {stem}_normal.png\nmap_Bump -bm 1.0 {stem}_normal.exr\n\n"
         f"newmtl eyes\nillum 2\nKd 1 1 1\nKs {film}\nNs {CORNEA.typical:.6g}\nPr {CORNEA_ROUGHNESS}\n"
         f"map_Kd {stem}_diffuse.png\n\n"
         f"newmtl rest\nillum 1\nKd {colour}\nKs 0 0 0\n",

@@ -1202,7 +1202,12 @@ def colours(base: Path) -> Iterator[Case]:
         "exposure nan": radiance(b"FORMAT=32-bit_rle_rgbe\nEXPOSURE=nan\n"), "exposure text": radiance(b"FORMAT=32-bit_rle_rgbe\nEXPOSURE=x\n"),
         "exposure huge": radiance(b"FORMAT=32-bit_rle_rgbe\nEXPOSURE=1e-300\n"), "square": radiance(b"FORMAT=32-bit_rle_rgbe\n", b"-Y 16 +X 16"),
     }.items():  # fmt: skip
-        yield Case(f"colours:hdr {name}", ("relight", "result", "--env", "e.hdr", "--out", "out"), ("result", "ball.npz"), prepare)
+        yield Case(
+            f"colours:hdr {name}",
+            ("relight", "result", "--env", "e.hdr", "--out", "out"),
+            ("result", "ball.npz"),
+            prepare,
+        )
 
     def eight_bits(work: Path) -> None:
         write_image(work / "e.png", rng.random((16, 32, 3)))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mifit.core.image import read_image
+from mifit.core.image import read_image, srgb_to_linear
 from mifit.core.mesh import part_of, split_at_seams, vertex_normals
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
@@ -166,6 +166,7 @@ def test_obj_opens_in_trimesh_with_its_maps(ball, tmp_path):
         "ball_diffuse.png",
         "ball_specular.png",
         "ball_normal.png",
+        "ball_normal.exr",
     }
     scene = trimesh.load(tmp_path / "ball.obj", process=False)
     meshes = list(scene.geometry.values())
@@ -279,6 +280,9 @@ def test_obj_has_gltfs_roughness_and_links_its_normal_map(ball, glb, tmp_path):
     skin = (tmp_path / "a.mtl").read_text().split("newmtl")[1]
     roughness = read_glb(glb)[0]["materials"][0]["pbrMetallicRoughness"]["roughnessFactor"]
     assert float(skin.split("Pr ")[1].split()[0]) == pytest.approx(roughness, abs=1e-4)
-    assert "Ks 0.08 0.08 0.08" in skin and "norm a_normal.png" in skin and "map_Bump -bm 1.0 a_normal.png" in skin
-    shown = cv2.imread(str(tmp_path / "a_specular.png"), cv2.IMREAD_UNCHANGED).max() / 255 * 0.08
+    assert "Ks 0.08 0.08 0.08" in skin and "norm a_normal.png" in skin and "map_Bump -bm 1.0 a_normal.exr" in skin
+    shown = srgb_to_linear(cv2.imread(str(tmp_path / "a_specular.png"), cv2.IMREAD_UNCHANGED).max() / 255) * 0.08
     assert shown == pytest.approx(min(ball.lobe.factor() * 0.15, 0.08), abs=1e-3)
+    codes = read_image(tmp_path / "a_normal.exr")
+    with_png = cv2.imread(str(tmp_path / "a_normal.png"))[..., ::-1] / 255.0
+    np.testing.assert_allclose(codes, with_png, atol=0.003)
