@@ -32,7 +32,6 @@ from benchmarks.heads import ICT, Case
 from benchmarks.judge import Row
 from benchmarks.record import RESULTS, conditions, record
 from mifit import Capture, FitConfig, MorphableModel, Reconstruction
-from mifit.config import ReflectanceConfig
 from mifit.core.files import write_text
 from mifit.core.process import set_threads, threads
 from mifit.errors import MifitError
@@ -75,17 +74,13 @@ def without_specular(
 ) -> Reconstruction:
     """The same mesh with light, albedo, normals and residual fitted again, without specular reflection."""
     given = capture, full.model, full.geometry
-    reflectance = mifit.infer_reflectance(*given, cameras, lambertian(config.reflectance), seed=SEED)
+    settings = replace(config.reflectance, specular=False)
+    reflectance = mifit.infer_reflectance(*given, cameras, settings, seed=SEED)
     normals = mifit.refine_normals(*given, reflectance, cameras, config.normals, seed=SEED)
     residual = full.residual
     if residual is not None:
         residual = mifit.find_residual(*given, reflectance, normals, cameras, config.residual, SEED)
     return replace(full, reflectance=reflectance, normals=normals, mesh=None, residual=residual)
-
-
-def lambertian(config: ReflectanceConfig) -> ReflectanceConfig:
-    """Settings of stage 2 without specular reflection."""
-    return replace(config, specular=False)
 
 
 def constant_albedo(full: Reconstruction) -> Reconstruction:
