@@ -77,6 +77,9 @@ class _Cache:
     def __len__(self) -> int:
         return len(self._frames)
 
+    def __reduce__(self) -> tuple[type[_Cache], tuple[int]]:
+        return _Cache, (self.limit,)  # a copy reads its images anew
+
     def get(self, key: tuple[str, int]) -> Frame | None:
         with self._lock:
             if key in self._frames:

@@ -125,7 +125,8 @@ def import_material(
     numbers = range(start, sources[0].length, every)[:count]
     with replacing_folder(out) as part:
         shots = list(_copy(sources, part, numbers, progress))
-        shots = _copy_annotations(shots, material.annotated, part, numbers)
+        sizes = {view.name: (view.height, view.width) for view in material.views}
+        shots = _copy_annotations(shots, material.annotated, part, numbers, sizes)
         write_transforms(part / "transforms.json", material.views, shots, material.units)
         Capture.load(part)  # nothing is handed over that can't be read back
     return out
@@ -166,9 +167,13 @@ def match_views(sources: Sequence[Source], views: Iterable[View], where: str) ->
 
 
 def _copy_annotations(
-    shots: Sequence[Shot], annotated: Mapping[str, Sequence[Shot]], folder: Path, numbers: Sequence[int]
+    shots: Sequence[Shot],
+    annotated: Mapping[str, Sequence[Shot]],
+    folder: Path,
+    numbers: Sequence[int],
+    sizes: Mapping[str, tuple[int, int]],
 ) -> list[Shot]:
-    """Bring the masks and landmarks of the source along."""
+    """Bring the masks and landmarks of the source along; ``sizes`` are heights and widths of the cameras' images."""
     copied = []
     for shot in shots:
         if shot.camera not in annotated:
@@ -177,7 +182,12 @@ def _copy_annotations(
         source = annotated[shot.camera][numbers[shot.timestep]]
         if source.mask is not None:
             content = read_bytes(source.mask, MAX_IMAGE_BYTES, "mask")
-            decode_image(content, source.mask)
+            found, expected = decode_image(content, source.mask).pixels.shape[:2], sizes[shot.camera]
+            if found != expected:
+                raise InputError(
+                    f"{source.mask}: found a mask of {found[1]} x {found[0]} pixels, expected {expected[1]} x "
+                    f"{expected[0]} as the image"
+                )
             name = f"{shot.timestep:04d}{image_kind(content, source.mask)}"
             mask = folder / "masks" / file_name(shot.camera) / name
             write_bytes(mask, content)

@@ -25,6 +25,7 @@ from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_NUMBER, MAX_PIXELS, MAX_TI
 from mifit.errors import InputError
 
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0}
+CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 MIN_SIDE = 16
 MAX_DISTORTION = 1e4
 """Magnitude of a lens coefficient: those of rational models reach tens."""
@@ -119,9 +120,6 @@ def read_transforms(path: str | Path, units: str = "cm") -> Transforms:
     units = document.get("units", units)
     if not isinstance(units, str) or units not in UNITS_MM:
         raise InputError(f"{path}: units: found {_short(units)}, expected one of {', '.join(UNITS_MM)}")
-    model = document.get("camera_model", "OPENCV")
-    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV"):
-        raise InputError(f"{path}: camera_model: found {_short(model)}, expected OPENCV or PINHOLE")
     frames = document.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: frames: found {_short(frames)}, expected a list of at least one image")
@@ -132,6 +130,8 @@ def read_transforms(path: str | Path, units: str = "cm") -> Transforms:
         if not isinstance(frame, dict):
             raise InputError(f"{where}: found {_short(frame)}, expected an object")
         entry = _Entry({**{k: v for k, v in document.items() if k != "frames"}, **frame}, where)
+        if entry.values.get("camera_model", "OPENCV") not in CAMERA_MODELS:
+            raise entry.fail("camera_model", "OPENCV or PINHOLE")
         shot = _shot(entry, path.parent)
         view = _view(entry, shot.camera)
         key = (shot.camera, shot.timestep)

@@ -55,7 +55,8 @@ def _synth_scan(arguments: Namespace) -> None:
         if getattr(arguments, name) != default:
             option = name.replace("_", "-")
             raise InputError(f"--{option}: found with --head, whose shape and skin are the scan's; leave it out")
-    from mifit.synth.compose import place_cameras, read_environment
+    from mifit.core.image import read_environment
+    from mifit.synth.compose import place_cameras
     from mifit.synth.procedural import studio_environment
     from mifit.synth.scanned import ScannedHead, maps_of, synthesize_scan
 

@@ -1,9 +1,10 @@
 """Image files: PNG, JPEG, TIFF, OpenEXR and Radiance HDR, read to linear float32 and written whole or not at all.
 
-8- and 16-bit files hold sRGB-coded values and are decoded to linear Rec. 709, 0..1; floating-point files (EXR,
-HDR) are linear already. The kind of a file is told by its first bytes, not by its name. Sizes are read
-from the header and checked before a pixel is decoded, so a small file can't claim gigabytes. An orientation tag
-is not applied: pixel coordinates of a calibration refer to the pixels as stored.
+8- and 16-bit files hold sRGB-coded values, or those of a PNG's own gamma, and are decoded to linear Rec. 709, 0..1;
+floating-point files (EXR, HDR) are linear already. The primaries of an EXR and the exposure of a Radiance file are
+heeded; files of luminance and chroma or XYZ are refused. The kind of a file is told by its first bytes, not by its
+name. Sizes are read from the header and checked before a pixel is decoded, so a small file can't claim gigabytes. An
+orientation tag is not applied: pixel coordinates of a calibration refer to the pixels as stored.
 """
 
 from __future__ import annotations
@@ -160,14 +161,27 @@ def _decode_raster(data: bytes, path: str | Path) -> Image:
         _check_size(image.size, path)
         if image.mode == "CMYK":
             raise InputError(f"{path}: found a CMYK image, expected RGB; convert it with its ink profile first")
+        gamma = None if "srgb" in image.info else image.info.get("gamma")
         if _bits(image, data) > 8:
             image.verify()
-            return _decode_16_bit(data, path)
+            return _decode_16_bit(data, path, gamma)
         has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
         codes = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
     alpha = np.float32(1 / 255) * codes[..., 3] if has_alpha else None
     colour = codes[..., :3]
-    return Image(_TABLE_8[colour], alpha, (colour == 255).any(-1), 8)
+    return Image(_table(8, gamma, path)[colour], alpha, (colour == 255).any(-1), 8)
+
+
+def _table(bits: int, gamma: float | None, path: str | Path) -> NDArray[np.float32]:
+    """Linear value of each code: sRGB, or where a PNG has a gamma that isn't about sRGB's, code^(1 / gamma)."""
+    if bits == 8 and (gamma is None or abs(gamma - 1 / 2.2) < 0.02):
+        return _TABLE_8
+    codes = np.arange(2**bits) / (2**bits - 1.0)
+    if gamma is None or abs(gamma - 1 / 2.2) < 0.02:
+        return srgb_to_linear(codes).astype(np.float32)
+    if not 0.1 <= gamma <= 2.0:
+        raise InputError(f"{path}: found gamma {gamma:g} in the header (gAMA), expected 0.1 to 2; save it as sRGB")
+    return (codes ** (1.0 / gamma)).astype(np.float32)
 
 
 def _bits(image: Any, data: bytes) -> int:
@@ -178,7 +192,7 @@ def _bits(image: Any, data: bytes) -> int:
     return 8
 
 
-def _decode_16_bit(data: bytes, path: str | Path) -> Image:
+def _decode_16_bit(data: bytes, path: str | Path, gamma: float | None) -> Image:
     codes = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if codes is None:
         raise _damaged(path)
@@ -189,8 +203,7 @@ def _decode_16_bit(data: bytes, path: str | Path) -> Image:
     channels = codes.shape[2]
     colour = codes[..., 2::-1] if channels >= 3 else np.repeat(codes[..., :1], 3, axis=-1)
     alpha = np.float32(1 / 65535) * codes[..., -1] if channels in (2, 4) else None
-    table = srgb_to_linear(np.arange(65536) / 65535.0).astype(np.float32)
-    return Image(table[colour], alpha, (colour == 65535).any(-1), 16)
+    return Image(_table(16, gamma, path)[colour], alpha, (colour == 65535).any(-1), 16)
 
 
 def _float_image(colour: NDArray, alpha: NDArray | None) -> Image:
@@ -237,12 +250,48 @@ def _decode_exr(data: bytes, path: str | Path) -> Image:
         )
     with OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:
         found = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
+        primaries = file.header().get("chromaticities")
     names = next((n for n in (("R", "G", "B"), ("Y", "Y", "Y")) if set(n) <= set(found)), None)
-    if names is None:
-        raise InputError(f"{path}: found channels {', '.join(sorted(found))[:80]}, expected R, G, B or Y")
+    if names is None or (names[0] == "Y" and {"RY", "BY", "X", "Z"} & set(found)):
+        raise InputError(f"{path}: found channels {', '.join(sorted(found))[:80]}, expected R, G, B or Y alone")
     if any(found[name].shape != size[::-1] for name in names):
         raise InputError(f"{path}: found channels of different resolutions, expected one; save them at full size")
-    return _float_image(np.stack([found[name] for name in names], axis=-1), found.get("A"))
+    colour = np.stack([found[name] for name in names], axis=-1)
+    if names[0] == "R" and primaries is not None:
+        colour = _from_primaries(colour, np.ravel(primaries), path)
+    return _float_image(colour, found.get("A"))
+
+
+REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+"""Chromaticities x, y of red, green, blue and white."""
+
+
+def _from_primaries(colour: NDArray, primaries: NDArray, path: str | Path) -> NDArray[np.float32]:
+    """Linear colour of other primaries in Rec. 709, its white adapted as by Bradford; what lies outside is cut off."""
+    if primaries.shape == (8,) and np.allclose(primaries, REC_709, atol=2e-3):
+        return np.asarray(colour, np.float32)
+    bradford = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+    try:
+        (source, white), (target, white_709) = (_to_xyz(np.asarray(p, np.float64)) for p in (primaries, REC_709))
+        adapted = np.linalg.inv(bradford) @ np.diag(bradford @ white_709 / (bradford @ white)) @ bradford
+        matrix = np.linalg.inv(target) @ adapted @ source
+    except (np.linalg.LinAlgError, ValueError):
+        matrix = np.full((3, 3), np.nan)
+    if not (np.abs(matrix) < 100.0).all():
+        raise InputError(
+            f"{path}: found chromaticities {np.round(primaries, 4).tolist()}, expected those of red, green, blue and "
+            "white; save it as linear Rec. 709"
+        )
+    return np.maximum(colour @ matrix.T, 0.0).astype(np.float32)
+
+
+def _to_xyz(primaries: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(3, 3) from RGB to XYZ, and XYZ of white, of chromaticities (8,)."""
+    x, y = primaries.reshape(4, 2).T
+    if not (np.abs(y) > 1e-6).all():
+        raise ValueError("a chromaticity without luminance")
+    xyz = np.stack([x / y, np.ones(4), (1.0 - x - y) / y])
+    return xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3]), xyz[:, 3]
 
 
 _HDR_RESOLUTION = re.compile(rb"-Y (\d{1,9}) \+X (\d{1,9})\n")
@@ -268,12 +317,43 @@ def _decode_hdr(data: bytes, path: str | Path) -> Image:
     _check_size((width, height), path)
     if width * height > (len(data) - start) * _HDR_RUN:
         raise _damaged(path)
+    factor = np.ones(3)
+    for line in data[:start].decode("latin-1").splitlines():
+        key, _, value = line.partition("=")
+        if key == "FORMAT" and value.strip() != "32-bit_rle_rgbe":
+            raise InputError(f"{path}: found FORMAT={value.strip()[:40]}, expected 32-bit_rle_rgbe; save it as RGB")
+        if key in ("EXPOSURE", "COLORCORR"):  # what the pixels were multiplied by; of several lines the product
+            factor = factor * np.array(value.split(), dtype=np.float64)
+    if not ((factor >= 1e-9) & (factor <= 1e9)).all():
+        raise InputError(f"{path}: found an exposure of {factor.tolist()}, expected positive numbers within 1e9")
     # OpenCV gets a header of ours: it can't find another resolution than the one that was checked
     head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode()
     pixels = cv2.imdecode(np.frombuffer(head + data[start:], np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.shape != (height, width, 3):
         raise _damaged(path)
-    return _float_image(pixels[..., ::-1], None)
+    return _float_image(pixels[..., ::-1] / factor.astype(np.float32), None)
+
+
+def read_environment(path: str | Path) -> NDArray[np.float32]:
+    """A lat-long environment (H, 2 H, 3) of linear radiance; InputError as of `check_environment`, or for 8 bits."""
+    image = load_image(path)
+    if image.bits < 32:
+        raise InputError(
+            f"{path}: found {image.bits} bits per channel, which cut lamps off; expected a measured environment, "
+            ".hdr or .exr"
+        )
+    return check_environment(path, image.pixels)
+
+
+def check_environment(name: str | Path, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The image, where it is a lat-long one: twice as wide as high, finite, from 0 up and not black."""
+    if image.ndim != 3 or image.shape[2] != 3 or image.shape[0] < 8 or image.shape[1] != 2 * image.shape[0]:
+        raise InputError(
+            f"{name}: found an image of shape {image.shape}, expected a lat-long one twice as wide as high (H, 2 H, 3)"
+        )
+    if not np.isfinite(image).all() or image.min() < 0 or image.max() <= 0:
+        raise InputError(f"{name}: found radiance {image.min():g} to {image.max():g}, expected finite values from 0 up")
+    return image
 
 
 def write_image(path: str | Path, linear: ArrayLike) -> None:

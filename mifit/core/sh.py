@@ -255,9 +255,9 @@ class SHLighting:
             A file that can't be read, a wrong shape, or pixels that are not finite.
         """
         if isinstance(source, (str, Path)):
-            from mifit.core.image import read_image
+            from mifit.core.image import read_environment
 
-            pixels = read_image(source)
+            pixels = read_environment(source)
             try:
                 return cls(project_latlong(pixels, order))
             except InputError as error:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mifit.appearance.illumination import Illumination
 from mifit.core.files import file_name, write_text
-from mifit.core.image import read_image, to_8_bit, write_image
+from mifit.core.image import check_environment, read_environment, to_8_bit, write_image
 from mifit.core.metrics import psnr, rmse
 from mifit.core.sh import LUMINANCE, SHLighting
 from mifit.errors import InputError
@@ -88,12 +88,10 @@ def _level(lighting: SHLighting) -> float:
 
 def _environment(source: str | Path | NDArray) -> NDArray[np.float32]:
     """A lat-long image of linear radiance, checked, of at most `MAP_ROWS` rows."""
-    name = source if isinstance(source, (str, Path)) else "environment"
-    image = read_image(source) if isinstance(source, (str, Path)) else np.asarray(source, np.float32)
-    if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8 or not np.isfinite(image).all():
-        raise InputError(f"{name}: found an image of shape {image.shape}, expected a finite lat-long image (H, W, 3)")
-    if (image < 0).any() or not image.any():
-        raise InputError(f"{name}: found negative or only black pixels, expected linear radiance")
+    if isinstance(source, (str, Path)):
+        image = read_environment(source)
+    else:
+        image = check_environment("environment", np.asarray(source, np.float32))
     if image.shape[0] > MAP_ROWS:
         width = round(image.shape[1] * MAP_ROWS / image.shape[0])
         image = np.asarray(cv2.resize(image, (width, MAP_ROWS), interpolation=cv2.INTER_AREA), np.float32)

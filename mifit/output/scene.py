@@ -29,6 +29,7 @@ from mifit.output.deferred import render_local, visible_surface
 from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials
 from mifit.render.description import Parameter, to_mitsuba, to_xml
 from mifit.render.sensor import sensor_description
+from mifit.render.variant import check_active_variant
 from mifit.result import METHODS
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ def render_view(
 ) -> NDArray[np.float32]:
     """(H, W, 4) one view of a result; see `Reconstruction.render`."""
     check_shown(result, timestep, method)
+    check_active_variant()
     if integrator == "local":
         return render_local(result, camera, timestep, method, samples or 2)
     if integrator == "path":

@@ -17,7 +17,7 @@ from mifit.capture.landmark_files import write_landmarks
 from mifit.capture.transforms import MIN_SIDE, Shot, View, write_transforms
 from mifit.core.camera import Camera
 from mifit.core.files import replacing, write_text
-from mifit.core.image import read_image, write_image
+from mifit.core.image import read_environment, write_image
 from mifit.core.limits import (
     MAX_RENDERED_PIXELS,
     MAX_RUNS,
@@ -155,18 +155,6 @@ def synthesize(  # noqa: PLR0913
 
 def _shifted(progress: Progress, start: int, total: int) -> Callable[[int], None]:
     return lambda done: progress("Rendering", start + done, total)
-
-
-def read_environment(path: str | Path) -> NDArray[np.float32]:
-    """A lat-long environment (H, 2 H, 3), finite and not black; InputError otherwise."""
-    image = read_image(path)
-    if image.shape[1] != 2 * image.shape[0]:
-        raise InputError(
-            f"{path}: found {image.shape[1]} x {image.shape[0]} pixels, expected a lat-long image twice as wide as high"
-        )
-    if not np.isfinite(image).all() or image.min() < 0 or image.max() <= 0:
-        raise InputError(f"{path}: found radiance {image.min():g} to {image.max():g}, expected finite values from 0 up")
-    return image
 
 
 def place_cameras(width: int, height: int, distance: float = DISTANCE) -> list[Camera]:

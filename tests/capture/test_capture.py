@@ -188,3 +188,15 @@ def test_the_shared_captures_agree_with_their_ground_truth(shared: Path, ict_pat
             assert found is not None
             error = np.linalg.norm(found.points - capture.camera(camera).project(truth), axis=1)
             assert np.median(error[found.visible]) < 1.3  # detector noise of 0.8 px a coordinate
+
+
+def test_a_capture_is_pickled_and_copied(folder: Path) -> None:
+    import copy
+    import pickle
+
+    capture = Capture.load(folder)
+    name, timestep = capture.cameras[0], capture.timesteps[0]
+    image = capture.frame(name, timestep).image
+    for other in (pickle.loads(pickle.dumps(capture)), copy.deepcopy(capture), copy.copy(capture)):
+        assert other.digest() == capture.digest()
+        np.testing.assert_array_equal(other.frame(name, timestep).image, image)

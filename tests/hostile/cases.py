@@ -1175,8 +1175,7 @@ def colours(base: Path) -> Iterator[Case]:
 
     def exr(names: str, folder: str = ".", **header: Any) -> Callable[[Path], None]:
         def prepare(work: Path) -> None:
-            shape = {n: (8, 16) if n in ("RY", "BY") else (16, 32) for n in names.split(",")}
-            channels = {n: OpenEXR.Channel(rng.random(s).astype(np.float32), *((2, 2) if n in ("RY", "BY") else ())) for n, s in shape.items()}  # fmt: skip
+            channels = {n: rng.random((16, 32)).astype(np.float32) for n in names.split(",")}
             fields = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
             with OpenEXR.File(fields, channels) as file:
                 file.write(str(work / "e.exr"))
@@ -1226,6 +1225,18 @@ def colours(base: Path) -> Iterator[Case]:
 
     fitted = ("fit", "capture", "--out", "out", "--model", "ball.npz", "--until", "geometry")
     for name, chunk, content in (
-        ("linear", b"gAMA", struct.pack(">I", 100000)), ("0", b"gAMA", struct.pack(">I", 0)), ("huge", b"gAMA", struct.pack(">I", 2**32 - 1)),
+        ("0", b"gAMA", struct.pack(">I", 0)), ("huge", b"gAMA", struct.pack(">I", 2**32 - 1)),
     ):  # fmt: skip
         yield Case(f"colours:png gamma {name}", fitted, ("capture", "ball.npz"), gamma(chunk, content))
+
+    def small_mask(work: Path) -> None:
+        write_image(work / "capture" / "mask.png", np.ones((SIZE // 2, SIZE)))
+
+    def fisheye(work: Path) -> None:
+        document = json.loads((work / "capture" / "transforms.json").read_text())
+        document["frames"][1]["camera_model"] = "OPENCV_FISHEYE"
+        _write_json(work / "capture" / "transforms.json", document)
+
+    imported = ("import", "--transforms", "capture/transforms.json", "--out", "out")
+    yield Case("colours:mask of another size", imported, ("capture",), small_mask)
+    yield Case("colours:camera model of one image", imported, ("capture",), fisheye)

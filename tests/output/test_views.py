@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -113,3 +115,15 @@ def test_bad_environments_are_refused(ball, stage_1_ball, tmp_path):
         ball.relight(smooth_environment(), exposure=-1)
     with pytest.raises(InputError, match="no cameras"):
         orbit_camera(replace(ball, cameras=()), 0, 0.0)
+
+
+def test_rendering_without_a_variant_names_the_call() -> None:
+    code = (
+        "from tests.output.conftest import ball_result; from mifit.errors import VariantError\n"
+        "ball = ball_result()\n"
+        "for integrator in ('local', 'path'):\n"
+        "    try: ball.render(ball.cameras[0], 0, integrator=integrator)\n"
+        "    except VariantError as error: print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.count("call mifit.set_variant('auto') first") == 2
