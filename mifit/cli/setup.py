@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from mifit.cli import arguments as types
 from mifit.cli.console import console_progress
+from mifit.core.diagnostics import Diagnostic
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
 
 
 def doctor(arguments: Namespace) -> int:
-    """Print what works; exit code 1 when the pipeline can't run."""
+    """Print what works, exit code 1 when the pipeline can't run; or what is wrong with a capture."""
+    if arguments.capture is not None:
+        return _examine(arguments)
     from mifit.capture.face_networks import install_networks, missing, networks_folder
     from mifit.render.variant import doctor
 
@@ -30,6 +38,59 @@ def doctor(arguments: Namespace) -> int:
             if not check["ok"] and check["fix"]:
                 print(f"     {'':<{width}}  mend: {check['fix']}")
     return 0 if all(check["ok"] for check in checks if check["required"]) else 1
+
+
+def _examine(arguments: Namespace) -> int:
+    """Print how well each camera agrees with the others, what is wrong, and what would explain it; exit code 0 or 3."""
+    import mifit
+    from mifit.fitting import choose, choose_timesteps
+    from mifit.stages.checks.capture_checks import check_capture, landmark_offsets
+
+    capture, model = mifit.Capture.load(arguments.capture), mifit.MorphableModel.load(arguments.model)
+    cameras = choose("camera", capture.cameras, arguments.cameras, 2)
+    timesteps = choose_timesteps(capture, arguments.timesteps)
+    found = check_capture(capture, model, cameras, timesteps)
+    faults = [one for one in found if one.severity == "fault"]
+    figures: dict[str, Any] = {"cameras": {}}
+    if capture.calibrated:
+        figures["cameras"] = landmark_offsets(capture, model, cameras, timesteps)
+        if not faults and not arguments.quick and len(cameras) > 1:
+            figures["matches"] = _dense(arguments, capture, model, cameras, timesteps, found)
+    if arguments.json:
+        print(json.dumps({"findings": [one.document() for one in found], **figures}, indent=2))
+    else:
+        for name in cameras:
+            mine = {one.severity for one in found if one.camera in (name, None)}
+            verdict = "wrong" if "fault" in mine else "doubtful" if "warning" in mine else "sound"
+            pixels = figures["cameras"].get(name)
+            text = "landmarks not judged" if pixels is None else f"landmarks {pixels:.1f} pixels from a face"
+            print(f"camera {name}: {verdict}, {text}")
+        if "matches" in figures:
+            print(f"dense matches: {figures['matches']['finding']}")
+    return types.tell(arguments, found)
+
+
+def _dense(
+    arguments: Namespace,
+    capture: Capture,
+    model: MorphableModel,
+    cameras: Sequence[str],
+    timesteps: Sequence[int],
+    found: list[Diagnostic],
+) -> dict[str, Any]:
+    """What dense matches between the views of a fitted face say of the calibration; findings are added to ``found``."""
+    import mifit
+    from mifit.extras.refine_cameras import refine_cameras
+
+    types.use_variant(arguments)
+    progress = console_progress(arguments.quiet)
+    result = mifit.fit(capture, model, cameras, timesteps, until="geometry", progress=progress)
+    found += [one for one in result.diagnostics if one not in found]
+    refined = refine_cameras(capture, model, result.geometry, cameras, progress)
+    if refined.doubtful or refined.cameras:
+        remedy = "`mifit calibrate CAPTURE --refine` adjusts it" if refined.cameras else "calibrate again"
+        found.append(Diagnostic("calibration-off", f"{refined.finding}; {remedy}"))
+    return {"finding": refined.finding, **refined.figures}
 
 
 @types.writes("preview", "out")
@@ -58,7 +119,13 @@ def model(arguments: Namespace) -> None:
 
 def add_commands(add: types.Add) -> None:
     """Add these commands to the parser."""
-    p = add("doctor", doctor, "what of the set-up works, what doesn't, and the command that mends it")
+    p = add("doctor", doctor, "what of the set-up, or of a capture, is wrong, and what mends it")
+    p.add_argument("capture", type=types.path, nargs="?", help="capture to examine; default: the set-up")
+    p.add_argument("--model", default="auto", help="of a capture: a path, builtin or auto (default)")
+    p.add_argument("--cameras", type=types.listed, help="of a capture: cameras to examine; default: the first two")
+    p.add_argument("--timesteps", type=types.timesteps, help="of a capture: default: the first four")
+    p.add_argument("--quick", action="store_true", help="of a capture: no fit, landmarks and colours alone")
+    types.add_strict(p)
     p.add_argument("--json", action="store_true", help="print JSON")
     p.add_argument("--install", choices=["landmarks"], help="fetch the networks that find landmarks, then check")
 

@@ -206,7 +206,7 @@ class Result:
             said = any(one.code == "not-converged" for one in report.warnings)
             if report.outcome not in ("converged", "inconsistent") and not said:
                 words = report.outcome.replace("_", " ")
-                found.append(Diagnostic("not-converged", f"stage {name} ended without convergence ({words})"))
+                found.append(Diagnostic("not-converged", f"stage {name} ended without convergence ({words})", "note"))
         return worst_first(found)
 
     @property

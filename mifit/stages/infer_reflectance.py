@@ -105,7 +105,7 @@ def infer_reflectance(
     filled = blend_unseen(model, surface.texels, albedo, fitted.maps, quality, fitted.told, mirrored)
     if fitted.outcome is Outcome.MAX_ITERATIONS:
         text = "the lighting had not converged when the iterations ran out; raise max_iterations"
-        warnings = (*warnings, Diagnostic("not-converged", text))
+        warnings = (*warnings, Diagnostic("not-converged", text, "note"))
     details: dict = {
         "shading": {
             "model": fitted.appearance.model.name,

@@ -95,7 +95,7 @@ def test_report_is_whole_and_self_contained(ball, capture, variant, tmp_path):
     words = " ".join(page.text)
     assert f"{evaluation['methods']['full']['psnr']:.2f}" in words and "held out, never fitted" in words
     assert "Warning: one landmark is hidden" in words
-    assert "stage reflectance ended without convergence (max iterations)" in words
+    assert "Note: stage reflectance ended without convergence (max iterations)" in words
     assert words.count("Timestep 3") == 2
     assert re.search(r"left: 0\.0% clipped, \d+\.\d% unexplained", words)
     assert float(re.search(r"right: (\d+\.\d)% clipped", words)[1]) == pytest.approx(50, abs=15)

@@ -16,11 +16,11 @@ from mifit.morphable import MorphableModel
 from mifit.stages.checks.hypotheses import UNITS_MM, Hypothesis, hypotheses
 from mifit.stages.checks.landmark_model import INNER, Explanation, FaceStatistics, Shot, explain
 
-TIMESTEPS, DELAY_TIMESTEPS = 3, 8
+TIMESTEPS, DELAY_TIMESTEPS = 2, 6
 """Timesteps whose landmarks are judged, and among which delays are looked for."""
 FEWEST = 12
 """Landmarks inside the face that an image must show to be judged."""
-SOUND, DOUBTFUL = 0.6, 0.9
+SOUND, DOUBTFUL = 0.3, 0.9
 """Cost of a landmark (`Explanation`) up to which no mistake is looked for, and beyond which a person is told anyway:
 0.9 is that of normal errors as large as a detector's (3/2 of the mean of log(1 + e), e exponential)."""
 BETTER = 0.65
@@ -28,7 +28,7 @@ BETTER = 0.65
 views are then less likely as they are by a factor of e^20 or more; errors are correlated, so that a fifth counts."""
 ALIKE = 1.15
 """Costs, over the least, of mistakes that landmarks don't tell apart: all are named."""
-LARGEST_FACE = 1.5
+LARGEST_FACE = 1.6
 """Size of a face over the model's, and its inverse, beyond which nobody's is: outer corners of adults' eyes lie
 91 +- 5 mm apart, an infant's 60 mm (Farkas 1994)."""
 UNIT_SPREAD = 1.35
@@ -95,6 +95,14 @@ def landmark_shots(capture: Capture, cameras: Sequence[str], timesteps: Sequence
                 pixels = np.where(found.visible[:, None], found.points, np.nan)
                 shots.append(Shot(capture.camera(name), step, pixels))
     return shots
+
+
+def landmark_offsets(
+    capture: Capture, model: MorphableModel, cameras: Sequence[str], timesteps: Sequence[int]
+) -> dict[str, float]:
+    """Median distance in pixels of each camera's landmarks from a face that suits all cameras, where there are any."""
+    shots = landmark_shots(capture, cameras, timesteps[:TIMESTEPS])
+    return explain(shots, FaceStatistics.of(model, capture.unit_mm)).offsets if shots else {}
 
 
 def landmark_diagnostics(shots: Sequence[Shot], later: Sequence[Shot], face: FaceStatistics) -> list[Diagnostic]:

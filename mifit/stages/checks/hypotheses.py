@@ -193,7 +193,7 @@ def hypotheses(shots: Sequence[Shot], later: Sequence[Shot] = ()) -> Iterator[Hy
             other = {a: cameras[b], b: cameras[a]}
             undone = tuple(replace(shot, camera=other.get(shot.camera.name, shot.camera)) for shot in shots)
             text = f"cameras {a} and {b} are exchanged"
-            yield Hypothesis("cameras-swapped", text, "exchange their images or their poses", undone, b)
+            yield Hypothesis("cameras-swapped", text, "exchange their images or their poses", undone)
     for code, (change, text, remedy) in IMAGES.items():
         for name in (None, *(names if len(names) > 1 else ())):
             undone = tuple(change(shot) if name in (None, shot.camera.name) else shot for shot in shots)

@@ -15,6 +15,7 @@ from mifit.progress import Progress
 from mifit.stages.geometry.landmarks import LandmarkTerm, LandmarkView
 from mifit.stages.geometry.start import State, coordinate_deviation
 
+FARTHEST_IDENTITY = 8.0  # standard deviations; heads beyond a model's span reach six, wrong cameras ten
 SCATTER_OF_WIDTH = 0.015  # deviation of landmarks from the fit, as part of the image's width, that deserves a warning
 
 
@@ -50,7 +51,7 @@ class Journal:
         )
         if solution.outcome is Outcome.MAX_ITERATIONS:
             text = f"the fit of {name} was stopped after {solution.iterations} iterations before it converged"
-            self.warn(Diagnostic("not-converged", text))
+            self.warn(Diagnostic("not-converged", text, "note"))
         if geometric:
             self.last = solution
             self._extend(solution.energies)
@@ -103,7 +104,7 @@ def pack(
         text = f"landmarks scatter by {scatter:.1f} pixels about the fitted face: check detector and calibration"
         journal.warn(Diagnostic("landmarks-scatter", text))
     identity = x[layout.at("identity")].copy() if fixed is None else fixed.identity
-    if len(identity) and np.abs(identity).max() > 5.0:
+    if len(identity) and np.abs(identity).max() > FARTHEST_IDENTITY:
         text = (
             f"an identity coefficient is {np.abs(identity).max():.1f} standard deviations from the mean: the model "
             "may not span this face, or the calibration is off"
