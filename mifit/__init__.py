@@ -17,7 +17,6 @@ _EXPORTS = {
     "SHLighting": "mifit.core.sh",
     "Illumination": "mifit.appearance.illumination",
     "DistantLight": "mifit.appearance.illumination",
-    "NearLight": "mifit.appearance.near_light",
     "FitConfig": "mifit.config",
     "GeometryConfig": "mifit.config",
     "ReflectanceConfig": "mifit.config",

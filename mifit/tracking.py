@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +36,6 @@ from mifit.stages.fit_geometry import fit_pose_expression
 from mifit.stages.geometry.refine import texture_reference
 from mifit.stages.normals.refine_mesh import MeshRefiner
 from mifit.stages.normals.refine_normals import check_maps, refine_frame
-from mifit.stages.surface.frame_offsets import OUT_OF_STEP, frame_offset_warnings, frame_offsets
 from mifit.stages.surface.kept_texture import KeptTexture
 from mifit.stages.surface.model_fit import landmarks_are_biased
 
@@ -364,23 +363,8 @@ def track_into(
             result = extend(result, frame, refiner, digests[frame.timestep], room)
             add_timestep(result, folder, frame.timestep)
         if timesteps:
-            result = with_frame_offsets(result, capture)
             write_remarks(result, folder)
     return result
-
-
-def with_frame_offsets(result: R, capture: Capture) -> R:
-    """A tracked result whose normals' report says by how much cameras are out of step (``frame_offsets``)."""
-    if result.normals is None:
-        return result
-    names = [camera.name for camera in result.cameras]
-    seen = result.seen(capture)
-    found = frame_offsets(seen, result.model, result.geometry, names)
-    report = result.normals.report
-    details = {**report.details, "frame_offsets": {name: asdict(offset) for name, offset in found.items()}}
-    before = tuple(one for one in report.warnings if one.code != OUT_OF_STEP)
-    warnings = (*before, *frame_offset_warnings(found, names[0]))
-    return replace(result, normals=replace(result.normals, report=replace(report, details=details, warnings=warnings)))
 
 
 def sequence_left(result: Result, capture: Capture, resume: bool) -> tuple[int, ...]:

@@ -13,13 +13,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mifit.appearance.near_light import RAYS, NearLight
 from mifit.core.limits import MAX_NUMBER
 from mifit.core.sh import SHLighting, basis, order_of
 from mifit.errors import InputError
 
 if TYPE_CHECKING:
     from mifit.render.gbuffer import SurfaceScene
+
+RAYS = 16
+"""Points that stand for the extent of a compact light."""
 
 
 class Light(Protocol):
@@ -160,8 +162,6 @@ def light_from(document: dict[str, Any]) -> Light:
     KeyError, TypeError, ValueError
         A value is missing, of the wrong kind or shape, or not finite.
     """
-    if "position" in document:
-        return NearLight.of(document)
     direction, colour = (np.array(document[name], dtype=np.float64) for name in ("direction", "irradiance"))
     radius = float(document["radius"])
     if direction.shape != (3,) or colour.shape != (3,) or not (np.abs(colour) <= MAX_NUMBER).all():

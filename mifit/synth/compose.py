@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.near_light import NearLight
 from mifit.capture.landmark_files import write_landmarks
 from mifit.capture.transforms import MIN_SIDE, Shot, View, write_transforms
 from mifit.core.camera import Camera
@@ -240,7 +239,10 @@ def _write_capture(
 ) -> None:
     """Render and write one capture; ``transforms.json`` comes last, so a broken-off folder isn't taken for whole."""
     advance(0)
-    lamps = [] if lamp is None else [NearLight(np.array(lamp, float), 0.0, np.full(3, LAMP), np.zeros(3)).emitter()]
+    lamps: list[dict[str, object]] = []
+    if lamp is not None:
+        intensity = {"type": "rgb", "value": LAMP * float(np.sum(np.square(lamp)))}
+        lamps = [{"type": "point", "position": [float(x) for x in lamp], "intensity": intensity}]
     tracer = PathTracer(_materials(subject), environment, lamps=lamps)
     exposure = _exposure(tracer, subject, cameras[0])
     _write_maps(folder / "truth" / "maps.npz", subject.skin["face"])

@@ -218,22 +218,6 @@ def test_each_frame_is_on_disk_when_it_is_done(scene, fit_truth, saved, monkeypa
         assert (saved / "refined" / f"{t:04d}.ply").is_file()
 
 
-def test_cameras_out_of_step_are_named_once(scene, fit_truth, saved, monkeypatch):
-    from mifit import tracking
-    from mifit.stages.surface.frame_offsets import FrameOffset
-
-    asked = []
-    monkeypatch.setattr(
-        tracking, "frame_offsets", lambda *given: asked.append(given[2].timesteps) or {"right": FrameOffset(0.4, 0.02)}
-    )
-    tracking.track_into(saved, reload(saved), scene, (1,), CONFIG)
-    tracking.track_into(saved, reload(saved), scene, (2,), CONFIG)
-    report = reload(saved).normals.report
-    assert asked == [(0, 1), (0, 1, 2)]
-    assert report.details["frame_offsets"] == {"right": {"frames": 0.4, "deviation": 0.02}}
-    assert sum("0.40 of a frame later than those of left" in one.text for one in report.warnings) == 1
-
-
 def test_meshes_of_tracked_frames_are_refined_as_those_of_the_fit(scene, fit_truth, saved):
     from mifit.stages.normals.refine_mesh import refine_mesh
     from mifit.tracking import track_into
