@@ -329,7 +329,7 @@ class EnvironmentLight:
         specular = self.specular(_parts(self.image).soft, scene, points, normals, view, lobe, radiosity, group)
         matt, glossy = self.lamps(scene, points, normals, view, lobe)
         specular += glossy
-        rows = np.flatnonzero(eye) if eye is not None else []
+        rows = np.flatnonzero(eye if eye is not None else ())
         if len(rows):
             wet = points.take(rows), normals[rows], view[rows]
             specular[rows] = self.specular(self.image, scene, *wet, CORNEA, radiosity)

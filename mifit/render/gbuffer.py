@@ -197,7 +197,7 @@ class SurfaceScene:
         u, v = (np.where(valid, np.array(x, dtype=np.float32), np.float32(0)) for x in hit.prim_uv)
         depth = np.full(t.shape, np.inf, np.float32)
         np.multiply(t, camera.rotation[2] @ directions, out=depth, where=valid, casting="same_kind")
-        found = (box, *(x.reshape(part) for x in (face, u, v, depth)))
+        found: _Hits = (box, face.reshape(part), u.reshape(part), v.reshape(part), depth.reshape(part))
         while self._kept and len(self._kept) >= KEPT_VIEWS:
             self._kept.pop(next(iter(self._kept)))
         if t.size <= LARGEST_KEPT:

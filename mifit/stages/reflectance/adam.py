@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -131,8 +132,9 @@ def minimize_by_adam(
         light.step(lambda x: problem.total(problem.shade(*unpack(x)), specular_albedo.value, base, offset.value))
         shaded = problem.shade(*unpack(light.value))
         dr.eval(shaded)
-        specular_albedo.step(lambda x, s=shaded: problem.total(s, x, base, offset.value))
-        offset.step(lambda x, s=shaded: problem.total(s, specular_albedo.value, base, x))
+        shown = partial(problem.total, shaded)
+        specular_albedo.step(lambda x: shown(x, base, offset.value))  # noqa: B023, called at once
+        offset.step(lambda x: shown(specular_albedo.value, base, x))  # noqa: B023
         for name, value in zip(HISTORY, problem.terms(shaded, specular_albedo.value, base, offset.value), strict=True):
             history[name].append(float(value[0]))
         if on_iteration is not None:

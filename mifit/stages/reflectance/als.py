@@ -156,8 +156,8 @@ class _Shaded:
         """Blocks of all N texels, zero where nothing is seen, under weights (n, J, 3)."""
 
         def accumulate(part: slice) -> TexelSystems:
-            values = (array[part] for array in (self.colour, weight, self.diffuse, self.specular))
-            return TexelSystems.accumulate(*values, pairs, difference)
+            diffuse, specular = self.diffuse[part], self.specular[part]
+            return TexelSystems.accumulate(self.colour[part], weight[part], diffuse, specular, pairs, difference)
 
         parts = on_all_cores(accumulate, self._parts or [slice(0, 0)])
         joined = TexelSystems.join(parts)
@@ -269,8 +269,8 @@ def fit_als(
     prior = np.zeros((surface.texels.size**2, 4), dtype=np.float32)
     prior[surface.texels.index, :3] = albedo
     prior[:, 3] = found.expected
-    prior = prior.reshape(surface.texels.size, surface.texels.size, 4)
-    solved = fit_maps(surface, forward, found, prior, config, progress)
+    image = prior.reshape(surface.texels.size, surface.texels.size, 4)
+    solved = fit_maps(surface, forward, found, image, config, progress)
     maps, energy = solved.maps, {"lighting": found.energy}
     if not config.robust:
         found, maps, energy = alternate(surface, forward, found, maps, prior, albedo, config, progress)
@@ -386,7 +386,7 @@ def _turning_step(
     solution = np.linalg.solve(system + floor * np.eye(len(system)), right)
     if solution[-1] < 0.0:
         solution[:-1] = np.linalg.solve(system[:-1, :-1] + floor * np.eye(3 * k), right[:-1])
-    return solution[:-1].reshape(3, k).T, max(float(solution[-1]), 0.0)
+    return np.asarray(solution[:-1].reshape(3, k).T, dtype=np.float64), max(float(solution[-1]), 0.0)
 
 
 def _add(

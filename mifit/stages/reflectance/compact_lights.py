@@ -110,7 +110,7 @@ def _settled(
             found = solve_lighting(problem, found.light, (found.diffuse, found.specular), iterations=LAST_ITERATIONS)
         bright = found.light[smooth:] @ LUMINANCE > FAINT * _irradiance(found.light) @ LUMINANCE
         if not bright.all():
-            kept = [lights[k] for k in np.flatnonzero(bright)]
+            kept = [lights[k] for k in np.flatnonzero(bright).tolist()]
             return _settled(seen, forward, kept, albedo) if kept else ()
         if found.unexplained < least:
             best, least = tuple(lights), found.unexplained
@@ -138,7 +138,7 @@ def _place_steps(problem: LightingProblem, found: LightingSolution, slopes: Sequ
         specular=np.concatenate([problem.specular, slopes[1]], axis=2),
     )
     rows, light = wider.rows(), np.concatenate([found.light, np.zeros((m, 3))])
-    shaded = [each @ light.astype(np.float32) for each in (rows.diffuse, rows.specular)]
+    shaded = rows.diffuse @ light.astype(np.float32), rows.specular @ light.astype(np.float32)
     maps = found.diffuse[rows.texel], found.specular[rows.texel, None]
     residual = rows.colour - form_image(0.0, maps[0], shaded[0], maps[1], shaded[1])
     weight, sigma = active_weight(rows.weight, rows.clipped, residual, True)
@@ -152,7 +152,8 @@ def _place_steps(problem: LightingProblem, found: LightingSolution, slopes: Sequ
     tied = tied.reshape(-1, 3 * k + m)
     system = tied.T @ remaining.reduced @ tied
     system += 1e-6 * float(np.diag(system).mean()) * np.eye(len(system))
-    return np.linalg.solve(system, tied.T @ remaining.right)[3 * k :].reshape(-1, 3)
+    steps = np.linalg.solve(system, tied.T @ remaining.right)[3 * k :].reshape(-1, 3)
+    return np.asarray(steps, dtype=np.float64)
 
 
 def _sparse(

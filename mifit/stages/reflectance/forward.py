@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,7 +116,7 @@ class Forward:
         steps = [self.appearance.trace(mesh, _surface_points(seen, t)) for t, mesh in enumerate(self.meshes)]
         transfer = None
         if self.model.needs_shadows:
-            transfer = VertexTransfer.joined([s.transfer for s in steps], seen.step)
+            transfer = VertexTransfer.joined([cast(VertexTransfer, s.transfer) for s in steps], seen.step)
         visible = tuple(
             np.stack(bits, axis=1)[:, seen.step].ravel() for bits in zip(*(s.visible for s in steps), strict=True)
         )
