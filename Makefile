@@ -23,7 +23,7 @@ demo:
 	@echo "The command is $(BIN)/mifit; two clips of a face: $(BIN)/mifit fit left.mp4 right.mp4 --out me"
 
 test:
-	@.ci/setup test cluster view bench
+	@.ci/setup test cluster view bench sound
 	$(BIN)/ruff check .
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
