@@ -273,7 +273,7 @@ def fit_als(
     solved = fit_maps(surface, forward, found, image, config, progress)
     maps, energy = solved.maps, {"lighting": found.energy}
     if not config.robust:
-        found, maps, energy = alternate(surface, forward, found, maps, prior, albedo, config, progress)
+        found, maps, energy = alternate(surface, forward, found, maps, image, albedo, config, progress)
     return Fitted(
         forward.under(found.light, found.ambient),
         maps,
