@@ -31,7 +31,7 @@ from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
 from mifit.result.ownership import locked
 from mifit.result.record import R
-from mifit.result.writing import add_timestep, write_remarks
+from mifit.result.writing import add_timestep
 from mifit.stages.fit_geometry import fit_pose_expression
 from mifit.stages.geometry.refine import texture_reference
 from mifit.stages.normals.refine_mesh import MeshRefiner
@@ -362,8 +362,6 @@ def track_into(
         ):
             result = extend(result, frame, refiner, digests[frame.timestep], room)
             add_timestep(result, folder, frame.timestep)
-        if timesteps:
-            write_remarks(result, folder)
     return result
 
 

@@ -63,12 +63,6 @@ def add_timestep(result: Result, folder: Path, timestep: int) -> None:
         _write_document(result, new)
 
 
-def write_remarks(result: Result, folder: Path) -> None:
-    """Write ``result.json`` anew, whose reports say more than before; all else of the result is in its folder."""
-    with replacing_files(folder) as new:
-        _write_document(result, new)
-
-
 def _write_document(result: Result, folder: Path) -> None:
     write_text(folder / "result.json", json.dumps(_document(result), indent=1, allow_nan=False) + "\n")
 
