@@ -51,9 +51,9 @@ UNKNOWABLE = {
 }  # fmt: skip
 """What no image tells; docs/limits.md says why, and what it costs."""
 SAID = {
-    "inches": 'lengths of the cameras are in inches, the capture says one is 10 mm; correct "units"',
+    "inches": "lengths of the cameras are in inches, the capture says one is 10 mm; multiply the translations by 2.54",
     "feet": "multiply the translations by 30.48",
-    "lengths x 10": "lengths of the cameras are in millimetres",
+    "lengths x 10": 'in millimetres, the capture says one is 10 mm; correct "units" in transforms.json, or',
     "all mirrored": ", or all cameras: images are mirrored",
     "one late": "camera right is 1 timestep late",
     "one turned, pitch": "camera left or right",

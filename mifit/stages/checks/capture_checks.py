@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.capture import Capture
+from mifit.capture.transforms import UNITS_MM as FILE_UNITS_MM
 from mifit.core.camera import Camera
 from mifit.core.diagnostics import Diagnostic, worst_first
 from mifit.morphable import MorphableModel
@@ -181,9 +182,12 @@ def _size_diagnostics(right: Explanation, unit_mm: float) -> list[Diagnostic]:
     unit = min(UNITS_MM, key=lambda name: abs(np.log(size * UNITS_MM[name] / unit_mm)))
     factor = UNITS_MM[unit] / unit_mm
     if abs(np.log(size * factor)) <= np.log(UNIT_SPREAD):
+        named = UNITS_MM[unit] in FILE_UNITS_MM.values()
         text = (
             f"the face is {size:.3g} times a human one: lengths of the cameras are in {unit}, the capture says one is "
-            f'{unit_mm:g} mm; correct "units" in transforms.json, or multiply the translations by {factor:g}'
+            f"{unit_mm:g} mm; "
+            + ('correct "units" in transforms.json, or ' if named else "")
+            + f"multiply the translations by {factor:g}"
         )
     else:
         text = (
