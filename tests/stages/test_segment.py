@@ -12,6 +12,7 @@ from stages.memory_capture import make_capture
 from mifit.config import ReflectanceConfig
 from mifit.core.estimate import GeometryEstimate, Label, ReflectanceEstimate, Report, hidden
 from mifit.core.image import linear_to_srgb, srgb_to_linear
+from mifit.core.process import one_blas_thread
 from mifit.morphable import MorphableModel
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface
@@ -91,6 +92,7 @@ def painted(head, kinds: dict[tuple[str, int], str], lift: dict[tuple[str, int],
     return capture.changed(change), areas
 
 
+@one_blas_thread()
 def labels_of(head, capture) -> dict[tuple[str, int], np.ndarray]:
     model, original = head
     surface = Surface(capture, model, geometry_of(model, original), CAMERAS, 128, whole=True)
