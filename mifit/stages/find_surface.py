@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
+ROUNDS, RESTS = 6, 0.25
+"""Rounds of the coarse levels at the most, and the movement that ends them, in parallax of a pixel."""
 SETTLING = 2
 """Further sweeps at the finest level, at the most, until it has."""
 FINEST_AGAIN = 2
@@ -76,8 +78,8 @@ def find_surface(
     Notes
     -----
     Coarse to fine: at every level the texels of the current surface are moved along their normals to where the views
-    agree best (`surface.sweep`), and the mesh follows by sparse least squares (`surface.displace`). Where landmarks
-    are biased, pose and expression of the timesteps follow the images too (`surface.align_timesteps`).
+    agree best (`surface.sweep`), and the mesh follows by sparse least squares (`surface.displace`). The coarse levels are
+    swept again until the surface rests: a head far from the model's span takes several rounds. Where landmarks are biased, pose and expression of the timesteps follow the images too (`surface.align_timesteps`).
     """
     began = time.perf_counter()
     config = config or SurfaceConfig()
@@ -95,7 +97,13 @@ def find_surface(
     tries = (TRIES if len(geometry.timesteps) == 1 else 1) * (config.refit and beyond)
     coarse, finest = levels[:-1], levels[-1:]
     spanned, over_lids = [*levels, *finest * FINEST_AGAIN], [(config.finest, CLOSED_LAYERS), *finest]
-    total = len(levels) + SETTLING + (len(coarse) + len(spanned) + SHADING_ROUNDS) * tries + len(over_lids) * beyond
+    total = (
+        len(coarse) * ROUNDS
+        + 1
+        + SETTLING
+        + (len(coarse) + len(spanned) + SHADING_ROUNDS) * tries
+        + len(over_lids) * beyond
+    )
     search = Search(capture, model, cameras, resolution, pairs, config, progress, total, beyond)
     last = search.descend(Reached.at(geometry), coarse)
     between: list[float] = []  # without and with it
@@ -122,6 +130,13 @@ def find_surface(
         if refit:
             last = other
             break
+    rounds = 1
+    while coarse and rounds < ROUNDS:  # each round sees further, from where the last one has brought the surface
+        before = last.world
+        last, rounds = search.descend(Reached.at(last.estimate), coarse), rounds + 1
+        step = np.linalg.norm(last.world - before, axis=2)[:, np.unique(model.faces[model.face_mask])]
+        if float(np.sqrt(np.mean(step**2))) < RESTS * resolution.pixel / resolution.parallax:
+            break
     last = search.descend(last, finest)
     again = 0
     while again < SETTLING and last.outcome is not Outcome.CONVERGED:
@@ -144,8 +159,9 @@ def find_surface(
         "name": "surface",
         "outcome": last.outcome.value,
         "moved_last_mm": last.moved * capture.unit_mm,
-        "levels": [level for level, _ in (*levels, *finest * again, *over_lids * covering)],
+        "levels": [level for level, _ in (*coarse * rounds, *finest * (1 + again), *over_lids * covering)],
         "matched": last.matched,
+        "rounds": rounds,
         "refitted": refit,
         "between_views": between,
         "stiffness": last.stiffness,
