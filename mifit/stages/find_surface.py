@@ -78,8 +78,9 @@ def find_surface(
     Notes
     -----
     Coarse to fine: at every level the texels of the current surface are moved along their normals to where the views
-    agree best (`surface.sweep`), and the mesh follows by sparse least squares (`surface.displace`). The coarse levels are
-    swept again until the surface rests: a head far from the model's span takes several rounds. Where landmarks are biased, pose and expression of the timesteps follow the images too (`surface.align_timesteps`).
+    agree best (`surface.sweep`), and the mesh follows by sparse least squares (`surface.displace`). The coarse
+    levels are swept again until the surface rests: a head far from the model's span takes several rounds. Where
+    landmarks are biased, pose and expression of the timesteps follow the images too (`surface.align_timesteps`).
     """
     began = time.perf_counter()
     config = config or SurfaceConfig()

@@ -162,7 +162,9 @@ def test_the_estimate_is_consistent_in_itself(model, found):
         np.testing.assert_allclose(found.vertices[k], expected, atol=1e-4)
 
 
-def test_the_skin_does_not_intersect_itself(model, start, found):
+def test_the_skin_does_not_intersect_itself(model, bumpy, start):
+    """Of the search alone: lips that are closed may fold behind their corners, where nothing shows."""
+    found = find_surface(bumpy, model, start, BOTH, SurfaceConfig(close_lips=False))
     eyes = np.concatenate(eyeballs(model))
     skin = model.faces[~np.isin(model.faces, eyes).any(1)]
     before, after = (intersections(10.0 * g.vertices[0], skin) for g in (start, found))
