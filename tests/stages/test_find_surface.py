@@ -483,6 +483,7 @@ def test_the_finest_sweep_is_repeated_until_the_surface_has_settled(model, bumpy
     def swept(count: int, settling: int) -> dict:
         monkeypatch.setattr("mifit.stages.find_surface.sweeps", lambda *_: [(0, 6)] * count)
         monkeypatch.setattr("mifit.stages.find_surface.SETTLING", settling)
+        monkeypatch.setattr("mifit.stages.find_surface.ROUNDS", 1)
         return find_surface(bumpy, model, start, BOTH).report.details["phases"][-1]
 
     once, again, settled = swept(1, 0), swept(1, 2), swept(5, 2)
