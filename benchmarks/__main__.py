@@ -36,7 +36,9 @@ FULL = (
     ("mutations", []),
 )
 NEED_SHARED = ("foreign", "ablation", "speed")
-README = Path(__file__).resolve().parents[1] / "README.md"
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ROOT / "README.md", ROOT / "docs" / "results.md"
+"""Pages that quote tables between marks."""
 
 
 def main() -> int:
@@ -51,7 +53,8 @@ def main() -> int:
         done = subprocess.run([sys.executable, "-m", f"benchmarks.{name}", *options], check=False)
         print(f"{name}: {time.perf_counter() - started:.0f} s, exit code {done.returncode}", file=sys.stderr)
         failed += [name] * bool(done.returncode)
-        renew_tables(README, RESULTS)
+        for page in PAGES:
+            renew_tables(page, RESULTS)
     return 1 if failed else 0
 
 

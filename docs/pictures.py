@@ -1,9 +1,9 @@
 """The pictures of the pages, made from fits of heads whose licences allow it.
 
-    python docs/pictures.py [--size 512] [--only hero gallery light eyes]
+    python docs/pictures.py [--size 512] [--only hero gallery light sides]
 
-Fits the shared captures of the Perry-Smith scan (CC-BY 3.0) and of Digital Emily (MIT) into ``out/pictures`` where no result is
-there yet, and writes ``docs/images``. People's photographs stay out.
+Fits the shared captures of the Perry-Smith scan (CC-BY 3.0) and of Digital Emily (MIT) into ``out/pictures`` where
+there is no result yet, and writes ``docs/images``. People's photographs stay out.
 """
 
 from __future__ import annotations
@@ -65,7 +65,9 @@ class Head:
         surface = visible_surface(self.result, view, 0)
         return on_white(surface.image(values(surface_material(self.result, surface, 0))))[self.box]
 
-    def lit(self, environment: str | None = None, rotate: float = 0.0, camera: Camera | None = None) -> NDArray[np.uint8]:
+    def lit(
+        self, environment: str | None = None, rotate: float = 0.0, camera: Camera | None = None
+    ) -> NDArray[np.uint8]:
         """The third view, or another, in the capture's light or under an environment."""
         result = self.result
         if environment is not None:
@@ -102,7 +104,7 @@ def clay(surface: object, normals: NDArray, faces: NDArray) -> NDArray[np.uint8]
     """Grey shading of a traced mesh by a light beside the camera."""
     normal = (normals[faces[surface.face]] * surface.weights[..., None]).sum(axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    light = surface.view + [0.3, 0.5, 0.0]
+    light = surface.view + np.float32([0.3, 0.5, 0.0])
     light /= np.linalg.norm(light, axis=1, keepdims=True)
     shade = 0.08 + 0.6 * np.clip((normal * light).sum(axis=1), 0.0, 1.0)
     return on_white(surface.image(np.repeat(shade[:, None], 3, axis=1)))
@@ -137,13 +139,12 @@ def page(rows: list[NDArray], path: Path) -> None:
 def strip(head: Head) -> NDArray[np.uint8]:
     """Two photographs in; albedo, specular reflection, normals, mesh and scan, relit."""
     rotation = head.capture.camera(head.third).world_to_camera[:3, :3]
-    linear = ((0.5 + 0.5 * np.float32([1, -1, -1])) * 0 + 1).astype(np.float32)
     pictures = {
         "in": head.photograph(head.cameras[0]),
         "in ": head.photograph(head.cameras[1]),
         "diffuse albedo": head.shown(lambda m: m.diffuse),
         "specular albedo": head.shown(lambda m: np.repeat(8.0 * m.specular[:, None], 3, axis=1)),
-        "normals": head.shown(lambda m: (0.5 + 0.5 * (m.normal @ rotation.T) * [1, -1, -1]) ** 2.2 * linear),
+        "normals": head.shown(lambda m: (0.5 + 0.5 * (m.normal @ rotation.T) * [1, -1, -1]) ** 2.2),
         "mesh": head.mesh(),
         "scan": head.scan(),
         "relit": head.lit("sunset"),
@@ -172,7 +173,8 @@ def light(size: int, frames: int = 24, height: int = 260) -> None:
     """A light that turns about a head, as a small moving picture."""
     head = Head("scan_city", size)
     view, box = head.capture.camera(head.third), head.box
-    turned = head.result.relight(SHARED / "hdri" / "sunset.hdr", rotations=[360.0 * k / frames for k in range(frames)], exposure="auto")
+    turns = [360.0 * k / frames for k in range(frames)]
+    turned = head.result.relight(SHARED / "hdri" / "sunset.hdr", rotations=turns, exposure="auto")
     images = []
     for lit in turned:
         picture = on_white(lit.render(view, 0, samples=1))[box]

@@ -18,10 +18,11 @@ ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
 
 
-def test_the_readme_quotes_the_benchmarks_tables(tmp_path):
-    page = Path(shutil.copy(README, tmp_path))
-    assert "captures" in renew_tables(page, RESULTS)
-    assert page.read_text() == README.read_text()
+@pytest.mark.parametrize(("page", "table"), [(README, "foreign_short"), (ROOT / "docs" / "results.md", "foreign")])
+def test_pages_quote_the_benchmarks_tables(page, table, tmp_path):
+    copied = Path(shutil.copy(page, tmp_path))
+    assert table in renew_tables(copied, RESULTS)
+    assert copied.read_text() == page.read_text()
 
 
 def test_tables_are_renewed_between_their_marks_alone(tmp_path):

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [*sorted((ROOT / "docs").glob("stage*.md")), ROOT / "docs" / "paper.md", ROOT / "README.md"]
+METHOD = ("geometry", "surface", "reflectance", "normals", "paper")
+PAGES = [*(ROOT / "docs" / f"{name}.md" for name in METHOD), ROOT / "README.md"]
 FIGURE = re.compile(
     r"(?<![\w.])(\d+(?:\.\d+)?)(?: to (\d+(?:\.\d+)?))?\s?(dB|mm|millimetres|degrees|°|seconds|s|ms|%)(?!\w)"
 )
