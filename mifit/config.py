@@ -202,7 +202,7 @@ class SurfaceConfig:
     """The surface beyond the model's span (``stages.find_surface``); needs two views or more."""
 
     enabled: bool = flag(True, "move the surface to where all views agree; false: it stays in the model's span")
-    reach: float = number(8.0, "distance from the model's surface that is searched", "millimetres", above=0, most=100)
+    reach: float = number(4.0, "distance from the model's surface that is searched", "millimetres", above=0, most=100)
     stiffness: float = number(
         2.0,
         "least resistance of the displacements to bending; what the images show raises it",

@@ -58,16 +58,22 @@ def add_rate(p: argparse.ArgumentParser) -> None:
     p.add_argument("--fps", type=rate, default=12.0, help="timesteps per second of what moves (default: 12)")
 
 
-def writes(*options: str) -> Callable[[Command], Command]:
+def writes(*options: str, outside: str = "") -> Callable[[Command], Command]:
     """Make a command refuse to write over files: without ``--force`` all, with it those that it reads.
 
     ``options`` name what its user says to write; a file, or a folder with something in it, is refused before any work.
+    Outside the folder of the option ``outside`` a PNG with coverage, as a render is, may be replaced: a view is rendered
+    again and again.
     """
 
     def decorate(command: Command) -> Command:
         @functools.wraps(command)
         def run(arguments: Namespace) -> int | None:
-            with overwriting(arguments.force):
+            home = getattr(arguments, outside, None) if outside else None
+            free = (
+                home is not None and _is_render(arguments.out) and home.resolve() not in arguments.out.resolve().parents
+            )
+            with overwriting(arguments.force or free):
                 for out in filter(None, (getattr(arguments, option, None) for option in options)):
                     check_empty(out, arguments.force) if out.is_dir() else check_overwriting(out)
                 return command(arguments)
@@ -75,6 +81,15 @@ def writes(*options: str) -> Callable[[Command], Command]:
         return run
 
     return decorate
+
+
+def _is_render(path: Path) -> bool:
+    """Whether a file is a PNG with an alpha channel."""
+    if not path.is_file() or path.is_symlink():
+        return False
+    with open(path, "rb") as stream:
+        head = stream.read(26)
+    return head[:8] == b"\x89PNG\r\n\x1a\n" and head[25:] == b"\x06"
 
 
 def check_empty(folder: Path, force: bool = False) -> None:
