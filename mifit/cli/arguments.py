@@ -62,8 +62,7 @@ def writes(*options: str, outside: str = "") -> Callable[[Command], Command]:
     """Make a command refuse to write over files: without ``--force`` all, with it those that it reads.
 
     ``options`` name what its user says to write; a file, or a folder with something in it, is refused before any work.
-    Outside the folder of the option ``outside`` a PNG with coverage, as a render is, may be replaced: a view is rendered
-    again and again.
+    Outside the folder of the option ``outside`` a PNG with coverage may be replaced, as renders are made again.
     """
 
     def decorate(command: Command) -> Command:
