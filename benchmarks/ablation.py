@@ -120,14 +120,6 @@ PARTS = (
     ),
     Part("stage 2: robust weights and what needs them", {"reflectance.robust": False}),
     Part("stage 2: relief in the light", {"reflectance.relief": False}),
-    Part(
-        "stage 2: film of the eyes",
-        patches={
-            "mifit.stages.infer_reflectance.reflects": lambda lobe: False,
-            "mifit.output.surface.reflects": lambda lobe: False,
-        },
-        step="reflectance",
-    ),
     Part("stage 2: difference term", {"reflectance.specular_difference_weight": 0.0}),
     Part("stage 3: off", without=("normals", "mesh", "residual")),
     Part("stage 3: robust weights", {"normals.robust": False}),

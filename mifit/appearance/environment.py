@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.arrays import aligned, on_device, stored
-from mifit.appearance.cornea import CORNEA
 from mifit.appearance.kernels import fresnel_factor, light_transfer, normalization, prepare_exponent
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.reception import reception
@@ -315,13 +314,11 @@ class EnvironmentLight:
         view: NDArray,
         lobe: Lobe,
         albedo: NDArray,
-        eye: NDArray[np.bool_] | None = None,
         group: tuple[NDArray, int] | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Diffuse and specular radiance (N, 3) of points at unit albedo; ``albedo`` (V, 3) is that of the vertices.
 
-        Shadows belong to the mesh; bent normals change what an open surface would receive. Where ``eye`` (N,) says so
-        the lobe is the cornea's. ``group`` as in `specular`.
+        Shadows belong to the mesh; bent normals change what an open surface would receive. ``group`` as in `specular`.
         """
         soft, whole = self.at_vertices(scene, albedo)
         diffuse = interpolate(soft, scene.faces, points.face, points.barycentric) / np.float32(np.pi)
@@ -329,10 +326,6 @@ class EnvironmentLight:
         specular = self.specular(_parts(self.image).soft, scene, points, normals, view, lobe, radiosity, group)
         matt, glossy = self.lamps(scene, points, normals, view, lobe)
         specular += glossy
-        rows = np.flatnonzero(eye if eye is not None else ())
-        if len(rows):
-            wet = points.take(rows), normals[rows], view[rows]
-            specular[rows] = self.specular(self.image, scene, *wet, CORNEA, radiosity)
         return (diffuse * self.bend(normals, points.normal) + matt).astype(np.float32), specular
 
 

@@ -148,10 +148,6 @@ class ReflectanceEstimate:
     specular_confidence : (S, S) float32 or None
         `confidence` of the specular map: 0 as well where a texel was seen but told nothing of its specular albedo. None
         in results of older versions.
-    lit_eyes : (S, S, 3) float32 or None
-        On eyes, what stands for ``diffuse`` in the capture's own light: with the highlights that its images show, which
-        nothing tells apart from that light. 0 elsewhere; None under any other light, whose highlights are the cornea's
-        (`appearance.cornea`), in results of older versions, and for models whose eyes have no maps.
     """
 
     diffuse: NDArray
@@ -165,13 +161,11 @@ class ReflectanceEstimate:
     labelled: tuple[tuple[str, int], ...] = ()
     relief: NDArray | None = None
     specular_confidence: NDArray | None = None
-    lit_eyes: NDArray | None = None
 
     @property
     def lit_diffuse(self) -> NDArray:
         """(S, S, 3) what the diffuse light of this illumination is multiplied by: albedo, and relief where known."""
-        lit = self.diffuse if self.relief is None else self.diffuse * self.relief[..., None]
-        return lit if self.lit_eyes is None else np.where(self.lit_eyes.any(axis=-1, keepdims=True), self.lit_eyes, lit)
+        return self.diffuse if self.relief is None else self.diffuse * self.relief[..., None]
 
     def label(self, camera: str, timestep: int) -> NDArray | None:
         """The labels of one image; None where there are none."""

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.cornea import REFLECTANCE, shade_eyes
 from mifit.appearance.environment import EnvironmentLight
 from mifit.appearance.formation import Appearance, form_image
 from mifit.appearance.occlusion import MeshPoints
@@ -20,7 +19,7 @@ from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.sh import basis
 from mifit.core.uv import sample_map
-from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials
+from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 from mifit.render.first_hits import occluding_mesh
 
 if TYPE_CHECKING:
@@ -124,15 +123,12 @@ class SampledMaterial:
         Unit, world space: the refined ones and the mesh's.
     diffuse : (N, 3), specular : (N,) float32
         Albedo, 0..1.
-    eye : (N,) bool
-        On an eyeball under its film of tears.
     """
 
     normal: NDArray[np.float32]
     base: NDArray[np.float32]
     diffuse: NDArray[np.float32]
     specular: NDArray[np.float32]
-    eye: NDArray[np.bool_]
 
 
 def surface_material(reconstruction: Result, surface: VisibleSurface, timestep: int) -> SampledMaterial:
@@ -153,10 +149,8 @@ def surface_material(reconstruction: Result, surface: VisibleSurface, timestep: 
     uv = interpolate(model.uv, model.faces_uv, surface.face[inside], surface.weights[inside])
     diffuse[inside] = sample_map(maps.diffuse, uv)
     specular[inside] = sample_map(maps.specular, uv)
-    eye = eye_faces(reconstruction)[surface.face]
-    specular[eye] = REFLECTANCE
     normal[inside] = normalize(sample_map(maps.normal, uv)) @ rotation.T
-    return SampledMaterial(normal, base, diffuse, specular, eye)
+    return SampledMaterial(normal, base, diffuse, specular)
 
 
 def render_local(
@@ -188,7 +182,7 @@ def shade_methods(
         assert reflectance is not None
         model, vertices = reconstruction.model, reconstruction.geometry.vertices[reconstruction.index(timestep)]
         material = material or surface_material(reconstruction, surface, timestep)
-        base, eye = material.base, material.eye
+        base = material.base
         appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: _look_up(model, surface, m)))
         points = MeshPoints(surface.points, base, surface.face, surface.weights)
         mesh = occluding_mesh(vertices, model.faces)
@@ -196,10 +190,10 @@ def shade_methods(
             turn = reconstruction.environment_rotation
             light = EnvironmentLight(reconstruction.environment, np.eye(3) if turn is None else turn)
             albedo, lobe, view = _vertex_albedo(reconstruction), appearance.lobe, surface.view
-            shaded = light.shade(mesh.scene, points, material.normal, view, lobe, albedo, eye, surface.group)
+            shaded = light.shade(mesh.scene, points, material.normal, view, lobe, albedo, surface.group)
         else:
             occlusion = appearance.trace(mesh, points)
-            shaded = shade_eyes(appearance, eye, material.normal, base, surface.view, occlusion, surface.points)
+            shaded = appearance.shade_bent(material.normal, base, surface.view, occlusion, surface.points)
         ambient = np.float32(reflectance.illumination.ambient)
         for method in finer:
             specular = material.specular[:, None] if method == "full" else np.float32(0.0)

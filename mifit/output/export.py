@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from mifit.appearance.cornea import CORNEA, REFLECTANCE
 from mifit.core.arrays import write_ply
 from mifit.core.files import check_overwriting, write_bytes, write_text
 from mifit.core.image import encode_png, to_8_bit, write_image
 from mifit.core.mesh import part_of, split_at_seams, tangent_space_map, vertex_normals
 from mifit.errors import InputError
-from mifit.output.gltf import CORNEA_ROUGHNESS, write_glb
-from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials
+from mifit.output.gltf import write_glb
+from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
     from mifit.result import Result
@@ -108,7 +107,7 @@ def export(
 
 
 def _write_obj(reconstruction: Result, path: Path, timestep: int, factor: float, units: str) -> None:
-    """OBJ with ``vt`` and ``vn``; what has maps, eyes and the rest are groups with a material each."""
+    """OBJ with ``vt`` and ``vn``; what has maps and the rest are groups with a material each."""
     model, i = reconstruction.model, reconstruction.index(timestep)
     vertices = reconstruction.geometry.vertices[i]
     normals = vertex_normals(vertices, model.faces)
@@ -129,7 +128,6 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int, factor: float,
     grey = albedo[rest.origin].mean(0) if rest else np.full(3, 0.5)
     colour = " ".join(f"{c:.5f}" for c in np.clip(grey, 0, 1))
     specular = " ".join([f"{OBJ_SPECULAR:g}"] * 3)
-    film, eyes = " ".join([f"{REFLECTANCE:.5f}"] * 3), eye_faces(reconstruction, skin=True)
     write_text(
         path.with_suffix(".mtl"),
         # Pr, of physically based programs, is glTF's roughness. Blender reads a normal map from map_Bump, and takes its
@@ -137,8 +135,6 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int, factor: float,
         f"newmtl skin\nillum 2\nKd 1 1 1\nKs {specular}\nNs {reconstruction.lobe.typical:.6g}\n"
         f"Pr {math.sqrt(reconstruction.lobe.roughness):.4f}\nmap_Kd {stem}_diffuse.png\nmap_Ks {stem}_specular.png\n"
         f"norm {stem}_normal.png\nmap_Bump -bm 1.0 {stem}_normal.exr\n\n"
-        f"newmtl eyes\nillum 2\nKd 1 1 1\nKs {film}\nNs {CORNEA.typical:.6g}\nPr {CORNEA_ROUGHNESS}\n"
-        f"map_Kd {stem}_diffuse.png\n\n"
         f"newmtl rest\nillum 1\nKd {colour}\nKs 0 0 0\n",
     )
     codes = to_8_bit(albedo) / 255.0
@@ -149,9 +145,7 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int, factor: float,
     ]
     lines += [f"vt {u:.7g} {v:.7g}" for u, v in model.uv.tolist()]
     lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in normals.tolist()]
-    for name, selected in (("skin", mapped & ~eyes), ("eyes", eyes), ("rest", ~mapped)):
-        if name == "eyes" and not eyes.any():
-            continue
+    for name, selected in (("skin", mapped), ("rest", ~mapped)):
         lines += [f"g {name}", f"usemtl {name}"]
         for f, t in zip((model.faces[selected] + 1).tolist(), (model.faces_uv[selected] + 1).tolist(), strict=True):
             lines.append("f " + " ".join(f"{a}/{b}/{a}" for a, b in zip(f, t, strict=True)))

@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import mifit
-from mifit.appearance.cornea import REFLECTANCE
 from mifit.core.files import replacing
 from mifit.core.image import encode_png, to_8_bit
 from mifit.core.mesh import SplitMesh, part_of, split_at_seams, tangent_space_map, tangents, vertex_normals
-from mifit.morphable.openings import eyeball_faces
 from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
@@ -31,11 +29,9 @@ _KINDS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 DIELECTRIC_F0 = 0.04
 """Reflectance at normal incidence of glTF's dielectric, which KHR_materials_specular scales."""
-CORNEA_ROUGHNESS = 0.05
-"""Of the film of tears on an eye, in glTF's terms: as smooth as viewers bear."""
 STILL = 1e-4
 """Metres at full weight by which a vertex moves so little that a morph target leaves it out."""
-SKIN, REST, EYES = range(3)
+SKIN, REST = range(2)
 """Materials, in their order."""
 
 
@@ -103,8 +99,7 @@ def write_glb(
     The head is in metres, in object space, under a node that holds its pose; the fitted cameras stand beside it.
     Faces with a place in the atlas have the maps: base colour, tangent-space normals, and the specular albedo through
     KHR_materials_specular. glTF has GGX lobes, so the Blinn-Phong exponent m becomes alpha = sqrt(2 / (m + 2)), the
-    usual relation, and roughness = sqrt(alpha). Eyeballs have a material of their own, which is that of the skin under
-    the clear coat of a cornea (KHR_materials_clearcoat). The other faces have vertex colours. The model's expressions
+    usual relation, and roughness = sqrt(alpha). The other faces have vertex colours. The model's expressions
     are morph targets, with the timestep's coefficients as weights. Recovered lighting is in the scene's ``extras``:
     glTF has no spherical harmonics. Node and mesh are called as the file. Morph targets have ARKit's names where the
     model has its shapes; where a coefficient runs from 0 to a bound, the weight runs from 0 to 1. They hold only the
@@ -141,8 +136,7 @@ def write_glb(
     albedo = vertex_materials(reconstruction, skin=True)[:, :3]
     primitives = []
     mapped = mapped_faces(reconstruction)
-    balls = mapped & eyeball_faces(model)
-    parts = {SKIN: mapped & ~balls, REST: ~mapped, EYES: balls}
+    parts = {SKIN: mapped, REST: ~mapped}
     for material, selected in parts.items():
         if selected.any():
             part = part_of(mesh, selected)
@@ -171,7 +165,6 @@ def write_glb(
     materials = [
         skin,
         {"name": "rest", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}},
-        *([_eyes(skin)] if balls.any() else []),
     ]
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"mifit {mifit.__version__}"},
@@ -283,12 +276,6 @@ def _skin(
         },
     }
     return images, textures, skin
-
-
-def _eyes(skin: dict[str, Any]) -> dict[str, Any]:
-    """Material of eyeballs: what the maps show, under a clear coat with the mesh's own smooth normals."""
-    coat = {"clearcoatFactor": REFLECTANCE / DIELECTRIC_F0, "clearcoatRoughnessFactor": CORNEA_ROUGHNESS}
-    return {**skin, "name": "eyes", "extensions": {**skin["extensions"], "KHR_materials_clearcoat": coat}}
 
 
 def _animation(

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.cornea import CORNEA, REFLECTANCE
 from mifit.appearance.lobe import Lobe
 from mifit.core.arrays import write_ply
 from mifit.core.camera import Camera
@@ -26,7 +25,7 @@ from mifit.core.sh import SHLighting
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.output.deferred import render_local, visible_surface
-from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials
+from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 from mifit.render.description import Parameter, to_mitsuba, to_xml
 from mifit.render.sensor import sensor_description
 from mifit.render.variant import check_active_variant
@@ -57,7 +56,7 @@ def write_scene(
     lobe's rise and the refined normals as slopes, and the light is ``shenv``. In ``NAME_stock.xml`` the skin blends
     ``diffuse`` with a ``roughconductor`` of Beckmann roughness sqrt(2 / (m + 2)), which doesn't rise, under a
     ``normalmap``, and the light is a lat-long ``envmap``. A relit reconstruction has its environment as ``envmap`` in
-    both, and its eyes are under a film of tears: their lobe is the cornea's. A compact light is a stock
+    both. A compact light is a stock
     ``directional`` or, where it is near, ``point`` emitter in both. The ambient term stands for light that local
     shading leaves out, such as interreflection, so a path-traced scene doesn't have it. A camera whose pixels aren't
     square is mifit's ``pinhole`` in ``NAME.xml``; in ``NAME_stock.xml`` it has square ones
@@ -183,9 +182,9 @@ def _write_files(reconstruction: Result, files: Path, timestep: int, method: Met
 
 
 def _parts(reconstruction: Result) -> dict[str, NDArray[np.bool_]]:
-    """(F,) faces of each shape, by its name: with maps, an eye's, and without maps."""
-    mapped, eyes = mapped_faces(reconstruction), eye_faces(reconstruction)
-    return {"face": mapped & ~eyes, "eyes": eyes, "rest": ~mapped}
+    """(F,) faces of each shape, by its name: with maps, and without maps."""
+    mapped = mapped_faces(reconstruction)
+    return {"face": mapped, "rest": ~mapped}
 
 
 def _slopes(
@@ -263,7 +262,7 @@ def scene_description(
     """The scene of `write_scene` as a plain dictionary (`render.description`), its files in the folder ``files``.
 
     Ids are ours, not the user's: ``skin`` and ``light`` (maps and lighting), ``light_1`` ... (compact lights),
-    ``face``, ``eyes`` and ``rest`` (shapes), and ``camera_NAME`` (see `sensor_ids`).
+    ``face`` and ``rest`` (shapes), and ``camera_NAME`` (see `sensor_ids`).
     """
     if method == "pca":
         reconstruction = replace(reconstruction, reflectance=None, normals=None)
@@ -273,10 +272,7 @@ def scene_description(
         scene[name] = sensor_description(camera.with_square_pixels() if stock else camera, samples)
     scene["skin"] = _skin(reconstruction, files, stock)
     scene["face"] = _shape(f"{files}/face.ply", {"type": "ref", "id": "skin"})
-    parts = _parts(reconstruction)
-    if parts["eyes"].any():
-        scene["eyes"] = _shape(f"{files}/eyes.ply", _eyes(files, stock, method))
-    if parts["rest"].any():
+    if _parts(reconstruction)["rest"].any():
         scene["rest"] = _shape(f"{files}/rest.ply", _vertex_albedo(stock))
     if stock or reconstruction.environment is not None:
         scene["light"] = {"type": "envmap", "filename": f"{files}/environment.exr"}
@@ -316,14 +312,9 @@ def _skin(reconstruction: Result, files: str, stock: bool) -> dict[str, Any]:
     return {**found, "normal_correction": _texture(f"{files}/slopes.exr")}
 
 
-def _eyes(files: str, stock: bool, method: Method) -> dict[str, Any]:
-    """The BSDF of eyes: the diffuse map under a film of tears, with the mesh's own smooth normals."""
-    return _mapped(CORNEA, files, stock, REFLECTANCE if method == "full" else 0.0)
-
-
-def _mapped(lobe: Lobe, files: str, stock: bool, specular: float | None = None) -> dict[str, Any]:
-    """The BSDF of the diffuse map with a lobe, by the specular map unless a number stands for it."""
-    strength = _texture(f"{files}/specular.exr") if specular is None else specular
+def _mapped(lobe: Lobe, files: str, stock: bool) -> dict[str, Any]:
+    """The BSDF of the maps with a lobe."""
+    strength = _texture(f"{files}/specular.exr")
     if stock:
         mirror = {"type": "roughconductor", "material": "none", "distribution": "beckmann", "alpha": lobe.roughness}
         base = {"type": "diffuse", "reflectance": _texture(f"{files}/diffuse_stock.exr", False)}

@@ -16,11 +16,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from mifit.appearance.cornea import reflects
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.mesh_solve import factored_membrane
 from mifit.core.uv import TexelMap, rasterize_uv, sample_map
-from mifit.morphable.openings import eyeball_faces
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
@@ -123,17 +121,6 @@ def mapped_faces(reconstruction: Result) -> NDArray[np.bool_]:
         return model.mapped
     outside = _outside(model, len(reflectance.diffuse))
     return model.mapped if reflectance.diffuse.reshape(-1, 3).take(outside, axis=0).any() else model.face_mask
-
-
-def eye_faces(reconstruction: Result, skin: bool = False) -> NDArray[np.bool_]:
-    """(F,) faces with maps that are an eye's under a film of tears (`appearance.cornea`).
-
-    In the capture's own light, whose highlights are in the maps, there are none; ``skin`` as in `surface_maps`.
-    """
-    model, reflectance = reconstruction.model, reconstruction.reflectance
-    if reflectance is None or not reflects(reflectance.lobe) or (reflectance.lit_eyes is not None and not skin):
-        return np.zeros(len(model.faces), dtype=bool)
-    return mapped_faces(reconstruction) & eyeball_faces(model)
 
 
 @lru_cache(maxsize=4)

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.cornea import CORNEA, REFLECTANCE
 from mifit.core.image import to_8_bit
 from mifit.core.mesh import part_of, split_at_seams, vertex_normals
 from mifit.core.sh import SHLighting, bands, cosine_coefficients
 from mifit.output.figures import jpeg_uri, png_uri
-from mifit.output.surface import eye_faces, mapped_faces, surface_maps, vertex_materials
+from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
     from mifit.result import Result
@@ -24,20 +23,20 @@ def viewer_data(reconstruction: Result, timestep: int) -> str:
     """JSON for the 3D view of one timestep; quantised, for looking at only.
 
     Positions have 16 bits of the bounding sphere, normals 8, texture coordinates 16; the alpha of the vertex
-    colour tells whether a face has maps (1), is an eye with maps (0.5), or has none.
+    colour tells whether a face has maps (1) or none (0).
     """
     model, geometry = reconstruction.model, reconstruction.geometry
     i = reconstruction.index(timestep)
     rotation, translation, scale = geometry.rotation[i], geometry.translation[i], geometry.scale
     vertices = (geometry.vertices[i] - translation) @ rotation / scale
     mesh = split_at_seams(model)
-    # Parts that share no vertex: with maps, eyes with maps, and without.
-    mapped, eyes = mapped_faces(reconstruction), eye_faces(reconstruction, skin=True)
-    parts = [part_of(mesh, selected) for selected in (mapped & ~eyes, eyes, ~mapped)]
+    # Parts that share no vertex: with maps, and without.
+    mapped = mapped_faces(reconstruction)
+    parts = [part_of(mesh, selected) for selected in (mapped, ~mapped)]
     origin = np.concatenate([p.origin for p in parts])
     uv = np.concatenate([p.uv for p in parts])
     starts = np.cumsum([0, *(len(p.origin) for p in parts)])
-    kind = np.repeat([255, 128, 0], np.diff(starts))
+    kind = np.repeat([255, 0], np.diff(starts))
     faces = np.concatenate([p.faces + start for p, start in zip(parts, starts, strict=False)])
     position = vertices[origin]
     normals = vertex_normals(vertices, model.faces)[origin]
@@ -91,7 +90,6 @@ def _lighting(reconstruction: Result) -> dict[str, Any]:
         "lobe_tilt": np.polynomial.polynomial.polyfit(cosines, tilt, 5).tolist(),
         "ambient": float(reconstruction.illumination.ambient),
         "exponent": reconstruction.lobe.typical,
-        "film": [REFLECTANCE, CORNEA.grazing - 1.0, CORNEA.typical],
     }
 
 

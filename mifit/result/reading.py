@@ -280,9 +280,9 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
     diffuse = _read_map(folder / "maps" / "diffuse.exr", 3)
     labels = _labels(folder, document)
 
-    def optional(name: str, channels: int = 1) -> NDArray[np.float32] | None:
+    def optional(name: str) -> NDArray[np.float32] | None:
         path = folder / "maps" / f"{name}.exr"
-        return _read_map(path, channels, len(diffuse)) if path.exists() else None
+        return _read_map(path, 1, len(diffuse)) if path.exists() else None
 
     return ReflectanceEstimate(
         diffuse=diffuse,
@@ -296,7 +296,6 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
         labelled=tuple(labels),
         relief=optional("relief"),
         specular_confidence=optional("specular_confidence"),
-        lit_eyes=optional("lit_eyes", 3),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -151,16 +151,12 @@ class Result:
                 f"{name}: found shape {array.shape} with values {np.min(array):g} to {np.max(array):g}, "
                 f"expected {before.shape} with reflectances 0 to 1"
             )
-        lit_eyes = None if name == "diffuse" else self.reflectance.lit_eyes
-        changes: dict[str, Any] = {name: array, "lit_eyes": lit_eyes}
-        edited = replace(self.reflectance, **changes)
-        return replace(self, reflectance=edited, residual=None)
+        return replace(self, reflectance=replace(self.reflectance, **{name: array}), residual=None)
 
     def with_illumination(self: R, illumination: Illumination) -> R:
         """The same face in another light, taken as it is; see `Reconstruction.relight` for environment maps.
 
-        What the capture's own light left unexplained (``reflectance.relief``, ``residual``) is gone with it, and so are
-        the highlights that its images show on eyes (``reflectance.lit_eyes``).
+        What the capture's own light left unexplained (``reflectance.relief``, ``residual``) is gone with it.
 
         Raises
         ------
@@ -169,7 +165,7 @@ class Result:
         """
         if self.reflectance is None:
             raise InputError("illumination: this result has no reflectance; fit with --until reflectance")
-        reflectance = replace(self.reflectance, illumination=illumination, relief=None, lit_eyes=None)
+        reflectance = replace(self.reflectance, illumination=illumination, relief=None)
         return replace(self, reflectance=reflectance, residual=None, environment=None, environment_rotation=None)
 
     @property

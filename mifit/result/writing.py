@@ -42,7 +42,7 @@ def save(result: Result, folder: Path, write_scene: Callable[[Path], None], forc
         surfaces = _surfaces(result)
         files = [partial(_write_timestep, result, new, timestep, surfaces) for timestep in result.timesteps]
         if result.reflectance is not None:
-            for name in ("diffuse", "specular", "confidence", "relief", "specular_confidence", "lit_eyes"):
+            for name in ("diffuse", "specular", "confidence", "relief", "specular_confidence"):
                 found = getattr(result.reflectance, name)
                 if found is not None:
                     files.append(partial(write_image, new / "maps" / f"{name}.exr", found))

@@ -8,19 +8,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mifit.appearance.cornea import reflects
 from mifit.config import ReflectanceConfig
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report, hidden
 from mifit.core.mesh import interpolate
 from mifit.core.process import one_blas_thread
 from mifit.errors import ConvergenceError
-from mifit.morphable.openings import eyeball_faces
 from mifit.optim import Outcome
 from mifit.progress import Progress, silent
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.als import find_forward, fit_als
-from mifit.stages.reflectance.beneath_film import beneath_the_film
 from mifit.stages.reflectance.fill import blend_unseen, mirrored_coordinates
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.objective import energies
@@ -131,20 +128,9 @@ def infer_reflectance(
         parted = part_relief(model, surface.texels, diffuse, filled.confidence)
         diffuse, relief = parted.skin, parted.relief
         details["spread"] = {"symmetric": parted.symmetric, "sided": parted.sided}
-    lit_eyes = None
-    eye = eyeball_faces(model)[surface.texels.face]
-    if config.robust and eye.any() and reflects(fitted.appearance.lobe):
-        lit = diffuse if relief is None else diffuse * relief[..., None]
-        lit_eyes = np.where(surface.texels.to_map(eye)[..., None], lit, np.float32(0.0))
-        forward = Forward(fitted.appearance, surface.meshes)
-        light = illumination.unknowns, illumination.ambient
-        rows, beneath = beneath_the_film(surface, np.flatnonzero(eye), forward, *light)
-        diffuse = diffuse.copy()
-        diffuse.reshape(-1, 3)[surface.texels.index[rows]] = beneath
     return ReflectanceEstimate(
         diffuse=diffuse,
         relief=relief,
-        lit_eyes=lit_eyes,
         specular=filled.specular,
         confidence=filled.confidence,
         specular_confidence=filled.specular_confidence,

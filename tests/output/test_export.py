@@ -15,11 +15,7 @@ import trimesh
 from mifit.core.image import read_image, srgb_to_linear
 from mifit.core.mesh import part_of, split_at_seams, vertex_normals
 from mifit.errors import InputError
-from mifit.morphable import MorphableModel
-from mifit.morphable.openings import eyeballs
 from mifit.output.export import SUFFIXES, export
-from mifit.reconstruction import Reconstruction
-from tests.output.conftest import mean_geometry
 
 
 def read_glb(path):
@@ -118,29 +114,7 @@ def test_gltf_takes_the_fresnel_rise_over(ball, tmp_path):
     assert specular["specularFactor"] * 0.04 * specular["specularColorFactor"][0] == pytest.approx(0.15)
 
 
-def test_gltf_gives_eyeballs_a_clear_coat(tmp_path):
-    model = MorphableModel.load("builtin:coarse")
-    geometry = mean_geometry(model)
-    result = Reconstruction(model=model, geometry=geometry, config={}, cameras=(), capture_digest="")
-    export(result, "glb", tmp_path / "a.glb")
-    document, read, _ = read_glb(tmp_path / "a.glb")
-    names = [material["name"] for material in document["materials"]]
-    balls = [p for p in document["meshes"][0]["primitives"] if names[p["material"]] == "eyes"]
-    assert len(balls) == 1 and "KHR_materials_clearcoat" in document["extensionsUsed"]
-    eyes, skin = document["materials"][names.index("eyes")], document["materials"][names.index("skin")]
-    coat = eyes["extensions"]["KHR_materials_clearcoat"]
-    assert coat["clearcoatFactor"] * 0.04 == pytest.approx(((1.376 - 1) / (1.376 + 1)) ** 2)
-    assert coat["clearcoatRoughnessFactor"] < 0.1
-    assert "KHR_materials_clearcoat" not in skin["extensions"] and eyes["normalTexture"] == skin["normalTexture"]
-    shown = np.unique(read(balls[0]["attributes"]["POSITION"]), axis=0)
-    expected = model.mean[np.concatenate(eyeballs(model))] * np.float32(model.unit_mm / 1000)
-    np.testing.assert_allclose(shown, np.unique(expected, axis=0), atol=1e-6)
-    assert "TEXCOORD_0" in balls[0]["attributes"]  # iris and sclera are in the maps
-    faces = sum(document["accessors"][p["indices"]]["count"] for p in document["meshes"][0]["primitives"])
-    assert faces == model.faces.size
-
-
-def test_gltf_without_eyeballs_has_no_clear_coat(glb):
+def test_gltf_names_the_extensions_it_uses(glb):
     document = read_glb(glb)[0]
     assert document["extensionsUsed"] == ["KHR_materials_specular"]
     assert [material["name"] for material in document["materials"]] == ["skin", "rest"]

@@ -24,7 +24,6 @@
     uniform sampler2D glossyMap;  // lighting blurred by the lobe, lat-long, square roots
     uniform vec3 eye, keyDirection, irradiance[9];
     uniform float lobeAlbedo[6], lobeTilt[6], glossyScale, ambient, exponent;
-    uniform vec3 film;            // of tears: reflectance along the normal, its rise at grazing angles, exponent
     uniform int mode, light;
     vec3 expand(vec3 n, vec3 c[9]) {
       float x = n.x, y = n.y, z = n.z;
@@ -39,11 +38,10 @@
     }
     vec3 decode(vec3 c) { return mix(c / 12.92, pow((c + 0.055) / 1.055, vec3(2.4)), step(0.04045, c)); }
     void main() {
-      bool face = vColour.a > 0.25, wet = face && vColour.a < 0.75;
+      bool face = vColour.a > 0.5;
       vec3 albedo = face ? decode(texture2D(diffuseMap, vUv).rgb) : decode(vColour.rgb);
       float specular = face ? texture2D(specularMap, vUv).r * float(SPECULAR_SCALE) : 0.0;
-      if (wet) specular = film.x;
-      vec3 objectNormal = normalize(face && !wet ? texture2D(normalMap, vUv).rgb * 2.0 - 1.0 : vNormal);
+      vec3 objectNormal = normalize(face ? texture2D(normalMap, vUv).rgb * 2.0 - 1.0 : vNormal);
       vec3 n = normalize(toWorld * objectNormal);
       vec3 v = normalize(toWorld * (eye - vPosition));
       if (mode == 2) { gl_FragColor = vec4(code(albedo), 1.0); return; }
@@ -57,15 +55,13 @@
         float mu = clamp(dot(n, v), 0.05, 1.0);
         float reflected = lobeAlbedo[5], tilt = lobeTilt[5];
         for (int k = 4; k >= 0; k--) { reflected = reflected * mu + lobeAlbedo[k]; tilt = tilt * mu + lobeTilt[k]; }
-        if (wet) { reflected = 1.0 + film.y * pow(1.0 - mu, 5.0); tilt = 0.0; }
         vec3 d = turnBack * normalize(mix(reflect(-v, n), n, tilt));
         vec2 place = vec2(atan(-d.x, d.z) / 6.28318531 + 0.5, 1.0 - acos(clamp(d.y, -1.0, 1.0)) / 3.14159265);
         vec3 root = texture2D(glossyMap, place).rgb;
         colour += specular * reflected * glossyScale * root * root;
       } else {
         float cosine = max(dot(n, keyDirection), 0.0);
-        float sharp = wet ? film.z : exponent;
-        float highlight = pow(max(dot(n, normalize(keyDirection + v)), 0.0), sharp) * (sharp + 8.0) / 8.0;
+        float highlight = pow(max(dot(n, normalize(keyDirection + v)), 0.0), exponent) * (exponent + 8.0) / 8.0;
         colour = albedo * (2.0 * cosine + 0.12) + 2.0 * specular * highlight * cosine;
       }
       gl_FragColor = vec4(code(colour), 1.0);
@@ -136,7 +132,6 @@
   texture(3, "glossyMap", data.glossy, true);
 
   gl.uniform3fv(at("irradiance"), data.irradiance);
-  gl.uniform3fv(at("film"), data.film);
   gl.uniform1fv(at("lobeAlbedo"), data.lobe_albedo);
   gl.uniform1fv(at("lobeTilt"), data.lobe_tilt);
   gl.uniform1f(at("glossyScale"), data.glossy_scale);
