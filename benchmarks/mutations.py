@@ -117,7 +117,7 @@ MUTATIONS = (
       "clipped = found.clipped & False", "tests/capture/test_capture.py"),
     # Measures.
     M("PSNR of powers", "metrics.psnr_from_rmse", "20.0", "10.0", "tests/core/test_metrics.py"),
-    M("the evaluated region isn't eroded", "evaluate", "EROSION = 2", "EROSION = 0",
+    M("the evaluated region isn't eroded", "evaluate.face_area", "np.ones((5, 5))", "np.ones((1, 1))",
       "tests/output/test_render_evaluate.py"),
     M("relit views compared without their factors", "compare.scaled_psnr", "_channel_scale(a, b) * a", "a",
       "tests/test_foreign.py"),

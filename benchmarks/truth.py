@@ -14,7 +14,7 @@ from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, rasterize_uv, sample_map
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import STRIP, leading_faces
-from mifit.reconstruction import Reconstruction
+from mifit.result import Reconstruction
 
 
 def true_geometry(capture: Capture, model: MorphableModel, timesteps: Sequence[int]) -> GeometryEstimate:

@@ -41,7 +41,7 @@ _EXPORTS = {
     "refine_normals": "mifit.stages.normals.refine_normals",
     "find_residual": "mifit.stages.find_residual",
     "refine_mesh": "mifit.stages.normals.refine_mesh",
-    "Reconstruction": "mifit.reconstruction",
+    "Reconstruction": "mifit.result",
     "evaluate": "mifit.output.evaluate",
     "export": "mifit.output.export",
     "synthesize": "mifit.synth",

@@ -48,7 +48,7 @@ from mifit.core.estimate import (
 from mifit.core.process import one_blas_thread
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
-from mifit.reconstruction import Reconstruction
+from mifit.result import Reconstruction
 from mifit.result.ownership import CHECKPOINTS, check_ours, locked
 from mifit.result.reading import read_document
 from mifit.stages.checks.capture_checks import check_capture
@@ -65,7 +65,6 @@ from mifit.stages.photometry import find_photometry
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
-    from mifit.result import Result
 
 T = TypeVar("T")
 ESTIMATED_CAMERAS = Diagnostic(
@@ -585,7 +584,7 @@ def choose_timesteps(capture: Capture, wanted: Sequence[int] | FrameChoice | Non
     return tuple(sorted(choose("timestep", capture.timesteps, named, 4)))
 
 
-def fitted_to(result: Result, capture: Capture) -> bool:
+def fitted_to(result: Reconstruction, capture: Capture) -> bool:
     """Whether a result was fitted to this very capture: its calibration, images, masks and landmarks."""
     names = [camera.name for camera in result.cameras]
     timesteps = result.fitted

@@ -29,8 +29,8 @@ from mifit.core.process import one_blas_thread
 from mifit.core.uv import TexelMap, bend, rasterize_uv, tangent_plane, transport, unbend
 from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
+from mifit.result import Reconstruction
 from mifit.result.ownership import locked
-from mifit.result.record import R
 from mifit.result.writing import add_timestep
 from mifit.stages.fit_geometry import fit_pose_expression
 from mifit.stages.geometry.refine import texture_reference
@@ -42,7 +42,6 @@ from mifit.stages.surface.model_fit import landmarks_are_biased
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
-    from mifit.result import Result
 
 MEMORY = 4
 """Frames whose corrections make the prior of the next."""
@@ -293,7 +292,7 @@ class _Memory:
 
 def track_into(
     folder: str | Path,
-    result: R,
+    result: Reconstruction,
     capture: Capture,
     timesteps: Sequence[int],
     config: NormalsConfig | None = None,
@@ -301,7 +300,7 @@ def track_into(
     seed: int = 0,
     resume: bool = False,
     progress: Progress = silent,
-) -> R:
+) -> Reconstruction:
     """Track timesteps and write each into the result folder as it is done.
 
     Parameters
@@ -365,12 +364,12 @@ def track_into(
     return result
 
 
-def sequence_left(result: Result, capture: Capture, resume: bool) -> tuple[int, ...]:
+def sequence_left(result: Reconstruction, capture: Capture, resume: bool) -> tuple[int, ...]:
     """Timesteps of a capture to track by default: those without geometry, and with ``resume`` the tracked ones."""
     return tuple(t for t in capture.timesteps if t not in result.timesteps or (resume and t in result.tracked))
 
 
-def mesh_refiner(result: Result) -> MeshRefiner:
+def mesh_refiner(result: Reconstruction) -> MeshRefiner:
     """What refines the meshes of further timesteps as those of a result are."""
     assert result.mesh is not None and result.reflectance is not None
     settings = from_mapping(MeshConfig, result.config.get("mesh", {}), "result.json: config: mesh")
@@ -378,7 +377,7 @@ def mesh_refiner(result: Result) -> MeshRefiner:
     return MeshRefiner(result.model, len(result.reflectance.diffuse), settings)
 
 
-def _not_yet(result: Result, timesteps: Sequence[int], digests: Mapping[int, str]) -> list[int]:
+def _not_yet(result: Reconstruction, timesteps: Sequence[int], digests: Mapping[int, str]) -> list[int]:
     """The timesteps that aren't in a result, or whose images are others now, or that come after one of those."""
     known = result.tracked
     kept = [t for t in timesteps if t in known and known[t] == digests[t]]
@@ -397,7 +396,7 @@ class _Room:
     displacement: Rows | None = None
 
 
-def _with_room(result: R, count: int) -> tuple[R, _Room]:
+def _with_room(result: Reconstruction, count: int) -> tuple[Reconstruction, _Room]:
     """A result whose large arrays lie where ``count`` further timesteps have room behind them."""
 
     def moved(array: NDArray) -> tuple[Rows, NDArray]:
@@ -421,8 +420,12 @@ def _with_room(result: R, count: int) -> tuple[R, _Room]:
 
 
 def extend(
-    result: R, frame: TrackedFrame, refiner: MeshRefiner | None = None, digest: str = "", room: _Room | None = None
-) -> R:
+    result: Reconstruction,
+    frame: TrackedFrame,
+    refiner: MeshRefiner | None = None,
+    digest: str = "",
+    room: _Room | None = None,
+) -> Reconstruction:
     """A result with one more timestep; its normals' report lists it under ``tracked``, with the images' digest.
 
     With a refiner its refined mesh is made too. With ``room``, in which the result's arrays lie, they aren't copied.
@@ -466,7 +469,7 @@ def extend(
     return replace(result, geometry=geometry, normals=normals, mesh=mesh)
 
 
-def _without(result: R, dropped: Sequence[int]) -> R:
+def _without(result: Reconstruction, dropped: Sequence[int]) -> Reconstruction:
     """A result less some of its tracked timesteps."""
     if not dropped or result.normals is None:
         return result

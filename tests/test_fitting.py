@@ -16,8 +16,7 @@ from mifit.errors import InputError
 from mifit.fitting import fit_into, fitted_to
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs, with_eyes
-from mifit.reconstruction import Reconstruction
-from mifit.result import ownership
+from mifit.result import Reconstruction, ownership
 from mifit.result.ownership import CHECKPOINTS
 from tests.output.conftest import ball_result
 from tests.output.test_result_safety import tree

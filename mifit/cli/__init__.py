@@ -6,49 +6,18 @@ Exit codes: 0 success, 2 bad usage or bad input (one line on stderr), 3 a named 
 
 from __future__ import annotations
 
-import argparse
 import errno
 import os
 import sys
 import warnings
 from collections.abc import Sequence
 
-import mifit
-from mifit.cli import captures, fits, results, setup
-from mifit.cli.arguments import Command, Parser, common_options, one_line
+from mifit.cli.arguments import one_line
 from mifit.cli.console import drop_chatter
+from mifit.cli.options import build_parser as build_parser
 from mifit.core.files import FULL
 from mifit.core.process import keep_freed_memory
 from mifit.errors import InputError, MifitError
-
-EXAMPLES = """examples:
-  mifit demo                                               a face from a capture made on the spot
-  mifit fit left.mp4 right.mp4 --out me                    a face from two clips of it
-  mifit relight me --env studio.hdr --out relit --turn 36  that face under a turning light"""
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """The parser of all commands; ``run`` of what it parses is the command."""
-    parser = Parser(
-        prog="mifit",
-        description="Facial reflectance and geometry from two views.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--version", action="version", version=f"mifit {mifit.__version__}")
-    commands = parser.add_subparsers(
-        dest="command", required=True, metavar="COMMAND", parser_class=Parser, title="commands"
-    )
-    common = common_options()
-
-    def add(name: str, run: Command, text: str) -> argparse.ArgumentParser:
-        p = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".", parents=[common])
-        p.set_defaults(run=run)
-        return p
-
-    for group in (setup, captures, fits, results):
-        group.add_commands(add)
-    return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -8,21 +8,15 @@ import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from mifit.core.diagnostics import Diagnostic, worst_first
 from mifit.core.files import check_overwriting, overwriting
-from mifit.core.limits import MAX_NUMBER, MAX_SEED, MAX_TIMESTEPS
+from mifit.core.limits import MAX_NUMBER, MAX_RENDERED_PIXELS, MAX_SAMPLES, MAX_SEED, MAX_TIMESTEPS
 from mifit.errors import InputError
 
-STRICT = 3
-"""Exit code of a command that named a fault of its capture, with ``--strict``."""
-LONGEST = 1000
-"""Characters of a message; one that quotes more of an input says nothing."""
 Command = Callable[[Namespace], "int | None"]
 """A command: given its arguments, it returns the exit code; None is 0."""
-Add = Callable[[str, Command, str], argparse.ArgumentParser]
-"""``add(name, command, help)`` adds a command and returns its parser."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -37,25 +31,7 @@ def one_line(text: str) -> str:
     """A message as one line of a terminal: no control characters, and not without end."""
     line = " ".join(text.split())
     line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
-    return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
-
-
-def common_options() -> Parser:
-    """Options that every command has."""
-    p = Parser(add_help=False)
-    p.add_argument("--quiet", action="store_true", help="no progress on stderr, warnings alone")
-    p.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    p.add_argument(
-        "--variant", default="auto", help="Mitsuba variant; auto: CUDA where it works, else LLVM (default: auto)"
-    )
-    p.add_argument("--threads", type=whole(1, 1024), help="processor cores to use; default: all")
-    p.add_argument("--seed", type=whole(0, MAX_SEED), default=0, help="seed of everything random (default: 0)")
-    return p
-
-
-def add_rate(p: argparse.ArgumentParser) -> None:
-    """Add ``--fps``."""
-    p.add_argument("--fps", type=rate, default=12.0, help="timesteps per second of what moves (default: 12)")
+    return line if len(line) <= 1000 else f"{line[:500]} ... {line[-500:]}"
 
 
 def writes(*options: str, outside: str = "") -> Callable[[Command], Command]:
@@ -97,32 +73,6 @@ def check_empty(folder: Path, force: bool = False) -> None:
         raise InputError(f"{folder}: is there already and not empty; --force writes into it, or name another folder")
 
 
-def add_force(p: argparse.ArgumentParser) -> None:
-    """Add ``--force`` of a command that `writes`."""
-    p.add_argument("--force", action="store_true", help="replace files that are there, but never what is read")
-
-
-def add_offset(p: argparse.ArgumentParser) -> None:
-    """Add ``--offset``."""
-    p.add_argument(
-        "--offset",
-        type=offsets,
-        metavar="S,S",
-        help="of clips: seconds by which each began after the first, such as 0,0.4; or auto, found by sound or motion",
-    )
-
-
-def add_address(p: argparse.ArgumentParser) -> None:
-    """Add ``--host`` and ``--port``."""
-    p.add_argument("--host", default="127.0.0.1", help="of the view: address (default: this machine only)")
-    p.add_argument("--port", type=whole(0, 65535), default=8080, help="of the view (default: 8080); 0: a free one")
-
-
-def add_strict(p: argparse.ArgumentParser) -> None:
-    """Add ``--strict``."""
-    p.add_argument("--strict", action="store_true", help="exit with 3 where a fault of the capture is named")
-
-
 def use_variant(arguments: Namespace) -> str:
     """Activate the variant that ``--variant`` names; returns its name. VariantError where it can't fit."""
     from mifit.render.variant import set_fitting_variant
@@ -142,7 +92,7 @@ def tell(arguments: Namespace, found: Iterable[Diagnostic]) -> int:
     for one in found:
         if one.severity != "note" or not arguments.quiet:
             print(f"mifit: {one.severity}: {one_line(one.text)}", file=sys.stderr, flush=True)
-    return STRICT if arguments.strict and any(one.severity == "fault" for one in found) else 0
+    return 3 if arguments.strict and any(one.severity == "fault" for one in found) else 0
 
 
 def say(arguments: Namespace, text: str) -> None:
@@ -205,11 +155,6 @@ def whole(low: int, high: int) -> Callable[[str], int]:
     return parse
 
 
-def at_least(low: int) -> Callable[[str], int]:
-    """A reader of counts from ``low``."""
-    return whole(low, MAX_TIMESTEPS)
-
-
 def path(text: str) -> Path:
     """A file or folder."""
     if not text or "\0" in text:
@@ -252,3 +197,21 @@ def exposure(text: str) -> float | str:
 def offsets(text: str) -> list[float] | str:
     """``0,0.4`` -> [0.0, 0.4], or ``auto``."""
     return text if text == "auto" else [real(part) for part in listed(text)]
+
+
+READERS: dict[str, Callable[[str], Any]] = {
+    "text": str,
+    "path": path,
+    "names": listed,
+    "steps": timesteps,
+    "auto_steps": timesteps_or_auto,
+    "real": real,
+    "positive": positive,
+    "rate": rate,
+    "exposure": exposure,
+    "offsets": offsets,
+    "pixels": whole(16, MAX_RENDERED_PIXELS // 16),
+    "samples": whole(1, MAX_SAMPLES),
+    "seed": whole(0, MAX_SEED),
+}
+"""Readers of arguments by the kind that `cli.options` names."""

@@ -6,11 +6,9 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mifit.cli import arguments as types
-from mifit.cli.arguments import use_variant
+from mifit.cli.arguments import check_empty, use_variant
 from mifit.cli.clips import start_times
 from mifit.cli.console import console_progress
-from mifit.core.limits import MAX_RENDERED_PIXELS, MAX_SAMPLES
 from mifit.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,7 +19,7 @@ if TYPE_CHECKING:
 def synth(arguments: Namespace) -> None:
     """Write path-traced captures."""
     out: Path = arguments.out
-    types.check_empty(out, arguments.force)
+    check_empty(out, arguments.force)
     if arguments.head is not None:
         _synth_scan(arguments)
         return
@@ -60,9 +58,9 @@ def _synth_scan(arguments: Namespace) -> None:
     from mifit.synth.procedural import studio_environment
     from mifit.synth.scanned import ScannedHead, maps_of, synthesize_scan
 
-    head = ScannedHead.load(arguments.head, maps_of(arguments.maps), arguments.unit_mm, arguments.flip_v)
+    head = ScannedHead.load(arguments.head, maps_of(arguments.maps or ()), arguments.unit_mm, arguments.flip_v)
     environment = read_environment(arguments.env) if arguments.env else studio_environment(arguments.seed)
-    relit = {path.stem: read_environment(path) for path in arguments.relit}
+    relit = {path.stem: read_environment(path) for path in arguments.relit or ()}
     use_variant(arguments)
     synthesize_scan(
         arguments.out,
@@ -125,7 +123,7 @@ def calibrate(arguments: Namespace) -> None:
     board = Board.parse(arguments.board)
     if out is None:
         raise InputError("--board needs --out, the folder to write")
-    types.check_empty(out, arguments.force)
+    check_empty(out, arguments.force)
     if not arguments.video and not arguments.images:
         for path in board.write(out):
             print(f"Board: {path}")
@@ -199,114 +197,3 @@ def landmarks(arguments: Namespace) -> None:
     from mifit.capture import detect_landmarks
 
     print(detect_landmarks(arguments.capture, arguments.detector, progress=console_progress(arguments.quiet)))
-
-
-def add_commands(add: types.Add) -> None:
-    """Add these commands to the parser."""
-    p = add("synth", synth, "path-traced captures with ground truth")
-    p.add_argument("--out", type=types.path, required=True, help="capture folder to write")
-    p.add_argument("--subjects", type=types.at_least(1), default=1, help="people, a capture each (default: 1)")
-    p.add_argument("--timesteps", type=types.at_least(1), default=4, help="moments of a capture (default: 4)")
-    p.add_argument("--env", type=types.path, help="lat-long HDR environment; default: a procedural studio")
-    p.add_argument("--model", default="builtin", help="morphable model: a path or builtin")
-    p.add_argument(
-        "--width", type=types.whole(16, MAX_RENDERED_PIXELS // 16), default=680, help="pixels (default: 680)"
-    )
-    p.add_argument(
-        "--height", type=types.whole(16, MAX_RENDERED_PIXELS // 16), default=480, help="pixels (default: 480)"
-    )
-    p.add_argument("--spp", type=types.whole(1, MAX_SAMPLES), default=64, help="samples per pixel (default: 64)")
-    p.add_argument("--tone", type=types.real, help="skin from 0, fair, to 1, deep; default: drawn for each subject")
-    p.add_argument(
-        "--motion",
-        choices=["poses", "talk", "turn"],
-        default="poses",
-        help="default: poses; of talk and turn 30 timesteps are a second",
-    )
-    p.add_argument(
-        "--outside",
-        type=types.real,
-        default=0.5,
-        help="millimetres by which heads leave the model's span (default: 0.5)",
-    )
-    p.add_argument(
-        "--landmark-bias", type=types.real, default=0.0, help="millimetres; a detector's is about 2 (default: 0)"
-    )
-    p.add_argument(
-        "--head", type=types.path, help="a scanned head with texture coordinates (.glb, .obj, .ply), moved rigidly"
-    )
-    p.add_argument(
-        "--maps",
-        nargs="+",
-        default=[],
-        metavar="NAME=FILE",
-        help="of --head: albedo, specular, roughness, displacement",
-    )
-    p.add_argument("--unit-mm", type=types.real, default=10.0, help="of --head: millimetres of its unit (default: 10)")
-    p.add_argument("--flip-v", action="store_true", help="of --head: turn its maps upside down")
-    p.add_argument(
-        "--relit", type=types.path, nargs="+", default=[], help="of --head: environments of relit true views"
-    )
-    p.add_argument("--force", action="store_true", help="write into a folder that holds something already")
-
-    p = add(
-        "import",
-        import_,
-        "a capture from videos, image folders, photogrammetry projects, nerfstudio, VHAP or NeRSemble",
-    )
-    p.add_argument(
-        "--video", type=types.path, action="append", default=[], help="one camera's video; repeat per camera"
-    )
-    p.add_argument(
-        "--images", type=types.path, action="append", default=[], help="one camera's folder of images; repeat"
-    )
-    p.add_argument("--calibration", type=types.path, help="OpenCV stereo calibration, YAML or XML")
-    p.add_argument("--colmap", type=types.path, help="folder of a COLMAP model, text or binary")
-    p.add_argument("--metashape", type=types.path, help="cameras exported by Metashape as XML")
-    p.add_argument(
-        "--realitycapture", type=types.path, help="folder of RealityCapture's XMP files, or its CSV of cameras"
-    )
-    p.add_argument("--photos", type=types.path, help="folder of the photographs of these three (default: beside them)")
-    p.add_argument("--vhap", type=types.path, help="folder exported by VHAP")
-    p.add_argument("--nersemble", type=types.path, help="folder of one sequence of NeRSemble")
-    p.add_argument("--transforms", type=types.path, help="nerfstudio transforms.json")
-    p.add_argument("--digital-emily", type=types.path, help="checkout of the public Digital Emily repository")
-    p.add_argument(
-        "--units", help="unit of length of the cameras: mm, cm, dm or m (default: as the source has it, or cm)"
-    )
-    types.add_offset(p)
-    p.add_argument("--every", type=types.at_least(1), default=1, help="keep every N-th frame (default: 1)")
-    p.add_argument("--start", type=types.at_least(0), default=0, help="first frame (default: 0)")
-    p.add_argument("--count", type=types.at_least(1), help="number of frames to keep")
-    p.add_argument("--out", type=types.path, required=True, help="capture folder to write")
-
-    p = add("calibrate", calibrate, "cameras from a calibration board, or of a capture from the heads in it")
-    p.add_argument("capture", type=types.path, nargs="?", help="the cameras are written into it")
-    p.add_argument(
-        "--video", type=types.path, action="append", default=[], help="one camera's video of the board; repeat"
-    )
-    p.add_argument(
-        "--images", type=types.path, action="append", default=[], help="one camera's folder of images; repeat"
-    )
-    p.add_argument(
-        "--board",
-        help="charuco:9x6:30:22, chessboard:10x7:25 or apriltag:6x4:34:9: columns, rows and lengths in millimetres; "
-        "without videos and images it is written for printing",
-    )
-    p.add_argument("--names", type=types.listed, help="of a board: names of the cameras; default: those of the files")
-    p.add_argument("--units", default="cm", help="unit of length of the calibration: mm, cm or m (default: cm)")
-    p.add_argument("--model", default="auto", help="of a capture: a path, builtin or auto (default)")
-    p.add_argument("--cameras", type=types.listed, help="of a capture: cameras that decide; default: the first two")
-    p.add_argument("--timesteps", type=types.timesteps, help="of a capture: timesteps to use; default: the first four")
-    p.add_argument(
-        "--refine",
-        action="store_true",
-        help="of a calibrated capture: adjust poses and focal lengths to dense matches between the views, where these "
-        "agree better then; the calibration as it was is kept beside it",
-    )
-    p.add_argument("--out", type=types.path, help="of a board: folder to write")
-    p.add_argument("--force", action="store_true", help="of a board: write into a folder that holds something already")
-
-    p = add("landmarks", landmarks, "detect 68 landmarks in every image and write them into the capture")
-    p.add_argument("capture", type=types.path, help="capture folder, or its transforms.json")
-    p.add_argument("--detector", help="mediapipe, face-alignment or lbf:FOLDER; default: the first that is there")

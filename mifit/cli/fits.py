@@ -7,8 +7,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mifit.cli import arguments as types
-from mifit.cli.arguments import add_offset, say, tell, use_variant
+from mifit.cli.arguments import say, tell, use_variant
 from mifit.cli.clips import capture_of
 from mifit.cli.console import console_progress
 from mifit.cli.results import judge
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.capture.choose_frames import FrameChoice
     from mifit.progress import Progress
-    from mifit.reconstruction import Reconstruction
+    from mifit.result import Reconstruction
 
 
 DEMO: dict[str, Any] = {"model": "builtin:coarse", "width": 340, "height": 240, "spp": 32, "timesteps": 3}
@@ -262,74 +261,3 @@ def run(arguments: Namespace) -> None:
         progress=console_progress(arguments.quiet),
     )
     print(summary)
-
-
-def add_commands(add: types.Add) -> None:
-    """Add these commands to the parser."""
-    p = add("demo", demo, "fit a small capture made on the spot, judge it on the held-out view, write a report")
-    p.add_argument("--out", type=types.path, default=Path("out/demo"), help="folder to write (default: out/demo)")
-
-    p = add("fit", fit, "fit geometry, reflectance and normals to a capture, or to clips of a face")
-    p.add_argument(
-        "capture",
-        type=types.path,
-        nargs="+",
-        help="capture folder; or a clip, folder of frames or photograph of each camera, of which a capture is made in "
-        "the result's folder: frames brought into step and chosen, landmarks found, cameras estimated",
-    )
-    p.add_argument("--out", type=types.path, required=True, help="result folder to write")
-    p.add_argument("--calibration", type=types.path, help="of clips: stereo calibration or transforms.json")
-    p.add_argument("--board", type=types.path, nargs="+", help="of clips: a clip of a calibration board by each camera")
-    p.add_argument("--pattern", default="charuco:9x6:30:22", help="of --board: as mifit calibrate --board takes it")
-    add_offset(p)
-    p.add_argument("--every", type=types.at_least(1), help="of clips: keep every N-th frame; default: 24 in all")
-    p.add_argument(
-        "--config", type=types.path, help="TOML file with tables geometry, reflectance, shape, normals, mesh"
-    )
-    p.add_argument("--preset", choices=["default", "paper"], help="paper: the paper as written")
-    p.add_argument(
-        "--model",
-        default="auto",
-        help="morphable model: a path, builtin, or auto (default): the one that mifit model fetch has fetched, else "
-        "builtin",
-    )
-    p.add_argument("--cameras", type=types.listed, help="cameras to use, e.g. left,right; default: the first two")
-    p.add_argument(
-        "--timesteps",
-        type=types.timesteps_or_auto,
-        help="e.g. 0,1,2,3 or 0-3, or auto (auto:6): the four (six) that tell most; default: the first four, of clips "
-        "auto",
-    )
-    p.add_argument(
-        "--until",
-        choices=["geometry", "reflectance", "normals"],
-        default="normals",
-        help="last stage (default: normals, everything)",
-    )
-    p.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
-    p.add_argument("--force", action="store_true", help="replace an existing result")
-    p.add_argument(
-        "--view", action="store_true", help="show the fit in the browser while it is being fitted, and after"
-    )
-    types.add_strict(p)
-    types.add_address(p)
-
-    p = add("track", track, "geometry and normals of further timesteps, reflectance and lighting fixed")
-    p.add_argument("capture", type=types.path, help="capture folder, or its transforms.json")
-    p.add_argument("--result", type=types.path, required=True, help="result folder of mifit fit; extended in place")
-    p.add_argument("--timesteps", type=types.timesteps, help="default: all that aren't in the result yet")
-    p.add_argument("--resume", action="store_true", help="keep the frames that an earlier run has written")
-    p.add_argument(
-        "--refine", action="store_true", help="first find maps, lighting and normals anew, from frames of the video too"
-    )
-    p.add_argument("--overlay", type=types.listed, help="cameras to write overlay videos of; default: the fitted ones")
-    types.add_strict(p)
-    types.add_rate(p)
-
-    p = add("run", run, "a scene-file driven experiment or a sweep of them")
-    p.add_argument("experiment", type=types.path, help="experiment file, TOML")
-    p.add_argument(
-        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="replace a setting; repeat"
-    )
-    p.add_argument("--out", type=types.path, help="folder of the runs; default: out/NAME")
-    p.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from argparse import Namespace
 from typing import TYPE_CHECKING
 
-from mifit.cli import arguments as types
-from mifit.cli.arguments import add_force, say, tell, use_variant, writes
+from mifit.cli.arguments import say, tell, use_variant, writes
 from mifit.cli.console import console_progress
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.files import write_text
-from mifit.core.limits import MAX_RENDERED_PIXELS
 from mifit.errors import InputError
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
-    from mifit.reconstruction import Reconstruction
+    from mifit.result import Reconstruction
 
 
 @writes("json")
@@ -245,128 +242,3 @@ def export(arguments: Namespace) -> None:
         units=arguments.units,
     )
     print(f"Export: {arguments.out}")
-
-
-def add_commands(add: types.Add) -> None:
-    """Add these commands to the parser."""
-    p = add("evaluate", evaluate, "error on a held-out view")
-    p.add_argument("result", type=types.path, help="result folder of mifit fit")
-    p.add_argument("--capture", type=types.path, required=True, help="capture that has the view")
-    p.add_argument("--camera", required=True, help="camera to judge by, one that was not fitted")
-    p.add_argument(
-        "--timesteps",
-        type=types.timesteps,
-        help="default: all of the result; at one without a fit landmarks place the head",
-    )
-    p.add_argument(
-        "--region",
-        choices=["face", "skin", "truth"],
-        default="face",
-        help="the fitted model's face area (default); skin, as the benchmarks have it; the truth's face area",
-    )
-    p.add_argument("--fitted", action="store_true", help="of a camera that was fitted: its error is no held-out one")
-    p.add_argument("--baseline", action="store_true", help="compare image-based rendering on the same mesh and pixels")
-    p.add_argument(
-        "--passes",
-        action="store_true",
-        help="compare diffuse and specular images of the capture's first timestep with the truth's",
-    )
-    p.add_argument("--json", type=types.path, help="file to write the figures to")
-    add_force(p)
-    types.add_strict(p)
-
-    p = add("score", score, "any program's images, relit views, passes or meshes against a capture's truth")
-    p.add_argument("capture", type=types.path, help="capture folder with truth, or its transforms.json")
-    p.add_argument(
-        "--images",
-        type=types.path,
-        required=True,
-        help="folder with CAMERA_TTTT.png, relit_ENV.exr, diffuse_CAMERA.exr, specular_CAMERA.exr, TTTT.ply",
-    )
-    p.add_argument("--cameras", type=types.listed, help="cameras that the program was given; default: the first two")
-    p.add_argument("--model", help="morphable model that the capture was made with, if its truth has no triangles")
-    p.add_argument("--json", type=types.path, help="file to write the scores to")
-    add_force(p)
-
-    p = add("render", render, "render a reconstruction from a camera of the capture, or from any side")
-    p.add_argument("result", type=types.path, help="result folder of mifit fit")
-    p.add_argument("--capture", type=types.path, help="capture that --camera is of; default: the fitted cameras")
-    p.add_argument("--camera", help="default: a view of the face from --yaw, --pitch and --distance")
-    p.add_argument("--yaw", type=types.real, help="degrees about the vertical; 0 is the front")
-    p.add_argument("--pitch", type=types.real, help="degrees upwards")
-    p.add_argument(
-        "--distance", type=types.positive, help="from the face, the result's units; default: the fitted cameras'"
-    )
-    p.add_argument("--timestep", type=types.at_least(0), help="default: the first of the result")
-    p.add_argument("--out", type=types.path, required=True, help="image to write: .png (8-bit sRGB) or .exr (linear)")
-    add_force(p)
-    p.add_argument(
-        "--method",
-        choices=["full", "diffuse", "pca"],
-        default="full",
-        help="everything (default), without specular, the model alone",
-    )
-    p.add_argument(
-        "--integrator", choices=["local", "path"], default="local", help="closed form (default) or path tracing"
-    )
-
-    p = add("turntable", turntable, "novel views about the vertical axis, with and without specular")
-    p.add_argument("result", type=types.path, help="result folder of mifit fit")
-    p.add_argument("--out", type=types.path, required=True, help="folder to write")
-    add_force(p)
-    p.add_argument("--from", dest="start", type=types.real, default=-35.0, help="first angle in degrees (default: -35)")
-    p.add_argument("--to", dest="stop", type=types.real, default=35.0, help="last angle in degrees (default: 35)")
-    p.add_argument("--steps", type=types.at_least(1), default=7, help="number of views (default: 7)")
-    p.add_argument(
-        "--sequence",
-        action="store_true",
-        help="play the timesteps while the camera turns: sequence.mp4, one frame per timestep in place of --steps",
-    )
-    _add_light(p, False)
-    types.add_rate(p)
-
-    p = add("view", view, "a live view in the browser: turn the head and the light, switch parts, load an environment")
-    p.add_argument("result", type=types.path, help="result folder")
-    types.add_address(p)
-
-    p = add("relight", relight, "relit views under a measured environment")
-    p.add_argument("result", type=types.path, help="result folder of mifit fit")
-    p.add_argument("--out", type=types.path, required=True, help="folder to write")
-    add_force(p)
-    _add_light(p, True)
-    p.add_argument("--turn", type=types.at_least(1), help="number of rotations of the light about the vertical")
-    p.add_argument("--video", type=types.path, help="of --turn: .mp4 or .webp to write in place of images")
-    p.add_argument("--camera", help="a fitted camera; default: all of them, with --turn the front")
-    p.add_argument("--yaw", type=types.real, help="a view of the face from so many degrees about the vertical")
-    p.add_argument("--size", type=types.whole(16, MAX_RENDERED_PIXELS // 16), help="width in pixels")
-    p.add_argument("--integrator", choices=["local", "path"], default="local", help="fast (default) or path tracing")
-    p.add_argument("--check", action="store_true", help="compare both integrators in one small view")
-    types.add_rate(p)
-
-    p = add("export", export, "geometry with its maps for other programs")
-    p.add_argument("result", type=types.path, help="result folder of mifit fit")
-    p.add_argument("--format", choices=["glb", "obj", "ply", "mitsuba"], required=True, help="kind of file")
-    p.add_argument("--out", type=types.path, required=True, help="file to write")
-    add_force(p)
-    p.add_argument("--timestep", type=types.at_least(0), help="default: the first of the result")
-    p.add_argument("--units", choices=["m", "cm", "mm"], help="of obj and ply; default: the result's")
-    p.add_argument("--animate", action="store_true", help="glb: play all timesteps, from --timestep's maps")
-    types.add_rate(p)
-    p.add_argument(
-        "--mesh",
-        choices=["fitted", "refined"],
-        default="fitted",
-        help="refined: with the refined normals as shape, and its displacement map (default: fitted)",
-    )
-
-
-def _add_light(p: argparse.ArgumentParser, required: bool) -> None:
-    """Add the options of an environment."""
-    p.add_argument("--env", type=types.path, required=required, help="lat-long environment, .hdr or .exr")
-    p.add_argument("--rotate", type=types.real, default=0.0, help="of --env: degrees about the vertical (default: 0)")
-    p.add_argument(
-        "--exposure",
-        type=types.exposure,
-        default=1.0,
-        help="of --env: factor on the file's radiance (default: 1), or auto: the capture's level",
-    )

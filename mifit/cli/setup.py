@@ -7,7 +7,7 @@ from argparse import Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from mifit.cli import arguments as types
+from mifit.cli.arguments import tell, use_variant, writes
 from mifit.cli.console import console_progress
 from mifit.core.diagnostics import Diagnostic
 
@@ -67,7 +67,7 @@ def _examine(arguments: Namespace) -> int:
             print(f"camera {name}: {verdict}, {text}")
         if "matches" in figures:
             print(f"dense matches: {figures['matches']['finding']}")
-    return types.tell(arguments, found)
+    return tell(arguments, found)
 
 
 def _dense(
@@ -82,7 +82,7 @@ def _dense(
     import mifit
     from mifit.extras.refine_cameras import refine_cameras
 
-    types.use_variant(arguments)
+    use_variant(arguments)
     progress = console_progress(arguments.quiet)
     result = mifit.fit(capture, model, cameras, timesteps, until="geometry", progress=progress)
     found += [one for one in result.diagnostics if one not in found]
@@ -93,7 +93,7 @@ def _dense(
     return {"finding": refined.finding, **refined.figures}
 
 
-@types.writes("preview", "out")
+@writes("preview", "out")
 def model(arguments: Namespace) -> None:
     """Inspect, convert or fetch a morphable model."""
     import mifit
@@ -115,34 +115,3 @@ def model(arguments: Namespace) -> None:
         loaded = mifit.MorphableModel.load(arguments.source, **options)
         (with_eyes(loaded) if arguments.eyes else loaded).save(arguments.out)
         print(f"Model: {arguments.out}")
-
-
-def add_commands(add: types.Add) -> None:
-    """Add these commands to the parser."""
-    p = add("doctor", doctor, "what of the set-up, or of a capture, is wrong, and what mends it")
-    p.add_argument("capture", type=types.path, nargs="?", help="capture to examine; default: the set-up")
-    p.add_argument("--model", default="auto", help="of a capture: a path, builtin or auto (default)")
-    p.add_argument("--cameras", type=types.listed, help="of a capture: cameras to examine; default: the first two")
-    p.add_argument("--timesteps", type=types.timesteps, help="of a capture: default: the first four")
-    p.add_argument("--quick", action="store_true", help="of a capture: no fit, landmarks and colours alone")
-    types.add_strict(p)
-    p.add_argument("--json", action="store_true", help="print JSON")
-    p.add_argument("--install", choices=["landmarks"], help="fetch the networks that find landmarks, then check")
-
-    p = add("model", model, "inspect, convert and fetch morphable models")
-    actions = p.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=types.Parser)
-    common = types.common_options()
-    q = actions.add_parser("info", help="print a table", parents=[common])
-    q.add_argument("model", help="a path, builtin or auto")
-    q.add_argument("--preview", type=types.path, help="also write a sheet of the mean and the first modes")
-    types.add_force(q)
-    q = actions.add_parser("convert", help="write a model in mifit's own format", parents=[common])
-    q.add_argument("source", type=types.path, help="file of a model, of any known kind")
-    q.add_argument("out", type=types.path, help="file to write, .npz")
-    types.add_force(q)
-    q.add_argument("--kind", help="format of SOURCE; default: recognised by content")
-    q.add_argument("--eyes", action="store_true", help="put simple eyes and a mouth's inside where the model has holes")
-    q = actions.add_parser("fetch", help="fetch a public model, once, for --model auto", parents=[common])
-    q.add_argument("name", choices=["ict"], help="ict: ICT-FaceKit Light (MIT licence), 400 MB to fetch, 30 to keep")
-    q.add_argument("--from", dest="address", help="address of its folder FaceXModel; default: its public repository")
-    types.add_force(q)

@@ -1,11 +1,4 @@
-"""Image error measures over a region of pixels: RMSE, PSNR, SSIM and FLIP.
-
-FLIP: FLIP: how different two images look when one flips between them (Andersson et al. 2020).
-
-The measure for images of standard range: colours are blurred by the eye's contrast sensitivity and compared where
-they are perceptually even, and edges and points are compared beside them, because they draw the eye. It needs no
-trained weights. Constants are the paper's.
-"""
+"""Image error measures over a region of pixels: RMSE, PSNR, SSIM and FLIP."""
 
 from __future__ import annotations
 
@@ -18,8 +11,11 @@ from scipy.ndimage import correlate1d, gaussian_filter
 from mifit.core.image import srgb_to_linear
 from mifit.errors import InputError
 
+Image = NDArray
+Mask = NDArray[np.bool_] | None
 
-def rmse(image: NDArray, reference: NDArray, mask: NDArray | None = None) -> float:
+
+def rmse(image: Image, reference: Image, mask: Mask = None) -> float:
     """Root-mean-square difference over the pixels of a region and all channels.
 
     Parameters
@@ -37,7 +33,7 @@ def rmse(image: NDArray, reference: NDArray, mask: NDArray | None = None) -> flo
     return math.sqrt(mean_squared_error(image, reference, mask))
 
 
-def psnr(image: NDArray, reference: NDArray, mask: NDArray | None = None, peak: float = 255.0) -> float:
+def psnr(image: Image, reference: Image, mask: Mask = None, peak: float = 255.0) -> float:
     """Peak signal-to-noise ratio in dB, ``20 log10(peak / rmse)``; infinite for equal images."""
     return psnr_from_rmse(rmse(image, reference, mask), peak)
 
@@ -47,29 +43,20 @@ def psnr_from_rmse(error: float, peak: float = 255.0) -> float:
     return math.inf if error == 0 else 20.0 * math.log10(peak / error)
 
 
-def mean_squared_error(image: NDArray, reference: NDArray, mask: NDArray | None = None) -> float:
+def mean_squared_error(image: Image, reference: Image, mask: Mask = None) -> float:
     """Mean squared difference over a region; parameters and errors as for `rmse`."""
-    a, b, mask = checked_pair(image, reference, mask)
-    difference = a[mask] - b[mask]
-    return float(np.mean(difference * difference))
+    a, b, mask = _checked(image, reference, mask)
+    return float(np.mean((a[mask] - b[mask]) ** 2))
 
 
-def ssim(image: NDArray, reference: NDArray, mask: NDArray | None = None, peak: float = 255.0) -> float:
+def ssim(image: Image, reference: Image, mask: Mask = None, peak: float = 255.0) -> float:
     """Structural similarity (Wang et al. 2004), averaged over a region and the channels; 1 for equal images.
 
-    Gaussian window of 1.5 pixels cut at 5 pixels (11 x 11), K1 = 0.01, K2 = 0.03. The window of a pixel at the
-    region's border reaches outside the region, as is usual.
-
-    Parameters
-    ----------
-    image, reference, mask
-        As for `rmse`.
-    peak : float
-        Largest value that a pixel can take.
+    Gaussian window of 1.5 pixels cut at 5 pixels (11 x 11), K1 = 0.01, K2 = 0.03. The window of a pixel at the region's
+    border reaches outside the region, as is usual. ``peak`` is the largest value that a pixel can take.
     """
-    a, b, mask = checked_pair(image, reference, mask)
-    if a.ndim == 2:
-        a, b = a[..., None], b[..., None]
+    a, b, mask = _checked(image, reference, mask)
+    a, b = (np.atleast_3d(x) for x in (a, b))
 
     def blur(x: NDArray) -> NDArray:
         return gaussian_filter(x, (1.5, 1.5, 0.0), truncate=5.0 / 1.5, mode="reflect")
@@ -82,7 +69,7 @@ def ssim(image: NDArray, reference: NDArray, mask: NDArray | None = None, peak: 
     return float(score[mask].mean())
 
 
-def checked_pair(image: NDArray, reference: NDArray, mask: NDArray | None) -> tuple[NDArray, NDArray, NDArray]:
+def _checked(image: Image, reference: Image, mask: Mask) -> tuple[NDArray, NDArray, NDArray[np.bool_]]:
     """Both images as float64 and the region as a boolean array, after checks of shape."""
     a, b = np.asarray(image, dtype=np.float64), np.asarray(reference, dtype=np.float64)
     if a.shape != b.shape or a.ndim not in (2, 3):
@@ -95,56 +82,36 @@ def checked_pair(image: NDArray, reference: NDArray, mask: NDArray | None) -> tu
     return a, b, region
 
 
-PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
-"""The paper's viewing conditions: a screen 0.7 m wide with 3840 pixels across, seen from 0.7 m."""
-
-# Contrast sensitivity of the channels Y, Cx, Cz as sums of Gaussians in degrees: pairs (a, b) of
-# a sqrt(pi / b) exp(-pi^2 x^2 / b).
-SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
-FEATURE_DEGREES = 0.082
-COLOUR_EXPONENT, FEATURE_EXPONENT = 0.7, 0.5
-KNEE, KNEE_ERROR = 0.4, 0.95
-"""Colour differences up to 0.4 of the largest are spread over errors up to 0.95."""
-
-XYZ_FROM_RGB = np.array(
-    [
-        [0.4123907992659595, 0.357584339383878, 0.1804807884018343],
-        [0.2126390058715103, 0.715168678767756, 0.0721923153607337],
-        [0.0193308187155918, 0.119194779794626, 0.9505321522496607],
-    ]
-)
-RGB_FROM_XYZ = np.linalg.inv(XYZ_FROM_RGB)
-WHITE = XYZ_FROM_RGB.sum(axis=1)
-
-
 def flip(
-    image: NDArray,
-    reference: NDArray,
-    mask: NDArray | None = None,
+    image: Image,
+    reference: Image,
+    mask: Mask = None,
     peak: float = 255.0,
-    pixels_per_degree: float = PIXELS_PER_DEGREE,
+    pixels_per_degree: float = 3840 * math.pi / 180,
 ) -> float:
-    """Mean FLIP error over a region: 0 for equal images, at most 1.
+    """Mean FLIP error (Andersson et al. 2020) over a region: 0 for equal images, at most 1.
+
+    Colours are blurred by the eye's contrast sensitivity and compared where they are perceptually even; edges and
+    points are compared beside them. The constants are the paper's.
 
     Parameters
     ----------
     image, reference : (H, W, 3) or (H, W)
         sRGB codes, 0..peak.
     mask : (H, W) bool, optional
-        Region; the whole image by default. As the eye's blur does, a pixel's error depends on its neighbours, also
-        on those outside the region.
+        Region; the whole image by default. A pixel's error depends on its neighbours, also on those outside.
     peak : float
         Code of white.
     pixels_per_degree : float
-        Pixels that a degree of the field of view holds.
+        Pixels in a degree of the field of view; default: a screen of 3840 pixels seen from its own width.
 
     Raises
     ------
     InputError
         Shapes differ, or the region is empty.
     """
-    a, b, region = checked_pair(image, reference, mask)
-    margin = len(_sensitivity_support(pixels_per_degree)) // 2  # no filter reaches further
+    a, b, region = _checked(image, reference, mask)
+    margin = len(_support(_widest(pixels_per_degree))) // 2  # no filter reaches further
     box = tuple(
         slice(max(inside[0] - margin, 0), inside[-1] + margin + 1)
         for inside in (np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0)))
@@ -152,80 +119,86 @@ def flip(
     return float(flip_map(a[box] / peak, b[box] / peak, pixels_per_degree)[region[box]].mean())
 
 
-def flip_map(image: NDArray, reference: NDArray, pixels_per_degree: float = PIXELS_PER_DEGREE) -> NDArray[np.float64]:
+def flip_map(image: Image, reference: Image, pixels_per_degree: float = 3840 * math.pi / 180) -> NDArray[np.float64]:
     """(H, W) FLIP error of every pixel, 0..1, of two sRGB images with values 0..1; see `flip`."""
     a, b = (_opponent(x) for x in (image, reference))
     return _colour_error(a, b, pixels_per_degree) ** (1.0 - _feature_error(a[..., 0], b[..., 0], pixels_per_degree))
 
 
+# Contrast sensitivity of the channels Y, Cx, Cz as sums of Gaussians in degrees: a sqrt(pi / b) exp(-pi^2 x^2 / b).
+_SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
+_XYZ = np.array(  # of linear Rec. 709
+    [
+        [0.4123907992659595, 0.357584339383878, 0.1804807884018343],
+        [0.2126390058715103, 0.715168678767756, 0.0721923153607337],
+        [0.0193308187155918, 0.119194779794626, 0.9505321522496607],
+    ]
+)
+_NORMALIZED_XYZ = _XYZ / _XYZ.sum(axis=1, keepdims=True)  # 1, 1, 1 for white
+
+
 def _opponent(srgb: NDArray) -> NDArray[np.float64]:
     """SRGB 0..1 -> YCxCz, linear opponent colours."""
     rgb = srgb if srgb.ndim == 3 else np.repeat(srgb[..., None], 3, axis=-1)
-    x, y, z = np.moveaxis(srgb_to_linear(np.clip(rgb, 0.0, 1.0)) @ (XYZ_FROM_RGB / WHITE[:, None]).T, -1, 0)
+    x, y, z = np.moveaxis(srgb_to_linear(np.clip(rgb, 0.0, 1.0)) @ _NORMALIZED_XYZ.T, -1, 0)
     return np.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], axis=-1)
 
 
 def _blurred(opponent: NDArray, pixels_per_degree: float) -> NDArray[np.float64]:
     """YCxCz after the eye's contrast sensitivity -> linear RGB within the display's range."""
-    x = _sensitivity_support(pixels_per_degree) / pixels_per_degree
+    x = _support(_widest(pixels_per_degree)) / pixels_per_degree
     out = np.zeros_like(opponent)
-    for c, channel in enumerate(SENSITIVITY):
+    for c, channel in enumerate(_SENSITIVITY):
         total = 0.0
         for a, b in channel:
-            kernel = np.exp(-((math.pi * x) ** 2) / b)
-            weight = a * math.sqrt(math.pi / b)
+            kernel, weight = np.exp(-((math.pi * x) ** 2) / b), a * math.sqrt(math.pi / b)
             out[..., c] += weight * _separable(opponent[..., c], kernel, kernel)
             total += weight * kernel.sum() ** 2
         out[..., c] /= total
     y = (out[..., 0] + 16.0) / 116.0
-    xyz = np.stack([y + out[..., 1] / 500.0, y, y - out[..., 2] / 200.0], axis=-1) * WHITE
-    return np.clip(xyz @ RGB_FROM_XYZ.T, 0.0, 1.0)
+    xyz = np.stack([y + out[..., 1] / 500.0, y, y - out[..., 2] / 200.0], axis=-1)
+    return np.clip(xyz @ np.linalg.inv(_NORMALIZED_XYZ).T, 0.0, 1.0)
 
 
 def _hunt_lab(linear: NDArray) -> NDArray[np.float64]:
     """Linear RGB -> CIELAB whose colourfulness grows with lightness, as the eye's does (Hunt)."""
-    t = linear @ (XYZ_FROM_RGB / WHITE[:, None]).T
-    d = 6.0 / 29.0
+    t, d = linear @ _NORMALIZED_XYZ.T, 6.0 / 29.0
     fx, fy, fz = np.moveaxis(np.where(t > d**3, np.cbrt(t), t / (3.0 * d**2) + 4.0 / 29.0), -1, 0)
     lightness = 116.0 * fy - 16.0
     return np.stack([lightness, 5.0 * lightness * (fx - fy), 2.0 * lightness * (fy - fz)], axis=-1)
 
 
-def _hyab(a: NDArray, b: NDArray) -> NDArray[np.float64]:
-    """Distance of colours that stays meaningful when they are far apart."""
-    d = a - b
-    return np.abs(d[..., 0]) + np.hypot(d[..., 1], d[..., 2])
-
-
 def _colour_error(a: NDArray, b: NDArray, pixels_per_degree: float) -> NDArray[np.float64]:
-    found = _hyab(*(_hunt_lab(_blurred(x, pixels_per_degree)) for x in (a, b))) ** COLOUR_EXPONENT
-    largest = float(_hyab(_hunt_lab(np.array([0.0, 1.0, 0.0])), _hunt_lab(np.array([0.0, 0.0, 1.0]))))
-    largest **= COLOUR_EXPONENT
-    knee = KNEE * largest
-    above = KNEE_ERROR + (found - knee) / (largest - knee) * (1.0 - KNEE_ERROR)
-    return np.clip(np.where(found < knee, found * KNEE_ERROR / knee, above), 0.0, 1.0)
+    """HyAB distance in powers of 0.7; up to 0.4 of the largest, green against blue, it fills errors up to 0.95."""
+
+    def distance(one: NDArray, other: NDArray) -> NDArray:
+        d = _hunt_lab(one) - _hunt_lab(other)
+        return (np.abs(d[..., 0]) + np.hypot(d[..., 1], d[..., 2])) ** 0.7
+
+    found = distance(*(_blurred(x, pixels_per_degree) for x in (a, b)))
+    largest = float(distance(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])))
+    return np.interp(found, (0.0, 0.4 * largest, largest), (0.0, 0.95, 1.0))
 
 
 def _feature_error(a: NDArray, b: NDArray, pixels_per_degree: float) -> NDArray[np.float64]:
-    """Difference in edges and points of lightness."""
-    sigma = 0.5 * FEATURE_DEGREES * pixels_per_degree
+    """Difference in edges and points of lightness, 0.082 degrees wide."""
+    sigma = 0.5 * 0.082 * pixels_per_degree
     x = _support(3.0 * sigma)
     blur = np.exp(-(x**2) / (2.0 * sigma**2))
-    difference = np.zeros(a.shape)
+    smooth, difference = blur / blur.sum(), np.zeros(a.shape)
     for profile in (-x * blur, (x**2 / sigma**2 - 1.0) * blur):
         balanced = np.where(profile > 0, profile / profile[profile > 0].sum(), -profile / profile[profile < 0].sum())
-        strength = []
-        for image in (a, b):
-            y = (image + 16.0) / 116.0
-            smooth = blur / blur.sum()
-            strength.append(np.hypot(_separable(y, smooth, balanced), _separable(y, balanced, smooth)))
-        difference = np.maximum(difference, np.abs(strength[0] - strength[1]))
-    return np.clip(difference / math.sqrt(2.0), 0.0, 1.0) ** FEATURE_EXPONENT
+        one, other = (
+            np.hypot(_separable(y, smooth, balanced), _separable(y, balanced, smooth))
+            for y in ((image + 16.0) / 116.0 for image in (a, b))
+        )
+        difference = np.maximum(difference, np.abs(one - other))
+    return np.clip(difference / math.sqrt(2.0), 0.0, 1.0) ** 0.5
 
 
-def _sensitivity_support(pixels_per_degree: float) -> NDArray[np.float64]:
-    widest = max(b for channel in SENSITIVITY for _, b in channel)
-    return _support(3.0 * math.sqrt(widest / (2.0 * math.pi**2)) * pixels_per_degree)
+def _widest(pixels_per_degree: float) -> float:
+    """Pixels that the widest Gaussian of the contrast sensitivity reaches."""
+    return 3.0 * math.sqrt(max(b for c in _SENSITIVITY for _, b in c) / (2.0 * math.pi**2)) * pixels_per_degree
 
 
 def _support(radius: float) -> NDArray[np.float64]:

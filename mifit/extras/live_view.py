@@ -37,7 +37,7 @@ from mifit.output.deferred import render_local
 from mifit.output.relight import relit
 from mifit.output.views import on_backdrop, orbit_camera
 from mifit.progress import Progress
-from mifit.result import METHODS, Method, Result
+from mifit.result import METHODS, Method, Reconstruction
 
 ROWS = (160, 600)
 """Rows of a picture while something moves, and when it rests."""
@@ -77,12 +77,12 @@ class Picture:
 
     Parameters
     ----------
-    result : Result
+    result : Reconstruction
     """
 
-    def __init__(self, result: Result) -> None:
+    def __init__(self, result: Reconstruction) -> None:
         self.result = result
-        self._lit: tuple[tuple[float, Path | None], Result] = ((0.0, None), result)
+        self._lit: tuple[tuple[float, Path | None], Reconstruction] = ((0.0, None), result)
 
     def render(self, shown: Shown, camera: Camera) -> NDArray[np.uint8]:
         """(H, W, 3) 8-bit sRGB; raises InputError for an environment that can't be read."""
@@ -93,7 +93,7 @@ class Picture:
         return to_8_bit(on_backdrop(image))
 
 
-def under(result: Result, turn: float, environment: Path | None) -> Result:
+def under(result: Reconstruction, turn: float, environment: Path | None) -> Reconstruction:
     """A result under its own light or an environment, turned about the vertical by degrees."""
     if environment is not None:
         return relit(result, environment, [turn], "auto")[0]
@@ -104,7 +104,7 @@ def under(result: Result, turn: float, environment: Path | None) -> Result:
     return result.with_illumination(illumination)
 
 
-def vertical(result: Result) -> NDArray[np.float64]:
+def vertical(result: Reconstruction) -> NDArray[np.float64]:
     """(3,) unit vector: up in the mean of the fitted cameras."""
     return normalize(-np.mean([c.rotation[1] for c in result.cameras], axis=0))
 
@@ -209,7 +209,7 @@ class LiveView:
 
     Parameters
     ----------
-    result : Result
+    result : Reconstruction
         Fitted, tracked or relit.
     host, port : str, int
         Where the server listens; port 0 takes a free one.
@@ -220,7 +220,7 @@ class LiveView:
         The result has no cameras, viser isn't installed, or nothing can listen at the address.
     """
 
-    def __init__(self, result: Result, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(self, result: Reconstruction, host: str = "127.0.0.1", port: int = 8080) -> None:
         try:
             import viser
         except ImportError:
@@ -277,7 +277,7 @@ class LiveView:
                 self._coarse.discard(client)
                 self._send(handle, ROWS[1])
 
-    def replace(self, result: Result) -> None:
+    def replace(self, result: Reconstruction) -> None:
         """Show a later state of the same fit: what it has newly is offered, and shown unless a person chose a part."""
         new = result.methods[-1] if self._shown.method == self._newest else self._shown.method
         if result.reflectance is not None and self._picture.result.reflectance is None:
@@ -297,7 +297,7 @@ class LiveView:
         self._server.stop()
         self._folder.cleanup()
 
-    def _controls(self, result: Result) -> None:
+    def _controls(self, result: Reconstruction) -> None:
         gui = self._server.gui
         parts = {LABELS[m]: m for m in METHODS}
         shown = gui.add_dropdown(
@@ -414,7 +414,7 @@ class FitView:
         after = time.monotonic()
         self._next = after + max(0.1, (after - now) * (1.0 / SHARE - 1.0))
 
-    def watch(self, result: Result) -> None:
+    def watch(self, result: Reconstruction) -> None:
         """Show the result so far."""
         if self.live is not None:
             self.live.replace(result)

@@ -30,7 +30,7 @@ from mifit.tracking import Follower
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
-    from mifit.reconstruction import Reconstruction
+    from mifit.result import Reconstruction
 
 MOST = 16
 """Frames that enter, fitted ones included."""

@@ -10,7 +10,6 @@ Regions follow the landmarks of the photograph alone, so that they are the same 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -22,19 +21,13 @@ from mifit.core.metrics import flip, psnr_from_rmse, ssim
 from mifit.core.sh import LUMINANCE
 from mifit.errors import InputError
 
-SHRINK = 4
-"""Pixels by which the hull of the landmarks shrinks."""
 EYES, INNER_LIPS, BROWS = ((36, 42), (42, 48)), (60, 68), ((17, 22), (22, 27))
 """iBUG landmarks of what is no skin, first and past the last."""
-BROW_WIDTH = 0.05
-"""Of the face's width: half of a brow's height."""
-SMOOTH = 3.0
-"""Pixels by which specular images are blurred before they are compared a second time."""
 
 Region = NDArray[np.bool_]
 
 
-def face_region(landmarks: NDArray, camera: Camera, shrink: int = SHRINK) -> Region:
+def face_region(landmarks: NDArray, camera: Camera, shrink: int = 4) -> Region:
     """(H, W) hull of 68 landmarks (68, 2), eroded by ``shrink`` pixels."""
     side = 2 * shrink + 1
     return cv2.erode(_hull(landmarks, camera), np.ones((side, side), np.uint8)) > 0
@@ -56,7 +49,7 @@ def pass_region(landmarks: NDArray, camera: Camera) -> Region:
     """(H, W) as `relit_region`, without brows and further from the hull: bare skin, for diffuse and specular images."""
     hair = np.zeros((camera.height, camera.width), np.uint8)
     for first, last in BROWS:
-        width = max(int(BROW_WIDTH * np.ptp(landmarks[:, 0])), 1)
+        width = max(int(0.05 * np.ptp(landmarks[:, 0])), 1)  # half of a brow's height
         cv2.polylines(hair, [landmarks[first:last].astype(np.int32)], False, 1, width)
     inner = face_region(landmarks, camera, 7)
     return inner & (_openings(landmarks, camera, 2.0, 2.0) == 0) & (hair == 0)
@@ -84,29 +77,31 @@ class Errors:
         self.pixels = 0
         self._sums = np.zeros(4)
 
-    def add(self, image: NDArray[np.uint8], photograph: NDArray[np.uint8], region: Region) -> None:
-        """Add the pixels of a region of 8-bit sRGB images (H, W, 3); an empty region adds nothing."""
+    def add(self, image: NDArray[np.uint8], photograph: NDArray[np.uint8], region: Region) -> dict[str, float]:
+        """Add a region of 8-bit sRGB images (H, W, 3); returns its own `figures`, none of an empty region."""
         count = int(region.sum())
         if not count:
-            return
+            return {}
         a, b = image[region].astype(np.float64), photograph[region].astype(np.float64)
         means = ((a - b) ** 2).mean(), (matched_difference(a, b) ** 2).mean()
         box = _around(region)
         pair = image[box], photograph[box], region[box]
-        self._sums += count * np.array([*means, ssim(*pair), flip(*pair)])
+        sums = count * np.array([*means, ssim(*pair), flip(*pair)])
+        self._sums += sums
         self.pixels += count
+        return _figures(sums, count)
 
     def figures(self) -> dict[str, float]:
         """PSNR (dB), PSNR after one factor per channel and image, RMSE (0..255), SSIM, FLIP and number of pixels."""
-        squared, matched, likeness, flipped = self._sums / max(self.pixels, 1)
-        return {
-            "psnr": psnr_from_rmse(math.sqrt(squared)),
-            "psnr_matched": psnr_from_rmse(math.sqrt(matched)),
-            "rmse": math.sqrt(squared),
-            "ssim": float(likeness),
-            "flip": float(flipped),
-            "pixels": self.pixels,
-        }
+        return _figures(self._sums, self.pixels)
+
+
+def _figures(sums: NDArray, pixels: int) -> dict[str, float]:
+    squared, matched, likeness, flipped = map(float, sums / max(pixels, 1))
+    rmse = math.sqrt(squared)
+    psnr, psnr_matched = psnr_from_rmse(rmse), psnr_from_rmse(math.sqrt(matched))
+    figures = {"psnr": psnr, "psnr_matched": psnr_matched, "rmse": rmse, "ssim": likeness, "flip": flipped}
+    return {**figures, "pixels": pixels}
 
 
 def _around(region: Region, margin: int = 48) -> tuple[slice, slice]:
@@ -161,7 +156,7 @@ def separation(
     weights = np.asarray(LUMINANCE, np.float64)
 
     def blurred(image: NDArray) -> NDArray:
-        return cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTH)
+        return cv2.GaussianBlur(image.astype(np.float32), (0, 0), 3.0)
 
     def likeness(found: NDArray, true: NDArray) -> tuple[float, float]:
         a, b = found[region] @ weights, true[region] @ weights
@@ -187,8 +182,3 @@ def separation(
         "diffuse_psnr": scaled_psnr(diffuse, true_diffuse, region),
         "diffuse_psnr_unseparated": scaled_psnr(true_diffuse + true_specular, true_diffuse, region),
     }
-
-
-def pooled(figures: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Mean of every figure over several views."""
-    return {key: float(np.mean([f[key] for f in figures])) for key in figures[0]} if figures else {}

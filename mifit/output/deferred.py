@@ -24,7 +24,7 @@ from mifit.render.first_hits import occluding_mesh
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
-    from mifit.result import Method, Result
+    from mifit.result import Method, Reconstruction
 
 
 @dataclass(frozen=True)
@@ -74,10 +74,10 @@ class VisibleSurface:
         return out.reshape(height, width, 4)
 
 
-def visible_surface(reconstruction: Result, camera: Camera, timestep: int, oversampling: int = 2) -> VisibleSurface:
+def visible_surface(result: Reconstruction, camera: Camera, timestep: int, oversampling: int = 2) -> VisibleSurface:
     """Find the front-facing surface under every sample of a camera's pixels."""
-    i = reconstruction.index(timestep)
-    return trace_mesh(reconstruction.geometry.vertices[i], reconstruction.model.faces, camera, oversampling)
+    i = result.index(timestep)
+    return trace_mesh(result.geometry.vertices[i], result.model.faces, camera, oversampling)
 
 
 def trace_mesh(vertices: NDArray, faces: NDArray, camera: Camera, oversampling: int) -> VisibleSurface:
@@ -131,21 +131,19 @@ class SampledMaterial:
     specular: NDArray[np.float32]
 
 
-def surface_material(reconstruction: Result, surface: VisibleSurface, timestep: int) -> SampledMaterial:
+def surface_material(result: Reconstruction, surface: VisibleSurface, timestep: int) -> SampledMaterial:
     """Look up maps where there are maps, and vertex albedo that continues them and the mesh's normals elsewhere."""
-    model, geometry = reconstruction.model, reconstruction.geometry
-    rotation = geometry.rotation[reconstruction.index(timestep)]
-    base = _mesh_normals(reconstruction, surface, timestep).astype(np.float32)
+    model, geometry = result.model, result.geometry
+    rotation = geometry.rotation[result.index(timestep)]
+    base = _mesh_normals(result, surface, timestep).astype(np.float32)
     normal = base.copy()
-    inside = mapped_faces(reconstruction)[surface.face]
+    inside = mapped_faces(result)[surface.face]
     diffuse = np.zeros((len(inside), 3), dtype=np.float32)
     specular = np.zeros(len(inside), dtype=np.float32)
     if not inside.all():
-        values = interpolate(
-            vertex_materials(reconstruction), model.faces, surface.face[~inside], surface.weights[~inside]
-        )
+        values = interpolate(vertex_materials(result), model.faces, surface.face[~inside], surface.weights[~inside])
         diffuse[~inside], specular[~inside] = values[:, :3], values[:, 3]
-    maps = surface_maps(reconstruction, timestep)
+    maps = surface_maps(result, timestep)
     uv = interpolate(model.uv, model.faces_uv, surface.face[inside], surface.weights[inside])
     diffuse[inside] = sample_map(maps.diffuse, uv)
     specular[inside] = sample_map(maps.specular, uv)
@@ -154,15 +152,15 @@ def surface_material(reconstruction: Result, surface: VisibleSurface, timestep: 
 
 
 def render_local(
-    reconstruction: Result, camera: Camera, timestep: int, method: Method, oversampling: int = 2
+    result: Reconstruction, camera: Camera, timestep: int, method: Method, oversampling: int = 2
 ) -> NDArray[np.float32]:
     """Render one view by local shading; see `Reconstruction.render`."""
-    surface = visible_surface(reconstruction, camera, timestep, oversampling)
-    return shade_methods(reconstruction, surface, timestep, (method,))[method]
+    surface = visible_surface(result, camera, timestep, oversampling)
+    return shade_methods(result, surface, timestep, (method,))[method]
 
 
 def shade_methods(
-    reconstruction: Result,
+    result: Reconstruction,
     surface: VisibleSurface,
     timestep: int,
     methods: tuple[Method, ...],
@@ -175,21 +173,21 @@ def shade_methods(
     """
     out: dict[Method, NDArray[np.float32]] = {}
     if "pca" in methods:
-        out["pca"] = surface.image(_shade_stage_1(reconstruction, surface, timestep))
+        out["pca"] = surface.image(_shade_stage_1(result, surface, timestep))
     finer = [m for m in methods if m != "pca"]
     if finer:
-        reflectance = reconstruction.reflectance
+        reflectance = result.reflectance
         assert reflectance is not None
-        model, vertices = reconstruction.model, reconstruction.geometry.vertices[reconstruction.index(timestep)]
-        material = material or surface_material(reconstruction, surface, timestep)
+        model, vertices = result.model, result.geometry.vertices[result.index(timestep)]
+        material = material or surface_material(result, surface, timestep)
         base = material.base
         appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: _look_up(model, surface, m)))
         points = MeshPoints(surface.points, base, surface.face, surface.weights)
         mesh = occluding_mesh(vertices, model.faces)
-        if reconstruction.environment is not None and appearance.lobe.fresnel is not None:
-            turn = reconstruction.environment_rotation
-            light = EnvironmentLight(reconstruction.environment, np.eye(3) if turn is None else turn)
-            albedo, lobe, view = _vertex_albedo(reconstruction), appearance.lobe, surface.view
+        if result.environment is not None and appearance.lobe.fresnel is not None:
+            turn = result.environment_rotation
+            light = EnvironmentLight(result.environment, np.eye(3) if turn is None else turn)
+            albedo, lobe, view = _vertex_albedo(result), appearance.lobe, surface.view
             shaded = light.shade(mesh.scene, points, material.normal, view, lobe, albedo, surface.group)
         else:
             occlusion = appearance.trace(mesh, points)
@@ -198,26 +196,26 @@ def shade_methods(
         for method in finer:
             specular = material.specular[:, None] if method == "full" else np.float32(0.0)
             colour = form_image(ambient, material.diffuse, shaded[0], specular, shaded[1])
-            out[method] = surface.image(_with_residual(reconstruction, surface, timestep, colour, method))
+            out[method] = surface.image(_with_residual(result, surface, timestep, colour, method))
     return {m: out[m] for m in methods}
 
 
 def _with_residual(
-    reconstruction: Result, surface: VisibleSurface, timestep: int, colour: NDArray, method: Method
+    result: Reconstruction, surface: VisibleSurface, timestep: int, colour: NDArray, method: Method
 ) -> NDArray:
     """Colours (N, 3) with what the fitted images of the timestep show beyond the model, which ``full`` alone has."""
-    residual = None if reconstruction.residual is None else reconstruction.residual.at(timestep)
+    residual = None if result.residual is None else result.residual.at(timestep)
     if residual is None or method != "full":
         return colour
-    inside = mapped_faces(reconstruction)[surface.face, None]
-    return np.where(inside, np.maximum(colour + _look_up(reconstruction.model, surface, residual), 0), colour)
+    inside = mapped_faces(result)[surface.face, None]
+    return np.where(inside, np.maximum(colour + _look_up(result.model, surface, residual), 0), colour)
 
 
-def _vertex_albedo(reconstruction: Result) -> NDArray[np.float32]:
+def _vertex_albedo(result: Reconstruction) -> NDArray[np.float32]:
     """(V, 3) diffuse albedo at the vertices: the map's in the face area, the fitted model's elsewhere."""
-    model, reflectance = reconstruction.model, reconstruction.reflectance
+    model, reflectance = result.model, result.reflectance
     assert reflectance is not None
-    albedo = np.clip(reconstruction.geometry.vertex_albedo, 0.0, 1.0).astype(np.float32)
+    albedo = np.clip(result.geometry.vertex_albedo, 0.0, 1.0).astype(np.float32)
     inside = model.face_mask
     uv = model.uv[model.faces_uv[inside].ravel()]
     albedo[model.faces[inside].ravel()] = sample_map(reflectance.lit_diffuse, uv)
@@ -230,16 +228,16 @@ def _look_up(model: MorphableModel, surface: VisibleSurface, image: NDArray) -> 
     return sample_map(image, np.clip(uv, 0.0, 1.0))
 
 
-def _mesh_normals(reconstruction: Result, surface: VisibleSurface, timestep: int) -> NDArray:
+def _mesh_normals(result: Reconstruction, surface: VisibleSurface, timestep: int) -> NDArray:
     """(N, 3) unit normals of the fitted mesh in world space, interpolated."""
-    faces = reconstruction.model.faces
-    normals = vertex_normals(reconstruction.geometry.vertices[reconstruction.index(timestep)], faces)
+    faces = result.model.faces
+    normals = vertex_normals(result.geometry.vertices[result.index(timestep)], faces)
     return normalize(interpolate(normals, faces, surface.face, surface.weights))
 
 
-def _shade_stage_1(reconstruction: Result, surface: VisibleSurface, timestep: int) -> NDArray:
+def _shade_stage_1(result: Reconstruction, surface: VisibleSurface, timestep: int) -> NDArray:
     """The paper's I_a + I_d (section 4.1) with the fitted model's albedo and normals."""
-    geometry = reconstruction.geometry
-    normal = _mesh_normals(reconstruction, surface, timestep)
-    albedo = interpolate(geometry.vertex_albedo, reconstruction.model.faces, surface.face, surface.weights)
+    geometry = result.geometry
+    normal = _mesh_normals(result, surface, timestep)
+    albedo = interpolate(geometry.vertex_albedo, result.model.faces, surface.face, surface.weights)
     return geometry.ambient + albedo * (basis(normal, 3) @ geometry.shading)

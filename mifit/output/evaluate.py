@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,12 +13,10 @@ from scipy.ndimage import binary_erosion
 
 from mifit.core.camera import Camera
 from mifit.core.image import to_8_bit
-from mifit.core.metrics import flip, mean_squared_error, psnr_from_rmse, ssim
 from mifit.errors import InputError
-from mifit.output.compare import pass_region, separation, skin_region
+from mifit.output.compare import Errors, pass_region, separation, skin_region
 from mifit.output.deferred import shade_methods, trace_mesh, visible_surface
-from mifit.output.pose import pose_head
-from mifit.output.resect import needs_resection, resect
+from mifit.output.placement import needs_resection, pose_head, resect
 from mifit.output.truth import TrueMesh, landmarks_of, true_mesh, true_passes
 from mifit.progress import Progress, silent
 from mifit.render.image_based import BLENDS, image_based
@@ -26,11 +24,9 @@ from mifit.render.image_based import BLENDS, image_based
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
-    from mifit.result import Method, Result
+    from mifit.result import Method, Reconstruction
 
 Region = Literal["face", "skin", "truth"]
-EROSION = 2
-"""Pixels by which the face area shrinks before errors are measured in it."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +60,7 @@ class Comparison:
 
 
 def evaluate(
-    reconstruction: Result,
+    result: Reconstruction,
     capture: Capture,
     camera: str,
     timesteps: Sequence[int] | None = None,
@@ -74,28 +70,24 @@ def evaluate(
     watch: Callable[[Comparison], None] | None = None,
     passes: bool = False,
 ) -> dict[str, Any]:
-    """Compare renders with photographs over the face area.
+    """Errors of renders against photographs over the face area, in 8-bit sRGB.
 
-    Values are 8-bit sRGB. The region is the face area visible in the camera, eroded by 2 pixels, and the same for
-    all methods. A pixel of the region that the fitted model does not cover is an error pixel: it was rendered as 0.
-    Pixels that undistortion left without a value do not count. Over several timesteps the squared error is pooled
-    over all pixels before PSNR and RMSE are taken.
-
-    A camera of an uncalibrated capture that was not fitted is placed from its landmarks against the fitted head. At a
-    timestep that was not fitted the head is placed by its landmarks (`output.pose`), and image-based rendering takes
-    its colours from all fitted ones.
+    The region is the same for all methods. A pixel of it that the fitted model doesn't cover counts as black; pixels
+    without a value after undistortion don't count. Over several timesteps squared errors are pooled over all pixels. A
+    camera of an uncalibrated capture that was not fitted, and the head of a timestep that was not fitted, are placed by
+    landmarks (`output.placement`); image-based rendering then takes its colours from all fitted timesteps.
 
     Parameters
     ----------
-    reconstruction : Result
+    result : Reconstruction
     capture : Capture
     camera : str
         A camera of the capture.
     timesteps : sequence of int, optional
         Default: the timesteps that were fitted.
     region : {"face", "skin", "truth"}
-        ``face``: face area of the fitted model; ``truth``: face area of the capture's ground-truth mesh; ``skin``: the
-        hull of the photograph's landmarks without eyes and inner mouth (`output.compare.skin_region`), where a fitted
+        ``face``: face area of the fitted model, eroded by 2 pixels; ``truth``: that of the capture's true mesh;
+        ``skin``: the hull of the landmarks without eyes and inner mouth (`output.compare.skin_region`), where a fitted
         view sees the true mesh, or the fitted one where there is none.
     progress : Progress
     baseline : bool
@@ -108,14 +100,12 @@ def evaluate(
     Returns
     -------
     dict
-        ``{"camera", "timesteps", "region", "region_pixels", "methods": {method: {"psnr", "rmse", "ssim",
-        "flip"}}, "per_timestep": [{"timestep", "region_pixels", "methods"}]}``; PSNR in dB, RMSE 0..255, FLIP 0..1.
-        With ``baseline`` also ``"baseline": {"region_pixels", "methods"}``, over the pixels of the region that a
-        fitted view sees, with ``"image_based"`` (squared cosine), ``"image_based_nearest"`` and
-        ``"image_based_angle"`` among the methods; for a camera that had to be placed,
-        ``"resected": {"landmark_pixels", "focal_pixels"}``, and for timesteps that had no head
-        ``"posed": {timestep: {"landmark_pixels"}}``; with ``passes`` also ``"passes"``, what
-        `output.compare.separation` gives.
+        ``camera``, ``timesteps``, ``region``, ``region_pixels``, ``methods``: by method what
+        `output.compare.Errors.figures` gives; ``per_timestep``: a list of ``timestep``, ``region_pixels`` and
+        ``methods``. With ``baseline`` also ``baseline``: ``region_pixels`` and ``methods`` over the pixels that a
+        fitted view sees, ``image_based``, ``image_based_nearest`` and ``image_based_angle`` among them. For a camera
+        that had to be placed ``resected``: ``landmark_pixels`` and ``focal_pixels``; for timesteps without a fit
+        ``posed``, by timestep ``landmark_pixels``; with ``passes`` what `output.compare.separation` gives.
 
     Raises
     ------
@@ -123,20 +113,21 @@ def evaluate(
         Unknown camera or timestep, a head or a camera that has too few landmarks to be placed by, no ground truth, or
         a face area that is not visible.
     """
-    steps = reconstruction.timesteps if timesteps is None else tuple(timesteps)
-    placed = resect(reconstruction, capture, camera) if needs_resection(reconstruction, capture, camera) else None
+    steps = result.timesteps if timesteps is None else tuple(timesteps)
+    placed = resect(result, capture, camera) if needs_resection(result, capture, camera) else None
     if placed is not None:
-        capture = capture.with_estimate([*reconstruction.cameras, placed.camera])
-    separated = separation_of(reconstruction, capture, camera) if passes else None
+        capture = capture.with_estimate([*result.cameras, placed[0]])
+    separated = separation_of(result, capture, camera) if passes else None
     per_timestep, posed = [], {}
-    whole, seen = _Sums(), _Sums()
+    whole, seen = defaultdict(Errors), defaultdict(Errors)
     progress("Evaluating", 0, len(steps))
     for done, timestep in enumerate(steps):
-        found = compare(reconstruction, capture, camera, timestep, region, baseline=baseline)
+        found = compare(result, capture, camera, timestep, region, baseline=baseline)
         renders = {str(method): render[..., :3] for method, render in found.renders.items()}
-        figures = whole.add(renders, found.photograph, found.region)
+        figures = {m: whole[m].add(image, found.photograph, found.region) for m, image in renders.items()}
         if found.seen is not None:
-            seen.add({**found.baseline, **renders}, found.photograph, found.seen)
+            for name, image in {**found.baseline, **renders}.items():
+                seen[name].add(image, found.photograph, found.seen)
         per_timestep.append({"timestep": timestep, "region_pixels": int(found.region.sum()), "methods": figures})
         if found.landmark_pixels is not None:
             posed[str(timestep)] = {"landmark_pixels": found.landmark_pixels}
@@ -147,22 +138,27 @@ def evaluate(
         "camera": camera,
         "timesteps": list(steps),
         "region": region,
-        "region_pixels": whole.pixels,
-        "methods": whole.figures(),
+        **_figures(whole),
         "per_timestep": per_timestep,
     }
     if baseline:
-        out["baseline"] = {"region_pixels": seen.pixels, "methods": seen.figures()}
+        out["baseline"] = _figures(seen)
     if separated is not None:
         out["passes"] = separated
     if posed:
         out["posed"] = posed
     if placed is not None:
-        out["resected"] = {"landmark_pixels": placed.landmark_pixels, "focal_pixels": placed.camera.fx}
+        out["resected"] = {"landmark_pixels": placed[1], "focal_pixels": placed[0].fx}
     return out
 
 
-def separation_of(reconstruction: Result, capture: Capture, camera: str) -> dict[str, float]:
+def _figures(errors: Mapping[str, Errors]) -> dict[str, Any]:
+    """Pixels, which all methods share, and figures by method."""
+    pixels = next((e.pixels for e in errors.values()), 0)
+    return {"region_pixels": pixels, "methods": {name: e.figures() for name, e in errors.items()}}
+
+
+def separation_of(result: Reconstruction, capture: Capture, camera: str) -> dict[str, float]:
     """How well a result's diffuse and specular image of the first timestep agree with the truth's.
 
     The result is rendered without its residual, which is neither. See `output.compare.separation`.
@@ -175,10 +171,10 @@ def separation_of(reconstruction: Result, capture: Capture, camera: str) -> dict
     truth, timestep = true_passes(capture, camera), capture.timesteps[0]
     if truth is None:
         raise InputError(f"{capture.path}: --passes needs truth/diffuse_{camera}.exr, which is missing")
-    if timestep not in reconstruction.timesteps or "diffuse" not in reconstruction.methods:
+    if timestep not in result.timesteps or "diffuse" not in result.methods:
         raise InputError(f"--passes: needs reflectance and timestep {timestep}, of which the truth's passes are")
-    alone = replace(reconstruction, residual=None)
-    view = located(capture, reconstruction, camera).camera(camera)
+    alone = replace(result, residual=None)
+    view = located(capture, result, camera).camera(camera)
     surface = visible_surface(alone, view, timestep)
     linear = shade_methods(alone, surface, timestep, ("full", "diffuse"))
     full, diffuse = (linear[method] for method in ("full", "diffuse"))
@@ -187,40 +183,8 @@ def separation_of(reconstruction: Result, capture: Capture, camera: str) -> dict
     return separation(*parts, truth.diffuse, truth.specular, region)
 
 
-class _Sums:
-    """Squared error, similarity and FLIP error of some images, summed over the pixels of regions."""
-
-    def __init__(self) -> None:
-        self.pixels, self._sums = 0, dict[str, NDArray]()
-
-    def add(
-        self, images: Mapping[str, NDArray], photograph: NDArray, region: NDArray[np.bool_]
-    ) -> dict[str, dict[str, float]]:
-        """Add the pixels of one photograph; returns its own figures."""
-        count, figures = int(region.sum()), {}
-        if not count:
-            return {}
-        self.pixels += count
-        for name, image in images.items():
-            pair = (image, photograph, region)
-            means = np.array([mean_squared_error(*pair), ssim(*pair), flip(*pair)])
-            self._sums[name] = self._sums.get(name, np.zeros(3)) + count * means
-            figures[name] = _figures(means)
-        return figures
-
-    def figures(self) -> dict[str, dict[str, float]]:
-        """Of all pixels together."""
-        return {name: _figures(total / self.pixels) for name, total in self._sums.items()}
-
-
-def _figures(means: NDArray) -> dict[str, float]:
-    squared, likeness, flipped = map(float, means)
-    error = math.sqrt(squared)
-    return {"psnr": psnr_from_rmse(error), "rmse": error, "ssim": likeness, "flip": flipped}
-
-
 def compare(
-    reconstruction: Result,
+    result: Reconstruction,
     capture: Capture,
     camera: str,
     timestep: int,
@@ -230,12 +194,12 @@ def compare(
     baseline: bool = False,
 ) -> Comparison:
     """Render one view by some methods (default: all) and find the region in which to compare it; see `evaluate`."""
-    capture = located(capture, reconstruction, camera)
+    capture = located(capture, result, camera)
     view = capture.camera(camera)
-    shown, moments, off = reconstruction, None, None
-    if timestep not in reconstruction.timesteps:
-        shown, off = pose_head(reconstruction, capture, timestep)
-        moments = dict(zip(reconstruction.timesteps, reconstruction.geometry.vertices, strict=True))
+    shown, moments, off = result, None, None
+    if timestep not in result.timesteps:
+        shown, off = pose_head(result, capture, timestep)
+        moments = dict(zip(result.timesteps, result.geometry.vertices, strict=True))
     elif timestep not in capture.timesteps:
         raise InputError(f"timestep {timestep} is not in the capture; it has {', '.join(map(str, capture.timesteps))}")
     frame = capture.frame(camera, timestep)
@@ -253,7 +217,7 @@ def compare(
         )
         area = skin_region(landmarks_of(capture, camera, timestep), view) & sight.seen
     elif region == "truth":
-        truth = true_mesh(capture, timestep, reconstruction.model)
+        truth = true_mesh(capture, timestep, result.model)
         if truth is None:
             raise InputError(
                 f"{capture.path}: has no true mesh of timestep {timestep} (truth/{timestep:04d}.npz); --region truth "
@@ -284,19 +248,19 @@ def _true_mesh_or_none(capture: Capture, timestep: int, model: MorphableModel) -
         return None
 
 
-def held_out(reconstruction: Result, found: Mapping[str, Any]) -> bool:
+def held_out(result: Reconstruction, found: Mapping[str, Any]) -> bool:
     """Whether nothing that an evaluation compared with was fitted: another camera, or timesteps without a fit."""
-    fitted = found["camera"] in [c.name for c in reconstruction.cameras]
-    return not fitted or not set(found["timesteps"]) & set(reconstruction.timesteps)
+    fitted = found["camera"] in [c.name for c in result.cameras]
+    return not fitted or not set(found["timesteps"]) & set(result.timesteps)
 
 
-def located(capture: Capture, reconstruction: Result, camera: str) -> Capture:
+def located(capture: Capture, result: Reconstruction, camera: str) -> Capture:
     """The capture with the fitted cameras, and with the named one placed where it is neither calibrated nor fitted."""
-    if needs_resection(reconstruction, capture, camera):
-        return capture.with_estimate([*reconstruction.cameras, resect(reconstruction, capture, camera).camera])
+    if needs_resection(result, capture, camera):
+        return capture.with_estimate([*result.cameras, resect(result, capture, camera)[0]])
     if camera in capture.estimated:
         return capture
-    return reconstruction.seen(capture)
+    return result.seen(capture)
 
 
 def rgba_8_bit(linear: NDArray) -> NDArray[np.uint8]:
@@ -310,6 +274,5 @@ def face_area(vertices: NDArray, faces: NDArray, face_mask: NDArray, camera: Cam
     surface = trace_mesh(vertices, faces, camera, 1)
     area = np.zeros(camera.height * camera.width, dtype=bool)
     area[surface.index] = face_mask[surface.face]
-    side = 2 * EROSION + 1
     # The image's border is no border of the face.
-    return binary_erosion(area.reshape(camera.height, camera.width), np.ones((side, side)), border_value=1)
+    return binary_erosion(area.reshape(camera.height, camera.width), np.ones((5, 5)), border_value=1)

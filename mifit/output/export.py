@@ -17,7 +17,7 @@ from mifit.output.gltf import write_glb
 from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
-    from mifit.result import Result
+    from mifit.result import Reconstruction
 
 Format = Literal["glb", "obj", "ply", "mitsuba"]
 SUFFIXES = {"glb": ".glb", "obj": ".obj", "ply": ".ply", "mitsuba": ".xml"}
@@ -31,7 +31,7 @@ Mesh = Literal["fitted", "refined"]
 
 
 def export(
-    reconstruction: Result,
+    result: Reconstruction,
     format: Format,
     path: str | Path,
     timestep: int | None = None,
@@ -44,7 +44,7 @@ def export(
 
     Parameters
     ----------
-    reconstruction : Result
+    result : Reconstruction
     format : {"glb", "obj", "ply", "mitsuba"}
         ``glb``: binary glTF (`write_glb`). ``obj``: mesh in world space, ``.mtl`` and maps beside it. ``ply``: mesh
         in world space with UVs, normals and vertex colours. ``mitsuba``: a scene with mifit's plugins and, as
@@ -76,8 +76,8 @@ def export(
         raise InputError(f"{path}: found suffix {path.suffix!r}, expected {SUFFIXES[format]!r} for format {format}")
     if mesh not in ("fitted", "refined"):
         raise InputError(f"mesh: found {mesh!r}, expected 'fitted' or 'refined'")
-    timestep = reconstruction.timesteps[0] if timestep is None else timestep
-    reconstruction.index(timestep)
+    timestep = result.timesteps[0] if timestep is None else timestep
+    result.index(timestep)
     beside = ("_diffuse.png", "_specular.png", "_normal.png", "_normal.exr", ".mtl") if format == "obj" else ()
     for end in ("_displacement.exr", *beside) if mesh == "refined" else beside:
         check_overwriting(path.with_name(path.stem + end))
@@ -85,45 +85,45 @@ def export(
         raise InputError(f"animate: found format {format!r}, expected 'glb', the only one that holds an animation")
     if units is not None and (format not in ("obj", "ply") or units not in PER_UNIT):
         raise InputError(f"units: found {units!r} for {format}, expected m, cm or mm for obj or ply")
-    factor = 1.0 if units is None else reconstruction.unit_mm / PER_UNIT[units]
+    factor = 1.0 if units is None else result.unit_mm / PER_UNIT[units]
     if mesh == "refined":
-        displacement = reconstruction.displacement(timestep)
-        reconstruction = reconstruction.with_refined_mesh()
+        displacement = result.displacement(timestep)
+        result = result.with_refined_mesh()
         write_image(path.with_name(f"{path.stem}_displacement.exr"), displacement)
     if format == "glb":
-        write_glb(reconstruction, path, timestep, sorted(reconstruction.timesteps) if animate else None, fps)
+        write_glb(result, path, timestep, sorted(result.timesteps) if animate else None, fps)
     elif format == "obj":
-        _write_obj(reconstruction, path, timestep, factor, units or reconstruction.units)
+        _write_obj(result, path, timestep, factor, units or result.units)
     elif format == "ply":
-        split = split_at_seams(reconstruction.model)
-        vertices = reconstruction.geometry.vertices[reconstruction.index(timestep)]
-        normals = vertex_normals(vertices, reconstruction.model.faces)[split.origin]
-        albedo = reconstruction.geometry.vertex_albedo[split.origin]
+        split = split_at_seams(result.model)
+        vertices = result.geometry.vertices[result.index(timestep)]
+        normals = vertex_normals(vertices, result.model.faces)[split.origin]
+        albedo = result.geometry.vertex_albedo[split.origin]
         write_ply(path, factor * vertices[split.origin], split.faces, normals, split.uv, albedo)
     else:
         from mifit.output.scene import write_scene
 
-        write_scene(reconstruction, path, timestep)
+        write_scene(result, path, timestep)
 
 
-def _write_obj(reconstruction: Result, path: Path, timestep: int, factor: float, units: str) -> None:
+def _write_obj(result: Reconstruction, path: Path, timestep: int, factor: float, units: str) -> None:
     """OBJ with ``vt`` and ``vn``; what has maps and the rest are groups with a material each."""
-    model, i = reconstruction.model, reconstruction.index(timestep)
-    vertices = reconstruction.geometry.vertices[i]
+    model, i = result.model, result.index(timestep)
+    vertices = result.geometry.vertices[i]
     normals = vertex_normals(vertices, model.faces)
-    mesh, mapped = split_at_seams(model), mapped_faces(reconstruction)
-    maps = surface_maps(reconstruction, timestep, skin=True)
-    rotation = reconstruction.geometry.rotation[i]
+    mesh, mapped = split_at_seams(model), mapped_faces(result)
+    maps = surface_maps(result, timestep, skin=True)
+    rotation = result.geometry.rotation[i]
     bent = tangent_space_map(
         maps.normal, (vertices @ rotation)[mesh.origin], (normals @ rotation)[mesh.origin], mesh, mapped
     )
     stem = path.stem
     write_image(path.with_name(f"{stem}_diffuse.png"), maps.diffuse)
-    reflectance = np.clip(reconstruction.lobe.factor() * maps.specular / OBJ_SPECULAR, 0.0, 1.0)
+    reflectance = np.clip(result.lobe.factor() * maps.specular / OBJ_SPECULAR, 0.0, 1.0)
     write_image(path.with_name(f"{stem}_specular.png"), reflectance)
     write_bytes(path.with_name(f"{stem}_normal.png"), encode_png(np.round(127.5 * (bent + 1)).astype(np.uint8)))
     write_image(path.with_name(f"{stem}_normal.exr"), 0.5 * (bent + 1))
-    albedo = vertex_materials(reconstruction, skin=True)[:, :3]
+    albedo = vertex_materials(result, skin=True)[:, :3]
     rest = part_of(mesh, ~mapped) if not mapped.all() else None
     grey = albedo[rest.origin].mean(0) if rest else np.full(3, 0.5)
     colour = " ".join(f"{c:.5f}" for c in np.clip(grey, 0, 1))
@@ -132,8 +132,8 @@ def _write_obj(reconstruction: Result, path: Path, timestep: int, factor: float,
         path.with_suffix(".mtl"),
         # Pr, of physically based programs, is glTF's roughness. Blender reads a normal map from map_Bump, and takes its
         # values as they are in an .exr alone; other programs read norm.
-        f"newmtl skin\nillum 2\nKd 1 1 1\nKs {specular}\nNs {reconstruction.lobe.typical:.6g}\n"
-        f"Pr {math.sqrt(reconstruction.lobe.roughness):.4f}\nmap_Kd {stem}_diffuse.png\nmap_Ks {stem}_specular.png\n"
+        f"newmtl skin\nillum 2\nKd 1 1 1\nKs {specular}\nNs {result.lobe.typical:.6g}\n"
+        f"Pr {math.sqrt(result.lobe.roughness):.4f}\nmap_Kd {stem}_diffuse.png\nmap_Ks {stem}_specular.png\n"
         f"norm {stem}_normal.png\nmap_Bump -bm 1.0 {stem}_normal.exr\n\n"
         f"newmtl rest\nillum 1\nKd {colour}\nKs 0 0 0\n",
     )

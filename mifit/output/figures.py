@@ -19,7 +19,7 @@ from mifit.core.sh import SHLighting
 HEAT_LIMIT = 40.0
 """Error, in 8-bit steps, at which the heat map's colours end."""
 
-CLIPPED_TINT, UNEXPLAINED_TINT = (214, 39, 160), (0, 150, 255)
+CLIPPED_TINT = (214, 39, 160)
 LABEL_TINTS = (
     (Label.HAIR, (0, 160, 60), "hair"),
     (Label.CLOTH, (240, 150, 0), "cloth"),
@@ -27,8 +27,7 @@ LABEL_TINTS = (
     (Label.EYES, (0, 215, 215), "eyes"),
     (Label.MOUTH, (150, 60, 220), "mouth"),
 )
-"""Labels that the report colours, with their colour and name."""
-"""RGB of the areas of the face mask: apart in hue and lightness, and from skin."""
+"""Labels that the report colours, with their colour and name: apart in hue and lightness, and from skin."""
 
 _CURVES = ("#0f6cbd", "#b3470a", "#2b7a3d", "#8a3ab9", "#a3262e", "#5b5f66", "#96750b", "#0b7a75")
 

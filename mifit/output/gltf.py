@@ -23,7 +23,7 @@ from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 if TYPE_CHECKING:
     from mifit.core.camera import Camera
     from mifit.core.estimate import GeometryEstimate
-    from mifit.result import Result
+    from mifit.result import Reconstruction
 
 _KINDS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
@@ -88,7 +88,7 @@ def shape_name(name: str) -> str:
 
 
 def write_glb(
-    reconstruction: Result,
+    result: Reconstruction,
     path: str | Path,
     timestep: int | None = None,
     animate: Sequence[int] | None = None,
@@ -107,7 +107,7 @@ def write_glb(
 
     Parameters
     ----------
-    reconstruction : Result
+    result : Reconstruction
     path : path
     timestep : int, optional
         Whose mesh and normal map it has; default: the first that is animated, or else that was fitted.
@@ -116,10 +116,10 @@ def write_glb(
     fps : float
         Animated timesteps per second.
     """
-    model, geometry = reconstruction.model, reconstruction.geometry
-    timestep = (animate or reconstruction.timesteps)[0] if timestep is None else timestep
-    i = reconstruction.index(timestep)
-    metre = reconstruction.unit_mm / 1000.0
+    model, geometry = result.model, result.geometry
+    timestep = (animate or result.timesteps)[0] if timestep is None else timestep
+    i = result.index(timestep)
+    metre = result.unit_mm / 1000.0
     rotation, scale = geometry.rotation[i], float(geometry.scale)
     posed = (geometry.vertices[i] - geometry.translation[i]) @ rotation * metre
     normals = vertex_normals(posed, model.faces)
@@ -133,15 +133,15 @@ def write_glb(
 
     out = _Buffer()
     mesh = split_at_seams(model)
-    albedo = vertex_materials(reconstruction, skin=True)[:, :3]
+    albedo = vertex_materials(result, skin=True)[:, :3]
     primitives = []
-    mapped = mapped_faces(reconstruction)
+    mapped = mapped_faces(result)
     parts = {SKIN: mapped, REST: ~mapped}
     for material, selected in parts.items():
         if selected.any():
             part = part_of(mesh, selected)
             primitives.append(_primitive(out, part, base, normals, targets, material, albedo))
-    images, textures, skin = _skin(out, reconstruction, timestep, mesh, posed, normals)
+    images, textures, skin = _skin(out, result, timestep, mesh, posed, normals)
     subject = Path(path).stem
     head: dict[str, Any] = {"name": subject, "mesh": 0}
     animations = []
@@ -151,7 +151,7 @@ def write_glb(
             "rotation": _quaternions(rotation[None])[0].tolist(),
             "translation": (geometry.translation[i] * metre).tolist(),
         }
-        rows = [reconstruction.index(t) for t in animate]
+        rows = [result.index(t) for t in animate]
         animations.append(_animation(out, geometry, rows, np.subtract(animate, animate[0]) / fps, metre, full))
     else:
         pose = np.eye(4)
@@ -159,7 +159,7 @@ def write_glb(
         head["matrix"] = pose.T.ravel().tolist()
     nodes: list[dict[str, Any]] = [head]
     cameras: list[dict[str, Any]] = []
-    for camera in reconstruction.cameras:
+    for camera in result.cameras:
         nodes.append(_camera_node(camera, len(cameras), metre))
         cameras.append(_camera(camera))
     materials = [
@@ -174,9 +174,9 @@ def write_glb(
             {
                 "nodes": list(range(len(nodes))),
                 "extras": {
-                    "sh_radiance": reconstruction.lighting.coefficients.tolist(),
+                    "sh_radiance": result.lighting.coefficients.tolist(),
                     "sh_convention": "real, Condon-Shortley phase, index l*l+l+m, world axes",
-                    "lights": [light.document() for light in reconstruction.illumination.lights],
+                    "lights": [light.document() for light in result.illumination.lights],
                     "timestep": timestep,
                 },
             }
@@ -233,15 +233,13 @@ def _primitive(
 
 
 def _skin(
-    out: _Buffer, reconstruction: Result, timestep: int, mesh: SplitMesh, vertices: NDArray, normals: NDArray
+    out: _Buffer, result: Reconstruction, timestep: int, mesh: SplitMesh, vertices: NDArray, normals: NDArray
 ) -> tuple[list[dict], list[dict], dict[str, Any]]:
     """Images, textures and material of the face area."""
-    maps = surface_maps(reconstruction, timestep, skin=True)
-    bent = tangent_space_map(
-        maps.normal, vertices[mesh.origin], normals[mesh.origin], mesh, mapped_faces(reconstruction)
-    )
+    maps = surface_maps(result, timestep, skin=True)
+    bent = tangent_space_map(maps.normal, vertices[mesh.origin], normals[mesh.origin], mesh, mapped_faces(result))
     peak = max(float(maps.specular.max()), 1e-6)
-    lobe = reconstruction.lobe
+    lobe = result.lobe
     # Plain Blinn-Phong reflects alike at all angles; a fitted Fresnel factor has Schlick's form, as glTF's has.
     grazing = lobe.grazing
     planes = {

@@ -23,12 +23,12 @@ from mifit.output.evaluate import face_area
 from mifit.output.scene import render_view
 from mifit.output.views import check_moving, sheet, write_moving
 from mifit.progress import Progress, silent
-from mifit.result.record import R
+from mifit.result import Reconstruction
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.core.camera import Camera
-    from mifit.result import Method, Result
+    from mifit.result import Method
 
 AGREEMENT = 30.0
 """PSNR in dB between fast and path-traced views below which a person is warned. Five measured environments gave 31.6 to
@@ -44,10 +44,13 @@ Exposure = float | Literal["auto"]
 
 
 def relit(
-    reconstruction: R, lighting: Lighting, rotations: Sequence[float | NDArray] = (0.0,), exposure: Exposure = 1.0
-) -> list[R]:
+    result: Reconstruction,
+    lighting: Lighting,
+    rotations: Sequence[float | NDArray] = (0.0,),
+    exposure: Exposure = 1.0,
+) -> list[Reconstruction]:
     """The face under a lighting that is turned in several ways; see `Reconstruction.relight`."""
-    reflectance = reconstruction.reflectance
+    reflectance = result.reflectance
     if reflectance is None:
         raise InputError("relighting needs reflectance, but this fit ended after the geometry stage; fit it further")
     if exposure != "auto" and not (isinstance(exposure, (int, float)) and np.isfinite(exposure) and exposure > 0):
@@ -56,21 +59,21 @@ def relit(
     if isinstance(lighting, Illumination):
         if exposure == "auto":
             raise InputError("exposure: found 'auto', expected a number: this lighting has a level of its own")
-        lit, middle = lighting.scaled(exposure), reconstruction.geometry.middle
-        return [reconstruction.with_illumination(lit.rotated(turn, middle)) for turn in turns]
+        lit, middle = lighting.scaled(exposure), result.geometry.middle
+        return [result.with_illumination(lit.rotated(turn, middle)) for turn in turns]
     if isinstance(lighting, SHLighting):
         image, smooth = None, lighting
     else:
         image = _environment(lighting)
-        smooth = SHLighting.from_envmap(image, reconstruction.lighting.order)
-    level = _level(reconstruction.lighting) / _level(smooth)
+        smooth = SHLighting.from_envmap(image, result.lighting.order)
+    level = _level(result.lighting) / _level(smooth)
     factor = level if exposure == "auto" else float(exposure)
     # The ambient term stands for light that the model leaves out, such as interreflection: it grows with the light.
     lit = Illumination(factor * smooth.coefficients, ambient=reflectance.illumination.ambient * factor / level)
     shown = None if image is None else (factor * image).astype(np.float32)
     return [
         replace(
-            reconstruction.with_illumination(lit.rotated(turn)),
+            result.with_illumination(lit.rotated(turn)),
             environment=shown,
             environment_rotation=None if shown is None else turn,
         )
@@ -112,7 +115,7 @@ def _rotation(value: float | NDArray) -> NDArray[np.float64]:
 
 
 def write_relit(  # noqa: PLR0913
-    reconstruction: Result,
+    result: Reconstruction,
     environment: str | Path,
     folder: str | Path,
     cameras: Sequence[Camera] = (),
@@ -133,7 +136,7 @@ def write_relit(  # noqa: PLR0913
 
     Parameters
     ----------
-    reconstruction : Result
+    result : Reconstruction
     environment : path
     folder : path
         Made when it is missing.
@@ -164,12 +167,12 @@ def write_relit(  # noqa: PLR0913
     if video is not None:
         check_moving(video)
     image = _environment(environment)
-    lits = relit(reconstruction, image, rotations, exposure)
-    timestep, views = lits[0].timesteps[0], list(cameras) or list(reconstruction.cameras)
+    lits = relit(result, image, rotations, exposure)
+    timestep, views = lits[0].timesteps[0], list(cameras) or list(result.cameras)
     if not views:
         raise InputError("this result has no cameras to show it from; give one")
-    level = _level(SHLighting.from_envmap(image, reconstruction.lighting.order))
-    capture_exposure = _level(reconstruction.lighting) / level
+    level = _level(SHLighting.from_envmap(image, result.lighting.order))
+    capture_exposure = _level(result.lighting) / level
     used = capture_exposure if exposure == "auto" else float(exposure)
     shared: list[tuple[VisibleSurface, SampledMaterial]] = []
     if integrator == "local":
@@ -218,7 +221,7 @@ def write_relit(  # noqa: PLR0913
     return figures
 
 
-def _check(lit: Result, camera: Camera, timestep: int, samples: int, seed: int) -> dict[str, float]:
+def _check(lit: Reconstruction, camera: Camera, timestep: int, samples: int, seed: int) -> dict[str, float]:
     """Error of a fast view against the path-traced one, over the pixels that the head covers."""
     fast = render_view(lit, camera, timestep)
     path = render_view(lit, camera, timestep, integrator="path", samples=samples, seed=seed)
@@ -228,7 +231,7 @@ def _check(lit: Result, camera: Camera, timestep: int, samples: int, seed: int) 
 
 
 def evaluate_relit(
-    reconstruction: Result,
+    result: Reconstruction,
     environment: str | Path | NDArray,
     capture: Capture,
     camera: str,
@@ -244,7 +247,7 @@ def evaluate_relit(
 
     Parameters
     ----------
-    reconstruction : Result
+    result : Reconstruction
         Fitted to the head under another lighting.
     environment, rotate
         As in `Reconstruction.relight`.
@@ -266,10 +269,10 @@ def evaluate_relit(
     InputError
         The judged camera was fitted, or a camera or timestep is missing in the capture.
     """
-    if camera in [c.name for c in reconstruction.cameras]:
+    if camera in [c.name for c in result.cameras]:
         raise InputError(f"camera {camera}: was fitted; expected another one to judge by")
-    lit = relit(reconstruction, environment, [rotate])[0]
-    capture = capture.with_fitted(reconstruction.cameras)
+    lit = relit(result, environment, [rotate])[0]
+    capture = capture.with_fitted(result.cameras)
     steps = [t for t in lit.timesteps if t in capture.timesteps]
     if not steps:
         raise InputError(f"the capture has none of the timesteps {', '.join(map(str, lit.timesteps))}")
@@ -289,7 +292,7 @@ def evaluate_relit(
 
     methods = {}
     for method in ("diffuse", "full"):
-        pairs = [views(c.name, steps[:1], method) for c in reconstruction.cameras]
+        pairs = [views(c.name, steps[:1], method) for c in result.cameras]
         photograph, render = (np.concatenate(part).astype(np.float64) for part in zip(*pairs, strict=True))
         exposure = float((photograph * render).sum() / max(float((render * render).sum()), 1e-12))
         photograph, render = views(camera, steps, method)

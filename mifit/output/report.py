@@ -1,26 +1,25 @@
-"""``report.html``: one self-contained page about a reconstruction."""
+"""``report.html``: one self-contained page about a result."""
 
 from __future__ import annotations
 
 import html
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import mifit
 from mifit.core.files import write_text
 from mifit.core.image import to_8_bit
-from mifit.output.evaluate import Comparison, compare, held_out, rgba_8_bit
-from mifit.output.face_mask import face_mask
+from mifit.output.evaluate import Comparison, compare, face_area, held_out, rgba_8_bit
 from mifit.output.figures import (
     CLIPPED_TINT,
     HEAT_LIMIT,
     LABEL_TINTS,
-    UNEXPLAINED_TINT,
     bounding_box,
     draw_landmarks,
     energy_plot,
@@ -32,19 +31,14 @@ from mifit.output.figures import (
     png_uri,
     tint,
 )
-from mifit.output.map_figures import figure, picture_maps
 from mifit.output.scene import render_view
 from mifit.output.viewer import viewer_data
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
-    from mifit.result import Result
+    from mifit.result import Reconstruction
 
-NAMES = {
-    "pca": "Stage 1 (PCA)",
-    "diffuse": "Diffuse only",
-    "full": "Full",
-}
+NAMES = {"pca": "Stage 1 (PCA)", "diffuse": "Diffuse only", "full": "Full"}
 STAGES = {
     "geometry": "1 Geometry",
     "reflectance": "2 Reflectance",
@@ -58,46 +52,43 @@ SHOWN_TIMESTEPS = 4
 
 def write_report(
     folder: str | Path,
-    reconstruction: Result,
+    result: Reconstruction,
     capture: Capture,
     evaluation: dict[str, Any] | None = None,
     comparisons: Sequence[Comparison] = (),
 ) -> Path:
-    """Write ``report.html`` into a folder, whole or not at all.
+    """Write ``report.html`` into a folder, whole or not at all; returns the file.
 
     Parameters
     ----------
     folder : path
-    reconstruction : Result
+    result : Reconstruction
     capture : Capture
         Only the fitted cameras are read, and the evaluated one when an evaluation is given.
     evaluation : dict, optional
         What `evaluate` returned; adds the comparison of that view.
     comparisons : sequence of Comparison
         Those of the evaluation, where they are at hand; others are rendered.
-
-    Returns
-    -------
-    Path
-        The file.
     """
-    capture = reconstruction.seen(capture)
-    shown = reconstruction.timesteps[:SHOWN_TIMESTEPS]
-    sections = [
-        ("Result", _summary(reconstruction, evaluation)),
-        ("3D view", _view3d(reconstruction, shown[0])),
-        ("Inputs and fit", _inputs(reconstruction, capture, shown)),
-        ("Frames", _frames(reconstruction)),
-        ("Maps", picture_maps(reconstruction, shown[0])),
-        ("Lighting", _lighting(reconstruction)),
-        ("Convergence", _convergence(reconstruction)),
-        ("Settings", _settings(reconstruction)),
-    ]
-    if evaluation is not None:
-        sections.insert(2, ("Comparison", _comparison(reconstruction, capture, evaluation, comparisons)))
-    sections = [(title, body) for title, body in sections if body]
+    capture = result.seen(capture)
+    shown = result.timesteps[:SHOWN_TIMESTEPS]
+    comparison = "" if evaluation is None else _comparison(result, capture, evaluation, comparisons)
+    titled = {
+        "Result": _summary(result, evaluation),
+        "3D view": _view3d(result, shown[0]),
+        "Comparison": comparison,
+        "Inputs and fit": _inputs(result, capture, shown),
+        "Frames": _frames(result),
+        "Maps": picture_maps(result, shown[0]),
+        "Lighting": _lighting(result),
+        "Convergence": _convergence(result),
+        "Settings": _settings(result),
+    }
+    sections = [(title, body) for title, body in titled.items() if body]
     links = "".join(f'<a href="#s{i}">{title}</a>' for i, (title, _) in enumerate(sections))
     body = "".join(f'<section><h2 id="s{i}">{title}</h2>{text}</section>' for i, (title, text) in enumerate(sections))
+    cameras = " and ".join(c.name for c in result.cameras)
+    subtitle = f"Model {result.model.name}; fitted to cameras {cameras} at timesteps {_some(result.timesteps)}."
     page = f"""<!doctype html>
 <html lang="en">
 <head>
@@ -108,7 +99,7 @@ def write_report(
 </head>
 <body><main>
 <h1>Face reconstruction</h1>
-<p class="soft">{_subtitle(reconstruction)}</p>
+<p class="soft">{html.escape(subtitle)}</p>
 <nav aria-label="Sections">{links}</nav>
 {body}
 <footer>Written by mifit {mifit.__version__}. Everything on this page is in the file itself.</footer>
@@ -126,15 +117,31 @@ def _asset(name: str) -> str:
     return resources.files("mifit.output").joinpath("assets", name).read_text(encoding="utf-8")
 
 
-def _subtitle(result: Result) -> str:
-    cameras = " and ".join(c.name for c in result.cameras)
-    steps = ", ".join(map(str, result.timesteps[:12])) + (", ..." if len(result.timesteps) > 12 else "")
-    return html.escape(f"Model {result.model.name}; fitted to cameras {cameras} at timesteps {steps}.")
+def _some(timesteps: Sequence[int]) -> str:
+    return ", ".join(map(str, timesteps[:12])) + (", ..." if len(timesteps) > 12 else "")
 
 
-def _summary(result: Result, evaluation: dict[str, Any] | None) -> str:
+def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    head = "".join(f"<th>{text}</th>" for text in heads)
+    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+    return f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>'
+
+
+def _figure(picture: NDArray | str, caption: str, alt: str) -> str:
+    """A picture, as an array or a data URI, with its caption."""
+    uri = picture if isinstance(picture, str) else jpeg_uri(picture)
+    return f'<figure><img src="{uri}" alt="{html.escape(alt)}"><figcaption>{html.escape(caption)}</figcaption></figure>'
+
+
+def _grid(figures: Iterable[str]) -> str:
+    return f'<div class="grid">{"".join(figures)}</div>'
+
+
+def _summary(result: Reconstruction, evaluation: dict[str, Any] | None) -> str:
     parts = []
-    if evaluation is not None:
+    if evaluation is None:
+        parts.append("<p>No held-out view was evaluated; <code>mifit evaluate</code> adds one to this page.</p>")
+    else:
         kind = "held out, never fitted" if held_out(result, evaluation) else "this camera was fitted, so it is no test"
         area = {"face": "the fitted model's face area", "skin": "skin"}.get(evaluation["region"], "the true face area")
         parts.append(
@@ -147,32 +154,30 @@ def _summary(result: Result, evaluation: dict[str, Any] | None) -> str:
                 f"<p>Beside image-based rendering on the same mesh, over {found['region_pixels']:,} pixels that a "
                 f"fitted view sees.</p>{_measures(found['methods'])}"
             )
-    else:
-        parts.append("<p>No held-out view was evaluated; <code>mifit evaluate</code> adds one to this page.</p>")
     found = result.diagnostics
     parts += [f'<p class="warning">{one.severity.capitalize()}: {html.escape(one.text)}</p>' for one in found]
-    if not found:
-        parts.append('<p class="soft">No warnings.</p>')
-    return "".join(parts)
+    return "".join(parts) + ("" if found else '<p class="soft">No warnings.</p>')
 
 
 def _measures(methods: Mapping[str, Mapping[str, float]]) -> str:
     """Table of errors."""
-    heads = "".join(f"<th>{text}</th>" for text in ("Method", "PSNR, dB", "RMSE of 255", "SSIM", "FLIP"))
-    rows = "".join(
-        f"<tr><td>{NAMES.get(m, m.replace('_', ' '))}</td><td>{f['psnr']:.2f}</td><td>{f['rmse']:.2f}</td>"
-        f"<td>{f['ssim']:.4f}</td><td>{f['flip']:.4f}</td></tr>"
+    rows = (
+        (
+            NAMES.get(m, m.replace("_", " ")),
+            f"{f['psnr']:.2f}",
+            f"{f['rmse']:.2f}",
+            f"{f['ssim']:.4f}",
+            f"{f['flip']:.4f}",
+        )
         for m, f in methods.items()
     )
-    return f'<div class="wide"><table><tr>{heads}</tr>{rows}</table></div>'
+    return _table(("Method", "PSNR, dB", "RMSE of 255", "SSIM", "FLIP"), rows)
 
 
-def _view3d(result: Result, timestep: int) -> str:
+def _view3d(result: Reconstruction, timestep: int) -> str:
     modes = ["Full", "Diffuse only", "Diffuse albedo", "Specular albedo", "Normals", "Grey surface"]
-    if result.reflectance is None:
-        modes = ["Full", *modes[2:3], *modes[4:]]
-    values = {"Full": 0, "Diffuse only": 1, "Diffuse albedo": 2, "Specular albedo": 3, "Normals": 4, "Grey surface": 5}
-    options = "".join(f'<option value="{values[m]}">{m}</option>' for m in modes)
+    shown = (0, 1, 2, 3, 4, 5) if result.reflectance is not None else (0, 2, 4, 5)
+    options = "".join(f'<option value="{k}">{modes[k]}</option>' for k in shown)
     data = viewer_data(result, timestep).replace("</", "<\\/")
     lights = '<option value="0">as recovered</option><option value="1">one lamp</option>'
     label = "3D view of the face; drag or use the arrow keys to turn it"
@@ -186,26 +191,27 @@ def _view3d(result: Result, timestep: int) -> str:
 <script type="application/json" id="view3d-data">{data}</script>"""
 
 
-def _comparison(result: Result, capture: Capture, evaluation: dict[str, Any], comparisons: Sequence[Comparison]) -> str:
-    camera, parts = evaluation["camera"], []
+def _comparison(
+    result: Reconstruction, capture: Capture, evaluation: dict[str, Any], comparisons: Sequence[Comparison]
+) -> str:
     known = {found.timestep: found for found in comparisons}
-    limit = f"{HEAT_LIMIT:.0f} of 255"
-    parts.append(
-        f'<p class="scale">Error maps: 0 <img src="{jpeg_uri(heat_scale())}" alt="black to yellow"> {limit} or more</p>'
-    )
+    parts = [
+        f'<p class="scale">Error maps: 0 <img src="{jpeg_uri(heat_scale())}" alt="black to yellow"> '
+        f"{HEAT_LIMIT:.0f} of 255 or more</p>"
+    ]
     for entry in evaluation["per_timestep"][:SHOWN_TIMESTEPS]:
-        timestep = entry["timestep"]
-        found = known.get(timestep) or compare(result, capture, camera, timestep, evaluation["region"])
-        maps = "".join(
-            figure(
-                jpeg_uri(heat_map(found.photograph, render, found.region)[bounding_box(found.region)]),
-                f"{NAMES[m]}: {entry['methods'][m]['psnr']:.2f} dB",
+        timestep, figures = entry["timestep"], entry["methods"]
+        found = known.get(timestep) or compare(result, capture, evaluation["camera"], timestep, evaluation["region"])
+        box = bounding_box(found.region)
+        maps = _grid(
+            _figure(
+                heat_map(found.photograph, render, found.region)[box],
+                f"{NAMES[m]}: {figures[m]['psnr']:.2f} dB",
                 f"error map of {NAMES[m]}",
             )
             for m, render in found.renders.items()
         )
-        body = f'{_slider(found)}<div class="grid">{maps}</div>'
-        parts.append(f'<h3>Timestep {found.timestep}</h3><div class="compare">{body}</div>')
+        parts.append(f'<h3>Timestep {timestep}</h3><div class="compare">{_slider(found)}{maps}</div>')
     return "".join(parts)
 
 
@@ -214,15 +220,12 @@ def _slider(found: Comparison) -> str:
     box = bounding_box(found.region)
     methods = list(found.renders)[::-1]
     name = f"slider{found.timestep}"
-    tops = ""
+    tops, buttons = "", ""
     for m in methods:
         uri = jpeg_uri(overlay(found.photograph, found.renders[m])[box], 90)
-        hidden = "" if m == methods[0] else " hidden"
+        hidden, pressed = ("", "true") if m == methods[0] else (" hidden", "false")
         tops += f'<img class="top" data-for="{m}" alt="render by {NAMES[m]}" src="{uri}"{hidden}>'
-    buttons = "".join(
-        f'<button type="button" value="{m}" aria-pressed="{str(m == methods[0]).lower()}">{NAMES[m]}</button>'
-        for m in methods
-    )
+        buttons += f'<button type="button" value="{m}" aria-pressed="{pressed}">{NAMES[m]}</button>'
     return f"""<div><div class="slider" id="{name}">
 <img alt="photograph" src="{jpeg_uri(found.photograph[box], 90)}">{tops}<span class="bar"></span>
 <span class="tag" style="left:6px">Photograph</span>
@@ -231,49 +234,43 @@ def _slider(found: Comparison) -> str:
 <div class="controls" data-choice="{name}">{buttons}</div></div>"""
 
 
-def _inputs(result: Result, capture: Capture, timesteps: tuple[int, ...]) -> str:
-    parts = []
-    for timestep in timesteps:
-        figures = []
-        points = result.geometry.vertices[result.index(timestep)][result.model.landmarks]
-        for camera in (c.name for c in result.cameras):
-            view, frame = capture.camera(camera), capture.frame(camera, timestep)
-            photograph = to_8_bit(frame.image)
-            linear = render_view(result, view, timestep, result.methods[-1], samples=1)
-            render = rgba_8_bit(linear)
-            box = bounding_box(render[..., 3] > 0)
-            marked = draw_landmarks(photograph, view, frame.landmarks, frame.visible, points)
-            label = html.escape(camera)
-            figures.append(figure(jpeg_uri(marked[box]), f"{label}: input with landmarks", f"input from {label}"))
-            figures.append(
-                figure(jpeg_uri(overlay(photograph, render)[box]), f"{label}: fit laid over", f"fit over {label}")
-            )
-            mask = face_mask(result, capture, camera, timestep, linear)
-            caption = f"{label}: {mask.part(mask.clipped):.1%} clipped, {mask.part(mask.unexplained):.1%} unexplained"
-            labels = None if result.reflectance is None else result.reflectance.label(camera, timestep)
-            kinds = [] if labels is None else [(labels == kind, colour) for kind, colour, _ in LABEL_TINTS]
-            tinted = tint(photograph, (mask.clipped, CLIPPED_TINT), (mask.unexplained, UNEXPLAINED_TINT), *kinds)
-            figures.append(figure(jpeg_uri(tinted[box]), caption, f"face mask of {label}"))
-        parts.append(f'<h3>Timestep {timestep}</h3><div class="grid">{"".join(figures)}</div>')
-    rest = len(result.timesteps) - len(timesteps)
-    more = f'<p class="soft">{rest} more timesteps are in the result but not on this page.</p>' if rest else ""
+def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]) -> str:
+    """Photographs with landmarks, under the fit, and with what was not used of them."""
     swatches = "".join(
         f'<span><i style="background:rgb{colour};height:12px"></i>{name}</span>'
-        for colour, name in (
-            (CLIPPED_TINT, "clipped"),
-            (UNEXPLAINED_TINT, "explained by no lighting and albedo"),
-            *((colour, name) for _, colour, name in LABEL_TINTS),
-        )
+        for colour, name in ((CLIPPED_TINT, "clipped"), *((colour, name) for _, colour, name in LABEL_TINTS))
     )
-    key = (
+    parts = [
         '<p class="soft">Cyan rings: detected landmarks. Orange dots: the fitted model\'s.</p>'
-        f'<p class="legend"><span>Not used, or outvoted by the other images:</span>{swatches}'
-        "<span>Percentages are of the face area.</span></p>"
-    )
-    return key + "".join(parts) + more
+        f'<p class="legend"><span>Not used:</span>{swatches}<span>Percentages are of the face area.</span></p>'
+    ]
+    model = result.model
+    for timestep in timesteps:
+        figures, vertices = [], result.geometry.vertices[result.index(timestep)]
+        for camera in (c.name for c in result.cameras):
+            view, frame, label = capture.camera(camera), capture.frame(camera, timestep), html.escape(camera)
+            photograph = to_8_bit(frame.image)
+            render = rgba_8_bit(render_view(result, view, timestep, result.methods[-1], samples=1))
+            box = bounding_box(render[..., 3] > 0)
+            marked = draw_landmarks(photograph, view, frame.landmarks, frame.visible, vertices[model.landmarks])
+            area = face_area(vertices, model.faces, model.face_mask, view) & frame.valid
+            clipped = frame.clipped & area
+            labels = None if result.reflectance is None else result.reflectance.label(camera, timestep)
+            kinds = [] if labels is None else [(labels == kind, colour) for kind, colour, _ in LABEL_TINTS]
+            tinted = tint(photograph, (clipped, CLIPPED_TINT), *kinds)
+            share = clipped.sum() / max(int(area.sum()), 1)
+            figures += [
+                _figure(marked[box], f"{label}: input with landmarks", f"input from {label}"),
+                _figure(overlay(photograph, render)[box], f"{label}: fit laid over", f"fit over {label}"),
+                _figure(tinted[box], f"{label}: {share:.1%} clipped", f"face mask of {label}"),
+            ]
+        parts.append(f"<h3>Timestep {timestep}</h3>{_grid(figures)}")
+    rest = len(result.timesteps) - len(timesteps)
+    more = f'<p class="soft">{rest} more timesteps are in the result but not on this page.</p>' if rest else ""
+    return "".join(parts) + more
 
 
-def _frames(result: Result) -> str:
+def _frames(result: Reconstruction) -> str:
     """Frames that were chosen, added or left out, and why; nothing where all was as asked for."""
     chosen = result.geometry.report.details.get("frames", {})
     refined = {} if result.reflectance is None else result.reflectance.report.details.get("refined", {})
@@ -287,38 +284,78 @@ def _frames(result: Result) -> str:
     return f"<ul>{''.join(f'<li>{html.escape(line)}</li>' for line in lines)}</ul>" if lines else ""
 
 
-def _lighting(result: Result) -> str:
+def picture_maps(result: Reconstruction, timestep: int) -> str:
+    """Figures of all maps of a result, as HTML; those of a moment at one timestep."""
+    reflectance, refined = result.reflectance, result.refined_normal(timestep)
+    if reflectance is None:
+        return ""
+    grey: list[tuple[str, NDArray | None, float | None]] = [
+        ("Specular albedo", reflectance.specular, None),
+        ("Confidence: how often and how well each texel was seen", reflectance.confidence, 1.0),
+        ("Confidence of the specular albedo: how far images tell it", reflectance.specular_confidence, 1.0),
+        ("Light that mesh and lighting don't explain, parted from the albedo", reflectance.relief, 2.0),
+    ]
+    figures = [_figure(to_8_bit(reflectance.diffuse), "Diffuse albedo", "diffuse albedo map")]
+    for caption, values, peak in grey:
+        if values is not None:
+            white = peak or _largest(values)
+            codes = np.round(255 * np.clip(values / white, 0, 1)).astype(np.uint8)
+            figures.append(_figure(codes, f"{caption} (white = {white:.3g})", caption.lower()))
+    if refined is not None:
+        colours = np.round(np.where(np.any(refined != 0, axis=-1, keepdims=True), 127.5 * (refined + 1), 0))
+        caption = f"Refined normals in object space, timestep {timestep}"
+        figures.append(_figure(colours.astype(np.uint8), caption, "normal map"))
+    signed = {}
+    if result.residual is not None:
+        signed["What images show beyond the model", "", "residual"] = result.residual.at(timestep)
+    if result.mesh is not None and timestep in result.mesh.timesteps:
+        height = result.displacement(timestep) * result.unit_mm
+        signed["Displacement of the refined mesh", " mm outwards", "displacement map"] = height
+    for (caption, unit, alt), values in signed.items():
+        if values is not None:
+            white = _largest(np.abs(values))
+            codes = np.round(127.5 * (1 + np.clip(values / white, -1, 1))).astype(np.uint8)
+            text = f"{caption}, timestep {timestep} (mid-grey: nothing, white = {white:.2g}{unit})"
+            figures.append(_figure(codes, text, alt))
+    return _grid(figures)
+
+
+def _largest(values: NDArray) -> float:
+    return max(float(np.quantile(values, 0.999)), 1e-6)
+
+
+def _lighting(result: Reconstruction) -> str:
     lighting = result.lighting
-    matt, mirror = lighting_balls(lighting)
+    ball, mirror = lighting_balls(lighting)
     panorama = np.maximum(lighting.to_latlong(), 0)
     codes = to_8_bit(panorama / max(float(panorama.max()), 1e-12))
     lights = [light.describe(result.unit_mm) for light in result.illumination.lights]
     compact = "".join(f"; the sharp light {light}, was found apart from them" for light in lights)
-    return f"""<div class="balls">{figure(png_uri(matt), "White matt ball", "lighting on a matt ball")}
-{figure(png_uri(mirror), "Mirror ball", "lighting in a mirror ball")}
-{figure(jpeg_uri(codes), "All directions, latitude by longitude", "lighting panorama")}</div>
+    return f"""<div class="balls">{_figure(png_uri(ball), "White matt ball", "lighting on a matt ball")}
+{_figure(png_uri(mirror), "Mirror ball", "lighting in a mirror ball")}
+{_figure(codes, "All directions, latitude by longitude", "lighting panorama")}</div>
 <p class="soft">Recovered as spherical harmonics of {lighting.order} bands, so only broad light shows{compact}.
 Ambient term {result.illumination.ambient:.4f}.</p>"""
 
 
-def _convergence(result: Result) -> str:
-    rows = "".join(
-        f"<tr><td>{STAGES[n]}</td><td>{html.escape(r.outcome.replace('_', ' '))}</td>"
-        f"<td>{max((len(v) for v in r.energies.values()), default=0)}</td><td>{r.seconds:.1f}</td></tr>"
-        for n, r in result.reports.items()
+def _convergence(result: Reconstruction) -> str:
+    rows = (
+        (
+            STAGES[name],
+            html.escape(report.outcome.replace("_", " ")),
+            str(max((len(v) for v in report.energies.values()), default=0)),
+            f"{report.seconds:.1f}",
+        )
+        for name, report in result.reports.items()
     )
     memory = f", peak memory {result.peak_memory / 2**20:.0f} MB" if result.peak_memory else ""
-    plots = ""
-    for name, report in result.reports.items():
-        plot = energy_plot(report.energies)
-        if plot:
-            plots += f"<h3>{STAGES[name]}: energy by iteration</h3>{plot}"
+    plots = [(STAGES[name], energy_plot(report.energies)) for name, report in result.reports.items()]
     return (
-        '<div class="wide"><table><tr><th>Stage</th><th>Ended</th><th>Iterations</th><th>Seconds</th></tr>'
-        f"{rows}</table></div><p>Whole fit {result.seconds:.1f} s{memory}.</p>{plots}"
+        f"{_table(('Stage', 'Ended', 'Iterations', 'Seconds'), rows)}<p>Whole fit {result.seconds:.1f} s{memory}.</p>"
+        + "".join(f"<h3>{name}: energy by iteration</h3>{plot}" for name, plot in plots if plot)
     )
 
 
-def _settings(result: Result) -> str:
+def _settings(result: Reconstruction) -> str:
     text = html.escape(json.dumps(result.config, indent=1, default=str))
     return f"<details><summary>Settings of this fit</summary><pre>{text}</pre></details>"

@@ -32,7 +32,7 @@ from mifit.render.variant import check_active_variant
 from mifit.result import METHODS
 
 if TYPE_CHECKING:
-    from mifit.result import Method, Result
+    from mifit.result import Method, Reconstruction
 
 SAMPLES = Parameter("spp", 64)
 Skin = Callable[[Mapping[str, dict[str, Any]]], Mapping[str, Any]]
@@ -43,7 +43,7 @@ STEEPEST = 4.0
 
 
 def write_scene(
-    reconstruction: Result,
+    result: Reconstruction,
     path: str | Path,
     timestep: int,
     cameras: Sequence[Camera] | None = None,
@@ -64,7 +64,7 @@ def write_scene(
 
     Parameters
     ----------
-    reconstruction : Result
+    result : Reconstruction
     path : path
         ``.xml`` file.
     timestep : int
@@ -79,22 +79,22 @@ def write_scene(
         A camera with lens distortion; nothing is written then.
     """
     path = Path(path)
-    cameras = reconstruction.cameras if cameras is None else cameras
+    cameras = result.cameras if cameras is None else cameras
     files = path.with_name(re.sub(r"[^\w.-]", "_", path.stem) + "_files")
     scenes = [
-        (name, scene_description(reconstruction, cameras, method, stock, files.name), needs)
+        (name, scene_description(result, cameras, method, stock, files.name), needs)
         for name, stock, needs in (
             (path, False, "Needs mifit.register_plugins()."),
             (path.with_name(f"{path.stem}_stock.xml"), True, "Plain Mitsuba renders this."),
         )
     ]
-    _write_files(reconstruction, files, timestep, method)
+    _write_files(result, files, timestep, method)
     for name, scene, needs in scenes:
         write_text(name, to_xml(scene, f"Written by mifit. {needs}"))
 
 
 def render_view(
-    result: Result,
+    result: Reconstruction,
     camera: Camera,
     timestep: int = 0,
     method: Method = "full",
@@ -112,7 +112,7 @@ def render_view(
     raise InputError(f"integrator: found {integrator!r}, expected 'local' or 'path'")
 
 
-def check_shown(result: Result, timestep: int, method: Method) -> None:
+def check_shown(result: Reconstruction, timestep: int, method: Method) -> None:
     """InputError for a timestep or a method that a result can't show."""
     result.index(timestep)
     if method not in METHODS:
@@ -125,34 +125,34 @@ def check_shown(result: Result, timestep: int, method: Method) -> None:
 
 
 def render_path(
-    reconstruction: Result, camera: Camera, timestep: int, method: Method, samples: int, seed: int
+    result: Reconstruction, camera: Camera, timestep: int, method: Method, samples: int, seed: int
 ) -> NDArray[np.float32]:
     """Path trace one view through the scene file; see `Reconstruction.render`."""
     from mifit.render.scene import render_scene
 
     with tempfile.TemporaryDirectory(prefix="mifit-scene-") as folder:
         path = Path(folder) / "scene.xml"
-        write_scene(reconstruction, path, timestep, [camera], method)
+        write_scene(result, path, timestep, [camera], method)
         image = render_scene(path, {}, spp=samples, seed=seed)
     # Mitsuba's film adds up light on black; colours here are those of the covered part. Its alpha also counts
     # the inside of the head, seen through the eye openings, so coverage is that of local rendering.
     hit = image[..., 3:]
-    surface = visible_surface(reconstruction, camera, timestep)
+    surface = visible_surface(result, camera, timestep)
     alpha = surface.image(np.zeros((len(surface.index), 3)))[..., 3:]
     colour = np.where(alpha > 0, image[..., :3] / np.maximum(hit, 1e-3), 0.0)
     return np.concatenate([colour, alpha], axis=-1).astype(np.float32)
 
 
-def _write_files(reconstruction: Result, files: Path, timestep: int, method: Method) -> None:
-    model, geometry = reconstruction.model, reconstruction.geometry
+def _write_files(result: Reconstruction, files: Path, timestep: int, method: Method) -> None:
+    model, geometry = result.model, result.geometry
     if method == "pca":
-        reconstruction = replace(reconstruction, reflectance=None, normals=None)
-    vertices = geometry.vertices[reconstruction.index(timestep)]
+        result = replace(result, reflectance=None, normals=None)
+    vertices = geometry.vertices[result.index(timestep)]
     normals = vertex_normals(vertices, model.faces)
     mesh = split_at_seams(model)
     files.mkdir(parents=True, exist_ok=True)
-    albedo = vertex_materials(reconstruction)[:, :3]
-    for name, selected in _parts(reconstruction).items():
+    albedo = vertex_materials(result)[:, :3]
+    for name, selected in _parts(result).items():
         if selected.any():
             part = part_of(mesh, selected)
             write_ply(
@@ -164,9 +164,9 @@ def _write_files(reconstruction: Result, files: Path, timestep: int, method: Met
                 albedo[part.origin],
                 viewer_colours=False,
             )
-    maps = surface_maps(reconstruction, timestep)
+    maps = surface_maps(result, timestep)
     specular = maps.specular if method == "full" else np.zeros_like(maps.specular)
-    slopes = _slopes(reconstruction, timestep, maps.normal, vertices, normals, mesh)
+    slopes = _slopes(result, timestep, maps.normal, vertices, normals, mesh)
     bent = normalize(np.concatenate([slopes[..., :2], np.ones_like(slopes[..., :1])], axis=-1))
     write_image(files / "diffuse.exr", np.clip(maps.diffuse, 0, 1))
     write_image(files / "specular.exr", np.clip(specular, 0, 1))
@@ -175,20 +175,20 @@ def _write_files(reconstruction: Result, files: Path, timestep: int, method: Met
     # A blend (1 - w) diffuse + w mirror with w = C_s wants its diffuse part to make up for the factor.
     base = maps.diffuse / np.maximum(1 - specular[..., None], 1e-3)
     write_image(files / "diffuse_stock.exr", np.clip(base, 0, 1))
-    environment = reconstruction.environment
+    environment = result.environment
     if environment is None:
-        environment = np.maximum(SHLighting(reconstruction.illumination.radiance).to_latlong(128, 256), 0.0)
+        environment = np.maximum(SHLighting(result.illumination.radiance).to_latlong(128, 256), 0.0)
     write_image(files / "environment.exr", environment)
 
 
-def _parts(reconstruction: Result) -> dict[str, NDArray[np.bool_]]:
+def _parts(result: Reconstruction) -> dict[str, NDArray[np.bool_]]:
     """(F,) faces of each shape, by its name: with maps, and without maps."""
-    mapped = mapped_faces(reconstruction)
+    mapped = mapped_faces(result)
     return {"face": mapped, "rest": ~mapped}
 
 
 def _slopes(
-    reconstruction: Result,
+    result: Reconstruction,
     timestep: int,
     normal_object: NDArray,
     vertices: NDArray,
@@ -199,10 +199,10 @@ def _slopes(
 
     That frame has s along dp/du of the triangle, made perpendicular to the interpolated normal n, and t = n x s.
     """
-    model = reconstruction.model
+    model = result.model
     size = normal_object.shape[0]
-    rotation = reconstruction.geometry.rotation[reconstruction.index(timestep)]
-    texels = rasterize_uv(model.uv, model.faces_uv, size, mapped_faces(reconstruction))
+    rotation = result.geometry.rotation[result.index(timestep)]
+    texels = rasterize_uv(model.uv, model.faces_uv, size, mapped_faces(result))
     n = normalize(interpolate(normals, model.faces, texels.face, texels.weights))
     p, t = vertices[model.faces].astype(np.float64), model.uv[model.faces_uv].astype(np.float64)
     d1, d2 = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
@@ -220,7 +220,7 @@ def _slopes(
 
 
 def load_result_scene(
-    reconstruction: Result,
+    result: Reconstruction,
     timestep: int,
     integrator: str | Mapping[str, Any],
     cameras: Sequence[Camera],
@@ -231,19 +231,19 @@ def load_result_scene(
     """A loaded ``mi.Scene`` of one timestep; see `Reconstruction.scene`."""
     from mifit.render.scene import load_scene
 
-    check_shown(reconstruction, timestep, method)
+    check_shown(result, timestep, method)
     chosen = {"type": integrator} if isinstance(integrator, str) else dict(integrator)
     if chosen.get("type") == "shdirect":
         # What it shades is the smooth light, whatever an environment has beside it.
-        reconstruction = replace(reconstruction, environment=None, environment_rotation=None)
-        fitted = None if method == "pca" else reconstruction.reflectance
-        ambient = reconstruction.geometry.ambient if fitted is None else fitted.illumination.ambient
+        result = replace(result, environment=None, environment_rotation=None)
+        fitted = None if method == "pca" else result.reflectance
+        ambient = result.geometry.ambient if fitted is None else fitted.illumination.ambient
         model = "prefiltered" if fitted is None else fitted.shading_model
         chosen = {"model": model, "ambient": float(ambient)} | chosen
     chosen = {"hide_emitters": True} | chosen
     with tempfile.TemporaryDirectory(prefix="mifit-scene-") as folder:
-        _write_files(reconstruction, Path(folder), timestep, method)
-        scene = scene_description(reconstruction, cameras, method, False, folder, chosen, samples)
+        _write_files(result, Path(folder), timestep, method)
+        scene = scene_description(result, cameras, method, False, folder, chosen, samples)
         if skin is not None:
             names = {"diffuse": False, "specular": True, "slopes": True, "normal": True}
             scene["skin"] = dict(skin({name: _texture(f"{folder}/{name}.exr", raw) for name, raw in names.items()}))
@@ -251,7 +251,7 @@ def load_result_scene(
 
 
 def scene_description(
-    reconstruction: Result,
+    result: Reconstruction,
     cameras: Sequence[Camera],
     method: Method,
     stock: bool,
@@ -265,26 +265,26 @@ def scene_description(
     ``face`` and ``rest`` (shapes), and ``camera_NAME`` (see `sensor_ids`).
     """
     if method == "pca":
-        reconstruction = replace(reconstruction, reflectance=None, normals=None)
+        result = replace(result, reflectance=None, normals=None)
     path = {"type": "path", "max_depth": Parameter("max_depth", 5), "hide_emitters": True}
     scene: dict[str, Any] = {"type": "scene", "integrator": path if integrator is None else dict(integrator)}
     for name, camera in zip(sensor_ids(cameras), cameras, strict=True):
         scene[name] = sensor_description(camera.with_square_pixels() if stock else camera, samples)
-    scene["skin"] = _skin(reconstruction, files, stock)
+    scene["skin"] = _skin(result, files, stock)
     scene["face"] = _shape(f"{files}/face.ply", {"type": "ref", "id": "skin"})
-    if _parts(reconstruction)["rest"].any():
+    if _parts(result)["rest"].any():
         scene["rest"] = _shape(f"{files}/rest.ply", _vertex_albedo(stock))
-    if stock or reconstruction.environment is not None:
+    if stock or result.environment is not None:
         scene["light"] = {"type": "envmap", "filename": f"{files}/environment.exr"}
-        if reconstruction.environment is not None and reconstruction.environment_rotation is not None:
+        if result.environment is not None and result.environment_rotation is not None:
             pose = np.eye(4)
-            pose[:3, :3] = reconstruction.environment_rotation
+            pose[:3, :3] = result.environment_rotation
             scene["light"]["to_world"] = pose
     else:
-        rows = reconstruction.illumination.radiance
+        rows = result.illumination.radiance
         text = ",  ".join(" ".join(f"{x:.9g}" for x in row) for row in rows)
         scene["light"] = {"type": "shenv", "coefficients": text}
-    for number, light in enumerate(reconstruction.illumination.lights, 1):
+    for number, light in enumerate(result.illumination.lights, 1):
         scene[f"light_{number}"] = light.emitter()
     return scene
 
@@ -305,8 +305,8 @@ def _texture(file: str, raw: bool = True) -> dict[str, Any]:
     return {"type": "bitmap", "filename": file, "raw": raw, "wrap_mode": "clamp"}
 
 
-def _skin(reconstruction: Result, files: str, stock: bool) -> dict[str, Any]:
-    found = _mapped(reconstruction.lobe, files, stock)
+def _skin(result: Reconstruction, files: str, stock: bool) -> dict[str, Any]:
+    found = _mapped(result.lobe, files, stock)
     if stock:
         return {"type": "normalmap", "normalmap": _texture(f"{files}/normal.exr"), "nested": found}
     return {**found, "normal_correction": _texture(f"{files}/slopes.exr")}

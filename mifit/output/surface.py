@@ -22,7 +22,7 @@ from mifit.core.uv import TexelMap, rasterize_uv, sample_map
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
-    from mifit.result import Result
+    from mifit.result import Reconstruction
 
 
 STIFFNESS = 1e-3
@@ -48,7 +48,7 @@ class SurfaceMaps:
     normal: NDArray[np.float32]
 
 
-def surface_maps(reconstruction: Result, timestep: int, skin: bool = False) -> SurfaceMaps:
+def surface_maps(result: Reconstruction, timestep: int, skin: bool = False) -> SurfaceMaps:
     """Maps of one timestep as a renderer wants them.
 
     Texels that belong to no face repeat the nearest texel inside, so bilinear look-ups at a seam see no gap.
@@ -56,27 +56,27 @@ def surface_maps(reconstruction: Result, timestep: int, skin: bool = False) -> S
     did not refine, the normals are the mesh's. ``skin`` asks for the albedo alone, for files without a light of their
     own: what the capture's light leaves unexplained (``relief``) is part of the diffuse map otherwise.
     """
-    model, geometry = reconstruction.model, reconstruction.geometry
-    reflectance = reconstruction.reflectance
+    model, geometry = result.model, result.geometry
+    reflectance = result.reflectance
     size = 512 if reflectance is None else reflectance.diffuse.shape[0]
-    texels, nearest = _shown_texels(reconstruction, size)
+    texels, nearest = _shown_texels(result, size)
     corners = (model.faces, texels.face, texels.weights)
     if reflectance is None:
         diffuse = texels.to_map(np.clip(interpolate(geometry.vertex_albedo, *corners), 0, 1).astype(np.float32))
         specular = np.zeros((size, size), dtype=np.float32)
     else:
         diffuse, specular = reflectance.diffuse if skin else reflectance.lit_diffuse, reflectance.specular
-    i = reconstruction.index(timestep)
+    i = result.index(timestep)
     normals = vertex_normals(geometry.vertices[i], model.faces) @ geometry.rotation[i]
     normal = texels.to_map(normalize(interpolate(normals, *corners)).astype(np.float32))
-    refined = reconstruction.refined_normal(timestep)
+    refined = result.refined_normal(timestep)
     if refined is not None:
         filled = np.any(refined != 0, axis=-1)
         normal[filled] = refined[filled]
     return SurfaceMaps(*(_padded(values, nearest) for values in (diffuse, specular, normal)))
 
 
-def vertex_materials(reconstruction: Result, skin: bool = False) -> NDArray[np.float32]:
+def vertex_materials(result: Reconstruction, skin: bool = False) -> NDArray[np.float32]:
     """Diffuse and specular albedo at the vertices: the maps' where there are maps, continued over the other faces.
 
     ``skin`` as in `surface_maps`.
@@ -86,13 +86,13 @@ def vertex_materials(reconstruction: Result, skin: bool = False) -> NDArray[np.f
     (V, 4) float32
         Linear, 0..1. The diffuse part is the fitted model's albedo plus an offset that is a membrane over the mesh.
     """
-    model, geometry, reflectance = reconstruction.model, reconstruction.geometry, reconstruction.reflectance
+    model, geometry, reflectance = result.model, result.geometry, result.reflectance
     albedo = np.asarray(geometry.vertex_albedo, dtype=np.float64)
     expected = np.column_stack([albedo, np.zeros(len(albedo))])
     if reflectance is None:
         return np.clip(expected, 0.0, 1.0).astype(np.float32)
-    known, uv, continued = _continuation(model, _whole(reconstruction))
-    _, nearest = _shown_texels(reconstruction, len(reflectance.diffuse))
+    known, uv, continued = _continuation(model, _whole(result))
+    _, nearest = _shown_texels(result, len(reflectance.diffuse))
     diffuse = reflectance.diffuse if skin else reflectance.lit_diffuse
     values = _padded(np.concatenate([diffuse, reflectance.specular[..., None]], axis=2), nearest)
     offset = sample_map(values, uv) - expected[known]
@@ -106,17 +106,17 @@ def _padded(values: NDArray, nearest: NDArray[np.intp]) -> NDArray:
     return values.reshape(-1, *values.shape[2:]).take(nearest, axis=0)
 
 
-def _shown_texels(reconstruction: Result, size: int) -> tuple[TexelMap, NDArray[np.intp]]:
-    return _texels(reconstruction.model, size, _whole(reconstruction))
+def _shown_texels(result: Reconstruction, size: int) -> tuple[TexelMap, NDArray[np.intp]]:
+    return _texels(result.model, size, _whole(result))
 
 
-def _whole(reconstruction: Result) -> bool:
-    return np.array_equal(mapped_faces(reconstruction), reconstruction.model.mapped)
+def _whole(result: Reconstruction) -> bool:
+    return np.array_equal(mapped_faces(result), result.model.mapped)
 
 
-def mapped_faces(reconstruction: Result) -> NDArray[np.bool_]:
+def mapped_faces(result: Reconstruction) -> NDArray[np.bool_]:
     """(F,) faces that are shown with the maps: all that the atlas holds, or the face area where a fit stayed in it."""
-    model, reflectance = reconstruction.model, reconstruction.reflectance
+    model, reflectance = result.model, result.reflectance
     if reflectance is None:
         return model.mapped
     outside = _outside(model, len(reflectance.diffuse))

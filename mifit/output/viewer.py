@@ -16,22 +16,22 @@ from mifit.output.figures import jpeg_uri, png_uri
 from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
-    from mifit.result import Result
+    from mifit.result import Reconstruction
 
 
-def viewer_data(reconstruction: Result, timestep: int) -> str:
+def viewer_data(result: Reconstruction, timestep: int) -> str:
     """JSON for the 3D view of one timestep; quantised, for looking at only.
 
     Positions have 16 bits of the bounding sphere, normals 8, texture coordinates 16; the alpha of the vertex
     colour tells whether a face has maps (1) or none (0).
     """
-    model, geometry = reconstruction.model, reconstruction.geometry
-    i = reconstruction.index(timestep)
+    model, geometry = result.model, result.geometry
+    i = result.index(timestep)
     rotation, translation, scale = geometry.rotation[i], geometry.translation[i], geometry.scale
     vertices = (geometry.vertices[i] - translation) @ rotation / scale
     mesh = split_at_seams(model)
     # Parts that share no vertex: with maps, and without.
-    mapped = mapped_faces(reconstruction)
+    mapped = mapped_faces(result)
     parts = [part_of(mesh, selected) for selected in (mapped, ~mapped)]
     origin = np.concatenate([p.origin for p in parts])
     uv = np.concatenate([p.uv for p in parts])
@@ -43,9 +43,9 @@ def viewer_data(reconstruction: Result, timestep: int) -> str:
     centre = (position.min(0) + position.max(0)) / 2
     radius = float(np.abs(position - centre).max())
     face_centre = vertices[np.unique(model.faces[model.face_mask])]
-    colour = np.column_stack([to_8_bit(vertex_materials(reconstruction, skin=True)[origin, :3]), kind]).astype(np.uint8)
+    colour = np.column_stack([to_8_bit(vertex_materials(result, skin=True)[origin, :3]), kind]).astype(np.uint8)
     wide = len(origin) > 65535
-    maps = surface_maps(reconstruction, timestep, skin=True)
+    maps = surface_maps(result, timestep, skin=True)
     peak = max(float(maps.specular.max()), 1e-3)
     data: dict[str, Any] = {
         "vertices": len(origin),
@@ -65,22 +65,22 @@ def viewer_data(reconstruction: Result, timestep: int) -> str:
             "specular": jpeg_uri(np.round(255 * np.clip(maps.specular / peak, 0, 1)).astype(np.uint8), 90),
             "normal": png_uri(np.round(127.5 * (maps.normal + 1)).astype(np.uint8)),
         },
-        **_lighting(reconstruction),
+        **_lighting(result),
     }
     return json.dumps(data)
 
 
-def _lighting(reconstruction: Result) -> dict[str, Any]:
+def _lighting(result: Reconstruction) -> dict[str, Any]:
     """Recovered lighting as the view's shader wants it.
 
     9 coefficients of what white reflects, and for the lobe a lat-long picture of the lighting that is convolved with
     it at a middling angle; the lobe's albedo and tilt follow the angle by polynomials in the cosine.
     """
-    irradiance = reconstruction.lighting.truncate(3).coefficients * (cosine_coefficients(3)[bands(3)] / np.pi)[:, None]
-    order = reconstruction.lighting.order
+    irradiance = result.lighting.truncate(3).coefficients * (cosine_coefficients(3)[bands(3)] / np.pi)[:, None]
+    order = result.lighting.order
     cosines = np.linspace(0.05, 1.0, 40)
-    albedo, tilt, factors = reconstruction.lobe.zonal(order, cosines)
-    blurred = SHLighting(factors[bands(order), None] * reconstruction.lighting.coefficients).to_latlong(64, 128)
+    albedo, tilt, factors = result.lobe.zonal(order, cosines)
+    blurred = SHLighting(factors[bands(order), None] * result.lighting.coefficients).to_latlong(64, 128)
     peak = max(float(blurred.max()), 1e-6)
     return {
         "irradiance": irradiance.ravel().tolist(),
@@ -88,8 +88,8 @@ def _lighting(reconstruction: Result) -> dict[str, Any]:
         "glossy_scale": peak,
         "lobe_albedo": np.polynomial.polynomial.polyfit(cosines, albedo, 5).tolist(),
         "lobe_tilt": np.polynomial.polynomial.polyfit(cosines, tilt, 5).tolist(),
-        "ambient": float(reconstruction.illumination.ambient),
-        "exponent": reconstruction.lobe.typical,
+        "ambient": float(result.illumination.ambient),
+        "exponent": result.lobe.typical,
     }
 
 

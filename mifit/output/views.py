@@ -25,7 +25,7 @@ from mifit.progress import Progress, silent
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
-    from mifit.result import Method, Result
+    from mifit.result import Method, Reconstruction
 
 BACKDROP = 0.35
 """Linear grey behind the head on sheets and in animations."""
@@ -34,7 +34,7 @@ CODECS = ("vp09", "mp4v")
 
 
 def orbit_camera(
-    reconstruction: Result, timestep: int, degrees: float, pitch: float = 0.0, distance: float | None = None
+    result: Reconstruction, timestep: int, degrees: float, pitch: float = 0.0, distance: float | None = None
 ) -> Camera:
     """A camera that looks at the face from an angle about the vertical; 0 is straight from the front.
 
@@ -47,16 +47,16 @@ def orbit_camera(
     InputError
         The result has no cameras, or ``distance`` isn't positive.
     """
-    if not reconstruction.cameras:
+    if not result.cameras:
         raise InputError("this result has no cameras, so there is no image size to render at; give one to render()")
-    model, i = reconstruction.model, reconstruction.index(timestep)
-    first = reconstruction.cameras[0]
-    vertices = reconstruction.geometry.vertices[i][np.unique(model.faces[model.face_mask])]
+    model, i = result.model, result.index(timestep)
+    first = result.cameras[0]
+    vertices = result.geometry.vertices[i][np.unique(model.faces[model.face_mask])]
     centre = 0.5 * (vertices.min(0) + vertices.max(0)).astype(np.float64)
-    up = normalize(-np.mean([c.rotation[1] for c in reconstruction.cameras], axis=0))
-    front = reconstruction.geometry.rotation[i][:, 2]
+    up = normalize(-np.mean([c.rotation[1] for c in result.cameras], axis=0))
+    front = result.geometry.rotation[i][:, 2]
     front = normalize(front - (front @ up) * up)
-    reach = float(np.mean([np.linalg.norm(c.position - centre) for c in reconstruction.cameras]))
+    reach = float(np.mean([np.linalg.norm(c.position - centre) for c in result.cameras]))
     facing = Camera.look_at(centre + reach * front, centre, up)
     cx, cy = first.width / 2, first.height / 2
     camera = replace(first, world_to_camera=facing.world_to_camera, distortion=(), cx=cx, cy=cy)
@@ -65,7 +65,7 @@ def orbit_camera(
 
 
 def write_turntable(
-    reconstruction: Result,
+    result: Reconstruction,
     folder: str | Path,
     start: float = -35.0,
     stop: float = 35.0,
@@ -80,7 +80,7 @@ def write_turntable(
 
     Parameters
     ----------
-    reconstruction : Result
+    result : Reconstruction
     folder : path
         Made when it is missing.
     start, stop : float
@@ -92,14 +92,14 @@ def write_turntable(
     progress : Progress
     """
     folder = Path(folder)
-    timestep = reconstruction.timesteps[0] if timestep is None else timestep
-    methods: tuple[Method, ...] = ("full", "diffuse") if reconstruction.reflectance is not None else ("pca",)
+    timestep = result.timesteps[0] if timestep is None else timestep
+    methods: tuple[Method, ...] = ("full", "diffuse") if result.reflectance is not None else ("pca",)
     rows: dict[Method, list[NDArray]] = {m: [] for m in methods}
     angles = np.linspace(start, stop, steps)
     progress("Turntable", 0, steps)
     for k, angle in enumerate(angles):
-        surface = visible_surface(reconstruction, orbit_camera(reconstruction, timestep, float(angle)), timestep)
-        for method, image in shade_methods(reconstruction, surface, timestep, methods).items():
+        surface = visible_surface(result, orbit_camera(result, timestep, float(angle)), timestep)
+        for method, image in shade_methods(result, surface, timestep, methods).items():
             write_image(folder / f"{method}_{k:02d}.png", image)
             rows[method].append(image)
         progress("Turntable", k + 1, steps)
@@ -108,7 +108,7 @@ def write_turntable(
 
 
 def write_sequence(
-    reconstruction: Result,
+    result: Reconstruction,
     path: str | Path,
     start: float = 0.0,
     stop: float = 0.0,
@@ -121,7 +121,7 @@ def write_sequence(
 
     Parameters
     ----------
-    reconstruction : Result
+    result : Reconstruction
         Fitted, tracked or relit.
     path : path
         ``.mp4``, or ``.webp`` for an animated picture.
@@ -141,19 +141,19 @@ def write_sequence(
         A timestep or method that the result lacks, another suffix, or no cameras.
     """
     check_moving(path)
-    steps = sorted(reconstruction.timesteps) if timesteps is None else timesteps
-    shown = tuple(reconstruction.methods[-1:] if methods is None else methods)
+    steps = sorted(result.timesteps) if timesteps is None else timesteps
+    shown = tuple(result.methods[-1:] if methods is None else methods)
     for method in shown:
-        if method not in reconstruction.methods:
-            raise InputError(f"method {method!r}: found no such result, expected one of {reconstruction.methods}")
+        if method not in result.methods:
+            raise InputError(f"method {method!r}: found no such result, expected one of {result.methods}")
     angles = np.linspace(start, stop, len(steps))
-    cameras = [orbit_camera(reconstruction, steps[0], float(angle)) for angle in angles]
+    cameras = [orbit_camera(result, steps[0], float(angle)) for angle in angles]
 
     def frames() -> Iterable[NDArray]:
         for k, (timestep, camera) in enumerate(zip(steps, cameras, strict=True)):
             progress("sequence", k, len(steps))
-            surface = visible_surface(reconstruction, camera, timestep)
-            images = shade_methods(reconstruction, surface, timestep, shown)
+            surface = visible_surface(result, camera, timestep)
+            images = shade_methods(result, surface, timestep, shown)
             yield np.concatenate([images[m] for m in shown], axis=1)
         progress("sequence", len(steps), len(steps))
 
@@ -161,7 +161,7 @@ def write_sequence(
 
 
 def write_overlay(
-    reconstruction: Result,
+    result: Reconstruction,
     capture: Capture,
     camera: str,
     path: str | Path,
@@ -172,7 +172,7 @@ def write_overlay(
 
     Parameters
     ----------
-    reconstruction : Result
+    result : Reconstruction
     capture : Capture
         Its images of ``camera``, at the timesteps of the result.
     camera : str
@@ -188,14 +188,14 @@ def write_overlay(
     InputError
         The capture has no such camera, or not all timesteps.
     """
-    capture = reconstruction.seen(capture)
-    view, steps = capture.camera(camera), sorted(reconstruction.timesteps)
+    capture = result.seen(capture)
+    view, steps = capture.camera(camera), sorted(result.timesteps)
 
     def frames() -> Iterable[NDArray[np.uint8]]:
         for k, timestep in enumerate(steps):
             progress(f"overlay {camera}", k, len(steps))
             photograph = to_8_bit(capture.frame(camera, timestep).image)
-            linear = render_view(reconstruction, view, timestep, reconstruction.methods[-1], samples=1)
+            linear = render_view(result, view, timestep, result.methods[-1], samples=1)
             yield np.concatenate([photograph, overlay(photograph, rgba_8_bit(linear))], axis=1)
         progress(f"overlay {camera}", len(steps), len(steps))
 
@@ -204,7 +204,7 @@ def write_overlay(
 
 def write_moving_pictures(
     folder: str | Path,
-    reconstruction: Result,
+    result: Reconstruction,
     capture: Capture,
     cameras: Sequence[str] | None = None,
     fps: float = 12.0,
@@ -215,9 +215,9 @@ def write_moving_pictures(
     Cameras are those of the fit by default. Parameters as in `write_overlay`.
     """
     folder = Path(folder)
-    for name in [camera.name for camera in reconstruction.cameras] if cameras is None else cameras:
-        write_overlay(reconstruction, capture, name, folder / f"overlay_{file_name(name)}.mp4", fps, progress)
-    write_glb(reconstruction, folder / "sequence.glb", animate=sorted(reconstruction.timesteps), fps=fps)
+    for name in [camera.name for camera in result.cameras] if cameras is None else cameras:
+        write_overlay(result, capture, name, folder / f"overlay_{file_name(name)}.mp4", fps, progress)
+    write_glb(result, folder / "sequence.glb", animate=sorted(result.timesteps), fps=fps)
 
 
 def on_backdrop(image: NDArray) -> NDArray:

@@ -1,5 +1,5 @@
-"""The record of a fit, and its folder. Nothing here renders."""
+"""The result of a fit, and its folder. What shows it is in `mifit.output`."""
 
-from mifit.result.record import METHODS, Method, Result
+from mifit.result.reconstruction import METHODS, Method, Reconstruction
 
-__all__ = ["METHODS", "Method", "Result"]
+__all__ = ["METHODS", "Method", "Reconstruction"]

@@ -36,20 +36,20 @@ from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import lacks_eyes, with_eyes
 from mifit.result.ownership import changed, unchanging
-from mifit.result.record import R
+from mifit.result.reconstruction import Reconstruction
 from mifit.result.writing import FORMAT_VERSION, label_file
 
 
-def load(cls: type[R], folder: Path, model: MorphableModel | None = None) -> R:
-    """Read a result folder as a `Result` or a class made from it; see `Reconstruction.load`."""
+def load(folder: Path, model: MorphableModel | None = None) -> Reconstruction:
+    """Read a result folder; see `Reconstruction.load`."""
     with unchanging(folder):
-        result = _load(cls, folder, model)
+        result = _load(folder, model)
         for name in changed(folder):
             warnings.warn(f"{folder / name}: has changed since mifit wrote it", stacklevel=3)
     return result
 
 
-def _load(cls: type[R], folder: Path, model: MorphableModel | None) -> R:
+def _load(folder: Path, model: MorphableModel | None) -> Reconstruction:
     path = folder / "result.json"
     document = read_document(folder)
     try:
@@ -67,7 +67,7 @@ def _load(cls: type[R], folder: Path, model: MorphableModel | None) -> R:
         geometry = _geometry(folder, document, model)
         reflectance = _reflectance(folder, document)
         capture = document["capture"]
-        return cls(
+        return Reconstruction(
             model=model,
             model_source=document["model"]["source"],
             geometry=geometry,

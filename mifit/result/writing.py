@@ -1,4 +1,4 @@
-"""Writing the result folder, a `Result` on disk (docs/formats.md)."""
+"""Writing the result folder, a `Reconstruction` on disk (docs/formats.md)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mifit.core.image import encode_png, write_image
 from mifit.core.mesh import SplitMesh, split_at_seams, split_faces, tangent_space_map, vertex_normals
 from mifit.core.process import on_all_cores
 from mifit.result.ownership import replacing_files
-from mifit.result.record import Result
+from mifit.result.reconstruction import Reconstruction
 
 FORMAT_VERSION = 1
 
@@ -32,7 +32,7 @@ def label_file(camera: str, timestep: int) -> Path:
     return Path("masks") / f"{file_name(camera)}_{timestep:04d}.png"
 
 
-def save(result: Result, folder: Path, write_scene: Callable[[Path], None], force: bool = False) -> None:
+def save(result: Reconstruction, folder: Path, write_scene: Callable[[Path], None], force: bool = False) -> None:
     """Write a result folder, or replace what an older result left in it; see `Reconstruction.save`.
 
     All files are written beside the old ones first, so that one that fails leaves the old result whole.
@@ -56,18 +56,18 @@ def save(result: Result, folder: Path, write_scene: Callable[[Path], None], forc
         _write_document(result, new)
 
 
-def add_timestep(result: Result, folder: Path, timestep: int) -> None:
+def add_timestep(result: Reconstruction, folder: Path, timestep: int) -> None:
     """Write the files of one timestep of a result into its folder, and ``result.json`` anew, all or none."""
     with replacing_files(folder) as new:
         _write_timestep(result, new, timestep, _surfaces(result))
         _write_document(result, new)
 
 
-def _write_document(result: Result, folder: Path) -> None:
+def _write_document(result: Reconstruction, folder: Path) -> None:
     write_text(folder / "result.json", json.dumps(_document(result), indent=1, allow_nan=False) + "\n")
 
 
-def _surfaces(result: Result) -> list[_Surface]:
+def _surfaces(result: Reconstruction) -> list[_Surface]:
     """The fitted mesh and, where there is one, the refined mesh, as files hold them."""
     albedo = result.geometry.vertex_albedo
     found = [_Surface("geometry", split_at_seams(result.model), result.model.faces, albedo)]
@@ -93,7 +93,7 @@ class _Surface:
         write_ply(path, vertices[at], self.mesh.faces, normals[at], self.mesh.uv, self.albedo[at])
 
 
-def _write_timestep(result: Result, folder: Path, timestep: int, surfaces: Sequence[_Surface]) -> None:
+def _write_timestep(result: Reconstruction, folder: Path, timestep: int, surfaces: Sequence[_Surface]) -> None:
     """Meshes, normal maps and displacement map of one timestep."""
     i, fitted = result.index(timestep), surfaces[0]
     vertices = result.geometry.vertices[i]
@@ -127,7 +127,7 @@ def write_data_png(path: Path, values: NDArray) -> None:
         temporary.write_bytes(encode_png(np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)))
 
 
-def _document(result: Result) -> dict[str, Any]:
+def _document(result: Reconstruction) -> dict[str, Any]:
     """``result.json`` as a dictionary."""
     geometry, reflectance = result.geometry, result.reflectance
     lighting: dict[str, Any] = {

@@ -12,7 +12,7 @@ from mifit.appearance import kernels, models
 from mifit.appearance.models import ShadingModel, Transfer
 from mifit.config import SHADINGS
 from mifit.errors import InputError
-from mifit.reconstruction import Reconstruction
+from mifit.result import Reconstruction
 
 SHEEN_MEAN = np.sqrt(1 / (4 * np.pi))
 """Mean radiance from all directions, as a factor on the constant coefficient."""

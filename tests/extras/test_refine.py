@@ -69,7 +69,7 @@ def asked(monkeypatch):
 @pytest.fixture
 def result(scene, asked):
     """A fit of two timesteps whose normals are the mesh's."""
-    from mifit.reconstruction import Reconstruction
+    from mifit.result import Reconstruction
 
     return Reconstruction(
         model=scene.model,

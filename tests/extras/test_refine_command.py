@@ -22,7 +22,7 @@ exponent = 100
 
 @pytest.mark.slow
 def test_frames_are_chosen_and_mend_the_maps_by_which_others_are_tracked(capsys, tiny_capture, tmp_path):
-    from mifit.reconstruction import Reconstruction
+    from mifit.result import Reconstruction
 
     out, config = tmp_path / "result", tmp_path / "c.toml"
     config.write_text(CONFIG)

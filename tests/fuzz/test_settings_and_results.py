@@ -19,7 +19,7 @@ from mifit.core.arrays import read_ply
 from mifit.errors import InputError
 from mifit.experiments import load_plan
 from mifit.morphable import MorphableModel
-from mifit.reconstruction import Reconstruction
+from mifit.result import Reconstruction
 from tests.fuzz.conftest import as_json, bounded, read_or_refuse, spoilt_bytes, spoilt_documents
 from tests.output.conftest import ball_model, ball_result
 

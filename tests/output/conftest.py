@@ -17,7 +17,7 @@ from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEs
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
-from mifit.reconstruction import Reconstruction
+from mifit.result import Reconstruction
 from mifit.stages.normals.refine_mesh import refine_mesh
 
 RADIUS = 9.0

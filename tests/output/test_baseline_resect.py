@@ -10,7 +10,7 @@ import pytest
 from mifit.capture import Capture
 from mifit.errors import InputError
 from mifit.output.evaluate import compare, evaluate
-from mifit.output.resect import needs_resection, resect
+from mifit.output.placement import needs_resection, resect
 from tests.output.conftest import RADIUS, ball_camera
 from tests.output.test_render_evaluate import FakeCapture
 
@@ -74,10 +74,10 @@ def uncalibrated(folder, ball, noise=0.0, intrinsics=False):
 def test_a_camera_is_placed_from_its_landmarks_alone(ball, tmp_path, intrinsics):
     capture = uncalibrated(tmp_path, ball, intrinsics=intrinsics)
     assert needs_resection(ball, capture, "third") and not needs_resection(ball, capture, "left")
-    found = resect(ball, capture, "third")
-    assert found.landmark_pixels < 0.02
-    assert np.linalg.norm(found.camera.position - THIRD.position) < 0.2
-    assert found.camera.fx == pytest.approx(THIRD.fx, rel=3e-3)
+    camera, pixels = resect(ball, capture, "third")
+    assert pixels < 0.02
+    assert np.linalg.norm(camera.position - THIRD.position) < 0.2
+    assert camera.fx == pytest.approx(THIRD.fx, rel=3e-3)
 
 
 def test_a_camera_of_another_size_gets_its_own_focal_length(ball, tmp_path):
@@ -91,17 +91,17 @@ def test_a_camera_of_another_size_gets_its_own_focal_length(ball, tmp_path):
             (tmp_path / frame["landmark_path"]).write_text(json.dumps({"points": points.tolist()}))
             frame |= {"w": 96, "h": 96}
     (tmp_path / "transforms.json").write_text(json.dumps(document))
-    found = resect(ball, Capture.load(tmp_path), "third")
-    assert found.camera.fx == pytest.approx(zoomed.fx, rel=0.03) and found.landmark_pixels < 0.1
+    camera, pixels = resect(ball, Capture.load(tmp_path), "third")
+    assert camera.fx == pytest.approx(zoomed.fx, rel=0.03) and pixels < 0.1
     assert needs_resection(ball, capture, "third")
 
 
 def test_noise_of_landmarks_moves_the_camera_little(ball, tmp_path):
-    found = resect(ball, uncalibrated(tmp_path, ball, noise=0.3), "third")
-    assert 0.2 < found.landmark_pixels < 0.8
-    centre = found.camera.project(ball.geometry.vertices[0].mean(0).astype(float))
+    camera, pixels = resect(ball, uncalibrated(tmp_path, ball, noise=0.3), "third")
+    assert 0.2 < pixels < 0.8
+    centre = camera.project(ball.geometry.vertices[0].mean(0).astype(float))
     assert np.linalg.norm(centre - THIRD.project(ball.geometry.vertices[0].mean(0).astype(float))) < 0.3
-    assert np.linalg.norm(found.camera.position - THIRD.position) < 0.1 * np.linalg.norm(THIRD.position)
+    assert np.linalg.norm(camera.position - THIRD.position) < 0.1 * np.linalg.norm(THIRD.position)
 
 
 def test_evaluation_says_that_it_placed_the_camera(ball, tmp_path, variant, monkeypatch):

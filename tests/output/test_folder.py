@@ -15,8 +15,8 @@ from mifit.core.mesh import split_at_seams, tangents, vertex_normals
 from mifit.core.photometry import Photometry
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
-from mifit.output.map_figures import picture_maps
-from mifit.reconstruction import Reconstruction
+from mifit.output.report import picture_maps
+from mifit.result import Reconstruction
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from mifit.appearance.illumination import DistantLight
 from mifit.core.mesh import normalize
 from mifit.core.sh import basis
 from mifit.output.deferred import _mesh_normals, surface_material, visible_surface
-from mifit.reconstruction import Reconstruction
+from mifit.result import Reconstruction
 
 TOWARDS = normalize(np.array([0.6, 0.5, 0.6]))
 POWER = np.array([2.0, 1.5, 1.0])

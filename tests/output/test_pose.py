@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from mifit.core.image import to_8_bit
 from mifit.errors import InputError
 from mifit.output.evaluate import compare, evaluate, held_out
-from mifit.output.pose import pose_head
+from mifit.output.placement import pose_head
 from mifit.render.image_based import image_based
 from tests.output.conftest import ball_camera
 from tests.output.test_render_evaluate import FakeCapture

@@ -9,7 +9,7 @@ import pytest
 
 from mifit.appearance.illumination import Illumination
 from mifit.output.surface import surface_maps
-from mifit.reconstruction import Reconstruction
+from mifit.result import Reconstruction
 from tests.output.conftest import ball_camera, ball_result
 
 

@@ -11,7 +11,7 @@ from mifit.appearance.illumination import Illumination
 from mifit.core.estimate import Report, ResidualEstimate
 from mifit.core.image import write_image
 from mifit.errors import InputError
-from mifit.reconstruction import Reconstruction
+from mifit.result import Reconstruction
 from tests.output.conftest import ball_camera, ball_result
 
 

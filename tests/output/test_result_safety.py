@@ -17,8 +17,7 @@ import pytest
 from mifit.cli import main
 from mifit.core.image import write_image
 from mifit.errors import InputError
-from mifit.reconstruction import Reconstruction
-from mifit.result import ownership, writing
+from mifit.result import Reconstruction, ownership, writing
 
 
 def tree(folder: Path) -> dict[str, bytes]:

@@ -13,7 +13,7 @@ from mifit.core.mesh import normalize
 from mifit.output.export import export
 from mifit.output.report import _lighting
 from mifit.output.scene import write_scene
-from mifit.reconstruction import Reconstruction
+from mifit.result import Reconstruction
 
 FAR = DistantLight(normalize(np.array([-0.6, 0.5, 0.6])), 0.01, np.array([1.0, 1.5, 2.0]))
 OTHER = DistantLight(normalize(np.array([0.4, 0.35, 0.85])), 0.02, np.array([2.0, 1.5, 1.0]))

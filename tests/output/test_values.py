@@ -14,7 +14,7 @@ from mifit.core.diagnostics import Diagnostic
 from mifit.core.image import read_image
 from mifit.core.sh import SHLighting
 from mifit.errors import InputError
-from mifit.reconstruction import Reconstruction
+from mifit.result import Reconstruction
 from tests.output.conftest import ball_camera
 from tests.output.test_views import smooth_environment
 from tests.variant import VARIANT

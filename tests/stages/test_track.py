@@ -171,7 +171,7 @@ def test_landmark_error_is_in_pixels(scene):
 @pytest.fixture
 def saved(scene, tmp_path):
     """A result with timestep 0 in a folder, and its reload."""
-    from mifit.reconstruction import Reconstruction
+    from mifit.result import Reconstruction
     from mifit.stages.normals.refine_mesh import refine_mesh
 
     scene.model.save(tmp_path / "dome.npz")
@@ -194,7 +194,7 @@ def saved(scene, tmp_path):
 
 
 def reload(folder):
-    from mifit.reconstruction import Reconstruction
+    from mifit.result import Reconstruction
 
     return Reconstruction.load(folder)
 

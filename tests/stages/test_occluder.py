@@ -1,8 +1,8 @@
-"""The face mask: a hand painted over one input image of a small capture is found, and kept out of the albedo."""
+"""A hand painted over one input image of a small capture is kept out of the albedo."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,29 +10,10 @@ import pytest
 from stages.reflectance_scene import turning_dome
 from stages.test_infer_reflectance import infer
 
-from mifit.output.face_mask import face_mask
-from mifit.output.figures import tint
-from mifit.reconstruction import Reconstruction
 from mifit.synth.compose import expose
 
 HAND = (0.42, 0.30, 0.24)
 VIEW = ("left", 1)
-
-
-@dataclass(frozen=True)
-class Photographs:
-    """A capture of a scene's frames."""
-
-    scene: object
-
-    def camera(self, name):
-        return self.scene.camera(name)
-
-    def frame(self, name, timestep):
-        return self.scene.frame(name, timestep)
-
-    def with_fitted(self, cameras):
-        return self
 
 
 def hand(shape, centre, size):
@@ -45,11 +26,6 @@ def hand(shape, centre, size):
         tip = foot + size * np.array([0.05 * (k - 1.5), -0.75])
         cv2.line(out, tuple(np.round(foot).astype(int)), tuple(np.round(tip).astype(int)), 1, round(0.2 * size))
     return out > 0
-
-
-def result(scene, reflectance):
-    cameras = tuple(scene.camera(name) for name in ("left", "right"))
-    return Reconstruction(scene.model, scene.geometry, reflectance, cameras=cameras)
 
 
 @pytest.fixture(scope="module")
@@ -71,25 +47,6 @@ def occluded(clean):
     return scene, shape, infer(scene)
 
 
-def test_a_hand_is_found_where_it_is(occluded):
-    scene, shape, fitted = occluded
-    mask = face_mask(result(scene, fitted), Photographs(scene), *VIEW)
-    there = shape & mask.area
-    union = (mask.unexplained | there).sum()
-    assert there.sum() > 0.05 * mask.area.sum()
-    assert (mask.unexplained & there).sum() / union > 0.9
-    assert not (mask.face & mask.unexplained).any()
-
-
-def test_other_images_are_left_alone(occluded, clean):
-    scene, _, fitted = occluded
-    for view in (("right", 1), ("left", 0)):
-        mask = face_mask(result(scene, fitted), Photographs(scene), *view)
-        assert mask.part(mask.unexplained) < 0.01
-    mask = face_mask(result(clean, infer(clean)), Photographs(clean), *VIEW)
-    assert mask.part(mask.unexplained) < 0.01
-
-
 def test_the_albedo_under_the_hand_stays_clean(occluded, clean):
     scene, shape, fitted = occluded
     from mifit.stages.observations import Surface
@@ -106,21 +63,3 @@ def test_the_albedo_under_the_hand_stays_clean(occluded, clean):
     painted = np.abs(np.float32(HAND) - clean.frames[VIEW].image[shape]).mean()
     assert under.sum() > 50 and painted > 0.1  # a hand unlike the skin under it
     assert np.median(moved) < 0.01 and np.sqrt((moved**2).mean()) < 0.02  # of albedos about 0.4
-
-
-def test_clipped_pixels_are_counted_apart(clean):
-    frame = clean.frames[VIEW]
-    clipped = np.zeros_like(frame.valid)
-    clipped[: len(clipped) // 2] = True
-    scene = replace(clean, frames={**clean.frames, VIEW: replace(frame, clipped=clipped)})
-    mask = face_mask(result(clean, infer(clean)), Photographs(scene), *VIEW)
-    assert mask.part(mask.clipped) == pytest.approx((mask.area & clipped).sum() / mask.area.sum())
-    assert 0.2 < mask.part(mask.clipped) < 0.8 and not (mask.clipped & mask.unexplained).any()
-
-
-def test_tint_colours_the_area_alone():
-    picture = np.full((4, 4, 3), 100, np.uint8)
-    area = np.zeros((4, 4), bool)
-    area[1, 2] = True
-    out = tint(picture, (area, (200, 0, 100)), strength=0.5)
-    assert (out[~area] == 100).all() and (out[area] == (150, 50, 100)).all() and (picture == 100).all()
