@@ -1,25 +1,11 @@
-"""Nonlinear least squares: Gauss-Newton and Levenberg-Marquardt; knows nothing of faces or rendering.
+"""Nonlinear least squares by Levenberg and Marquardt's method; knows nothing of faces or rendering.
 
-A *problem* linearises itself into a *system* (normal equations with their structure); a *descent* turns a system
-into a step; an *acceptance* judges the step and sets the size of the next one; `minimize` drives the three and
+A *problem* linearises itself into a *system* (normal equations with their structure); `minimize` takes damped steps and
 returns a `Solution` that says in an enumerated `Outcome` how it ended.
 """
 
-from mifit.optim.minimize import Backtracking, GaussNewton, LevenbergMarquardt, Outcome, Solution, TrustRatio, minimize
-from mifit.optim.robust import geman_mcclure, huber
-from mifit.optim.systems import ArrowSystem, DenseSystem, RowSystem
+from mifit.optim.minimize import Outcome, Solution, minimize
+from mifit.optim.robust import geman_mcclure
+from mifit.optim.systems import ArrowSystem, DenseSystem
 
-__all__ = [
-    "ArrowSystem",
-    "Backtracking",
-    "DenseSystem",
-    "GaussNewton",
-    "LevenbergMarquardt",
-    "Outcome",
-    "RowSystem",
-    "Solution",
-    "TrustRatio",
-    "geman_mcclure",
-    "huber",
-    "minimize",
-]
+__all__ = ["ArrowSystem", "DenseSystem", "Outcome", "Solution", "geman_mcclure", "minimize"]

@@ -16,12 +16,10 @@ from scipy import linalg
 
 
 class System(Protocol):
-    """What a descent and an acceptance need to know of a linearisation."""
+    """What `minimize` needs to know of a linearisation."""
 
-    @property
-    def gradient(self) -> NDArray[np.float64]:
-        """(n,) g = J^T r, half the gradient of the energy."""
-        ...
+    gradient: NDArray[np.float64]
+    """(n,) g = J^T r, half the gradient of the energy."""
 
     def product(self, step: NDArray) -> NDArray[np.float64]:
         """H times a vector."""
@@ -45,75 +43,12 @@ def _scaling(diagonal: NDArray) -> NDArray:
     return np.maximum(diagonal, 1e-12 * largest if largest > 0 else 1.0)
 
 
-class RowSystem:
-    """Residuals and Jacobian kept as rows; a step is an augmented least-squares problem solved by QR.
-
-    It squares no condition number: the choice for small or badly conditioned problems, and the reference
-    for the other two.
-
-    Parameters
-    ----------
-    residual : (m,), jacobian : (m, n)
-    """
-
-    def __init__(self, residual: NDArray, jacobian: NDArray) -> None:
-        self.residual = np.asarray(residual, dtype=np.float64)
-        self.jacobian = np.asarray(jacobian, dtype=np.float64)
-
-    @property
-    def gradient(self) -> NDArray[np.float64]:
-        """J^T r."""
-        return self.jacobian.T @ self.residual
-
-    def product(self, step: NDArray) -> NDArray[np.float64]:
-        """J^T (J d)."""
-        return self.jacobian.T @ (self.jacobian @ step)
-
-    def solve(self, damping: float, frozen: NDArray[np.bool_], gradient: NDArray | None = None) -> NDArray[np.float64]:
-        """Least squares of the rows [J; sqrt(lambda D)] d = [-r; 0]."""
-        free = ~frozen
-        jacobian = self.jacobian[:, free]
-        scale = np.sqrt(damping * _scaling(np.einsum("ij,ij->j", jacobian, jacobian)))
-        rows = np.vstack([jacobian, np.diag(scale)])
-        q, r = linalg.qr(rows, mode="economic")
-        diagonal = np.abs(np.diag(r))
-        if diagonal.size and diagonal.min() <= 1e-14 * diagonal.max():
-            raise np.linalg.LinAlgError("rank-deficient Jacobian and no damping")
-        step = np.zeros(len(frozen))
-        if gradient is None:
-            step[free] = linalg.solve_triangular(r, -(q[: len(self.residual)].T @ self.residual))
-        else:
-            step[free] = linalg.cho_solve((r, False), -gradient[free])
-        return step
-
-    def covariance_diagonal(self) -> NDArray[np.float64]:
-        """Diagonal of (J^T J)^-1 from R; infinite where the data leave a parameter free."""
-        r = linalg.qr(self.jacobian, mode="r")[0][: self.jacobian.shape[1]]
-        if r.shape[0] < r.shape[1] or np.abs(np.diag(r)).min() <= 1e-14 * np.abs(np.diag(r)).max():
-            return np.full(self.jacobian.shape[1], np.inf)
-        inverse = linalg.solve_triangular(r, np.eye(len(r)))
-        return np.einsum("ij,ij->i", inverse, inverse)
-
-
 class DenseSystem:
-    """Normal equations in one dense matrix: the choice when rows are many and parameters a few hundred.
-
-    Parameters
-    ----------
-    hessian : (n, n)
-        J^T J, accumulated block by block by the problem.
-    gradient : (n,)
-        J^T r.
-    """
+    """Normal equations in one dense matrix: ``hessian`` (n, n) = J^T J and ``gradient`` (n,) = J^T r."""
 
     def __init__(self, hessian: NDArray, gradient: NDArray) -> None:
         self.hessian = np.asarray(hessian, dtype=np.float64)
-        self._gradient = np.asarray(gradient, dtype=np.float64)
-
-    @property
-    def gradient(self) -> NDArray[np.float64]:
-        """J^T r."""
-        return self._gradient
+        self.gradient = np.asarray(gradient, dtype=np.float64)
 
     def product(self, step: NDArray) -> NDArray[np.float64]:
         """H d."""
@@ -125,7 +60,7 @@ class DenseSystem:
         h = self.hessian[np.ix_(free, free)]
         h[np.diag_indices(len(free))] += damping * _scaling(np.diag(h))
         step = np.zeros(len(frozen))
-        g = self._gradient if gradient is None else gradient
+        g = self.gradient if gradient is None else gradient
         step[free] = linalg.cho_solve(linalg.cho_factor(h), -g[free])
         return step
 
@@ -159,19 +94,14 @@ class ArrowSystem:
         self.shared = np.asarray(shared, dtype=np.float64)
         self.local = [np.asarray(block, dtype=np.float64) for block in local]
         self.coupling = [np.asarray(block, dtype=np.float64) for block in coupling]
-        self._gradient = np.concatenate([shared_gradient, *local_gradient]).astype(np.float64)
+        self.gradient = np.concatenate([shared_gradient, *local_gradient]).astype(np.float64)
         sizes = [len(self.shared), *(len(block) for block in self.local)]
         ends = np.cumsum(sizes)
         self.slices = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
 
-    @property
-    def gradient(self) -> NDArray[np.float64]:
-        """J^T r."""
-        return self._gradient
-
     def dense(self) -> NDArray[np.float64]:
         """(n, n) the whole matrix."""
-        h = np.zeros((len(self._gradient),) * 2)
+        h = np.zeros((len(self.gradient),) * 2)
         s = self.slices[0]
         h[s, s] = self.shared
         for at, block, coupling in zip(self.slices[1:], self.local, self.coupling, strict=True):
@@ -193,7 +123,7 @@ class ArrowSystem:
     def solve(self, damping: float, frozen: NDArray[np.bool_], gradient: NDArray | None = None) -> NDArray[np.float64]:
         """Damped step by the Schur complement on the shared parameters."""
         s = self.slices[0]
-        right = np.where(frozen, 0.0, -(self._gradient if gradient is None else gradient))
+        right = np.where(frozen, 0.0, -(self.gradient if gradient is None else gradient))
         schur, rhs = _damped(self.shared, damping, frozen[s]), right[s].copy()
         factors = []
         for at, block, coupling in zip(self.slices[1:], self.local, self.coupling, strict=True):

@@ -7,19 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mifit.optim import (
-    ArrowSystem,
-    Backtracking,
-    DenseSystem,
-    GaussNewton,
-    LevenbergMarquardt,
-    Outcome,
-    RowSystem,
-    TrustRatio,
-    geman_mcclure,
-    huber,
-    minimize,
-)
+from mifit.optim import ArrowSystem, DenseSystem, Outcome, geman_mcclure, minimize
+from mifit.optim.minimize import trust
+
+
+def of_rows(residual, jacobian):
+    return DenseSystem(jacobian.T @ jacobian, jacobian.T @ residual)
 
 
 @dataclass
@@ -30,7 +23,7 @@ class Rosenbrock:
         return {"valley": float(100 * (x[1] - x[0] ** 2) ** 2), "slope": float((1 - x[0]) ** 2)}
 
     def linearize(self, x):
-        return RowSystem(np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]]), np.array([[-20 * x[0], 10.0], [-1.0, 0.0]]))
+        return of_rows(np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]]), np.array([[-20 * x[0], 10.0], [-1.0, 0.0]]))
 
 
 @dataclass
@@ -44,7 +37,7 @@ class Linear:
         return {"rows": float(((self.a @ x - self.b) ** 2).sum())}
 
     def linearize(self, x):
-        return RowSystem(self.a @ x - self.b, self.a)
+        return of_rows(self.a @ x - self.b, self.a)
 
 
 def arrow(rng, shared=4, local=(3, 2, 3), m=20):
@@ -69,20 +62,22 @@ def arrow(rng, shared=4, local=(3, 2, 3), m=20):
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-3, 10.0])
-def test_three_systems_take_the_same_step(damping):
+def test_systems_take_the_step_of_damped_least_squares(damping):
     rng = np.random.default_rng(0)
     system, jacobian, residual = arrow(rng)
     frozen = np.zeros(jacobian.shape[1], dtype=bool)
     frozen[[1, 5, 9]] = True
-    rows = RowSystem(residual, jacobian)
-    dense = DenseSystem(jacobian.T @ jacobian, jacobian.T @ residual)
-    expected = rows.solve(damping, frozen)
-    assert np.all(expected[frozen] == 0) and np.abs(expected).max() > 1e-3
+    free = jacobian[:, ~frozen]
+    rows = np.vstack([free, np.diag(np.sqrt(damping * (free**2).sum(0)))])
+    expected = np.zeros(len(frozen))
+    expected[~frozen] = np.linalg.lstsq(rows, np.append(-residual, np.zeros(free.shape[1])), rcond=None)[0]
+    assert np.abs(expected).max() > 1e-3
+    dense = of_rows(residual, jacobian)
     np.testing.assert_allclose(dense.solve(damping, frozen), expected, atol=1e-10)
     np.testing.assert_allclose(system.solve(damping, frozen), expected, atol=1e-10)
     other = rng.normal(size=len(frozen))
-    np.testing.assert_allclose(system.solve(damping, frozen, other), rows.solve(damping, frozen, other), atol=1e-9)
-    np.testing.assert_allclose(system.product(expected), rows.product(expected), atol=1e-10)
+    np.testing.assert_allclose(system.solve(damping, frozen, other), dense.solve(damping, frozen, other), atol=1e-9)
+    np.testing.assert_allclose(system.product(expected), jacobian.T @ (jacobian @ expected), atol=1e-10)
 
 
 def test_covariance_is_that_of_the_estimator():
@@ -90,25 +85,20 @@ def test_covariance_is_that_of_the_estimator():
     system, jacobian, residual = arrow(rng)
     expected = np.diag(np.linalg.inv(jacobian.T @ jacobian))
     np.testing.assert_allclose(system.covariance_diagonal(), expected, rtol=1e-9)
-    np.testing.assert_allclose(RowSystem(residual, jacobian).covariance_diagonal(), expected, rtol=1e-9)
+    np.testing.assert_allclose(of_rows(residual, jacobian).covariance_diagonal(), expected, rtol=1e-9)
     # and of its scatter over repeated noise
     a = rng.normal(size=(40, 3))
     estimates = np.linalg.lstsq(a, rng.normal(size=(40, 4000)), rcond=None)[0]
-    np.testing.assert_allclose(RowSystem(np.zeros(40), a).covariance_diagonal(), estimates.var(axis=1), rtol=0.1)
+    np.testing.assert_allclose(of_rows(np.zeros(40), a).covariance_diagonal(), estimates.var(axis=1), rtol=0.1)
 
 
 def test_unseen_parameter_has_infinite_variance():
     jacobian = np.array([[1.0, 0.0], [2.0, 0.0]])
-    assert np.isinf(RowSystem(np.ones(2), jacobian).covariance_diagonal()).all()
-    assert np.isinf(DenseSystem(jacobian.T @ jacobian, np.zeros(2)).covariance_diagonal()).all()
+    assert np.isinf(of_rows(np.ones(2), jacobian).covariance_diagonal()).all()
 
 
-@pytest.mark.parametrize(
-    ("descent", "acceptance"),
-    [(LevenbergMarquardt(), TrustRatio()), (GaussNewton(), Backtracking()), (GaussNewton(), TrustRatio())],
-)
-def test_rosenbrock_from_the_classic_start(descent, acceptance):
-    solution = minimize(Rosenbrock(), np.array([-1.2, 1.0]), descent=descent, acceptance=acceptance, max_iterations=200)
+def test_rosenbrock_from_the_classic_start():
+    solution = minimize(Rosenbrock(), np.array([-1.2, 1.0]), max_iterations=200)
     assert solution.outcome is Outcome.CONVERGED
     np.testing.assert_allclose(solution.value, 1.0, atol=1e-6)
     total = np.sum(list(solution.energies.values()), axis=0)
@@ -116,12 +106,12 @@ def test_rosenbrock_from_the_classic_start(descent, acceptance):
     assert len(total) <= solution.iterations + 1
 
 
-def test_gauss_newton_solves_a_linear_problem_in_one_step():
+def test_a_linear_problem_is_solved_in_few_steps():
     rng = np.random.default_rng(2)
     a, b = rng.normal(size=(30, 5)), rng.normal(size=30)
-    solution = minimize(Linear(a, b), np.zeros(5), descent=GaussNewton(), acceptance=Backtracking())
-    np.testing.assert_allclose(solution.value, np.linalg.lstsq(a, b, rcond=None)[0], atol=1e-12)
-    assert solution.iterations == 2 and solution.rejected == 0  # one step, one look that nothing is left
+    solution = minimize(Linear(a, b), np.zeros(5), step_tolerance=1e-12, energy_tolerance=0.0)
+    np.testing.assert_allclose(solution.value, np.linalg.lstsq(a, b, rcond=None)[0], atol=1e-9)
+    assert solution.iterations < 8 and solution.rejected == 0
 
 
 def test_bounds_hold_and_the_rest_is_optimal():
@@ -150,7 +140,6 @@ def test_damping_carries_a_rank_deficient_problem():
     problem = Linear(a, np.array([1.0, 2.0]))
     solution = minimize(problem, np.zeros(2))
     assert solution.usable and solution.energy < 1e-12
-    assert minimize(problem, np.zeros(2), descent=GaussNewton()).outcome is Outcome.SINGULAR
 
 
 def test_outcomes_are_told_apart():
@@ -162,7 +151,7 @@ def test_outcomes_are_told_apart():
     @dataclass
     class WrongJacobian(Linear):
         def linearize(self, x):
-            return RowSystem(self.a @ x - self.b, -self.a)
+            return of_rows(self.a @ x - self.b, -self.a)
 
     a, b = np.eye(2), np.ones(2)
     start = np.zeros(2)
@@ -174,29 +163,20 @@ def test_outcomes_are_told_apart():
 
 
 def test_trust_ratio_rule():
-    rule = TrustRatio()
-    assert rule.judge(1.0, 1.0, 8.0, 0) == (True, 24.0)  # as promised: damping falls by 3
-    accepted, size = rule.judge(1.0, 0.5, 8.0, 0)
+    assert trust(1.0, 1.0, 8.0, 0) == (True, 24.0)  # as promised: damping falls by 3
+    accepted, size = trust(1.0, 0.5, 8.0, 0)
     assert accepted and size == 8.0  # half of what was promised: as it was
-    assert rule.judge(1.0, -0.1, 8.0, 0) == (False, 4.0)
-    assert rule.judge(1.0, -0.1, 8.0, 2) == (False, 1.0)  # growing faster with each rejection
-    assert rule.judge(1.0, float("nan"), 8.0, 0)[0] is False
-    assert rule.judge(-1.0, 1.0, 8.0, 0)[0] is False
+    assert trust(1.0, -0.1, 8.0, 0) == (False, 4.0)
+    assert trust(1.0, -0.1, 8.0, 2) == (False, 1.0)  # growing faster with each rejection
+    assert trust(1.0, float("nan"), 8.0, 0)[0] is False
+    assert trust(-1.0, 1.0, 8.0, 0)[0] is False
 
 
-def test_backtracking_rule():
-    rule = Backtracking()
-    assert rule.judge(1.0, 1.0, 0.25, 0) == (True, 0.5)
-    assert rule.judge(1.0, -1.0, 0.25, 0) == (False, 0.125)
-    assert rule.judge(1.0, float("nan"), 1.0, 0) == (False, 0.5)
-
-
-@pytest.mark.parametrize("penalty", [huber, geman_mcclure])
-def test_robust_weight_is_the_slope_of_the_penalty(penalty):
+def test_robust_weight_is_the_slope_of_the_geman_mcclure():
     squared = np.linspace(0.01, 30.0, 400)
-    rho, weight = penalty(squared, 1.7)
+    rho, weight = geman_mcclure(squared, 1.7)
     np.testing.assert_allclose(np.gradient(rho, squared)[1:-1], weight[1:-1], atol=5e-3)
-    small_rho, small_weight = penalty(np.array([1e-8]), 1.7)
+    small_rho, small_weight = geman_mcclure(np.array([1e-8]), 1.7)
     np.testing.assert_allclose([small_rho[0] / 1e-8, small_weight[0]], 1.0, atol=1e-6)
     assert np.all(np.diff(weight) <= 1e-12) and weight[-1] < 0.4
 
@@ -211,7 +191,7 @@ def test_outliers_do_not_pull_a_robust_mean():
 
         def linearize(self, x):
             root = np.sqrt(geman_mcclure((x[0] - data) ** 2, 3.0)[1])
-            return RowSystem(root * (x[0] - data), root[:, None])
+            return of_rows(root * (x[0] - data), root[:, None])
 
     solution = minimize(Mean(), np.array([np.median(data)]))
     assert solution.usable and abs(solution.value[0] - data[:90].mean()) < 0.1

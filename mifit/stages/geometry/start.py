@@ -12,7 +12,7 @@ from mifit.capture import Capture
 from mifit.core.camera import Camera
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
-from mifit.optim import Solution, TrustRatio, minimize
+from mifit.optim import Solution, minimize
 from mifit.stages.geometry.initial import pose_candidates, reprojection
 from mifit.stages.geometry.landmarks import LandmarkProblem, LandmarkTerm, LandmarkView, slide_contour
 from mifit.stages.geometry.parameters import Frames, Layout
@@ -198,7 +198,6 @@ def fit_landmarks(
             lower=low_now,
             upper=high_now,
             max_iterations=30,
-            acceptance=TrustRatio(),
             energy_tolerance=1e-5,
         )
         state = replace(state, x=solution.value)
