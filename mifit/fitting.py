@@ -67,11 +67,6 @@ if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
 
 T = TypeVar("T")
-ESTIMATED_CAMERAS = Diagnostic(
-    "uncalibrated", "the capture is uncalibrated: focal length, camera poses and so the scale are estimates"
-)
-BASELINE_DEGREES = 3.0
-"""Angle between the views below which a person is told that distance is not measured."""
 Stage = Literal["geometry", "reflectance", "normals"]
 STAGES: tuple[Stage, ...] = ("geometry", "reflectance", "normals")
 Part = Literal["geometry", "reflectance", "normals", "mesh", "residual"]
@@ -82,26 +77,12 @@ PARTS: dict[Part, type] = {
     "mesh": MeshEstimate,
     "residual": ResidualEstimate,
 }
-
-
 Inputs = Mapping[Part, Any]
 
 
 @dataclass(frozen=True)
 class Source:
-    """What every step starts from.
-
-    Attributes
-    ----------
-    capture : Capture
-        Calibrated, or with estimated cameras.
-    digest : str
-        Of the capture's files, for the chosen cameras and timesteps.
-    model : MorphableModel
-    cameras : tuple of str
-    timesteps : tuple of int
-    seed : int
-    """
+    """What every step starts from; ``digest`` is that of the capture's files, for these cameras and timesteps."""
 
     capture: Capture
     digest: str
@@ -136,21 +117,10 @@ class Source:
 
 @dataclass(frozen=True)
 class Step:
-    """One step of a fit.
+    """One step of a fit: ``run(source, inputs, progress, *settings)`` makes the estimate of ``part``.
 
-    Attributes
-    ----------
-    name : str
-        Of its checkpoint; one of a kind in a list of steps.
-    part : str
-        What it makes: a key of `PARTS`.
-    inputs : tuple of str
-        Parts that it is given, each as the last step before it left it.
-    settings : tuple of dataclass
-        Settings that it is given.
-    run : callable
-        ``run(source, inputs, progress, *settings)`` -> estimate of the part; a function of the module, so that it can
-        read nothing else.
+    ``name`` is that of its checkpoint; ``inputs`` are the parts that it is given, each as the last step before it left
+    it. ``run`` is a function of the module, so that it can read nothing else.
     """
 
     name: str
@@ -189,13 +159,11 @@ def fit(
         Timesteps to fit jointly, named in any order; default: the first four. A choice (`mifit.choose_frames`) is kept
         with its reasons in ``geometry.report.details["frames"]``.
     config : FitConfig, optional
-        Settings of the stages.
     until : {"geometry", "reflectance", "normals"}
         Last stage to run; the mesh update goes with the normals.
     seed : int
         Seed of everything random.
     progress : Progress
-        Called as work advances.
     checkpoints : path, optional
         Folder for finished stages. A stage found there, computed from the same inputs, isn't run again.
     shared : bool
@@ -238,7 +206,8 @@ def fit(
 
         dense = calibrate_capture(capture, model, cameras, timesteps, progress)
         note = Diagnostic("calibration-estimated", dense.note, "note")
-        capture, estimated = dense.capture, (ESTIMATED_CAMERAS, note)
+        text = "the capture is uncalibrated: focal length, camera poses and so the scale are estimates"
+        capture, estimated = dense.capture, (Diagnostic("uncalibrated", text), note)
     source = Source(capture, capture_digest, model, cameras, timesteps, seed)
 
     def result(estimates: Mapping[Part, Any], seconds: float = 0.0) -> Reconstruction:
@@ -253,12 +222,7 @@ def fit(
             model_source=model.source,
             units=capture.units,
             unit_mm=capture.unit_mm,
-            warnings=(
-                *estimated,
-                *found,
-                *one_place(capture, cameras, geometry),
-                *eyes_note(given, model),
-            ),
+            warnings=(*estimated, *found, *one_place(capture, cameras, geometry), *eyes_note(given, model)),
             seconds=seconds,
             peak_memory=peak_memory(),
         )
@@ -271,10 +235,9 @@ def fit(
         None if watch is None else lambda so_far: watch(result(so_far)),
     )
     if choice is not None:
-        geometry = estimates["geometry"]
-        details = {**geometry.report.details, "frames": choice.document()}
-        report = replace(geometry.report, details=details)
-        estimates["geometry"] = replace(geometry, report=report)
+        report = estimates["geometry"].report
+        report = replace(report, details={**report.details, "frames": choice.document()})
+        estimates["geometry"] = replace(estimates["geometry"], report=report)
     return result(estimates, seconds)
 
 
@@ -298,18 +261,12 @@ def fit_into(
     ----------
     folder : path
         New, empty, or a result folder.
-    capture, model, cameras, timesteps, config, until, seed, progress
-        As in `mifit.fit`.
     resume : bool
         Go on with what an earlier run left. A result that has all that is asked for, and perhaps more, stays as it is.
     force : bool
         Replace an existing result, or write beside files that aren't ours; those are never deleted.
-    watch : callable, optional
-        Called with the result so far, as in `mifit.fit`.
-
-    Returns
-    -------
-    Reconstruction
+    capture, model, cameras, timesteps, config, until, seed, progress, watch
+        As in `mifit.fit`.
 
     Raises
     ------
@@ -321,7 +278,9 @@ def fit_into(
     check_ours(folder, force)
     if (folder / "result.json").exists() and not (resume or force):
         raise InputError(f"--out {folder}: holds a result already; --resume goes on with it, --force replaces it")
-    wanted = _identity(capture, model, choose("camera", capture.cameras, cameras, 2), timesteps, config, seed)
+    named, moments = choose("camera", capture.cameras, cameras, 2), choose_timesteps(capture, timesteps)
+    source = Source(capture, capture.digest(named, moments), fitted_model(model, config), named, moments, seed)
+    wanted = {**source.key, "config": json.loads(json.dumps({**dataclasses.asdict(config), "seed": seed}))}
     if until not in STAGES:
         raise InputError(f"until: found {until!r}, expected one of {', '.join(STAGES)}")
     with locked(folder, force):
@@ -329,40 +288,10 @@ def fit_into(
             shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
         elif (folder / "result.json").exists() and _is_there(folder, wanted, until):
             return Reconstruction.load(folder, model)
-        result = fit(
-            capture,
-            model,
-            cameras=cameras,
-            timesteps=timesteps,
-            config=config,
-            until=until,
-            seed=seed,
-            progress=progress,
-            checkpoints=folder / CHECKPOINTS,
-            watch=watch,
-        )
+        kept = folder / CHECKPOINTS
+        result = fit(capture, model, cameras, timesteps, config, until, seed, progress, kept, watch=watch)
         result.save(folder, force)
     return result
-
-
-def _identity(
-    capture: Capture,
-    model: MorphableModel,
-    cameras: tuple[str, ...],
-    timesteps: Sequence[int] | FrameChoice | None,
-    config: FitConfig,
-    seed: int,
-) -> dict[str, Any]:
-    """What decides a result, as ``result.json`` tells it."""
-    steps = choose_timesteps(capture, timesteps)
-    return {
-        "version": mifit.__version__,
-        "capture": capture.digest(cameras, steps),
-        "model": fitted_model(model, config).digest,
-        "cameras": list(cameras),
-        "timesteps": list(steps),
-        "config": json.loads(json.dumps({**dataclasses.asdict(config), "seed": seed})),
-    }
 
 
 def _is_there(folder: Path, wanted: dict[str, Any], until: Stage) -> bool:
@@ -378,6 +307,7 @@ def _is_there(folder: Path, wanted: dict[str, Any], until: Stage) -> bool:
             "model": document["model"]["digest"],
             "cameras": [c["name"] for c in document["capture"]["cameras"]],
             "timesteps": [t for t in timesteps if t not in tracked],
+            "seed": document["config"]["seed"],
             "config": document["config"],
         }
     except (KeyError, TypeError, AttributeError):
@@ -442,18 +372,7 @@ def run_steps(
     cache: Cache,
     watch: Callable[[Mapping[Part, Any]], None] | None = None,
 ) -> tuple[dict[Part, Any], float]:
-    """Estimates by part, as the last step of each left it, and the wall time of all steps, those kept included.
-
-    Parameters
-    ----------
-    listed : sequence of Step
-    source : Source
-    progress : Progress
-    cache : Cache
-        Where steps are kept.
-    watch : callable, optional
-        Called with the estimates after each step.
-    """
+    """Estimates by part, as the last step of each left it, and the wall time of all steps, those kept included."""
     estimates: dict[Part, Any] = {}
     before = 0.0
     made = keys(listed, source)
@@ -555,7 +474,7 @@ def one_place(capture: Capture, cameras: Sequence[str], geometry: GeometryEstima
     towards = np.array([capture.camera(name).position for name in seen]) - geometry.vertices[0].mean(axis=0)
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     apart = float(np.degrees(np.arccos(np.clip((towards @ towards.T).min(), -1.0, 1.0))))
-    if apart >= BASELINE_DEGREES:
+    if apart >= 3.0:
         return ()
     place = f"landmarks in camera {seen[0]} alone" if len(seen) == 1 else f"cameras {apart:.1f} degrees apart"
     text = f"{place}: how far away and so how large the head is rests on the model's size more than on the images"
