@@ -20,7 +20,8 @@ from PIL import Image
 import mifit
 from mifit.core.camera import Camera
 from mifit.core.image import to_8_bit
-from mifit.output.deferred import surface_material, trace_mesh, visible_surface
+from mifit.output.deferred import surface_material, visible_surface
+from mifit.render.visible import trace_mesh
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED, IMAGES, WORK = ROOT.parent / "shared", ROOT / "docs" / "images", ROOT / "out" / "pictures"

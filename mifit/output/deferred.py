@@ -6,7 +6,7 @@ optimisers share.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,101 +16,21 @@ from mifit.appearance.environment import EnvironmentLight
 from mifit.appearance.formation import Appearance, form_image
 from mifit.appearance.occlusion import MeshPoints
 from mifit.core.camera import Camera
-from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
+from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.sh import basis
 from mifit.core.uv import sample_map
 from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
-from mifit.render.first_hits import occluding_mesh
+from mifit.render.visible import VisibleSurface, occluding_mesh, trace_mesh
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
     from mifit.result import Method, Reconstruction
 
 
-@dataclass(frozen=True)
-class VisibleSurface:
-    """What a camera sees of one timestep, supersampled; shared by all methods.
-
-    Attributes
-    ----------
-    shape : (int, int)
-        Height and width of the image.
-    oversampling : int
-        Samples along one side of a pixel.
-    index : (N,) int64
-        Flat sample index (row * width * oversampling + column) of every covered sample.
-    face : (N,) int32, weights : (N, 3) float32
-        Where on the mesh each sample lies.
-    points, view : (N, 3) float32
-        World positions and unit vectors towards the camera.
-    """
-
-    shape: tuple[int, int]
-    oversampling: int
-    index: NDArray[np.int64]
-    face: NDArray[np.int32]
-    weights: NDArray[np.float32]
-    points: NDArray[np.float32]
-    view: NDArray[np.float32]
-
-    @property
-    def group(self) -> tuple[NDArray[np.int64], int]:
-        """Number of each sample in its pixel, and how many samples a pixel has."""
-        k, width = self.oversampling, self.shape[1]
-        return self.index // (width * k) % k * k + self.index % k, k * k
-
-    def image(self, colour: NDArray) -> NDArray[np.float32]:
-        """Average sample colours (N, 3) into pixels: (H, W, 4), colour not premultiplied, alpha = coverage."""
-        height, width = self.shape
-        k = self.oversampling
-        row, column = self.index // (width * k) // k, self.index % (width * k) // k
-        pixel = row * width + column
-        count = np.bincount(pixel, minlength=height * width)
-        out = np.zeros((height * width, 4), dtype=np.float32)
-        for channel in range(3):
-            total = np.bincount(pixel, colour[:, channel], minlength=height * width)
-            out[:, channel] = total / np.maximum(count, 1)
-        out[:, 3] = count / (k * k)
-        return out.reshape(height, width, 4)
-
-
 def visible_surface(result: Reconstruction, camera: Camera, timestep: int, oversampling: int = 2) -> VisibleSurface:
     """Find the front-facing surface under every sample of a camera's pixels."""
     i = result.index(timestep)
     return trace_mesh(result.geometry.vertices[i], result.model.faces, camera, oversampling)
-
-
-def trace_mesh(vertices: NDArray, faces: NDArray, camera: Camera, oversampling: int) -> VisibleSurface:
-    """Find the front-facing surface of a mesh under a camera's samples.
-
-    A sample whose nearest surface shows its back (the inside of the head through an eye opening) is not covered.
-    """
-    k = oversampling
-    fine = replace(
-        camera,
-        width=camera.width * k,
-        height=camera.height * k,
-        fx=camera.fx * k,
-        fy=camera.fy * k,
-        cx=camera.cx * k,
-        cy=camera.cy * k,
-    )
-    buffer = occluding_mesh(vertices, faces).scene.gbuffer(fine)
-    index = np.flatnonzero(buffer.face.ravel() >= 0)
-    face = buffer.face.ravel()[index]
-    weights = buffer.weights.reshape(-1, 3)[index]
-    points = interpolate(vertices, faces, face, weights)
-    view = normalize(camera.position - points)
-    front = np.sum(face_cross(vertices, faces)[face] * view, axis=1) > 0
-    return VisibleSurface(
-        (camera.height, camera.width),
-        k,
-        index[front],
-        face[front],
-        weights[front].astype(np.float32),
-        points[front].astype(np.float32),
-        view[front].astype(np.float32),
-    )
 
 
 @dataclass(frozen=True)

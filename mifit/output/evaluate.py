@@ -15,11 +15,12 @@ from mifit.core.camera import Camera
 from mifit.core.image import to_8_bit
 from mifit.errors import InputError
 from mifit.output.compare import Errors, pass_region, separation, skin_region
-from mifit.output.deferred import shade_methods, trace_mesh, visible_surface
+from mifit.output.deferred import shade_methods, visible_surface
 from mifit.output.placement import needs_resection, pose_head, resect
 from mifit.output.truth import TrueMesh, landmarks_of, true_mesh, true_passes
 from mifit.progress import Progress, silent
 from mifit.render.image_based import BLENDS, image_based
+from mifit.render.visible import trace_mesh
 
 if TYPE_CHECKING:
     from mifit.capture import Capture

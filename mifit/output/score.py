@@ -49,7 +49,7 @@ from mifit.output.truth import (
     true_passes,
 )
 from mifit.progress import Progress, silent
-from mifit.render.gbuffer import SurfaceScene
+from mifit.render.image_based import image_based
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -173,10 +173,10 @@ class _Truths:
 
     def __init__(self, capture: Capture, fitted: Sequence[str], model: MorphableModel | None) -> None:
         self.capture, self.fitted, self._model = capture, tuple(fitted), model
-        self._meshes: dict[int, tuple[TrueMesh, SurfaceScene] | None] = {}
+        self._meshes: dict[int, TrueMesh | None] = {}
 
-    def at(self, timestep: int) -> tuple[TrueMesh, SurfaceScene] | None:
-        """The mesh of a timestep, and what rays are sent at; None where there is none, or no triangles are known."""
+    def at(self, timestep: int) -> TrueMesh | None:
+        """The mesh of a timestep; None where there is none, or no triangles are known."""
         if timestep not in self._meshes:
             try:
                 mesh = true_mesh(self.capture, timestep, self._model)
@@ -184,20 +184,17 @@ class _Truths:
                 if self._model is not None:
                     raise
                 mesh = None
-            self._meshes[timestep] = None if mesh is None else (mesh, SurfaceScene(mesh.vertices, mesh.faces))
+            self._meshes[timestep] = mesh
         return self._meshes[timestep]
 
     def regions(self, camera: str, timestep: int) -> dict[str, NDArray[np.bool_]]:
         """Pixels of one photograph that count, by region."""
         view, frame = self.capture.camera(camera), self.capture.frame(camera, timestep)
         marks = landmarks_of(self.capture, camera, timestep)
-        skin, whole, found = skin_region(marks, view), frame.valid, self.at(timestep)
-        if found is not None:
-            from mifit.render.image_based import image_based
-
-            mesh, scene = found
+        skin, whole, mesh = skin_region(marks, view), frame.valid, self.at(timestep)
+        if mesh is not None:
             cameras = [self.capture.camera(name) for name in self.fitted]
-            shown = image_based(self.capture, cameras, view, timestep, mesh.vertices, mesh.faces, scene=scene)
+            shown = image_based(self.capture, cameras, view, timestep, mesh.vertices, mesh.faces)
             skin, whole = skin & shown.seen, whole & shown.hit
         regions = {"skin": skin & frame.valid, "face": face_region(marks, view) & frame.valid, "whole": whole}
         for name, region in regions.items():
@@ -258,7 +255,7 @@ def _meshes(files: dict[int, Path], truth: _Truths) -> dict[str, float]:
                 f"{path}: the capture's truth has no mesh of timestep {timestep}, or vertices without triangles; name "
                 "the model that it was made with"
             )
-        points = points_seen(found[0], truth.capture, truth.fitted, timestep)
+        points = points_seen(found, truth.capture, truth.fitted, timestep)
         mesh = read_mesh(path)
         distances.append(nearest_points(points.position, mesh.vertices, mesh.faces)[0])
     return distance_figures(np.concatenate(distances) * truth.capture.unit_mm)

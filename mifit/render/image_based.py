@@ -13,7 +13,7 @@ skin is like.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize
 from mifit.core.uv import bilinear
+from mifit.render.visible import occluding_mesh, trace_mesh
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
 
 Blend = Literal["cosine", "nearest", "angle"]
 BLENDS: tuple[Blend, ...] = ("cosine", "nearest", "angle")
-LEAST_COSINE = 0.15
-"""Views that see a point at a flatter angle don't show it: a pixel of theirs covers too much of the surface."""
 
 
 @dataclass(frozen=True)
@@ -102,28 +101,15 @@ def image_based(
     InputError
         A fitted camera or the timestep is not in the capture.
     """
-    from mifit.render.gbuffer import SurfaceScene
-
-    scene = scene or SurfaceScene(vertices, faces)
-    k = oversampling
-    buffer = scene.gbuffer(camera if k == 1 else _finer(camera, k))
-    index = np.flatnonzero(buffer.face.ravel() >= 0)
-    face = buffer.face.ravel()[index]
-    normal = normalize(face_cross(vertices, faces)[face])
-    point = interpolate(np.asarray(vertices, np.float64), faces, face, buffer.weights.reshape(-1, 3)[index])
-    front = np.sum(normal * (camera.position - point), axis=1) > 0
-    index, face, normal, point = index[front], face[front], normal[front], point[front]
-    wanted = normalize(camera.position - point)
-    total = {blend: np.zeros((len(index), 3)) for blend in blends}
-    weight = {blend: np.zeros(len(index)) for blend in blends}
-    spare, best = np.zeros((len(index), 3)), np.full(len(index), -np.inf)
-    weights = buffer.weights.reshape(-1, 3)[index]
+    surface = trace_mesh(vertices, faces, camera, oversampling, scene)
+    face, wanted, count = surface.face, surface.view, len(surface.face)
+    total = {blend: np.zeros((count, 3)) for blend in blends}
+    weight = {blend: np.zeros(count) for blend in blends}
+    spare, best = np.zeros((count, 3)), np.full(count, -np.inf)
     for moment, then in (moments or {timestep: vertices}).items():
-        there = scene
-        if then is not vertices:
-            there = SurfaceScene(then, faces)
-            normal = normalize(face_cross(then, faces)[face])
-            point = interpolate(np.asarray(then, np.float64), faces, face, weights)
+        there = scene if then is vertices and scene is not None else occluding_mesh(then, faces).scene
+        normal = normalize(face_cross(then, faces)[face])
+        point = interpolate(np.asarray(then, np.float64), faces, face, surface.weights)
         for view in fitted:
             frame = capture.frame(view.name, moment)
             x, y = (view.project(point) - 0.5).T
@@ -136,7 +122,8 @@ def image_based(
             facing = np.where(inside, cosine, -np.inf)
             spare[facing > best] = colour[facing > best]
             best = np.maximum(best, facing)
-            visible = inside & (cosine > LEAST_COSINE) & there.visible_from(point, view.position)
+            # At a flatter angle a pixel covers too much of the surface.
+            visible = inside & (cosine > 0.15) & there.visible_from(point, view.position)
             for blend in blends:
                 share = np.where(visible, _weight(blend, cosine, np.sum(towards * wanted, axis=1)), 0.0)
                 if blend == "nearest":  # the largest takes all
@@ -146,26 +133,16 @@ def image_based(
                 else:
                     total[blend] += share[:, None] * colour
                     weight[blend] += share
-    shape, seen = (camera.height, camera.width), next(iter(weight.values())) > 0
-    pixel = index // (camera.width * k) // k * camera.width + index % (camera.width * k) // k
-    count = np.bincount(pixel, minlength=shape[0] * shape[1])
-    images: dict[Blend, NDArray[np.float32]] = {}
+    seen = next(iter(weight.values())) > 0
+    colours = {}
     for blend in blends:
         found = np.where(seen[:, None], total[blend] / np.maximum(weight[blend], 1e-12)[:, None], spare)
-        sums = np.stack([np.bincount(pixel, found[:, c], minlength=len(count)) for c in range(3)], axis=1)
-        images[blend] = (sums / np.maximum(count, 1)[:, None]).reshape(*shape, 3).astype(np.float32)
-    shown = np.full(len(count), -1, np.int32)
-    shown[pixel] = face
-    shown[count < k * k] = -1
-    covered = np.bincount(pixel, seen, minlength=len(count)) == k * k
-    return ImageBased(images, shown.reshape(shape), covered.reshape(shape))
-
-
-def _finer(camera: Camera, k: int) -> Camera:
-    """The same view with k times the pixels along each side."""
-    width, height = camera.width * k, camera.height * k
-    fx, fy, cx, cy = (value * k for value in (camera.fx, camera.fy, camera.cx, camera.cy))
-    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+        colours[blend] = surface.image(found)[..., :3]
+    share = surface.image(seen[:, None].astype(np.float64))
+    shown = np.full(camera.width * camera.height, -1, np.int32)
+    shown[surface.pixel] = face
+    whole = share[..., 1] == 1.0
+    return ImageBased(colours, np.where(whole, shown.reshape(whole.shape), -1), whole & (share[..., 0] == 1.0))
 
 
 def _weight(blend: Blend, cosine: NDArray, nearness: NDArray) -> NDArray[np.float64]:

@@ -163,7 +163,7 @@ class Surface:
             raise InputError(
                 f"found {len(cameras)} cameras and {len(geometry.timesteps)} timesteps, expected 1 or more of both"
             )
-        from mifit.render.first_hits import occluding_mesh
+        from mifit.render.visible import occluding_mesh
 
         shown = model.mapped if whole else model.face_mask
         self.texels: TexelMap = rasterize_uv(model.uv, model.faces_uv, size, shown) if texels is None else texels

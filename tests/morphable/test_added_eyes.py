@@ -15,8 +15,8 @@ from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import RADIUS_MM, eyeballs, holes, lacks_eyes, leading_faces, skin_weights, with_eyes
-from mifit.output.deferred import trace_mesh
 from mifit.render.gbuffer import SurfaceScene
+from mifit.render.visible import trace_mesh
 from tests.stages.memory_capture import look_at_head
 
 

@@ -15,8 +15,9 @@ from mifit.core.photometry import Photometry
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import with_eyes
-from mifit.output.deferred import surface_material, trace_mesh, visible_surface
+from mifit.output.deferred import surface_material, visible_surface
 from mifit.output.evaluate import compare, evaluate, face_area
+from mifit.render.visible import trace_mesh
 from tests.output.conftest import ball_camera, ball_result
 from tests.test_pipeline import mean_geometry, without_eyes
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mifit.render import first_hits as occluders
+from mifit.render import visible as occluders
 
 
 @pytest.fixture(autouse=True)
