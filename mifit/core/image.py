@@ -150,11 +150,6 @@ def _open_raster(data: bytes) -> Any:
             raise ValueError("header not understood") from None
 
 
-def _raster_size(data: bytes) -> tuple[int, int]:
-    with _open_raster(data) as header:
-        return header.size
-
-
 def _decode_raster(data: bytes, path: str | Path) -> Image:
     """PNG, JPEG, TIFF: Pillow decodes 8 bits (it notices truncation), OpenCV 16 bits."""
     with _open_raster(data) as image:
@@ -234,10 +229,6 @@ def _exr_header(data: bytes) -> tuple[tuple[int, int], int]:
     return size, decoded
 
 
-def _exr_size(data: bytes) -> tuple[int, int]:
-    return _exr_header(data)[0]
-
-
 def _decode_exr(data: bytes, path: str | Path) -> Image:
     import OpenEXR
 
@@ -262,17 +253,14 @@ def _decode_exr(data: bytes, path: str | Path) -> Image:
     return _float_image(colour, found.get("A"))
 
 
-REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-"""Chromaticities x, y of red, green, blue and white."""
-
-
 def _from_primaries(colour: NDArray, primaries: NDArray, path: str | Path) -> NDArray[np.float32]:
     """Linear colour of other primaries in Rec. 709, its white adapted as by Bradford; what lies outside is cut off."""
-    if primaries.shape == (8,) and np.allclose(primaries, REC_709, atol=2e-3):
+    rec_709 = np.array([0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290])  # x, y of red, green, blue and white
+    if primaries.shape == (8,) and np.allclose(primaries, rec_709, atol=2e-3):
         return np.asarray(colour, np.float32)
     bradford = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
     try:
-        (source, white), (target, white_709) = (_to_xyz(np.asarray(p, np.float64)) for p in (primaries, REC_709))
+        (source, white), (target, white_709) = (_to_xyz(np.asarray(p, np.float64)) for p in (primaries, rec_709))
         adapted = np.linalg.inv(bradford) @ np.diag(bradford @ white_709 / (bradford @ white)) @ bradford
         matrix = np.linalg.inv(target) @ adapted @ source
     except (np.linalg.LinAlgError, ValueError):
@@ -294,28 +282,19 @@ def _to_xyz(primaries: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
     return xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3]), xyz[:, 3]
 
 
-_HDR_RESOLUTION = re.compile(rb"-Y (\d{1,9}) \+X (\d{1,9})\n")
-_HDR_RUN = 16
-"""Pixels that a byte of run-length coded scanlines stands for at most: four channels, runs of 127 in two bytes."""
-
-
 def _hdr_header(data: bytes) -> tuple[tuple[int, int], int]:
     """(width, height) and where the pixels start: the line behind the first blank one gives the resolution."""
     blank = data.find(b"\n\n", 0, 65536)
-    match = _HDR_RESOLUTION.match(data, blank + 2) if blank > 0 else None
+    match = re.compile(rb"-Y (\d{1,9}) \+X (\d{1,9})\n").match(data, blank + 2) if blank > 0 else None
     if match is None:
         raise ValueError("no resolution line '-Y height +X width' behind the header's blank line")
     return (int(match[2]), int(match[1])), match.end()
 
 
-def _hdr_size(data: bytes) -> tuple[int, int]:
-    return _hdr_header(data)[0]
-
-
 def _decode_hdr(data: bytes, path: str | Path) -> Image:
     (width, height), start = _hdr_header(data)
     _check_size((width, height), path)
-    if width * height > (len(data) - start) * _HDR_RUN:
+    if width * height > (len(data) - start) * 16:  # a run of 127 values of four channels takes two bytes
         raise _damaged(path)
     factor = np.ones(3)
     for line in data[:start].decode("latin-1").splitlines():

@@ -28,12 +28,6 @@ def edges(faces: NDArray) -> tuple[NDArray, NDArray]:
     return unique, count
 
 
-def edges_of_faces(faces: NDArray) -> tuple[NDArray, NDArray]:
-    """As `edges`, but with the edge of every side: (E, 2), and (3, F) for the sides 01, 12 and 20 of each face."""
-    unique, which = np.unique(_sides(faces), axis=0, return_inverse=True)
-    return unique, which.reshape(3, len(faces))
-
-
 def _sides(faces: NDArray) -> NDArray:
     return np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
 
@@ -268,36 +262,23 @@ def split_faces(mesh: MaskedMesh, subdivisions: int) -> Topology:
     uv = mesh.uv.astype(np.float64)
     matrix = sp.identity(len(mesh.mean), format="csr")
     for _ in range(subdivisions):
-        split, split_uv = subdivide(faces, matrix.shape[0]), subdivide(faces_uv, len(uv))
-        matrix, uv = split.matrix @ matrix, split_uv.matrix @ uv
-        faces, faces_uv = split.faces, split_uv.faces
+        (faces, step), (faces_uv, step_uv) = subdivide(faces, matrix.shape[0]), subdivide(faces_uv, len(uv))
+        matrix, uv = step @ matrix, step_uv @ uv
     mask = np.repeat(mesh.face_mask, 4**subdivisions)
     return Topology(faces.astype(np.int32), faces_uv.astype(np.int32), uv.astype(np.float32), mask, matrix)
 
 
-@dataclass(frozen=True)
-class Subdivision:
-    """One step of midpoint subdivision.
+def subdivide(faces: NDArray, n_vertices: int) -> tuple[NDArray[np.int64], sp.csr_matrix]:
+    """Faces (4F, 3) split at the midpoints of their edges, and the matrix (V', V) from old vertices to new ones.
 
-    Attributes
-    ----------
-    faces : (4F, 3) int64
-        Face f becomes faces 4f .. 4f + 3.
-    matrix : (V', V) sparse
-        Values at old vertices -> values at new ones; old vertices come first, unchanged.
+    Face f becomes faces 4f .. 4f + 3; old vertices come first. Works for positions and for texture vertices.
     """
-
-    faces: NDArray[np.int64]
-    matrix: sp.csr_matrix
-
-
-def subdivide(faces: NDArray, n_vertices: int) -> Subdivision:
-    """Split every face into four at the midpoints of its edges; works for positions and for texture vertices."""
     f = np.asarray(faces, dtype=np.int64)
-    unique, which = edges_of_faces(f)
+    unique, which = np.unique(_sides(f), axis=0, return_inverse=True)
+    which = which.reshape(3, len(f))
     ab, bc, ca = n_vertices + which
     a, b, c = f.T
     new = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
     rows = np.repeat(np.arange(len(unique)), 2)
     middle = sp.csr_matrix((np.full(2 * len(unique), 0.5), (rows, unique.ravel())), shape=(len(unique), n_vertices))
-    return Subdivision(new, sp.vstack([sp.identity(n_vertices), middle]).tocsr())
+    return new, sp.vstack([sp.identity(n_vertices), middle]).tocsr()

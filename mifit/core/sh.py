@@ -12,7 +12,7 @@ Lat-long images: Mitsuba's ``envmap`` without ``to_world``: the middle column is
 (sin phi sin theta, cos theta, -cos phi sin theta).
 
 Sources: Ramamoorthi and Hanrahan 2001 (irradiance); Sloan, "Stupid Spherical Harmonics Tricks", 2008 (dominant
-direction, optimal linear light, windowing).
+direction, optimal linear light).
 """
 
 from __future__ import annotations
@@ -142,35 +142,6 @@ def radiance_of_shading(shading: ArrayLike) -> Array:
     return np.asarray(shading, dtype=np.float64) * (np.pi / cosine_coefficients(3)[bands(3)])[:, None]
 
 
-def window(kind: str, order: int, width: float | None = None) -> Array:
-    """(B,) factors that fade the high bands to damp ringing.
-
-    Parameters
-    ----------
-    kind : {"hann", "lanczos"}
-        Raised cosine, or sinc.
-    order : int
-        Number of bands.
-    width : float, optional
-        Band at which the window reaches zero; ``order`` by default. Smaller is smoother.
-
-    Raises
-    ------
-    InputError
-        An unknown kind or a width that isn't positive.
-    """
-    check_order(order)
-    width = float(order) if width is None else float(width)
-    if not width > 0:
-        raise InputError(f"window width: found {width}, expected a positive number of bands")
-    x = np.minimum(np.arange(order) / width, 1.0)
-    if kind == "hann":
-        return 0.5 * (1.0 + np.cos(np.pi * x))
-    if kind == "lanczos":
-        return np.sinc(x)
-    raise InputError(f"window: found {kind!r}, expected 'hann' or 'lanczos'")
-
-
 def rotation_matrix(rotation: ArrayLike, order: int) -> Array:
     """(B*B, B*B) matrix that rotates coefficients: the rotated field at ``R d`` is the old one at ``d``."""
     r = np.asarray(rotation, dtype=np.float64)
@@ -281,10 +252,6 @@ class SHLighting:
     def rotate(self, rotation: ArrayLike) -> SHLighting:
         """The lighting turned by a rotation R (3, 3): what came from d comes from R d."""
         return SHLighting(rotation_matrix(rotation, self.order) @ self.coefficients)
-
-    def window(self, kind: str = "hann", width: float | None = None) -> SHLighting:
-        """The lighting with its high bands faded, see ``window``; damps ringing around small bright lights."""
-        return SHLighting(window(kind, self.order, width)[bands(self.order), None] * self.coefficients)
 
     def truncate(self, order: int) -> SHLighting:
         """The first bands only, or zeros appended up to a higher order."""

@@ -267,40 +267,26 @@ class SurfaceScene:
         (N,) uint32
             Bit d tells of direction d.
         """
-        return self._open(points, normals, directions, False)
-
-    def open_to(self, points: NDArray, normals: NDArray, targets: NDArray) -> NDArray[np.uint32]:
-        """Which places in space surface points see past the mesh: as `open_towards`, with ``targets`` (D, 3)."""
-        return self._open(points, normals, targets, True)
-
-    def _open(self, points: NDArray, normals: NDArray, ends: NDArray, near: bool) -> NDArray[np.uint32]:
-        """Bits of the ends of rays from points: places in space, or directions in which rays never end."""
         import drjit as dr
         import mitsuba as mi
 
-        if len(ends) > 32:
-            raise InputError(f"{'targets' if near else 'directions'}: found {len(ends)}, expected at most 32")
+        if len(directions) > 32:
+            raise InputError(f"directions: found {len(directions)}, expected at most 32")
         if not len(points):
             return np.zeros(0, np.uint32)
         n = on_device(mi.Vector3f, normals)
         # Opaque: the kernel is compiled once, not once for every mesh.
         origin = on_device(mi.Vector3f, points) + dr.opaque(mi.Float, SHADOW_EPSILON * self._diagonal) * n
-        toward = mi.Float(aligned(ends).ravel())
+        toward = mi.Float(aligned(directions).ravel())
 
         def body(i: Any, bits: Any) -> tuple[Any, Any]:
-            d, reach = mi.Vector3f(*(dr.gather(mi.Float, toward, 3 * i + k) for k in range(3))), mi.Float(np.inf)
-            if near:
-                d -= origin
-                reach = dr.norm(d)
-                d /= reach
+            d = mi.Vector3f(*(dr.gather(mi.Float, toward, 3 * i + k) for k in range(3)))
             above = dr.dot(n, d) > 0.0
-            ray = mi.Ray3f(mi.Point3f(origin), d)
-            ray.maxt = reach
-            seen = above & ~self.rays.ray_test(ray, active=above)
+            seen = above & ~self.rays.ray_test(mi.Ray3f(mi.Point3f(origin), d), active=above)
             return i + 1, bits | dr.select(seen, mi.UInt(1) << i, mi.UInt(0))
 
         start = (mi.UInt(0), dr.zeros(mi.UInt, len(points)))
-        _, bits = dr.while_loop(state=start, cond=lambda i, bits: i < dr.opaque(mi.UInt, len(ends)), body=body)
+        _, bits = dr.while_loop(state=start, cond=lambda i, bits: i < dr.opaque(mi.UInt, len(directions)), body=body)
         return np.array(bits, dtype=np.uint32)
 
 

@@ -148,17 +148,6 @@ def test_lighting_without_a_direction_has_a_stated_one() -> None:
         assert light.dominant_direction().tolist() == [0.0, 0.0, 1.0]
 
 
-def test_windows_damp_ringing() -> None:
-    d = directions(1, 2)[0]
-    spike = sh.SHLighting(np.outer(sh.basis(d, 8), np.ones(3)))
-    lowest = spike.to_latlong(64, 128).min()
-    for kind in ("hann", "lanczos"):
-        faded = spike.window(kind)
-        assert faded.to_latlong(64, 128).min() > 0.35 * lowest
-        assert np.allclose(faded.coefficients[0], spike.coefficients[0])
-    assert np.allclose(spike.window("hann", 4.0).coefficients[16:], 0)
-
-
 def test_truncation() -> None:
     light = lighting(4)
     assert np.array_equal(light.truncate(2).coefficients, light.coefficients[:4])
@@ -174,8 +163,6 @@ def test_truncation() -> None:
         (lambda: sh.SHLighting(np.full((4, 3), np.nan)), "not finite"),
         (lambda: sh.basis(np.zeros((2, 2)), 3), r"expected \(\.\.\., 3\)"),
         (lambda: sh.basis(np.zeros((2, 3)), 0), "found 0, expected the number of bands"),
-        (lambda: sh.window("box", 3), "found 'box', expected 'hann' or 'lanczos'"),
-        (lambda: sh.window("hann", 3, 0.0), "expected a positive number of bands"),
         (lambda: sh.rotation_matrix(2 * np.eye(3), 3), "rotation"),
         (lambda: sh.project_latlong(np.zeros((4, 8)), 3), r"expected \(height, width, 3\)"),
         (lambda: sh.project_latlong(np.zeros((4, 8, 3)), 3), "found 4 rows, expected 6 or more"),
