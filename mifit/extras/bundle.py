@@ -1,25 +1,23 @@
 """Bundle adjustment of tracks on a head that moves before fixed cameras and changes its expression.
 
-Unknown are focal lengths, relative poses of the cameras, a head pose per timestep, points in the head's frame,
-free of any face model, and how each timestep's expression differs from the first one's, in the model's modes with a
-Gaussian prior. Levenberg-Marquardt on Cauchy's loss; points are eliminated by the Schur complement (Triggs et al.,
-Bundle adjustment, 2000).
+Unknown are focal lengths, poses of the cameras, a head pose per timestep, points in the head's frame, free of any face
+model, and how each timestep's expression differs from the first one's, in the model's modes with a Gaussian prior.
+Levenberg-Marquardt on Cauchy's loss; normal equations are sparse (Triggs et al., Bundle adjustment, 2000).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-STEPS = 100
-"""Steps that are taken at most."""
-SETTLED = 1e-5
-"""Relative fall of the energy in a step below which it counts as settled."""
-NEGLIGIBLE = 0.05
-"""Energy of a match below which falling further means nothing: a third of its deviation."""
+from mifit.optim import Outcome, minimize
+from mifit.stages.geometry.parameters import cross_matrix, left_jacobian
+
 CAUCHY = 1.5
 """Deviations of a match where the robust loss turns."""
 EXPRESSION_DEVIATION = 0.3
@@ -43,9 +41,9 @@ class Freedom:
 
     Attributes
     ----------
-    design : (P, R)
-        P are the C logarithms of focal lengths, then turn and shift of each camera but the first, camera axes.
-    mean, precision : (R,)
+    design : (7 C, R)
+        To the C logarithms of focal lengths, then turn and shift of each camera, camera axes.
+    mean : (R,), precision : (R, R)
         Of the prior; precision 0 where nothing is known.
     focals : int
         How many of z, the first ones, are logarithms of unknown focal lengths.
@@ -57,29 +55,34 @@ class Freedom:
     focals: int = 0
 
     @classmethod
-    def of(cls, ways: NDArray) -> Freedom:
-        """Ways (P, R) of moving, each by one deviation of the prior."""
-        return cls(ways, np.zeros(ways.shape[1]), np.ones(ways.shape[1]))
+    def none(cls, cameras: int) -> Freedom:
+        """Cameras that stay."""
+        return cls(np.zeros((7 * cameras, 0)), np.zeros(0), np.zeros((0, 0)))
+
+    @classmethod
+    def of_prior(cls, precision: NDArray) -> Freedom:
+        """Cameras that may move in every way, at this inverse covariance (7 C, 7 C)."""
+        return cls(np.eye(len(precision)), np.zeros(len(precision)), precision)
 
     @classmethod
     def of_focals(cls, group: NDArray, focal: NDArray, expected: NDArray, deviation: float) -> Freedom:
-        """Free poses, and focal lengths (C,) that cameras of one ``group`` share; -1 where a camera's is known.
+        """Free poses but the first, and focal lengths (C,) that cameras of a ``group`` share; -1: a known one.
 
         ``expected`` (G,) are the groups' focal lengths beforehand, with this deviation of their logarithms.
         """
-        cameras, count, poses = len(group), len(expected), 6 * (len(group) - 1)
-        design, mean, precision = np.zeros((cameras + poses, count + poses)), *np.zeros((2, count + poses))
-        for g in range(count):
-            design[:cameras, g] = group == g
-            mean[g] = np.log(expected[g] / focal[group == g][0])
-        design[cameras:, count:] = np.eye(poses)
+        cameras, count = len(group), len(expected)
+        design = np.zeros((7 * cameras, count + 6 * (cameras - 1)))
+        design[:cameras, :count] = group[:, None] == np.arange(count)
+        design[cameras + 6 :, count:] = np.eye(6 * (cameras - 1))
+        mean, precision = np.zeros((2, design.shape[1]))
+        mean[:count] = [np.log(expected[g] / focal[group == g][0]) for g in range(count)]
         precision[:count] = deviation**-2.0
-        return cls(design, mean, precision, count)
+        return cls(design, mean, np.diag(precision), count)
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """Cameras and a moving head; OpenCV axes. Camera 0 and the pose at timestep 0 stay as they are: they fix the gauge.
+    """Cameras and a moving head; OpenCV axes. The pose at timestep 0 stays as it is: it fixes the gauge.
 
     Attributes
     ----------
@@ -93,8 +96,6 @@ class Bundle:
         Head's frame, at timestep 0.
     expression : (T, K)
         Coefficients relative to timestep 0.
-    moved : (R,)
-        How far cameras have moved, `Freedom`'s z.
     """
 
     focal: NDArray[np.float64]
@@ -102,16 +103,17 @@ class Bundle:
     heads: NDArray[np.float64]
     points: NDArray[np.float64]
     expression: NDArray[np.float64]
-    moved: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
 class AdjustedBundle:
-    """A bundle at the optimum, or where `STEPS` ended.
+    """A bundle at the optimum, or where the iterations ended.
 
     Attributes
     ----------
     bundle : Bundle
+    moved : (R,)
+        How far cameras have moved, `Freedom`'s z.
     deviation : float
         Largest standard deviation of the logarithm of an unknown focal length, from the normal equations with all else
         eliminated, scaled by the residuals. Errors that matches share aren't in it. 0 where a calibration holds them.
@@ -121,9 +123,39 @@ class AdjustedBundle:
     """
 
     bundle: Bundle
+    moved: NDArray[np.float64]
     deviation: float
     residual: float
     settled: bool
+
+
+def adjust_bundle(start: Bundle, seen: Sightings, freedom: Freedom, modes: NDArray | None = None) -> AdjustedBundle:
+    """Bring projections onto matches.
+
+    Parameters
+    ----------
+    start : Bundle
+    seen : Sightings
+    freedom : Freedom
+    modes : (N, 3, K), optional
+        How expressions move the points; none by default.
+    """
+    modes = np.zeros((len(start.points), 3, 0)) if modes is None else modes
+    problem = _Problem(start, seen, freedom, modes)
+    solution = minimize(problem, problem.start(), energy_tolerance=1e-5)
+    residual, deviation = problem.project(solution.value).residual, 0.0
+    if freedom.focals:
+        few = np.eye(len(solution.value), freedom.focals)
+        variance = np.diag(problem.linearize(solution.value).inverse(few)[: freedom.focals])
+        scale = problem.weights(residual)[1] @ np.sum(residual**2, axis=1) / max(residual.size - len(few), 1)
+        deviation = float(np.sqrt(variance.max() * scale)) if variance.min() > 0 else np.inf
+    return AdjustedBundle(
+        problem.bundle(solution.value),
+        solution.value[: freedom.design.shape[1]],
+        deviation,
+        float(np.median(np.linalg.norm(residual, axis=1))),
+        solution.outcome in (Outcome.CONVERGED, Outcome.STALLED),
+    )
 
 
 @dataclass(frozen=True)
@@ -134,205 +166,138 @@ class _Projected:
     residual: NDArray[np.float64]  # (M, 2) pixels
 
 
-def adjust_bundle(start: Bundle, seen: Sightings, freedom: Freedom, modes: NDArray) -> AdjustedBundle:
-    """Bring projections onto matches.
-
-    Parameters
-    ----------
-    start : Bundle
-    seen : Sightings
-    freedom : Freedom
-    modes : (N, 3, K)
-        How expressions move the points; K may be 0.
-
-    Returns
-    -------
-    AdjustedBundle
-    """
-    damping, settled = 1e-4, False
-    bundle = replace(start, moved=np.zeros(freedom.design.shape[1]))
-    projected = _project(bundle, seen, modes)
-    energy = _energy(bundle, projected, seen, freedom)
-    for _ in range(STEPS):
-        system = _System.of(bundle, projected, seen, freedom, modes)
-        while damping < 1e6:
-            trial = _moved(bundle, *system.step(damping), freedom)
-            shown = _project(trial, seen, modes)
-            value = _energy(trial, shown, seen, freedom)
-            if value < energy:
-                break
-            damping *= 4.0
-        else:
-            settled = True  # no step falls further
-            break
-        settled = energy - value < SETTLED * max(energy, NEGLIGIBLE * len(seen.point))
-        bundle, projected, energy, damping = trial, shown, value, max(damping / 5.0, 1e-9)
-        if settled:
-            break
-    system = _System.of(bundle, projected, seen, freedom, modes)
-    lengths = np.linalg.norm(projected.residual, axis=1)
-    return AdjustedBundle(bundle, system.deviation(projected.residual), float(np.median(lengths)), settled)
-
-
-def camera_information(bundle: Bundle, seen: Sightings) -> NDArray[np.float64]:
-    """(P, P) mean square by which movements of the cameras change what a still head's matches show, pixels.
-
-    Points have followed the movement where they can. P as in `Freedom`.
-    """
-    modes, movements = np.zeros((len(bundle.points), 3, 0)), 7 * len(bundle.cameras) - 6
-    projected = _project(bundle, seen, modes)
-    # before a large movement all look like outliers
-    small = replace(projected, residual=np.zeros_like(projected.residual))
-    every = Freedom(np.eye(movements), np.zeros(movements), np.zeros(movements))
-    system = _System.of(replace(bundle, moved=np.zeros(movements)), small, seen, every, modes)
-    reduced, _ = system._reduced(system._inverse(0.0), 0.0)
-    return np.asarray(reduced * seen.deviation**2 / len(seen.point))
-
-
-def _project(bundle: Bundle, seen: Sightings, modes: NDArray) -> _Projected:
-    points = bundle.points[seen.point]
-    if modes.shape[2]:
-        points = points + np.einsum("mck,mk->mc", modes[seen.point], bundle.expression[seen.timestep])
-    head, camera = bundle.heads[seen.timestep], bundle.cameras[seen.camera]
-    turned = np.einsum("mij,mj->mi", head[:, :3, :3], points)
-    swung = np.einsum("mij,mj->mi", camera[:, :3, :3], turned + head[:, :3, 3])
-    at = swung + camera[:, :3, 3]
-    depth = np.where(at[:, 2:] > 0, at[:, 2:], np.nan)
-    return _Projected(turned, swung, at, bundle.focal[seen.camera, None] * at[:, :2] / depth - seen.pixels)
-
-
-def _weights(residual: NDArray, seen: Sightings) -> tuple[NDArray, NDArray]:
-    """Cauchy's loss and the weight (M,) of each match."""
-    squared = np.sum(residual**2, axis=1) / (CAUCHY * seen.deviation) ** 2
-    return 0.5 * CAUCHY**2 * np.log1p(squared), 1.0 / (seen.deviation**2 * (1.0 + squared))
-
-
-def _energy(bundle: Bundle, projected: _Projected, seen: Sightings, freedom: Freedom) -> float:
-    """Infinite where a point comes to lie behind a camera."""
-    loss = float(_weights(projected.residual, seen)[0].sum())
-    prior = float(freedom.precision @ (bundle.moved - freedom.mean) ** 2)
-    prior += float(np.sum((bundle.expression / EXPRESSION_DEVIATION) ** 2))
-    return loss + 0.5 * prior if np.isfinite(loss) else np.inf
-
-
-def _cross(v: NDArray) -> NDArray[np.float64]:
-    """(M, 3, 3) derivative of turning points v (M, 3) by small rotation vectors."""
-    x, y, z = v.T
-    zero = np.zeros_like(x)
-    rows = [np.stack(row, axis=1) for row in ((zero, z, -y), (-z, zero, x), (y, -x, zero))]
-    return np.stack(rows, axis=1)
-
-
 @dataclass(frozen=True)
-class _System:
-    """Normal equations: P variables of cameras, heads and expressions; points apart."""
+class _Problem:
+    """Unknowns, in this order: z, movements of all heads but the first, their expressions, points."""
 
-    block: NDArray[np.float64]  # (P, P)
-    right: NDArray[np.float64]  # (P,)
-    mixed: NDArray[np.float64]  # (N, P, 3)
-    points: NDArray[np.float64]  # (N, 3, 3)
-    points_right: NDArray[np.float64]  # (N, 3)
-    weight: NDArray[np.float64]  # (M,)
-    focals: int
+    origin: Bundle
+    seen: Sightings
+    freedom: Freedom
+    modes: NDArray[np.float64]
 
-    @classmethod
-    def of(cls, bundle: Bundle, projected: _Projected, seen: Sightings, freedom: Freedom, modes: NDArray) -> _System:
-        cameras, steps, k = len(bundle.cameras), len(bundle.heads), modes.shape[2]
-        head_at = 7 * cameras - 6
-        face_at = head_at + 6 * (steps - 1)
-        jacobian = np.zeros((len(seen.point), 2, face_at + k * (steps - 1)))
-        at, residual = projected.seen, projected.residual
-        focal = bundle.focal[seen.camera]
+    def start(self) -> NDArray[np.float64]:
+        moved = np.zeros(self.freedom.design.shape[1] + 6 * len(self.origin.heads) - 6)
+        return np.concatenate([moved, self.origin.expression[1:].ravel(), self.origin.points.ravel()])
+
+    def split(self, x: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
+        """Z, focal movements (C,), camera movements (C, 6), head movements (T - 1, 6), expressions (T - 1, K)."""
+        opened, cameras, steps = self.freedom.design.shape[1], len(self.origin.cameras), len(self.origin.heads) - 1
+        movement = self.freedom.design @ x[:opened]
+        heads, rest = np.split(x[opened : len(x) - self.origin.points.size], [6 * steps])
+        expressions = rest.reshape(steps, self.modes.shape[2])
+        return x[:opened], movement[:cameras], movement[cameras:].reshape(-1, 6), heads.reshape(-1, 6), expressions
+
+    def bundle(self, x: NDArray) -> Bundle:
+        _, focals, cameras, heads, expressions = self.split(x)
+        return Bundle(
+            self.origin.focal * np.exp(focals),
+            _moved(self.origin.cameras, cameras),
+            np.concatenate([self.origin.heads[:1], _moved(self.origin.heads[1:], heads)]),
+            x[len(x) - self.origin.points.size :].reshape(-1, 3),
+            np.concatenate([self.origin.expression[:1], expressions]),
+        )
+
+    def project(self, x: NDArray) -> _Projected:
+        bundle, seen = self.bundle(x), self.seen
+        points = bundle.points[seen.point]
+        if self.modes.shape[2]:
+            points = points + np.einsum("mck,mk->mc", self.modes[seen.point], bundle.expression[seen.timestep])
+        head, camera = bundle.heads[seen.timestep], bundle.cameras[seen.camera]
+        turned = np.einsum("mij,mj->mi", head[:, :3, :3], points)
+        swung = np.einsum("mij,mj->mi", camera[:, :3, :3], turned + head[:, :3, 3])
+        at = swung + camera[:, :3, 3]
+        depth = np.where(at[:, 2:] > 0, at[:, 2:], np.nan)  # an energy of NaN is refused
+        return _Projected(turned, swung, at, bundle.focal[seen.camera, None] * at[:, :2] / depth - seen.pixels)
+
+    def weights(self, residual: NDArray) -> tuple[NDArray, NDArray]:
+        """Cauchy's loss and the weight (M,) of each match."""
+        squared = np.sum(residual**2, axis=1) / (CAUCHY * self.seen.deviation) ** 2
+        return CAUCHY**2 * np.log1p(squared), 1.0 / (self.seen.deviation**2 * (1.0 + squared))
+
+    def energies(self, x: NDArray) -> dict[str, float]:
+        z, *_, expressions = self.split(x)
+        off = z - self.freedom.mean
+        prior = float(off @ self.freedom.precision @ off + np.sum((expressions / EXPRESSION_DEVIATION) ** 2))
+        matches = float(self.weights(self.project(x).residual)[0].sum())
+        # the last is constant: without noise an energy falls for ever
+        return {"matches": matches, "prior": prior, "noise": 0.1 * len(self.seen.point)}
+
+    def linearize(self, x: NDArray) -> _System:
+        z, _, camera_moves, head_moves, expressions = self.split(x)
+        bundle, projected, seen = self.bundle(x), self.project(x), self.seen
+        cameras, k = len(bundle.cameras), self.modes.shape[2]
+        head_at = 7 * cameras
+        face_at = head_at + head_moves.size
+        shared = np.zeros((len(seen.point), 2, face_at + expressions.size))
+        at, focal = projected.seen, bundle.focal[seen.camera]
         slope = np.zeros((len(at), 2, 3))
         slope[:, 0, 0] = slope[:, 1, 1] = focal / at[:, 2]
         slope[:, :, 2] = -focal[:, None] * at[:, :2] / at[:, 2:] ** 2
         turned = slope @ bundle.cameras[seen.camera, :3, :3]
         by_point = turned @ bundle.heads[seen.timestep, :3, :3]
-        for c in range(cameras):
-            of, first = seen.camera == c, cameras + 6 * (c - 1)
-            jacobian[of, :, c] = focal[of, None] * at[of, :2] / at[of, 2:]
-            if c == 0:
-                continue
-            jacobian[of, :, first : first + 3] = slope[of] @ _cross(projected.swung[of])
-            jacobian[of, :, first + 3 : first + 6] = slope[of]
-        for t in range(1, steps):
-            of, first = seen.timestep == t, head_at + 6 * (t - 1)
-            jacobian[of, :, first : first + 3] = turned[of] @ _cross(projected.turned[of])
-            jacobian[of, :, first + 3 : first + 6] = turned[of]
-            first = face_at + k * (t - 1)
-            jacobian[of, :, first : first + k] = by_point[of] @ modes[seen.point[of]]
-        jacobian = np.concatenate([jacobian[..., :head_at] @ freedom.design, jacobian[..., head_at:]], axis=2)
-        weight = _weights(residual, seen)[1]
-        weighted = jacobian * weight[:, None, None]
-        columns = jacobian.shape[2]
-        block = weighted.reshape(2 * len(at), columns).T @ jacobian.reshape(2 * len(at), columns)
-        right = weighted.reshape(2 * len(at), columns).T @ residual.ravel()
-        rest = np.zeros(6 * (steps - 1))
-        stiff = np.concatenate([freedom.precision, rest, np.full(k * (steps - 1), EXPRESSION_DEVIATION**-2.0)])
-        right += stiff * np.concatenate([bundle.moved - freedom.mean, rest, bundle.expression[1:].ravel()])
-        starts = np.flatnonzero(np.diff(seen.point, prepend=-1))
-        by_weight = by_point * weight[:, None, None]
-        return cls(
-            block + np.diag(stiff),
-            right,
-            np.add.reduceat(weighted.transpose(0, 2, 1) @ by_point, starts),
-            np.add.reduceat(by_weight.transpose(0, 2, 1) @ by_point, starts),
-            np.add.reduceat(np.einsum("mkp,mk->mp", by_weight, residual), starts),
-            weight,
-            freedom.focals,
-        )
-
-    def _inverse(self, damping: float) -> NDArray[np.float64]:
-        trace = np.einsum("nii->n", self.points) / 3.0
-        return np.linalg.inv(self.points + ((damping + 1e-9) * trace + 1e-12)[:, None, None] * np.eye(3))
-
-    def _reduced(self, inverse: NDArray, damping: float) -> tuple[NDArray, NDArray]:
-        """The Schur complement of the points (P, P), and the mixed block times their inverse (N, P, 3)."""
-        product, size = self.mixed @ inverse, len(self.block)
-        flat = [np.ascontiguousarray(m.transpose(1, 0, 2)).reshape(size, 3 * len(m)) for m in (product, self.mixed)]
-        return self.block + damping * np.diag(np.diag(self.block)) - flat[0] @ flat[1].T, product
-
-    def step(self, damping: float) -> tuple[NDArray, NDArray]:
-        """Changes of the P variables and of the points (N, 3)."""
-        inverse = self._inverse(damping)
-        reduced, product = self._reduced(inverse, damping)
-        change = -np.linalg.solve(reduced, self.right - np.einsum("npq,nq->p", product, self.points_right))
-        back = self.points_right + np.einsum("npq,p->nq", self.mixed, change)
-        return change, -np.einsum("nij,nj->ni", inverse, back)
-
-    def deviation(self, residual: NDArray) -> float:
-        """As in `AdjustedBundle`; infinite where nothing determines a focal length."""
-        if not self.focals:
-            return 0.0
-        reduced, _ = self._reduced(self._inverse(0.0), 0.0)
-        variance = np.diag(np.linalg.pinv(reduced, hermitian=True))[: self.focals]
-        freedom = 2 * len(residual) - 3 * len(self.points) - len(self.block)
-        scale = float(self.weight @ np.sum(residual**2, axis=1)) / max(freedom, 1)
-        return float(np.sqrt(variance.max() * scale)) if freedom > 0 and variance.min() > 0 else np.inf
+        for c, move in enumerate(camera_moves):
+            of, first = seen.camera == c, cameras + 6 * c
+            shared[of, :, c] = focal[of, None] * at[of, :2] / at[of, 2:]
+            shared[of, :, first : first + 6] = _by_pose(slope[of], projected.swung[of], move)
+        for t, move in enumerate(head_moves):
+            of, first, face = seen.timestep == t + 1, head_at + 6 * t, face_at + k * t
+            shared[of, :, first : first + 6] = _by_pose(turned[of], projected.turned[of], move)
+            shared[of, :, face : face + k] = by_point[of] @ self.modes[seen.point[of]]
+        shared = np.concatenate([shared[..., :head_at] @ self.freedom.design, shared[..., head_at:]], axis=2)
+        rows, columns = np.arange(at[:, :2].size).reshape(-1, 2, 1), 3 * seen.point[:, None, None] + np.arange(3)
+        places = np.broadcast_to(rows, by_point.shape).ravel(), np.broadcast_to(columns, by_point.shape).ravel()
+        points = sp.csr_matrix((by_point.ravel(), places), (rows.size, bundle.points.size))
+        jacobian = sp.hstack([sp.csr_matrix(shared.reshape(rows.size, -1)), points]).tocsr()
+        weighted = sp.diags(np.repeat(self.weights(projected.residual)[1], 2)) @ jacobian
+        stiff = np.full(expressions.size, EXPRESSION_DEVIATION**-2.0)
+        prior = [
+            self.freedom.precision,
+            np.zeros((head_moves.size,) * 2),
+            np.diag(stiff),
+            sp.csr_matrix((x.size - shared.shape[2],) * 2),
+        ]
+        pulls = [
+            self.freedom.precision @ (z - self.freedom.mean),
+            np.zeros(head_moves.size),
+            stiff * expressions.ravel(),
+        ]
+        gradient = weighted.T @ projected.residual.ravel()
+        gradient[: shared.shape[2]] += np.concatenate(pulls)
+        return _System((jacobian.T @ weighted + sp.block_diag(prior)).tocsc(), gradient)
 
 
-def _moved(bundle: Bundle, change: NDArray, points: NDArray, freedom: Freedom) -> Bundle:
-    cameras, steps, opened = len(bundle.cameras), len(bundle.heads), len(bundle.moved)
-    movement, rest = freedom.design @ change[:opened], change[opened:]
-    face_at = 6 * (steps - 1)
-    expression = bundle.expression.copy()
-    expression[1:] += rest[face_at:].reshape(expression[1:].shape)
-    return replace(
-        bundle,
-        focal=bundle.focal * np.exp(np.clip(movement[:cameras], -0.5, 0.5)),
-        cameras=_turned(bundle.cameras, movement[cameras:]),
-        heads=_turned(bundle.heads, rest[:face_at]),
-        points=bundle.points + points,
-        expression=expression,
-        moved=bundle.moved + change[:opened],
-    )
+@dataclass(frozen=True)
+class _System:
+    """Normal equations as `mifit.optim` wants them; no unknown is bounded. The factorisation takes points first."""
+
+    hessian: sp.csc_matrix
+    gradient: NDArray[np.float64]
+
+    def product(self, step: NDArray) -> NDArray[np.float64]:
+        return np.asarray(self.hessian @ step)
+
+    def solve(self, damping: float, frozen: NDArray[np.bool_], gradient: NDArray | None = None) -> NDArray[np.float64]:
+        return -self.inverse(self.gradient if gradient is None else gradient, damping)
+
+    def inverse(self, right: NDArray, damping: float = 0.0) -> NDArray[np.float64]:
+        """Of the damped matrix, times columns; the scale, which nothing determines, is held by what rounding leaves."""
+        diagonal = self.hessian.diagonal()
+        held = sp.diags((damping + 1e-9) * np.maximum(diagonal, 1e-9 * diagonal.max()))
+        return np.asarray(splu((self.hessian + held).tocsc(), permc_spec="MMD_AT_PLUS_A").solve(right))
+
+    def covariance_diagonal(self) -> NDArray[np.float64]:
+        return np.diag(self.inverse(np.eye(len(self.gradient))))
 
 
-def _turned(poses: NDArray, change: NDArray) -> NDArray[np.float64]:
-    """Poses of which all but the first are turned and shifted by ``change`` (6 numbers each)."""
+def _by_pose(slope: NDArray, turned: NDArray, move: NDArray) -> NDArray[np.float64]:
+    """(M, 2, 6) derivative of pixels by a pose's turn and shift, from that by places (M, 2, 3)."""
+    return np.concatenate([-slope @ cross_matrix(turned) @ left_jacobian(move[:3]), slope], axis=2)
+
+
+def _moved(poses: NDArray, moves: NDArray) -> NDArray[np.float64]:
+    """Poses (N, 4, 4) turned and shifted by 6 numbers each."""
     out = poses.copy()
-    change = change.reshape(-1, 6)
-    if len(change):
-        out[1:, :3, :3] = Rotation.from_rotvec(change[:, :3]).as_matrix() @ poses[1:, :3, :3]
-        out[1:, :3, 3] += change[:, 3:]
+    if len(moves):
+        out[:, :3, :3] = Rotation.from_rotvec(moves[:, :3]).as_matrix() @ poses[:, :3, :3]
+        out[:, :3, 3] += moves[:, 3:]
     return out

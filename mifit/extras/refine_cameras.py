@@ -16,21 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.spatial.transform import Rotation
 
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate
 from mifit.core.process import one_blas_thread
 from mifit.core.uv import rasterize_uv
-from mifit.extras.bundle import (
-    AdjustedBundle,
-    Bundle,
-    Freedom,
-    Sightings,
-    adjust_bundle,
-    camera_information,
-)
+from mifit.extras.bundle import AdjustedBundle, Bundle, Freedom, Sightings, adjust_bundle
 from mifit.extras.calibrate_densely import MATCH_DEVIATION, MATCH_SIDE, MOST_TIMESTEPS
 from mifit.extras.tracks import follow_points, unwrap_image
 from mifit.progress import Progress, silent
@@ -41,38 +33,21 @@ if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
-LARGEST_MAP = 1024
-"""Side of the unwrapped images, texels, at most."""
-MOST_MATCHES = 10000
-"""Texels of a timestep that are looked for in other views."""
-BLOCK = 32
-"""Side of the squares of texels, like a chessboard's, whose matches are adjusted or left out in turn."""
 FEWEST_MATCHES = 200
-"""Of each kind, below which nothing is adjusted."""
-TOLD_PIXELS = 0.2
-"""Root mean square change of matches by one deviation of the prior below which they don't tell a movement."""
-BETTER = 0.95
-"""Part of the residual of matches left out that an adjustment must leave at most to be kept."""
-SHARED_PIXELS = 0.05
-"""Smooth errors that neighbouring matches share, left out or not: residuals must fall by more, in quadrature."""
+"""Used ones, and as many left out, below which nothing is adjusted."""
+SHARED_ERROR = 0.1
+"""Smooth error that all matches share, pixels: whatever their number, together they weigh as one of this deviation."""
 LEFT_PIXELS = 0.5
 """Residual of matches left out beyond which it isn't the cameras' poses and focal lengths that are off, or not alone.
 
-These three lengths are for images whose longer side has `MATCH_SIDE` pixels or fewer."""
-PLAIN = 10.0
-"""Factor on the deviation of matches where none of them is to count as an outlier."""
+These two lengths are for images whose longer side has `MATCH_SIDE` pixels or fewer."""
+BETTER = 0.95
+"""Part of the residual of matches left out that an adjustment must leave at most to be kept."""
 FARTHEST = 3.0
 """Deviations of the prior beyond which a calibration isn't adjusted: it is another one."""
-
-
-FOCAL_DEVIATION = 0.005
-"""Of a focal length, relative."""
-TURN_DEGREES = 0.5
-"""Deviation of a camera's orientation about each axis."""
-SHIFT_DEVIATION = 0.005
-"""Of a camera's position along each axis, as a part of its distance to the head."""
-SETTLING = 3
-"""Linear steps that find the smallest movement of a rig; one nearly does."""
+FOCAL_DEVIATION, TURN_DEGREES, SHIFT_DEVIATION = 0.005, 0.5, 0.005
+"""What a calibration may be off by: a focal length, relative; an orientation about each axis; a position along each
+axis, as a part of its distance to the head."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +78,7 @@ class _Matches:
 
     seen: Sightings
     points: NDArray[np.float64]  # (N, 3) on the fitted mesh, world
-    block: NDArray[np.int64]  # (N,) row plus column of the square of texels that each lies in
+    block: NDArray[np.int64]  # (N,) row plus column of the square of 32 texels that each lies in, as on a chessboard
 
     def some(self, chosen: NDArray[np.bool_]) -> _Matches:
         """Those of chosen points (N,)."""
@@ -148,10 +123,9 @@ def refine_cameras(
 
     Notes
     -----
-    The prior is Gaussian, with `FOCAL_DEVIATION`, `TURN_DEGREES` and `SHIFT_DEVIATION` of each camera. Of
-    its directions those are opened that change matches by `TOLD_PIXELS` at one deviation or more; in all others
-    cameras stay. All cameras move: of rigs that explain matches alike the one that differs least from the calibration
-    is taken, so that the world frame, and with it cameras that weren't fitted, stay valid.
+    The prior is Gaussian, with `FOCAL_DEVIATION`, `TURN_DEGREES` and `SHIFT_DEVIATION` of each camera. All cameras
+    move: of rigs that explain matches alike the one that differs least from the calibration is taken, so that the
+    world frame, and with it cameras that weren't fitted, stay valid.
     """
     if not capture.calibrated:
         return _kept("the capture is uncalibrated: its cameras are estimates already", {})
@@ -169,23 +143,23 @@ def refine_cameras(
     centre = geometry.vertices[:, np.unique(model.faces[model.face_mask])].reshape(-1, 3).mean(axis=0)
     poses = np.array([view.world_to_camera for view in views])
     focal = np.array([_focal(view) for view in views])
-    precisions = pose_precisions(poses, np.array([np.linalg.norm(view.position - centre) for view in views]))
+    precision = calibration_precision(poses, np.array([np.linalg.norm(view.position - centre) for view in views]))
+    together = used.sum() * (SHARED_ERROR * scale / taken.seen.deviation) ** 2
     calibrated = Bundle(focal, poses, np.eye(4)[None], taken.points, np.zeros((1, 0)))
     before = _triangulated(taken, calibrated)
-    told = camera_information(before.bundle, taken.seen)
-    ways = told_ways(told, rig_precision(poses, precisions), TOLD_PIXELS * scale)
-    adjusted = adjust_bundle(before.bundle, taken.seen, Freedom.of(ways), _rigid(taken))
-    rig = replace(adjusted.bundle, cameras=settled_rig(poses, adjusted.bundle.cameras, precisions))
+    adjusted = adjust_bundle(before.bundle, taken.seen, Freedom.of_prior(together * precision))
+    rig = adjusted.bundle
     moved = [_moved(view, float(f), pose) for view, f, pose in zip(views, rig.focal, rig.cameras, strict=True)]
     judged = [_triangulated(left, one).residual for one in (calibrated, rig)]
+    deviations = np.abs(np.linalg.cholesky(precision).T @ adjusted.moved)
     details = {
         **counts,
         "residual_pixels": [before.residual, _triangulated(taken, rig).residual],
         "residual_left_out_pixels": judged,
-        "deviations": np.abs(rig.moved).tolist(),
+        "deviations": deviations.tolist(),
         "moved": {a.name: _movement(a, b, centre, capture.unit_mm) for a, b in zip(views, moved, strict=True)},
     }
-    farthest = float(np.abs(rig.moved).max(initial=0.0))
+    farthest = float(deviations.max())
     before_after = f"{judged[0]:.2f} pixels off with it, {judged[1]:.2f} with adjusted cameras"
     if not adjusted.settled:
         return _kept("the adjustment to dense matches hasn't settled", details)
@@ -195,23 +169,17 @@ def refine_cameras(
     if judged[1] > LEFT_PIXELS * scale:
         found = f"dense matches are {before_after}, expected at most {LEFT_PIXELS * scale:.2g}"
         return _kept(f"{found}; the cameras may be out of step, or their lenses distort otherwise", details)
-    if judged[1] > BETTER * judged[0] or judged[0] ** 2 - judged[1] ** 2 < (SHARED_PIXELS * scale) ** 2:
+    if judged[1] > BETTER * judged[0] or judged[0] ** 2 - judged[1] ** 2 < (0.5 * SHARED_ERROR * scale) ** 2:
         return _kept(f"matches that were left out are {before_after}", details, doubtful=False)
     away = ", in ".join(f"{name} by {way['at_head_mm']:.1f}" for name, way in details["moved"].items())
     finding = f"the calibration is off: dense matches are {before_after}, which shift the head in {away} mm"
     return RefinedCameras(tuple(moved), finding, False, details)
 
 
-def _rigid(matches: _Matches) -> NDArray[np.float64]:
-    """No expressions: points of different timesteps are different points."""
-    return np.zeros((len(matches.points), 3, 0))
-
-
 def _triangulated(matches: _Matches, rig: Bundle) -> AdjustedBundle:
-    """Points where cameras that stay see them best; least squares, so that two views share a residual."""
-    seen = replace(matches.seen, deviation=PLAIN * matches.seen.deviation)
-    still = Freedom.of(np.zeros((7 * len(rig.cameras) - 6, 0)))
-    return adjust_bundle(replace(rig, points=matches.points), seen, still, _rigid(matches))
+    """Points where cameras that stay see them best; none of them an outlier, so that two views share a residual."""
+    seen = replace(matches.seen, deviation=10.0 * matches.seen.deviation)
+    return adjust_bundle(replace(rig, points=matches.points), seen, Freedom.none(len(rig.cameras)))
 
 
 def _kept(why: str, figures: dict[str, Any], doubtful: bool = True) -> RefinedCameras:
@@ -231,7 +199,7 @@ def _match(
     steps = np.unique(np.linspace(0, len(geometry.timesteps) - 1, MOST_TIMESTEPS).round().astype(int))
     centre = geometry.vertices[0].mean(axis=0)
     length = min(float(np.linalg.norm(centre - view.position)) / _focal(view) for view in views)
-    size = texture_size(model, geometry.vertices[0].astype(np.float64), length, LARGEST_MAP)
+    size = texture_size(model, geometry.vertices[0].astype(np.float64), length, 1024)
     texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
     middle = np.array([(view.cx, view.cy) for view in views])
     square = np.array([(_focal(view) / view.fx, _focal(view) / view.fy) for view in views])
@@ -245,10 +213,10 @@ def _match(
             frame = capture.frame(view.name, geometry.timesteps[k])
             usable = frame.valid & ~frame.clipped
             unwrapped.append(unwrap_image(frame.image, usable, view, vertices, model.faces, texels, (i, 0)))
-        tracks = follow_points(unwrapped, 2, MOST_MATCHES)
+        tracks = follow_points(unwrapped, 2, 10000)
         at = np.searchsorted(texels.index, tracks.texel)
         row, column = np.divmod(tracks.texel, size)
-        block.append(row // BLOCK + column // BLOCK)
+        block.append(row // 32 + column // 32)
         points.append(interpolate(vertices, model.faces, texels.face[at], texels.weights[at]))
         pixels.append((tracks.pixels - middle[tracks.image]) * square[tracks.image])
         number.append(tracks.point + count)
@@ -286,15 +254,8 @@ def _movement(before: Camera, after: Camera, centre: NDArray, unit_mm: float) ->
     }
 
 
-# -- a rig that may move: a Gaussian about its calibration, whatever all cameras do together -------------------------
-#
-# A camera's movement is the logarithm of its focal length's change and six numbers, a rotation vector and a shift, by
-# which its world-to-camera pose changes: R' = exp(turn) R, t' = t + shift, camera axes. Matches between the cameras
-# don't show movements of all of them together: of those the smallest is taken.
-
-
-def pose_precisions(poses: NDArray, distances: NDArray) -> NDArray[np.float64]:
-    """(C, 6, 6) inverse covariances of the turns and shifts of cameras.
+def calibration_precision(poses: NDArray, distances: NDArray) -> NDArray[np.float64]:
+    """(7 C, 7 C) inverse covariance of what C cameras may be off by, in the order of `Freedom`.
 
     Parameters
     ----------
@@ -303,63 +264,11 @@ def pose_precisions(poses: NDArray, distances: NDArray) -> NDArray[np.float64]:
     distances : (C,)
         From the cameras to the head.
     """
-    found = []
+    found = [FOCAL_DEVIATION**-2.0 * np.eye(len(poses))]
     for shift, distance in zip(poses[:, :3, 3], distances, strict=True):
         # A camera that turns about its centre shifts its pose: the centre moves by -(shift + translation x turn).
         moved = np.eye(6)
         moved[3:, :3] = cross_matrix(shift)
         deviation = np.repeat([np.radians(TURN_DEGREES), SHIFT_DEVIATION * distance], 3)
         found.append(moved.T @ np.diag(deviation**-2.0) @ moved)
-    return np.array(found)
-
-
-def rig_precision(poses: NDArray, precisions: NDArray) -> NDArray[np.float64]:
-    """Inverse covariance of C focal lengths and the poses of all cameras but the first, (7 C - 6,) squared.
-
-    Poses are relative to the first camera's: what all cameras do together costs nothing.
-    """
-    whole, together, inverse = _together(poses, precisions)
-    relative = (whole - whole @ together @ inverse @ together.T @ whole)[6:, 6:]
-    return np.asarray(block_diag(np.eye(len(poses)) * FOCAL_DEVIATION**-2.0, relative))
-
-
-def settled_rig(start: NDArray, moved: NDArray, precisions: NDArray) -> NDArray[np.float64]:
-    """Poses (C, 4, 4) of a rig that has moved, brought back as a whole to where they differ least from its start."""
-    whole, together, inverse = _together(start, precisions)
-    poses = moved
-    for _ in range(SETTLING):
-        back = -inverse @ together.T @ whole @ movements(start, poses).ravel()
-        step = np.eye(4)
-        step[:3, :3], step[:3, 3] = Rotation.from_rotvec(back[:3]).as_matrix(), back[3:]
-        poses = poses @ step
-    return poses
-
-
-def movements(start: NDArray, moved: NDArray) -> NDArray[np.float64]:
-    """(C, 6) turns and shifts from one rig's poses to another's."""
-    turns = Rotation.from_matrix(moved[:, :3, :3] @ start[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
-    return np.concatenate([turns, moved[:, :3, 3] - start[:, :3, 3]], axis=1)
-
-
-def told_ways(information: NDArray, precision: NDArray, least: float) -> NDArray[np.float64]:
-    """(P, R) ways of moving that the matches tell.
-
-    Parameters
-    ----------
-    information : (P, P)
-        Mean square by which a movement changes what matches show, pixels, after points have followed it.
-    precision : (P, P)
-        Inverse covariance of the prior.
-    least : float
-        Pixels by which a movement of one of the prior's deviations must change matches.
-    """
-    factor = np.linalg.inv(np.linalg.cholesky(precision))
-    squared, ways = np.linalg.eigh(factor @ information @ factor.T)
-    return np.asarray(factor.T @ ways[:, squared > least**2])
-
-
-def _together(poses: NDArray, precisions: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Inverse covariance of all poses, what turns and shifts of the whole rig do to them, and what that costs."""
-    whole = block_diag(*precisions)
-    together = np.concatenate([block_diag(rotation, rotation) for rotation in poses[:, :3, :3]])
-    return whole, together, np.linalg.inv(together.T @ whole @ together)
+    return np.asarray(block_diag(*found))

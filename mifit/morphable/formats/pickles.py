@@ -1,18 +1,20 @@
 """Reading FLAME's pickles without running them.
 
-A pickle is a program for a stack machine that may call anything. This reader is such a machine for a subset: it
-builds lists, dictionaries and tuples, and arrays by NumPy's own recipes for pickling them, from their bytes. Nothing of
-the file is ever called, hashed (only text may be a key) or imported.
+A pickle is a program for a stack machine that may call anything. Here Python's own machine runs with what could do
+harm replaced: a name stays a name, arrays are built from their bytes by NumPy's recipes as they are written down here,
+and only text may be a key. Nothing of the file is ever called, hashed or imported.
 """
 
 from __future__ import annotations
 
+import io
 import math
+import pickle
 import pickletools
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -162,13 +164,11 @@ def _short(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
-_MARK = object()
-_VALUES = {
-    "NONE", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT",
-    "STRING", "BINSTRING", "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8", "UNICODE",
-    "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8",
+_REFUSED = {
+    "INST", "OBJ", "EXT1", "EXT2", "EXT4", "PERSID", "BINPERSID", "NEWOBJ_EX", "EMPTY_SET", "ADDITEMS", "FROZENSET",
+    "BYTEARRAY8", "NEXT_BUFFER", "READONLY_BUFFER",
 }  # fmt: skip
-_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
+"""Instructions that make objects in other ways, or believe a size."""
 
 
 def is_pickle(path: Path) -> bool:
@@ -192,7 +192,14 @@ def read_pickle(path: Path) -> dict[str, Any]:
     """
     data = read_bytes(path, MAX_MODEL_BYTES, "pickle")
     try:
-        out = _Machine().run(pickletools.genops(data))
+        for step, (op, argument, _) in enumerate(pickletools.genops(data)):
+            if step > MAX_STEPS:
+                raise InputError(f"found more than {MAX_STEPS} instructions, expected a dictionary of arrays")
+            if op.name in _REFUSED or op.proto > 5:
+                raise InputError(f"uses {op.name}, which is refused; expected arrays only")
+            if "PUT" in op.name and argument > 2**32:  # larger ones could be chosen to collide
+                raise InputError(f"memo index {_short(argument)}, expected at most {2**32}")
+        out = _Unpickler(io.BytesIO(data), encoding="latin1").load()
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except Exception as error:  # instructions that make no sense together
@@ -214,129 +221,47 @@ def plain_array(value: Any, where: str) -> np.ndarray:
     return value
 
 
-class _Machine:
-    """Stack and memo."""
+class _Unpickler(pickle._Unpickler):  # type: ignore[name-defined, misc]
+    """Python's machine; a name is a `Name`, which can't be called."""
 
-    def __init__(self) -> None:
-        self.stack: list[Any] = []
-        self.memo: dict[int, Any] = {}
+    stack: list[Any]
+    dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)  # type: ignore[attr-defined]
 
-    def run(self, instructions: Iterator[tuple[Any, Any, Any]]) -> Any:
-        for step, (op, argument, _) in enumerate(instructions):
-            if step > MAX_STEPS:
-                raise InputError(f"found more than {MAX_STEPS} instructions, expected a dictionary of arrays")
-            if op.name == "STOP":
-                return self.stack.pop()
-            if op.name in _VALUES:
-                self.stack.append(_CONSTANTS.get(op.name, argument))
-            elif not self.collect(op.name) and not self.remember(op.name, argument):
-                self.make(op.name, argument)
-        raise ValueError("no end")
-
-    def collect(self, op: str) -> bool:
-        """Containers, and what moves values of the stack; False for another instruction."""
-        stack = self.stack
-        match op:
-            case "MARK":
-                stack.append(_MARK)
-            case "POP":
-                stack.pop()
-            case "POP_MARK":
-                self.marked()
-            case "DUP":
-                stack.append(stack[-1])
-            case "EMPTY_TUPLE" | "EMPTY_LIST" | "EMPTY_DICT":
-                stack.append({"EMPTY_TUPLE": tuple, "EMPTY_LIST": list, "EMPTY_DICT": dict}[op]())
-            case "TUPLE1" | "TUPLE2" | "TUPLE3":
-                values = tuple(stack[-int(op[-1]) :])
-                del stack[-int(op[-1]) :]
-                stack.append(values)
-            case "TUPLE":
-                stack.append(tuple(self.marked()))
-            case "LIST":
-                stack.append(self.marked())
-            case "DICT":
-                items = self.marked()
-                stack.append({})
-                self.set_items(items)
-            case "APPEND":
-                value = stack.pop()
-                self.extend([value])
-            case "APPENDS":
-                self.extend(self.marked())
-            case "SETITEM":
-                value, key = stack.pop(), stack.pop()
-                self.set_items([key, value])
-            case "SETITEMS":
-                self.set_items(self.marked())
-            case _:
-                return False
-        return True
-
-    def remember(self, op: str, argument: Any) -> bool:
-        """The memo, and what says nothing of the values; False for another instruction."""
-        match op:
-            case "PROTO" | "FRAME":
-                pass
-            case "MEMOIZE":
-                self.memo[len(self.memo)] = self.stack[-1]
-            case "PUT" | "BINPUT" | "LONG_BINPUT":
-                if argument > 2**32:  # larger ones could be chosen to collide
-                    raise InputError(f"memo index {_short(argument)}, expected at most {2**32}")
-                self.memo[argument] = self.stack[-1]
-            case "GET" | "BINGET" | "LONG_BINGET":
-                self.stack.append(self.memo[argument])
-            case _:
-                return False
-        return True
-
-    def make(self, op: str, argument: Any) -> None:
-        """Names, and what they are used for: all that could do harm."""
-        match op:
-            case "GLOBAL":
-                self.name(*str(argument).split(" ", 1))
-            case "STACK_GLOBAL":
-                name, module = self.stack.pop(), self.stack.pop()
-                if type(name) is not str or type(module) is not str:
-                    raise ValueError("a name that isn't text")
-                self.name(module, name)
-            case "REDUCE":
-                arguments, function = self.stack.pop(), self.stack.pop()
-                if type(function) is not Name or function not in _RECIPES or type(arguments) is not tuple:
-                    raise InputError(f"wants to run {_short(function)}, which is refused; expected arrays only")
-                self.stack.append(_RECIPES[function](*arguments))
-            case "NEWOBJ":
-                _, kind = self.stack.pop(), self.stack.pop()
-                self.stack.append(_object(kind))
-            case "BUILD":
-                state, target = self.stack.pop(), self.stack[-1]
-                if not isinstance(target, (Array, Dtype, Instance)):
-                    kind = type(target).__name__
-                    raise InputError(f"sets the state of a {kind}, which is refused; expected arrays only")
-                target.build(state)
-            case "INST":
-                self.name(*str(argument).split(" ", 1))  # says which, where it is one that is never admitted
-                raise InputError("uses INST, which is refused; expected arrays only")
-            case _:
-                raise InputError(f"uses {op}, which is refused; expected arrays only")
-
-    def name(self, module: str, name: str) -> None:
+    def find_class(self, module: str, name: str) -> Name:
         if Name(module, name) not in _ADMITTED:
             raise InputError(f"wants to run {module}.{name}, which is refused; expected arrays only")
-        self.stack.append(Name(module, name))
+        return Name(module, name)
 
-    def marked(self) -> list[Any]:
-        """What lies above the last mark; both leave the stack."""
-        at = len(self.stack) - 1
-        while self.stack[at] is not _MARK:
-            at -= 1
-            if at < 0:
-                raise ValueError("no mark")
-        values = self.stack[at + 1 :]
-        del self.stack[at:]
-        return values
+    def load_reduce(self) -> None:
+        arguments, function = self.stack.pop(), self.stack.pop()
+        if type(function) is not Name or function not in _RECIPES or type(arguments) is not tuple:
+            raise InputError(f"wants to run {_short(function)}, which is refused; expected arrays only")
+        self.stack.append(_RECIPES[function](*arguments))
 
-    def set_items(self, values: list[Any]) -> None:
+    def load_newobj(self) -> None:
+        _, kind = self.stack.pop(), self.stack.pop()
+        self.stack.append(_object(kind))
+
+    def load_build(self) -> None:
+        state, target = self.stack.pop(), self.stack[-1]
+        if not isinstance(target, (Array, Dtype, Instance)):
+            kind = type(target).__name__
+            raise InputError(f"sets the state of a {kind}, which is refused; expected arrays only")
+        target.build(state)
+
+    def load_setitem(self) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        self._set([key, value])
+
+    def load_setitems(self) -> None:
+        self._set(self.pop_mark())
+
+    def load_dict(self) -> None:
+        items = self.pop_mark()
+        self.stack.append({})
+        self._set(items)
+
+    def _set(self, values: list[Any]) -> None:
         target = self.stack[-1]
         if type(target) is not dict or len(values) % 2:
             raise ValueError("items without a dictionary")
@@ -347,7 +272,6 @@ class _Machine:
                 raise InputError(f"a key is a {type(key).__name__}, expected text")
             target[key] = value
 
-    def extend(self, values: list[Any]) -> None:
-        if type(self.stack[-1]) is not list:
-            raise ValueError("values without a list")
-        self.stack[-1].extend(values)
+
+for _op in ("REDUCE", "NEWOBJ", "BUILD", "SETITEM", "SETITEMS", "DICT"):
+    _Unpickler.dispatch[getattr(pickle, _op)[0]] = getattr(_Unpickler, f"load_{_op.lower()}")
