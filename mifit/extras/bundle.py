@@ -2,7 +2,8 @@
 
 Unknown are focal lengths, poses of the cameras, a head pose per timestep, points in the head's frame, free of any face
 model, and how each timestep's expression differs from the first one's, in the model's modes with a Gaussian prior.
-Levenberg-Marquardt on Cauchy's loss; normal equations are sparse (Triggs et al., Bundle adjustment, 2000).
+Levenberg-Marquardt on Cauchy's loss; points are eliminated by the Schur complement (Triggs et al., Bundle adjustment,
+2000).
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from mifit.optim import Outcome, minimize
@@ -249,29 +249,22 @@ class _Problem:
         points = sp.csr_matrix((by_point.ravel(), places), (rows.size, bundle.points.size))
         jacobian = sp.hstack([sp.csr_matrix(shared.reshape(rows.size, -1)), points]).tocsr()
         weighted = sp.diags(np.repeat(self.weights(projected.residual)[1], 2)) @ jacobian
-        stiff = np.full(expressions.size, EXPRESSION_DEVIATION**-2.0)
-        prior = [
-            self.freedom.precision,
-            np.zeros((head_moves.size,) * 2),
-            np.diag(stiff),
-            sp.csr_matrix((x.size - shared.shape[2],) * 2),
-        ]
-        pulls = [
-            self.freedom.precision @ (z - self.freedom.mean),
-            np.zeros(head_moves.size),
-            stiff * expressions.ravel(),
-        ]
+        columns, opened = shared.shape[2], len(z)
+        stiff = np.repeat([0.0, EXPRESSION_DEVIATION**-2.0], [head_moves.size, expressions.size])
+        prior = sp.block_diag([self.freedom.precision, np.diag(stiff), sp.csr_matrix((x.size - columns,) * 2)])
         gradient = weighted.T @ projected.residual.ravel()
-        gradient[: shared.shape[2]] += np.concatenate(pulls)
-        return _System((jacobian.T @ weighted + sp.block_diag(prior)).tocsc(), gradient)
+        gradient[:opened] += self.freedom.precision @ (z - self.freedom.mean)
+        gradient[opened:columns] += stiff * x[opened:columns]
+        return _System((jacobian.T @ weighted + prior).tocsr(), gradient, columns)
 
 
 @dataclass(frozen=True)
 class _System:
-    """Normal equations as `mifit.optim` wants them; no unknown is bounded. The factorisation takes points first."""
+    """Normal equations as `mifit.optim` wants them; no unknown is bounded, and points come last."""
 
-    hessian: sp.csc_matrix
+    hessian: sp.csr_matrix
     gradient: NDArray[np.float64]
+    shared: int
 
     def product(self, step: NDArray) -> NDArray[np.float64]:
         return np.asarray(self.hessian @ step)
@@ -280,10 +273,19 @@ class _System:
         return -self.inverse(self.gradient if gradient is None else gradient, damping)
 
     def inverse(self, right: NDArray, damping: float = 0.0) -> NDArray[np.float64]:
-        """Of the damped matrix, times columns; the scale, which nothing determines, is held by what rounding leaves."""
-        diagonal = self.hessian.diagonal()
-        held = sp.diags((damping + 1e-9) * np.maximum(diagonal, 1e-9 * diagonal.max()))
-        return np.asarray(splu((self.hessian + held).tocsc(), permc_spec="MMD_AT_PLUS_A").solve(right))
+        """Of the damped matrix, times columns, by the Schur complement of the points' blocks.
+
+        The scale, which nothing determines, is held by a billionth of the diagonal.
+        """
+        p, diagonal = self.shared, self.hessian.diagonal()
+        damped = self.hessian + sp.diags((damping + 1e-9) * np.maximum(diagonal, 1e-9 * diagonal.max()))
+        points = damped[p:, p:].tobsr((3, 3))
+        inverse = sp.bsr_matrix((np.linalg.inv(points.data), points.indices, points.indptr))
+        mixed = damped[:p, p:].toarray()
+        product = mixed @ inverse
+        schur = damped[:p, :p].toarray() - product @ mixed.T
+        shared = np.linalg.solve(schur, right[:p] - product @ right[p:])
+        return np.concatenate([shared, inverse @ (right[p:] - mixed.T @ shared)])
 
     def covariance_diagonal(self) -> NDArray[np.float64]:
         return np.diag(self.inverse(np.eye(len(self.gradient))))

@@ -159,7 +159,7 @@ def refine_cameras(
         "deviations": deviations.tolist(),
         "moved": {a.name: _movement(a, b, centre, capture.unit_mm) for a, b in zip(views, moved, strict=True)},
     }
-    farthest = float(deviations.max())
+    farthest = float(np.linalg.norm(deviations))
     before_after = f"{judged[0]:.2f} pixels off with it, {judged[1]:.2f} with adjusted cameras"
     if not adjusted.settled:
         return _kept("the adjustment to dense matches hasn't settled", details)
