@@ -122,7 +122,6 @@ PARTS = (
     Part("stage 2: relief in the light", {"reflectance.relief": False}),
     Part("stage 2: difference term", {"reflectance.specular_difference_weight": 0.0}),
     Part("stage 3: off", without=("normals", "mesh", "residual")),
-    Part("stage 3: robust weights", {"normals.robust": False}),
     Part("residual", {"residual.enabled": False}),
     Part("photometry: gains and exposures", {"photometry.enabled": False}, photometry=True),
 )

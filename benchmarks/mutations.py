@@ -156,7 +156,7 @@ MUTATIONS = (
     M("Geman and McClure's weight not squared", "robust.geman_mcclure", "q * q", "q", "tests/optim/test_solve.py"),
     # Paper.
     M("1 / |F_view| dropped", "refine.paper_problem", "max(len(view.index), 1)", "1", "tests/test_paper.py"),
-    M("Adam's exponent 10", "als", "PAPER_EXPONENT = 5.0", "PAPER_EXPONENT = 10.0", "tests/test_paper.py"),
+    M("the paper's exponent 10", "paper.PaperModel", "exponent = 5.0", "exponent = 10.0", "tests/test_paper.py"),
     M("lambda_H for values of 0..1", "config.FitConfig.paper", "0.001 / 255.0", "0.001", "tests/test_paper.py"),
     M("preset with w2 ten times the paper's", "config.FitConfig.paper", "0.3", "3.0", "tests/test_paper.py"),
     # What is kept.

@@ -234,13 +234,10 @@ class ReflectanceConfig:
     """Stage 2, reflectance inference (paper, section 5)."""
 
     texture_size: int = number(512, "side of the maps", "texels", least=16, most=4096)
-    solver: Literal["als", "adam"] = one_of(
-        "als", "als: lighting with the texels eliminated, then the maps by ADMM; adam: the paper's gradient descent"
-    )
     shading: Annotated[str, pydantic.AfterValidator(_known_shading)] = one_of(
         "auto",
         "image-formation model: paper, printed, prefiltered, shadowed (with distant compact lights where images show "
-        "some), or another that is registered; auto is shadowed, with solver adam paper",
+        "some), or another that is registered; auto is shadowed",
     )
     bands: int = number(10, "bands of the lighting of prefiltered and shadowed; paper has 3", least=3, most=10)
     exponent: float | None = number(
@@ -260,8 +257,7 @@ class ReflectanceConfig:
     )
     robust: bool = flag(
         True,
-        "give outliers less weight, and weight by a noise model (als); false: als minimises the paper's objective "
-        "as it stands",
+        "give outliers less weight, and weight by a noise model; false: minimise the paper's objective as it stands",
     )
     segment: bool = flag(
         True, "leave out what hides the face in an image: hair, cloth, glasses, a hand; with robust alone"
@@ -274,9 +270,7 @@ class ReflectanceConfig:
     symmetric_fill: bool = flag(
         False, "fill what no image shows from the opposite half of the face, where that was seen"
     )
-    max_iterations: int = number(
-        30, "Gauss-Newton iterations (als), or tens of gradient steps (adam)", least=1, most=10_000
-    )
+    max_iterations: int = number(30, "Gauss-Newton iterations of the lighting", least=1, most=10_000)
 
 
 @settings
@@ -290,7 +284,6 @@ class NormalsConfig:
         1e-3, "the paper's w1, for images and normal maps in 8-bit steps", least=0, most=WEIGHT
     )
     magnitude_weight: float = number(3.0, "the paper's w2, likewise", least=0, most=WEIGHT)
-    robust: bool = flag(True, "give outliers less weight; false: plain squares, as in the paper")
     max_iterations: int = number(100, "iterations at most", least=1, most=100_000)
 
 
@@ -364,14 +357,12 @@ class FitConfig:
             surface=SurfaceConfig(enabled=False),
             photometry=PhotometryConfig(enabled=False),
             reflectance=ReflectanceConfig(
-                solver="adam",
                 shading="printed",
                 robust=False,
                 smoothness_weight=0.001 / 255.0,
                 specular_smoothness=1.0,
-                max_iterations=60,
             ),
-            normals=NormalsConfig(magnitude_weight=0.3, robust=False),
+            normals=NormalsConfig(magnitude_weight=0.3),
             residual=ResidualConfig(enabled=False),
         )
 

@@ -32,10 +32,10 @@ def test_defaults_are_the_papers():
 
 
 def test_nested_values_and_integers_for_floats():
-    config = from_mapping(FitConfig, {"reflectance": {"exponent": 20, "solver": "adam"}}, "here")
+    config = from_mapping(FitConfig, {"reflectance": {"exponent": 20, "shading": "paper"}}, "here")
     assert config.reflectance.exponent == 20.0
     assert isinstance(config.reflectance.exponent, float)
-    assert config.reflectance.solver == "adam"
+    assert config.reflectance.shading == "paper"
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_nested_values_and_integers_for_floats():
         ({"reflectance": {"bands": 99}}, "reflectance.bands: found 99, expected a whole number from 3 to 10"),
         ({"reflectance": {"exponent": -1}}, "reflectance.exponent: found -1, expected a finite number from 1 to 10000"),
         ({"reflectance": {"robust": 1}}, "reflectance.robust: found 1, expected true or false"),
-        ({"reflectance": {"solver": "sgd"}}, "found 'sgd', expected one of 'als', 'adam'"),
+        ({"geometry": {"objective": "sgd"}}, "found 'sgd', expected one of 'consistency', 'paper'"),
         ({"reflectance": {"shading": "shadow"}}, "reflectance.shading: found 'shadow', expected one of"),
         ({"reflectance": 3}, "reflectance: found 3, expected a table"),
         ({"geometry": {"texture_sigma": 7.0}}, "geometry.texture_sigma: found 7.0, expected below texture_window"),

@@ -35,10 +35,6 @@ NEVER = {"result": {"render"}, "output": {"stages"}}
 """Lower parts that a part has no business with: a result renders nothing, what is written fits nothing."""
 KERNELS = {"render", "appearance"}
 """Parts whose functions may import Mitsuba and Dr.Jit."""
-KERNEL_FILES = {f"stages/{name}.py" for name in ("normals/problem", "normals/refine_normals", "reflectance/adam")} | {
-    "extras/absorb/linear.py"
-}
-"""Further files that may, relative to the package: solvers of stages."""
 
 LATE = {"result/reconstruction.py"}
 """Files whose functions may import what is above them: the methods of a result that show, read and write it."""
@@ -105,7 +101,7 @@ def test_imports_go_one_way(name):
 @pytest.mark.parametrize("name", FILES)
 def test_mitsuba_and_drjit_are_imported_late_and_only_by_what_forms_images(name):
     kernels = {"mitsuba", "drjit"}
-    late = part_of(name) in KERNELS or name in KERNEL_FILES
+    late = part_of(name) in KERNELS
     found = {n.split(".")[0] for n in imported_names(TREES[name])} & kernels
     assert late or not found
     for node in TREES[name].body:

@@ -128,7 +128,7 @@ FIRST = {
 def another(section, name, value):
     """The settings of one section with one of them changed to something else that is allowed."""
     allowed = {
-        "objective": "paper", "solver": "adam", "shading": "paper",
+        "objective": "paper", "shading": "paper",
         "exponent": 77.0, "subdivisions": 1, "bands": 5,
     }  # fmt: skip
     if name in allowed:

@@ -225,7 +225,7 @@ class EnvironmentLight:
         dr.make_opaque(toward, colours)
         matt, glossy = mi.Color3f(0.0), mi.Color3f(0.0)
         for number, (d, colour) in enumerate(zip(toward, colours, strict=True)):
-            diffuse, specular = light_transfer(n, v, prepared, [d], 1.0, (bits >> number) & 1)
+            diffuse, specular = light_transfer(n, v, prepared, [d], (bits >> number) & 1)
             matt, glossy = matt + diffuse * colour, glossy + specular * colour
         both = stored([matt.x, matt.y, matt.z, glossy.x, glossy.y, glossy.z], count)
         return both[:, :3], both[:, 3:]

@@ -6,6 +6,7 @@ at unit albedo from smooth and from compact lights. `form_image` is the only pla
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -14,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mifit.appearance import models
 from mifit.appearance.arrays import aligned, expect, on_device, stored
-from mifit.appearance.illumination import Illumination, Light
-from mifit.appearance.kernels import PreparedLobe, diffuse_transfer, prepare
+from mifit.appearance.illumination import DistantLight, Illumination
+from mifit.appearance.kernels import PreparedLobe, prepare
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
 from mifit.appearance.models.base import Shade
@@ -80,7 +81,7 @@ class Appearance:
         return Occlusion.trace(mesh, points, self.illumination, seed, self.model.needs_shadows)
 
     def shade(
-        self, normals: ArrayLike, view: ArrayLike, occlusion: Occlusion = OPEN, points: ArrayLike | None = None
+        self, normals: ArrayLike, view: ArrayLike, occlusion: Occlusion = OPEN
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Diffuse and specular radiance (N, 3) of points at unit albedo, without ambient.
 
@@ -90,50 +91,33 @@ class Appearance:
             Unit normals and unit directions towards the camera, world axes.
         occlusion : Occlusion
             Shadows at the points; models that need none and illumination without compact lights may do without.
-        points : (N, 3), optional
-            World positions, for lights that are near.
 
         Raises
         ------
         InputError
             Arrays of unequal lengths or wrong shapes, or shadows that are missing.
         """
-        scene = _Scene(self, normals, view, occlusion, points)
+        scene = _Scene(self, normals, view, occlusion)
         if not scene.count:
             return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
         return scene.store(scene.with_lights(self._smooth(scene))(scene.n, scene.v))
 
     def shade_bent(
-        self,
-        normals: ArrayLike,
-        base: ArrayLike,
-        view: ArrayLike,
-        occlusion: Occlusion = OPEN,
-        points: ArrayLike | None = None,
+        self, normals: ArrayLike, base: ArrayLike, view: ArrayLike, occlusion: Occlusion = OPEN
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """As `shade`, for normals that are bent away from those of the mesh (``base``), where shadows were traced."""
-        scene = _Scene(self, base, view, occlusion, points)
-        if not scene.count:
-            return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
-        return scene.store(
-            scene.shader()(on_device(type(scene.n), expect(normals, (scene.count, 3), "normals")), scene.v)
-        )
-
-    def shader(
-        self, base: ArrayLike, view: ArrayLike, occlusion: Occlusion = OPEN, points: ArrayLike | None = None
-    ) -> Shade:
-        """Shading as a Dr.Jit function of the normal, differentiable; parameters as in `shade_bent`."""
-        return _Scene(self, base, view, occlusion, points).shader()
+        diffuse, specular, _ = BentShading(self, base, view, occlusion)(normals)
+        return diffuse, specular
 
     def transfers(
-        self, normals: ArrayLike, view: ArrayLike, occlusion: Occlusion = OPEN, points: ArrayLike | None = None
+        self, normals: ArrayLike, view: ArrayLike, occlusion: Occlusion = OPEN
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Diffuse and specular transfer (N, K): radiance at unit albedo = matrix @ ``illumination.unknowns``.
 
         The first B*B columns belong to the SH coefficients, the others to the compact lights' colours. For models that
         turn with the lighting they are those of this illumination.
         """
-        scene = _Scene(self, normals, view, occlusion, points)
+        scene = _Scene(self, normals, view, occlusion)
         if not scene.count:
             empty = np.zeros((0, len(self.illumination.unknowns)), np.float32)
             return empty, empty
@@ -164,7 +148,7 @@ class Appearance:
         import mitsuba as mi
 
         dark = Appearance(self.model, Illumination.dark(1), self.lobe)
-        scene = _Scene(dark, normals, view, Occlusion(), None, shadows=False)
+        scene = _Scene(dark, normals, view, Occlusion(), shadows=False)
         shape = len(directions), scene.count
         if not shape[0] * shape[1]:
             return np.zeros(shape, np.float32), np.zeros(shape, np.float32)
@@ -175,11 +159,50 @@ class Appearance:
         n, v = (dr.gather(mi.Vector3f, x, point) for x in (scene.n, scene.v))
         d = dr.gather(mi.Vector3f, towards, light)
         seen = mi.UInt(aligned(visible, np.uint32).ravel())
-        both = stored(list(self.model.light(n, v, scene.lobe, [d], mi.Float(1.0), seen)), shape[0] * shape[1])
+        both = stored(list(self.model.light(n, v, scene.lobe, [d], seen)), shape[0] * shape[1])
         return both[:, 0].reshape(shape), both[:, 1].reshape(shape)
 
     def _smooth(self, scene: _Scene) -> Shade:
         return lambda n, v: self.model.shade(n, v, scene.lobe, scene.coefficients, scene.shadowed)
+
+
+class BentShading:
+    """Shading of points by their normals, which may be bent away from the mesh's, with all else held.
+
+    Parameters
+    ----------
+    appearance : Appearance
+    base, view : (N, 3)
+        The mesh's unit normals, where shadows were traced, and unit directions towards the camera.
+    occlusion : Occlusion
+    """
+
+    def __init__(self, appearance: Appearance, base: ArrayLike, view: ArrayLike, occlusion: Occlusion = OPEN) -> None:
+        self._scene = _Scene(appearance, base, view, occlusion)
+        self._shade = self._scene.shader() if self._scene.count else None
+
+    def __call__(
+        self, normals: ArrayLike, turns: Sequence[ArrayLike] = ()
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], list[tuple[NDArray[np.float32], NDArray[np.float32]]]]:
+        """Diffuse and specular radiance (N, 3) at unit albedo, and the derivatives of both along each turn (N, 3)."""
+        import drjit as dr
+        import mitsuba as mi
+
+        scene, shape = self._scene, (self._scene.count, 3)
+        if self._shade is None:
+            empty = np.zeros((0, 3), np.float32)
+            return empty, empty, [(empty, empty) for _ in turns]
+        n = on_device(mi.Vector3f, expect(normals, shape, "normals"))
+        slopes = []
+        for turn in turns:
+            along = dr.opaque(mi.Float, 0.0)
+            dr.enable_grad(along)
+            shaded = self._shade(n + along * on_device(mi.Vector3f, expect(turn, shape, "turn")), scene.v)
+            dr.set_grad(along, 1.0)
+            dr.enqueue(dr.ADMode.Forward, along)
+            dr.traverse(dr.ADMode.Forward)
+            slopes.append(scene.store((dr.grad(shaded[0]), dr.grad(shaded[1]))))
+        return *scene.store(self._shade(n, scene.v)), slopes
 
 
 class _Scene:
@@ -191,7 +214,6 @@ class _Scene:
         normals: ArrayLike,
         view: ArrayLike,
         occlusion: Occlusion,
-        points: ArrayLike | None,
         shadows: bool = True,
     ) -> None:
         import drjit as dr
@@ -204,7 +226,6 @@ class _Scene:
         self.n, self.v = (
             on_device(mi.Vector3f, expect(x, shape, name)) for x, name in ((normals, "normals"), (view, "view"))
         )
-        self.points = None if points is None else on_device(mi.Point3f, expect(points, shape, "points"))
         self.shadowed = None
         if shadows and self.model.needs_shadows:
             if occlusion.transfer is None:
@@ -227,10 +248,14 @@ class _Scene:
         """Shading of bent normals, compact lights included."""
         return self.with_lights(self.model.about(self.n, self.v, self.lobe, self.coefficients, self.shadowed))
 
-    def light(self, light: Light, visible: Any) -> Shade:
+    def light(self, light: DistantLight, visible: Any) -> Shade:
         """Radiance at unit albedo per unit of a light's colour, as a function of normal and view."""
-        directions, strength = light.incident(self.points)
-        return lambda n, v: self.model.light(n, v, self.lobe, directions, strength, visible)
+        import drjit as dr
+        import mitsuba as mi
+
+        directions = [mi.Vector3f(*map(float, d)) for d in light.samples()]
+        dr.make_opaque(directions)
+        return lambda n, v: self.model.light(n, v, self.lobe, directions, visible)
 
     def with_lights(self, smooth: Shade) -> Shade:
         """Add the compact lights to the shading by smooth light."""
@@ -262,35 +287,20 @@ class _Scene:
         return both[:, :3], both[:, 3:]
 
 
-def _read_transfer(transfer: VertexTransfer | NDArray, count: int, order: int) -> list[Any]:
+def _read_transfer(transfer: VertexTransfer, count: int, order: int) -> list[Any]:
     """B*B Floats, not evaluated: kernels gather them from rows in memory, four at a time."""
     import drjit as dr
     import mitsuba as mi
 
     size = order * order
-    if isinstance(transfer, VertexTransfer):
-        values = expect(transfer.values, (len(transfer.values), size), "shadowed transfer")
-        expect(transfer.weights, (count, 3), "shadowed transfer: weights")
-        rows = [mi.UInt32(aligned(column, np.uint32)) for column in transfer.corners.T]
-        weights = [mi.Float(aligned(column)) for column in transfer.weights.T]
-    else:
-        values = expect(transfer, (count, size), "shadowed transfer")
-        rows, weights = [dr.arange(mi.UInt32, count)], [mi.Float(1.0)]
+    values = expect(transfer.values, (len(transfer.values), size), "shadowed transfer")
+    expect(transfer.weights, (count, 3), "shadowed transfer: weights")
+    rows = [mi.UInt32(aligned(column, np.uint32)) for column in transfer.corners.T]
+    weights = [mi.Float(aligned(column)) for column in transfer.weights.T]
     packets = -(-size // 4)
     flat = mi.Float(aligned(np.pad(values, ((0, 0), (0, 4 * packets - size)))).ravel())
     found: list[Any] = []
     for packet in range(packets):
         read = [dr.gather(mi.Vector4f, flat, row * packets + packet) for row in rows]
-        found += [
-            sum((w * r[i] for w, r in zip(weights[1:], read[1:], strict=True)), weights[0] * read[0][i])
-            for i in range(4)
-        ]
+        found += [weights[0] * read[0][i] + weights[1] * read[1][i] + weights[2] * read[2][i] for i in range(4)]
     return found[:size]
-
-
-def diffuse_matrix(normals: ArrayLike, order: int) -> NDArray[np.float32]:
-    """(N, B*B) unshadowed transfer: radiance of a white Lambertian point = matrix @ coefficients."""
-    import mitsuba as mi
-
-    n = expect(normals, (len(np.asarray(normals)), 3), "normals")
-    return stored(diffuse_transfer(on_device(mi.Vector3f, n), order), len(n))

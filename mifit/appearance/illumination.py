@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,81 +17,15 @@ from mifit.core.limits import MAX_NUMBER
 from mifit.core.sh import SHLighting, basis, order_of
 from mifit.errors import InputError
 
-if TYPE_CHECKING:
-    from mifit.render.gbuffer import SurfaceScene
-
 RAYS = 16
 """Points that stand for the extent of a compact light."""
 
 
-class Light(Protocol):
-    """A light that is too compact for spherical harmonics; its colour is what images are linear in.
-
-    A surface point that sees the light from a unit direction w reflects ``colour * strength * f(w, v) * (n . w)``,
-    averaged over the samples of the light's extent that it sees.
-
-    Attributes
-    ----------
-    colour : (3,)
-        Linear Rec. 709. Of a distant light the irradiance of a surface that faces it, of a near one that irradiance
-        at its centre.
-    direction : (3,)
-        Unit vector towards it, of a near light from its centre.
-    """
-
-    @property
-    def direction(self) -> NDArray[np.float64]:
-        """(3,) unit vector."""
-        ...
-
-    @property
-    def colour(self) -> NDArray[np.float64]:
-        """(3,) linear Rec. 709."""
-        ...
-
-    def samples(self, count: int = RAYS) -> NDArray[np.float64]:
-        """(count, 3) unit directions, or places of a near light, that cover its extent evenly."""
-        ...
-
-    def with_colour(self, colour: ArrayLike) -> Light:
-        """The same light in another colour."""
-        ...
-
-    def rotated(self, rotation: ArrayLike, about: ArrayLike = (0.0, 0.0, 0.0)) -> Light:
-        """The light turned by a rotation (3, 3) about a point of world space, its origin by default."""
-        ...
-
-    def coefficients(self, order: int) -> NDArray[np.float64]:
-        """(B*B, 3) SH coefficients of its radiance: what B bands can show of it; of a near one, at its centre."""
-        ...
-
-    def document(self) -> dict[str, Any]:
-        """JSON values from which `light_from` makes it again."""
-        ...
-
-    def emitter(self) -> dict[str, Any]:
-        """The stock Mitsuba emitter that is nearest to it."""
-        ...
-
-    def describe(self, unit_mm: float | None = None) -> str:
-        """A few words for a report; ``unit_mm`` are the millimetres per unit of the world, where they are known."""
-        ...
-
-    def visible(self, scene: SurfaceScene, points: NDArray, normals: NDArray) -> NDArray[np.uint32]:
-        """(N,) which samples the points (N, 3) of a mesh see, a bit each."""
-        ...
-
-    def incident(self, points: Any) -> tuple[list[Any], Any]:
-        """Unit directions (Vector3f) from points (Point3f) towards the samples, and the strength of the light there.
-
-        Dr.Jit; a distant light doesn't look at the points, and they may be None.
-        """
-        ...
-
-
 @dataclass(frozen=True)
 class DistantLight:
-    """A disc of even radiance, far away, such as the sun or a bare lamp.
+    """A disc of even radiance, far away, such as the sun or a bare lamp: too compact for spherical harmonics.
+
+    A surface point reflects ``colour * f(w, v) * (n . w)``, averaged over the directions w of the disc that it sees.
 
     Attributes
     ----------
@@ -115,8 +49,8 @@ class DistantLight:
         """The same light in another colour."""
         return replace(self, colour=np.asarray(colour, dtype=np.float64))
 
-    def rotated(self, rotation: ArrayLike, about: ArrayLike = (0.0, 0.0, 0.0)) -> DistantLight:
-        """The light turned by a rotation R (3, 3), whatever the point: what came from d comes from R d."""
+    def rotated(self, rotation: ArrayLike) -> DistantLight:
+        """The light turned by a rotation R (3, 3): what came from d comes from R d."""
         return replace(self, direction=np.asarray(rotation, dtype=np.float64) @ self.direction)
 
     def coefficients(self, order: int) -> NDArray[np.float64]:
@@ -135,27 +69,14 @@ class DistantLight:
             "irradiance": {"type": "rgb", "value": [float(x) for x in self.colour]},
         }
 
-    def describe(self, unit_mm: float | None = None) -> str:
-        """Where it is and how large it looks, which no unit matters to."""
+    def describe(self) -> str:
+        """Where it is and how large it looks, for a report."""
         x, y, z = self.direction
         return f"towards ({x:.2f}, {y:.2f}, {z:.2f}), with an angular radius of {math.degrees(self.radius):.1f} degrees"
 
-    def visible(self, scene: SurfaceScene, points: NDArray, normals: NDArray) -> NDArray[np.uint32]:
-        """(N,) which samples of the disc the points (N, 3) of a mesh see, a bit each."""
-        return scene.open_towards(points, normals, self.samples())
 
-    def incident(self, points: Any = None) -> tuple[list[Any], Any]:
-        """Directions towards the samples of the disc, the same for all points, and the strength 1."""
-        import drjit as dr
-        import mitsuba as mi
-
-        directions = [mi.Vector3f(*map(float, d)) for d in self.samples()]
-        dr.make_opaque(directions)
-        return directions, 1.0
-
-
-def light_from(document: dict[str, Any]) -> Light:
-    """The light of `Light.document`.
+def light_from(document: dict[str, Any]) -> DistantLight:
+    """The light of `DistantLight.document`.
 
     Raises
     ------
@@ -191,7 +112,7 @@ class Illumination:
     ----------
     radiance : (B*B, 3) float64
         SH coefficients of the smooth incident radiance, conventions of ``core.sh``; compact lights are not in it.
-    lights : tuple of Light
+    lights : tuple of DistantLight
         Compact lights beside it.
     ambient : float
         The paper's I_a, added to every point: light that the model leaves out.
@@ -203,7 +124,7 @@ class Illumination:
     """
 
     radiance: NDArray[np.float64]
-    lights: tuple[Light, ...] = field(default=())
+    lights: tuple[DistantLight, ...] = field(default=())
     ambient: float = 0.0
 
     def __post_init__(self) -> None:
@@ -215,7 +136,7 @@ class Illumination:
         object.__setattr__(self, "lights", tuple(self.lights))
 
     @classmethod
-    def dark(cls, order: int, lights: Sequence[Light] = ()) -> Illumination:
+    def dark(cls, order: int, lights: Sequence[DistantLight] = ()) -> Illumination:
         """No light from B bands, and compact lights of no colour: the shape of what is to be fitted."""
         return cls(np.zeros((order * order, 3)), tuple(light.with_colour(np.zeros(3)) for light in lights))
 
@@ -237,26 +158,15 @@ class Illumination:
         lights = tuple(light.with_colour(colour) for light, colour in zip(self.lights, values[count:], strict=True))
         return Illumination(values[:count], lights, self.ambient if ambient is None else ambient)
 
-    def rotated(self, rotation: ArrayLike, about: ArrayLike = (0.0, 0.0, 0.0)) -> Illumination:
-        """Turned by a rotation R (3, 3): what came from d comes from R d.
-
-        Near lights are carried around a point of world space, its origin by default.
-        """
+    def rotated(self, rotation: ArrayLike) -> Illumination:
+        """Turned by a rotation R (3, 3): what came from d comes from R d."""
         turned = SHLighting(self.radiance).rotate(rotation).coefficients
-        return replace(self, radiance=turned, lights=tuple(light.rotated(rotation, about) for light in self.lights))
+        return replace(self, radiance=turned, lights=tuple(light.rotated(rotation) for light in self.lights))
 
     def scaled(self, factor: float) -> Illumination:
         """Everything brighter by a factor."""
         lights = tuple(light.with_colour(factor * light.colour) for light in self.lights)
         return Illumination(factor * self.radiance, lights, factor * self.ambient)
-
-    def without_lights(self) -> Illumination:
-        """The smooth part alone."""
-        return replace(self, lights=())
-
-    def without_light(self, number: int) -> Illumination:
-        """All but one of the compact lights."""
-        return replace(self, lights=self.lights[:number] + self.lights[number + 1 :])
 
     def smooth(self) -> SHLighting:
         """All of it, without ambient, as far as the bands can show compact lights."""

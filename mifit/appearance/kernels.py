@@ -230,7 +230,7 @@ def dominant_direction(coefficients: Sequence[Any]) -> Any:
 
 
 def light_transfer(
-    n: Any, v: Any, lobe: PreparedLobe, directions: Sequence[Any], strength: Any, visible: Any
+    n: Any, v: Any, lobe: PreparedLobe, directions: Sequence[Any], visible: Any
 ) -> tuple[Any, Any]:
     """Radiance of a white diffuse and of a fully specular point per unit of a compact light's colour.
 
@@ -241,11 +241,9 @@ def light_transfer(
     n, v : Vector3f
     lobe : PreparedLobe
     directions : sequence of Vector3f
-        Directions that stand for the light's extent, at most 32 (``Light.incident``).
-    strength : Float
-        Irradiance of a surface that faces the light, per unit of its colour.
+        Directions that stand for the light's extent, at most 32 (``DistantLight.samples``).
     visible : UInt
-        Bit d tells whether direction d is visible (``Light.visible``).
+        Bit d is 1 where direction d is visible.
 
     Returns
     -------
@@ -272,7 +270,7 @@ def light_transfer(
             falloff = cosine * dr.power(dr.clip(cos_h, 1e-4, 1.0), lobe.exponent)
         diffuse = diffuse + dr.select(open_sky, cosine, 0.0)
         specular = specular + dr.select(open_sky, falloff, 0.0)
-    share = strength / len(directions)
+    share = 1.0 / len(directions)
     return diffuse * (share / np.pi), specular * (share * peak)
 
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from mifit.appearance.arrays import on_device, stored
 from mifit.appearance.illumination import Illumination
 from mifit.appearance.kernels import diffuse_transfer, sh_basis
-from mifit.core.mesh import interpolate, vertex_normals
+from mifit.core.mesh import vertex_normals
 from mifit.core.sh import check_order
 from mifit.errors import InputError
 
@@ -47,10 +47,6 @@ class MeshPoints:
     normal: NDArray
     face: NDArray
     barycentric: NDArray
-
-    def take(self, rows: NDArray | slice) -> MeshPoints:
-        """Some of the points."""
-        return MeshPoints(self.position[rows], self.normal[rows], self.face[rows], self.barycentric[rows])
 
 
 class OccludingMesh:
@@ -106,18 +102,6 @@ class VertexTransfer:
         weights = np.stack([parts[s].weights for s in step], axis=1).reshape(-1, 3)
         return cls(np.concatenate([part.values for part in parts]), corners, weights)
 
-    def __len__(self) -> int:
-        return len(self.corners)
-
-    @property
-    def rows(self) -> NDArray[np.float32]:
-        """(N, B*B) written out."""
-        return interpolate(self.values, self.corners, np.arange(len(self)), self.weights)
-
-    def take(self, rows: NDArray | slice) -> VertexTransfer:
-        """Those of some of the points."""
-        return VertexTransfer(self.values, self.corners[rows], self.weights[rows])
-
 
 @dataclass(frozen=True)
 class Occlusion:
@@ -125,13 +109,13 @@ class Occlusion:
 
     Attributes
     ----------
-    transfer : VertexTransfer, (N, B*B) float32 or None
+    transfer : VertexTransfer or None
         Shadowed diffuse transfer, for models that need it.
     visible : tuple of (N,) uint32
         Per compact light, which of its samples each point sees.
     """
 
-    transfer: VertexTransfer | NDArray[np.float32] | None = None
+    transfer: VertexTransfer | None = None
     visible: tuple[NDArray[np.uint32], ...] = ()
 
     @classmethod
@@ -160,21 +144,8 @@ class Occlusion:
         if smooth:
             at_vertices = mesh.transfer(illumination.order, seed)
             transfer = VertexTransfer(at_vertices, mesh.scene.faces[points.face], points.barycentric)
-        lights = illumination.lights
-        return cls(transfer, tuple(light.visible(mesh.scene, points.position, points.normal) for light in lights))
-
-    @property
-    def rows(self) -> NDArray[np.float32] | None:
-        """(N, B*B) transfer written out."""
-        return self.transfer.rows if isinstance(self.transfer, VertexTransfer) else self.transfer
-
-    def take(self, rows: NDArray | slice) -> Occlusion:
-        """Those of some of the points."""
-        if isinstance(self.transfer, VertexTransfer):
-            transfer: VertexTransfer | NDArray[np.float32] | None = self.transfer.take(rows)
-        else:
-            transfer = None if self.transfer is None else self.transfer[rows]
-        return Occlusion(transfer, tuple(bits[rows] for bits in self.visible))
+        place = points.position, points.normal
+        return cls(transfer, tuple(mesh.scene.open_towards(*place, light.samples()) for light in illumination.lights))
 
 
 def trace_transfer(

@@ -96,11 +96,6 @@ class GeometryEstimate:
     landmark_noise: float = 0.0
     face_width: float = 0.0
 
-    @property
-    def middle(self) -> NDArray:
-        """(3,) mean of the first timestep's vertices: what near lights are turned about."""
-        return np.asarray(self.vertices[0], dtype=np.float64).mean(axis=0)
-
     def index(self, timestep: int) -> int:
         """Position of a timestep in the per-timestep arrays; KeyError when it was not fitted."""
         if timestep not in self.timesteps:

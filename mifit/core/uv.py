@@ -166,6 +166,13 @@ def bend(normals: NDArray, tangents: NDArray, offsets: NDArray) -> NDArray:
     return bent / (1.0 + square)
 
 
+def bend_jacobian(normals: NDArray, tangents: NDArray, offsets: NDArray) -> NDArray:
+    """(N, 2, 3) derivatives of `bend` by the offsets."""
+    q = 0.5 * offsets
+    total = normals + bend(normals, tangents, offsets)
+    return (tangents - q[:, :, None] * total[:, None]) / (1.0 + (q**2).sum(1))[:, None, None]
+
+
 def unbend(normals: NDArray, tangents: NDArray, bent: NDArray) -> NDArray:
     """Offsets (N, 2) that turn the base normals into the bent ones; inverse of `bend`."""
     along = np.einsum("nc,nac->na", bent, tangents)

@@ -100,7 +100,7 @@ def under(result: Reconstruction, turn: float, environment: Path | None) -> Reco
     if turn == 0.0 or result.reflectance is None:
         return result
     rotation = Rotation.from_rotvec(np.radians(turn) * vertical(result)).as_matrix()
-    illumination = result.reflectance.illumination.rotated(rotation, result.geometry.middle)
+    illumination = result.reflectance.illumination.rotated(rotation)
     return result.with_illumination(illumination)
 
 

@@ -8,7 +8,7 @@ three and returns a `Solution` that says in an enumerated `Outcome` how it ended
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol
@@ -32,19 +32,6 @@ class Outcome(Enum):
     def worst(cls, outcomes: Iterable[Outcome]) -> Outcome:
         """The least satisfactory of several outcomes; ``CONVERGED`` where there is none."""
         return max(outcomes, key=list(cls).index, default=cls.CONVERGED)
-
-    @classmethod
-    def of_history(cls, energies: Sequence[float], window: float = 0.1, tolerance: float = 1e-2) -> Outcome:
-        """How a descent without a model of its steps, such as Adam's, ended, read off its energies.
-
-        Converged when the energy fell by less than ``tolerance``, relative, over the last ``window`` of the iterations,
-        which must be ten or more.
-        """
-        if not np.isfinite(energies).all():
-            return cls.DIVERGED
-        last = round(window * len(energies))
-        flat = last >= 10 and abs(energies[-1 - last] - energies[-1]) < tolerance * abs(energies[-1])
-        return cls.CONVERGED if flat else cls.MAX_ITERATIONS
 
 
 @dataclass(frozen=True)

@@ -111,7 +111,7 @@ def shade_methods(
             shaded = light.shade(mesh.scene, points, material.normal, view, lobe, albedo, surface.group)
         else:
             occlusion = appearance.trace(mesh, points)
-            shaded = appearance.shade_bent(material.normal, base, surface.view, occlusion, surface.points)
+            shaded = appearance.shade_bent(material.normal, base, surface.view, occlusion)
         ambient = np.float32(reflectance.illumination.ambient)
         for method in finer:
             specular = material.specular[:, None] if method == "full" else np.float32(0.0)

@@ -59,8 +59,8 @@ def relit(
     if isinstance(lighting, Illumination):
         if exposure == "auto":
             raise InputError("exposure: found 'auto', expected a number: this lighting has a level of its own")
-        lit, middle = lighting.scaled(exposure), result.geometry.middle
-        return [result.with_illumination(lit.rotated(turn, middle)) for turn in turns]
+        lit = lighting.scaled(exposure)
+        return [result.with_illumination(lit.rotated(turn)) for turn in turns]
     if isinstance(lighting, SHLighting):
         image, smooth = None, lighting
     else:

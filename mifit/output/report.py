@@ -329,7 +329,7 @@ def _lighting(result: Reconstruction) -> str:
     ball, mirror = lighting_balls(lighting)
     panorama = np.maximum(lighting.to_latlong(), 0)
     codes = to_8_bit(panorama / max(float(panorama.max()), 1e-12))
-    lights = [light.describe(result.unit_mm) for light in result.illumination.lights]
+    lights = [light.describe() for light in result.illumination.lights]
     compact = "".join(f"; the sharp light {light}, was found apart from them" for light in lights)
     return f"""<div class="balls">{_figure(png_uri(ball), "White matt ball", "lighting on a matt ball")}
 {_figure(png_uri(mirror), "Mirror ball", "lighting in a mirror ball")}

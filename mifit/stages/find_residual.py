@@ -134,7 +134,7 @@ def _difference(
     ambient = np.float32(appearance.illumination.ambient)
     difference = np.empty(seen.colour.shape, dtype=np.float32)
     for j in range(len(seen.step)):
-        d, s = appearance.shade_bent(normal, base, seen.view[:, j], occlusion, points.position)
+        d, s = appearance.shade_bent(normal, base, seen.view[:, j], occlusion)
         difference[:, j] = seen.colour[:, j] - form_image(ambient, diffuse, d, specular[:, None], s)
     weight = np.where(seen.measured > 0, seen.right, np.float32(0.0)).astype(np.float32)
     return rows, np.where(weight[..., None] > 0, difference, np.float32(0.0)), weight

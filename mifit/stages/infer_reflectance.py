@@ -20,8 +20,7 @@ from mifit.stages.observations import Surface
 from mifit.stages.reflectance.als import find_forward, fit_als
 from mifit.stages.reflectance.fill import blend_unseen, mirrored_coordinates
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.objective import energies
-from mifit.stages.reflectance.paper_solver import fit_adam
+from mifit.stages.reflectance.paper_energy import energies, fit_paper
 from mifit.stages.reflectance.relief import part_relief
 from mifit.stages.segment import segment
 
@@ -92,14 +91,15 @@ def infer_reflectance(
         labels = segment(surface, capture, model, forward, first.light)
         surface = surface.without([hidden(image) for image in labels])
     progress("Reflectance lighting", 1, 2)
-    solve = fit_adam if config.solver == "adam" else fit_als
+    solve = fit_als if config.robust else fit_paper
     fitted = solve(surface, forward, albedo, config, seed, progress)
+    solved = fitted.solved
     warnings: tuple[Diagnostic, ...] = ()
     illumination = fitted.appearance.illumination
-    if not (np.isfinite(fitted.maps).all() and np.isfinite(illumination.unknowns).all()):
+    if not (np.isfinite(solved.maps).all() and np.isfinite(illumination.unknowns).all()):
         raise ConvergenceError("stage 2 (reflectance): the maps or the lighting are not finite; see the images' range")
     quality = surface.quality()
-    filled = blend_unseen(model, surface.texels, albedo, fitted.maps, quality, fitted.told, mirrored)
+    filled = blend_unseen(model, surface.texels, albedo, solved.maps, quality, solved.observability, mirrored)
     if fitted.outcome is Outcome.MAX_ITERATIONS:
         text = "the lighting had not converged when the iterations ran out; raise max_iterations"
         warnings = (*warnings, Diagnostic("not-converged", text, "note"))
@@ -110,21 +110,21 @@ def infer_reflectance(
             "lights": len(illumination.lights),
         },
         "gauge": GAUGE,
-        "residual": float(fitted.sigma),
+        "residual": float(solved.sigma),
         "seen": float((quality[surface.facial] > 0).mean()),
         "texels": int(surface.facial.sum()),
         "texels_of_head": len(surface),
         "images": surface.image_count,
-        "maps_outcome": fitted.maps_outcome.value,
+        "maps_outcome": solved.outcome.value,
         "hidden": [float(hidden(image).sum() / max(int((image > 0).sum()), 1)) for image in labels],
     }
-    if config.solver == "adam" or not config.robust:
+    if not config.robust:
         forward = Forward(fitted.appearance, surface.meshes)
         light = illumination.unknowns, illumination.ambient
-        terms = energies(surface, forward, *light, fitted.maps, albedo, config)
+        terms = energies(surface, forward, *light, solved.maps, albedo, config)
         details["objective"] = {**terms, "total": sum(terms.values())}
     diffuse, relief = filled.diffuse, None
-    if config.robust and config.relief and config.solver == "als":
+    if config.robust and config.relief:
         parted = part_relief(model, surface.texels, diffuse, filled.confidence)
         diffuse, relief = parted.skin, parted.relief
         details["spread"] = {"symmetric": parted.symmetric, "sided": parted.sided}

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from mifit.appearance.formation import diffuse_matrix
 from mifit.appearance.occlusion import trace_transfer
 from mifit.core import sh
 from mifit.errors import InputError
 from mifit.render.gbuffer import SurfaceScene
+from tests.shaded import diffuse_matrix
 
 
 @pytest.fixture(scope="module")

@@ -202,16 +202,3 @@ def test_the_worst_of_several_outcomes_counts():
     assert Outcome.worst([]) is Outcome.CONVERGED
     assert Outcome.worst([Outcome.CONVERGED, Outcome.MAX_ITERATIONS, Outcome.STALLED]) is Outcome.MAX_ITERATIONS
     assert Outcome.worst([Outcome.DIVERGED, Outcome.CONVERGED]) is Outcome.DIVERGED
-
-
-@pytest.mark.parametrize(
-    ("energies", "outcome"),
-    [
-        (2.0 ** -np.arange(200.0) + 1.0, Outcome.CONVERGED),
-        (np.linspace(2.0, 1.0, 200), Outcome.MAX_ITERATIONS),  # still falling by 10 per cent
-        (np.ones(50), Outcome.MAX_ITERATIONS),  # too few to tell
-        (np.full(200, np.nan), Outcome.DIVERGED),
-    ],
-)
-def test_first_order_descents_are_judged_by_their_history(energies, outcome):
-    assert Outcome.of_history(energies) is outcome

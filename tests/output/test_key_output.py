@@ -27,7 +27,7 @@ def keyed(ball):
 
 
 def without_light(result):
-    dark = result.illumination.without_lights()
+    dark = replace(result.illumination, lights=())
     return replace(result, reflectance=replace(result.reflectance, illumination=dark))
 
 

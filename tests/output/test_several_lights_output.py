@@ -59,7 +59,7 @@ def test_scene_files_hold_an_emitter_each(lit, tmp_path):
 
 def test_the_report_says_where_each_is(lit):
     text = _lighting(lit)
-    assert all(light.describe(lit.unit_mm) in text for light in (FAR, OTHER))
+    assert all(light.describe() in text for light in (FAR, OTHER))
 
 
 def test_glb_files_name_each(lit, tmp_path):

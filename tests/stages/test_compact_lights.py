@@ -154,7 +154,7 @@ def dome_under(*lights: DistantLight, steps: int = 3) -> TurningDome:
         face, weights = buffer.face[buffer.mask], buffer.weights[buffer.mask]
         point = interpolate(v, faces, face, weights)
         normal = normalize(interpolate(vertex_normals(v, faces), faces, face, weights))
-        shadows = replace(OPEN, visible=tuple(light.visible(scene, point, normal) for light in lights))
+        shadows = replace(OPEN, visible=tuple(scene.open_towards(point, normal, light.samples()) for light in lights))
         diffuse, specular = look.shade(normal, normalize(view.position - point), shadows)
         uv = interpolate(dome.model.uv, dome.model.faces_uv, face, weights)
         image = frame.image.copy()

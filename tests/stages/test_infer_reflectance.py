@@ -153,24 +153,16 @@ def test_unseen_texels_show_the_models_albedo(dome):
 
 
 @pytest.mark.slow
-def test_adam_lowers_the_papers_objective(variant):
+@pytest.mark.parametrize("shading", ["paper", "printed"])
+def test_the_papers_objective_falls_to_its_end(variant, shading):
     scene = turning_dome("paper", None, exponent=5.0, steps=2)
-    config = ReflectanceConfig(
-        texture_size=24, shading="paper", robust=False, smoothness_weight=1e-4, solver="adam", max_iterations=6
-    )
-    adam = infer(scene, config)
-    total = np.sum([adam.report.energies[k] for k in ("data", "difference", "smoothness")], axis=0)
-    assert total[-1] < 0.3 * total[0] and np.isfinite(total).all()
-    # The history comes from Dr.Jit, the objective from NumPy: two forms of the same sum.
-    np.testing.assert_allclose(adam.report.details["objective"]["data"], adam.report.energies["data"][-1], rtol=1e-3)
-
-
-@pytest.mark.slow
-def test_als_ends_below_adam(dome):
-    config = replace(CONFIG, texture_size=24, robust=False, smoothness_weight=1e-4)
-    adam = infer(dome, replace(config, solver="adam", max_iterations=8))
-    als = infer(dome, config)
-    assert als.report.details["objective"]["total"] < adam.report.details["objective"]["total"]
+    config = ReflectanceConfig(texture_size=24, shading=shading, robust=False, smoothness_weight=1e-4)
+    found = infer(scene, config)
+    total = np.sum([found.report.energies[k] for k in ("data", "difference", "smoothness")], axis=0)
+    assert (np.diff(total) < 0).all() and found.report.outcome in ("converged", "stalled")
+    assert found.report.details["objective"]["total"] == pytest.approx(total[-1], rel=1e-3)
+    if shading == "paper":  # the images' own: what is left is the smoothness of the maps
+        assert total[-1] < 0.3 * total[0]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Stage 3: known normals are recovered, bounds hold, both solvers agree."""
+"""Stage 3: known normals are recovered and bounds hold."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, bend, rasterize_uv, tangent_plane, texel_neighbours
 from mifit.errors import InputError
 from mifit.optim import Outcome
-from mifit.stages.normals.refine_normals import gauss_newton
+from mifit.stages.normals.refine_normals import NormalProblem, NormalView, solve_normals
 
 CAMERAS = ("left", "right")
 
@@ -63,33 +63,30 @@ def bumpy_sphere(size=96):
     return texels, n, normalize(n * (1 + bumps(n))[:, None] - slope)
 
 
-def sphere_problem(w1=1e-3 * 127.5 / 255**2, w2=1e-3, huber=float("inf"), size=96, seed=0):
-    import drjit as dr
-    import mitsuba as mi
-
-    from mifit.appearance import kernels
-    from mifit.stages.normals.problem import NormalProblem, NormalView
-
+def sphere_problem(w1=1e-3 * 127.5 / 255**2, w2=1e-3, size=96, seed=0):
     texels, base, true = bumpy_sphere(size)
     radiance = 0.4 * np.random.default_rng(seed).normal(size=(9, 3))
     radiance[0] = 2.0
     factors = sh.cosine_coefficients(3)[sh.bands(3)] / np.pi
-    colour = sh.basis(true, 3) @ (factors[:, None] * radiance)
-    coefficients = [mi.Color3f(*map(float, c)) for c in radiance]
-    dr.make_opaque(coefficients)
 
-    def shade(n, v, view):
-        return kernels.radiance(kernels.diffuse_transfer(n, 3), coefficients)
+    def image(n):
+        return sh.basis(n, 3) @ (factors[:, None] * radiance)
 
-    tangents = tangent_plane(base)
-    view = NormalView(colour, np.ones(len(base)), base, base, tangents)
-    return NormalProblem(base, tangents, texel_neighbours(texels), [view], shade, w1, w2, huber), base, tangents, true
+    def shade(n, turns=()):
+        return image(n), [(image(n + 1e-6 * turn) - image(n - 1e-6 * turn)) / 2e-6 for turn in turns]
+
+    tangents, view = tangent_plane(base), NormalView(image(true), np.ones(len(base)), shade)
+    return NormalProblem(base, tangents, texel_neighbours(texels), [view], w1, w2), base, tangents, true
 
 
-def test_a_bumpy_sphere_is_recovered_to_two_degrees_at_the_poles_too(variant):
+def solved_sphere(problem, tolerance=1e-3):
+    return solve_normals(problem, 60, np.zeros((len(problem.normals), 2)), tolerance)
+
+
+def test_a_bumpy_sphere_is_recovered_to_two_degrees_at_the_poles_too():
     problem, base, tangents, true = sphere_problem(w2=1e-5)
-    solved = gauss_newton(problem)
-    error = angles(bend(base, tangents, solved.value), true).reshape(96, 96)
+    solved = solved_sphere(problem)
+    error = angles(bend(base, tangents, solved.value.reshape(-1, 2)), true).reshape(96, 96)
     assert angles(base, true).mean() > 3.0
     assert error.mean() < 0.2
     assert np.percentile(error, 99) < 2.0
@@ -97,52 +94,58 @@ def test_a_bumpy_sphere_is_recovered_to_two_degrees_at_the_poles_too(variant):
     assert solved.outcome is Outcome.CONVERGED
 
 
-@pytest.mark.parametrize(("w1", "w2", "huber"), [(1e-5, 1e-3, np.inf), (0.0, 1e-3, 0.05), (1e-5, 1e-2, 0.02)])
-def test_no_direction_lowers_the_energy_at_the_end(variant, w1, w2, huber):
-    problem, *_ = sphere_problem(w1, w2, float(huber), size=48)
-    found, rng = gauss_newton(problem, tolerance=1e-6, max_iterations=60), np.random.default_rng(0)
+@pytest.mark.parametrize(("w1", "w2"), [(1e-5, 1e-3), (0.0, 1e-3), (1e-5, 1e-2)])
+def test_no_direction_lowers_the_energy_at_the_end(w1, w2):
+    problem, *_ = sphere_problem(w1, w2, size=48)
+    found, rng = solved_sphere(problem, 1e-6), np.random.default_rng(0)
 
     def energy(offsets):
         return sum(problem.energies(offsets).values())
 
-    zero = energy(np.zeros((48 * 48, 2)))
-    assert found.energy < 0.5 * zero
+    assert found.energy < 0.5 * energy(np.zeros(2 * 48 * 48))
     assert energy(found.value) == pytest.approx(found.energy, rel=1e-5)
     for step in (1e-3, 1e-2):
         assert min(energy(found.value + step * rng.normal(size=found.value.shape)) for _ in range(5)) > found.energy
     assert energy(0.98 * found.value) > found.energy and energy(1.02 * found.value) > found.energy
 
 
-def test_energies_never_rise(variant):
-    problem, *_ = sphere_problem(1e-4, 1e-3, 0.05, size=48)
-    solved = gauss_newton(problem, tolerance=1e-6)
+def test_energies_never_rise():
+    solved = solved_sphere(sphere_problem(1e-4, 1e-3, size=48)[0], 1e-6)
     total = np.sum([solved.energies[k] for k in solved.energies], axis=0)
-    assert np.all(np.diff(total) <= 1e-9)
+    assert np.all(np.diff(total) <= 0)
     assert len(total) > 3
 
 
-def test_gradient_and_blocks_match_finite_differences(variant):
-    problem, base, _, _ = sphere_problem(0.0, 0.0, size=24)
+@pytest.mark.parametrize(("w1", "w2"), [(0.0, 0.0), (1e-2, 0.0), (0.0, 0.5)])
+def test_the_gradient_is_that_of_finite_differences(w1, w2):
+    problem, base, _, _ = sphere_problem(w1, w2, size=24)
     rng = np.random.default_rng(1)
-    x = 0.1 * rng.normal(size=(len(base), 2))
-    _, system = problem.linearize(*problem.load(x))
-    gradient = np.stack([np.array(g) for g in system[:2]], axis=1)
-    for i in range(2):
-        step = np.zeros_like(x)
-        step[:, i] = 2e-3
-        up, down = (np.array(problem.terms(*problem.load(x + s * step))[0]["data"]) for s in (1, -1))
-        slope = (up.astype(np.float64) - down) / 4e-3
-        assert_allclose(gradient[:, i], slope, atol=2e-3 * np.abs(slope).max())
+    x = 0.1 * rng.normal(size=2 * len(base))
+    system = problem.linearize(x)
+    for step in 1e-5 * rng.normal(size=(5, len(x))):
+        up, down = (sum(problem.energies(x + s * step).values()) for s in (1, -1))
+        assert 2.0 * system.gradient @ step == pytest.approx(0.5 * (up - down), rel=1e-3)
 
 
-def test_smoothing_spreads_corrections(variant):
+def test_a_step_solves_the_damped_equations_and_holds_what_is_frozen():
+    problem, base, _, _ = sphere_problem(1e-2, 1e-3, size=16)
+    rng = np.random.default_rng(2)
+    system = problem.linearize(0.1 * rng.normal(size=2 * len(base)))
+    frozen = rng.random(2 * len(base)) < 0.1
+    step = system.solve(0.5, frozen)
+    assert (step[frozen] == 0).all()
+    lift = 0.5 * np.repeat(np.einsum("naa->n", system.blocks), 2)
+    left = (system.product(step) + lift * step + system.gradient)[~frozen]
+    assert np.linalg.norm(left) < 0.05 * np.linalg.norm(system.gradient[~frozen])
+
+
+def test_smoothing_spreads_corrections():
     rough, base, tangents, _ = sphere_problem(0.0, 1e-3, size=48)
     smooth, *_ = sphere_problem(1e-2, 1e-3, size=48)
-    texels = bumpy_sphere(48)[0]
-    near = texel_neighbours(texels)
+    near = texel_neighbours(bumpy_sphere(48)[0])
 
     def roughness(problem):
-        n = bend(base, tangents, gauss_newton(problem).value) - base
+        n = bend(base, tangents, solved_sphere(problem).value.reshape(-1, 2)) - base
         return np.abs(4 * n - n[near].sum(1)).mean()
 
     assert roughness(smooth) < 0.5 * roughness(rough)
@@ -230,21 +233,14 @@ def test_gross_outliers_do_not_pull(scene):
     assert np.median(error) < 0.4 * angles(base, scene.normal_map)[texels.mask].mean()
 
 
-def test_refined_normals_face_the_cameras(scene):
-    from mifit.stages.observations import Surface
-
+def test_normals_stay_within_reach_of_the_meshs_whatever_the_images(scene):
     strange = {
         k: replace(f, image=np.random.default_rng(1).random(f.image.shape).astype(np.float32))
         for k, f in scene.frames.items()
     }
-    strange_scene = replace(scene, frames=strange)
-    found = refine(strange_scene, magnitude_weight=0.0, laplacian_weight=0.0).normal_object[0]
-    texels, _ = base_map(scene)
-    seen = Surface(strange_scene, scene.model, scene.geometry, CAMERAS, texels.size).observe(
-        np.arange(len(texels.index))
-    )
-    cosine = np.einsum("nc,njc->nj", texels.from_map(found), seen.view)
-    assert cosine[seen.measured > 0].min() > 0.0
+    found = refine(replace(scene, frames=strange), magnitude_weight=0.0, laplacian_weight=0.0).normal_object[0]
+    texels, base = base_map(scene)
+    assert angles(found, base)[texels.mask].max() < np.degrees(2 * np.arctan(np.sqrt(2) / 2)) + 0.1
 
 
 def test_the_same_inputs_give_the_same_normals(scene):

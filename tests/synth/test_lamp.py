@@ -32,7 +32,7 @@ def test_a_bulb_beside_a_moving_head_is_found(variant: str, tmp_path: Path) -> N
     config = ReflectanceConfig(texture_size=64, segment=False)
     found = infer_reflectance(capture, model, geometry, ("left", "right"), config)
     light = max(found.illumination.lights, key=lambda each: each.colour.sum())
-    towards = LAMP - geometry.middle
+    towards = LAMP - geometry.vertices[0].mean(axis=0)
     assert light.direction @ towards / np.linalg.norm(towards) > np.cos(np.radians(6.0))
 
 

@@ -1,46 +1,52 @@
-"""Stage 3: normals per timestep that explain the images better than the model's (paper, section 6).
+"""Stage 3: normals per timestep that explain the images better than the mesh's (paper, section 6).
+
+    E(x) = sum_images sum_texels w |I - L(n(x))|^2 + w1 |Laplacian (n(x) - n0)|_1 + w2 |n(x) - n0 - prior|^2
+
+over two tangent-plane offsets x per texel (`core.uv.bend`), reflectance and lighting held. The weight w of a texel in
+an image are the pixels that it covers. Gauss-Newton (`optim.minimize`; the paper takes Adam) with the L1 norm's
+quadratic majorant at the current point; its equations are solved by conjugate gradients.
 
 Units of the weights. The paper's images and normal maps are 8-bit: a colour of 1 is 255 steps, a unit normal spans
 127.5 steps to either side. With linear images 0..1 and unit normals its weights become
 
     w1 * 127.5 / 255^2,    w2 * 127.5^2 / 255^2 = w2 / 4.
-
-The data term sums over the pixels of the views, each shared out among the texels that it shows. Gauss-Newton with 2 x 2
-blocks per texel minimises it (the paper takes Adam); the energy and its derivatives are in `problem`.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.sparse.linalg as ssl
 from numpy.typing import NDArray
 
-from mifit.appearance.formation import Appearance
+from mifit.appearance.formation import Appearance, BentShading, form_image
 from mifit.appearance.occlusion import MeshPoints
 from mifit.config import NormalsConfig
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.mesh import normalize
 from mifit.core.process import one_blas_thread
-from mifit.core.uv import TexelMap, bend, rasterize_uv, tangent_plane, texel_neighbours
+from mifit.core.uv import TexelMap, bend, bend_jacobian, rasterize_uv, tangent_plane, texel_neighbours
 from mifit.errors import InputError
-from mifit.optim import Outcome, Solution
+from mifit.optim import Outcome, Solution, minimize
 from mifit.progress import Progress, silent
 from mifit.stages.observations import Surface
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
-    from mifit.stages.normals.problem import NormalProblem
 
-IMAGE_STEPS = 255.0
-NORMAL_STEPS = 127.5
-OUTLIER = 3.0
-"""Robust standard deviations of the residual beyond which an observation's pull stops growing."""
+IMAGE_STEPS, NORMAL_STEPS = 255.0, 127.5
+L1_FLOOR = 1e-4
+"""Radians below which the L1 norm is rounded off: sqrt(c^2 + floor^2); its reweighting stays finite."""
+MOST = 1.0
+"""Offset along either tangent at the most: 53 degrees, where a mesh of the face is never off by as much."""
+SETTLED, SOLVED = 1e-3, 0.03
+"""Part of the energy that the last step may promise, and of the residual that conjugate gradients leave."""
 
 
 @one_blas_thread()
@@ -70,43 +76,39 @@ def refine_normals(
     Returns
     -------
     NormalsEstimate
-        Unit normals in object space. Texels without a measurement keep the model's normal.
+        Unit normals in object space. Texels without a measurement keep the mesh's normal.
 
     Raises
     ------
     InputError
         No camera or timestep, or maps that aren't square and of one size.
-
-    Notes
-    -----
-    The paper's energy: squared residuals of all views, with a linear tail for outliers, ``laplacian_weight`` times the
-    L1 norm of the correction's Laplacian, ``magnitude_weight`` times its squared length.
     """
     began = time.perf_counter()
-    size = check_maps(reflectance)
-    texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
-    normals, energies, warnings, seconds = [], {}, [], []
-    outcomes = []
+    texels = rasterize_uv(model.uv, model.faces_uv, check_maps(reflectance), model.face_mask)
+    frames, warnings = [], []
     for i, timestep in enumerate(geometry.timesteps):
         progress("refine normals", i, len(geometry.timesteps))
-        frame = refine_frame(capture, model, geometry.at((timestep,)), reflectance, cameras, config, texels, seed=seed)
-        normals.append(texels.to_map(frame.normal_object))
-        if frame.measured == 0.0:
+        at = geometry.at((timestep,))
+        frames.append(refine_frame(capture, model, at, reflectance, cameras, config, texels, seed=seed))
+        if frames[-1].measured == 0.0:
             text = f"timestep {timestep}: no camera measures the face; normals are the model's"
             warnings.append(Diagnostic("face-unseen", text))
-        outcomes.append(frame.outcome)
-        seconds.append(frame.seconds)
-        for name, values in frame.energies.items():
-            energies[f"{name} {timestep}"] = values
     progress("refine normals", len(geometry.timesteps), len(geometry.timesteps))
-    longest = max((len(v) for v in energies.values()), default=0)
+    solutions = [frame.solution for frame in frames]
+    energies = {
+        f"{name} {timestep}": values
+        for timestep, solution in zip(geometry.timesteps, solutions, strict=True)
+        for name, values in (solution.energies if solution else {}).items()
+    }
+    longest = max((len(values) for values in energies.values()), default=0)
     report = Report(
-        Outcome.worst(outcomes).value,
+        Outcome.worst(solution.outcome for solution in solutions if solution).value,
         {name: values + values[-1:] * (longest - len(values)) for name, values in energies.items()},
         time.perf_counter() - began,
         tuple(warnings),
-        {"seconds_per_timestep": seconds},
+        {"seconds_per_timestep": [solution.seconds if solution else 0.0 for solution in solutions]},
     )
+    normals = [texels.to_map(frame.normal_object) for frame in frames]
     return NormalsEstimate(geometry.timesteps, np.stack(normals), report)
 
 
@@ -118,24 +120,15 @@ class FrameNormals:
     ----------
     normal_object : (N, 3) float32
         Unit normals per covered texel, object space.
-    base_object : (N, 3) float32
-        The model's normals there.
     measured : float
         Part of the texels that some camera measures.
-    outcome : Outcome
-        How the solver ended; converged where no texel is measured.
-    energies : dict
-        Per term, before and after each iteration.
-    seconds : float
-        Wall time of the solver.
+    solution : Solution or None
+        None where no texel is measured.
     """
 
     normal_object: NDArray[np.float32]
-    base_object: NDArray[np.float32]
     measured: float
-    outcome: Outcome
-    energies: dict[str, list[float]]
-    seconds: float
+    solution: Solution | None
 
 
 @one_blas_thread()
@@ -156,24 +149,20 @@ def refine_frame(
     to instead of to zero, and from which it starts.
     """
     problem, rows, base = frame_problem(capture, model, geometry, reflectance, cameras, config, texels, prior, seed)
-    rotation = geometry.rotation[0]
     offsets = np.zeros((len(base), 2)) if prior is None else prior.copy()
-    began = time.perf_counter()
     solution = None
     if problem is not None:
-        solution = gauss_newton(problem, config.max_iterations, start=None if prior is None else prior[rows])
-        offsets[rows] = solution.value
-    elapsed = time.perf_counter() - began
-    base_object = base @ rotation
-    found = normalize(bend(base_object, tangent_plane(base_object), offsets))
-    return FrameNormals(
-        found.astype(np.float32),
-        base_object.astype(np.float32),
-        len(rows) / max(len(base), 1),
-        Outcome.CONVERGED if solution is None else solution.outcome,
-        {} if solution is None else solution.energies,
-        elapsed,
-    )
+        solution = solve_normals(problem, config.max_iterations, offsets[rows])
+        offsets[rows] = solution.value.reshape(-1, 2)
+    found = normalize(bend(base, tangent_plane(base), offsets))
+    return FrameNormals(found.astype(np.float32), len(rows) / max(len(base), 1), solution)
+
+
+def solve_normals(problem: NormalProblem, max_iterations: int, start: NDArray, tolerance: float = SETTLED) -> Solution:
+    """Minimise from offsets (N, 2)."""
+    flat = np.clip(start, -MOST, MOST).ravel()
+    most = np.full(len(flat), MOST)
+    return minimize(problem, flat, lower=-most, upper=most, max_iterations=max_iterations, energy_tolerance=tolerance)
 
 
 def frame_problem(
@@ -189,104 +178,191 @@ def frame_problem(
 ) -> tuple[NormalProblem | None, NDArray, NDArray]:
     """The optimisation of one timestep, the texels (rows of ``texels``) that it solves for, and all base normals.
 
-    Without a measured texel there is no optimisation: None.
+    Normals are those of object space. Without a measured texel there is no optimisation: None.
     """
-    from mifit.stages.normals.problem import NormalProblem, NormalView, residual_scale, texel_shade
-
     rotation = geometry.rotation[0]
     surface = Surface(capture, model, geometry, cameras, texels.size, texels=texels)
     seen = surface.observe(np.arange(len(texels.index)))
-    base = seen.normal[:, 0].astype(np.float64)
+    base = seen.normal[:, 0].astype(np.float64) @ rotation
     rows = np.flatnonzero((seen.measured > 0).any(1))
     if not len(rows):
         return None, rows, base
     part = seen.take(rows)
-    object_normal = base[rows] @ rotation
-    object_tangents = tangent_plane(object_normal)
-    tangents = object_tangents @ rotation.T
-    views = [
-        NormalView(part.colour[:, j], part.measured[:, j], part.view[:, j], base[rows], tangents)
-        for j in range(len(part.step))
-    ]
     diffuse, specular = (texels.from_map(m)[rows] for m in (reflectance.lit_diffuse, reflectance.specular))
     appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: texels.from_map(m)[rows]))
-    points = MeshPoints(part.point[:, 0], base[rows], part.face, part.barycentric)
+    world = part.normal[:, 0]
+    points = MeshPoints(part.point[:, 0], world, part.face, part.barycentric)
     occlusion = appearance.trace(surface.meshes[0], points, seed)
-    shade = texel_shade(appearance, diffuse, specular, views, occlusion, points.position)
+    ambient = appearance.illumination.ambient
+    views = []
+    for j in range(len(part.step)):
+        shading = BentShading(appearance, world, part.view[:, j], occlusion)
+
+        def shade(n: NDArray, turns: Sequence[NDArray] = (), shading=shading) -> tuple[NDArray, list[NDArray]]:
+            d, s, slopes = shading(n @ rotation.T, [turn @ rotation.T for turn in turns])
+            image = form_image(ambient, diffuse, d, specular[:, None], s)
+            return image, [form_image(0.0, diffuse, turned, specular[:, None], sheen) for turned, sheen in slopes]
+
+        views.append(NormalView(part.colour[:, j], part.measured[:, j], shade))
     patch = TexelMap(texels.size, texels.index[rows], texels.face[rows], texels.weights[rows])
-    prior_correction = None
-    if prior is not None:
-        prior_correction = bend(object_normal, object_tangents, prior[rows]) - object_normal
     problem = NormalProblem(
-        object_normal,
-        object_tangents,
+        base[rows],
+        tangent_plane(base[rows]),
         texel_neighbours(patch),
         views,
-        shade,
         config.laplacian_weight * NORMAL_STEPS / IMAGE_STEPS**2,
         config.magnitude_weight * (NORMAL_STEPS / IMAGE_STEPS) ** 2,
-        OUTLIER * max(residual_scale(views, shade), 1e-4) if config.robust else np.inf,
-        prior_correction,
+        None if prior is None else prior[rows],
     )
     return problem, rows, base
 
 
-def gauss_newton(
-    problem: NormalProblem,
-    max_iterations: int = 20,
-    tolerance: float = 1e-3,
-    start: NDArray | None = None,
-    progress: Progress = silent,
-) -> Solution:
-    """Minimise by Gauss-Newton with 2 x 2 blocks per texel.
+@dataclass(frozen=True)
+class NormalView:
+    """One image of N texels.
 
-    The L1 norm is replaced by its quadratic majorant at the current point (iteratively reweighted least squares);
-    the joint system is solved by conjugate gradients with block-diagonal preconditioning. A step that raises the
-    energy is taken back and damped (Levenberg-Marquardt). Ends when the energy falls by less than ``tolerance``,
-    relative.
+    Attributes
+    ----------
+    colour : (N, 3), weight : (N,)
+        Linear image colour, and weight of its squared residual; 0 where the image doesn't measure the texel.
+    shade : callable
+        Image colour (N, 3) of normals (N, 3), and its derivatives along changes of the normals.
     """
-    import drjit as dr
 
-    from mifit.stages.normals.problem import stored_offsets, term_totals
+    colour: NDArray
+    weight: NDArray
+    shade: Callable[..., tuple[NDArray, list[NDArray]]]
 
-    began = time.perf_counter()
-    a, b = problem.facing(*problem.load(None), *problem.load(start))
-    local, system = problem.linearize(a, b)
-    rough = problem.roughness(a, b)
-    totals = term_totals(local, rough)
-    history = {name: [value] for name, value in totals.items()}
-    damping, outcome = problem.zeros(), Outcome.MAX_ITERATIONS
-    iteration = rejected = 0
-    if not np.isfinite(sum(totals.values())):
-        outcome, max_iterations = Outcome.DIVERGED, 0
-    for iteration in range(max_iterations):
-        progress("normals", iteration, max_iterations)
-        x, y = problem.facing(a, b, *problem.step(a, b, system, damping))
-        found, new_system = problem.linearize(x, y)
-        # Data and magnitude are separable: a texel whose own energy rises stays, and steps shorter next time.
-        worse = ~(sum(found.values()) <= 1.0001 * sum(local.values()) + 1e-9)  # also where it is NaN
-        x, y = dr.select(worse, a, x), dr.select(worse, b, y)
-        found = {name: dr.select(worse, local[name], value) for name, value in found.items()}
-        new_rough = problem.roughness(x, y)
-        after = term_totals(found, new_rough)
-        before = sum(totals.values())
-        increased = sum(after.values()) > before
-        damping = dr.select(worse | increased, dr.maximum(8.0 * damping, 0.05), 0.25 * damping)
-        dr.eval(damping, x, y)
-        if increased:
-            rejected += 1
-            continue
-        system = tuple(dr.select(worse, old, new) for old, new in zip(system, new_system, strict=True))
-        a, b, local, rough, totals = x, y, found, new_rough, after
-        dr.eval(system, local)
-        for name, value in totals.items():
-            history[name].append(value)
-        if before - sum(totals.values()) <= tolerance * before:
-            outcome = Outcome.CONVERGED
-            break
-    progress("normals", max_iterations, max_iterations)
-    seconds = time.perf_counter() - began
-    return Solution(stored_offsets(a, b), outcome, history, None, iteration + 1, iteration + 2, rejected, seconds)
+
+class NormalProblem:
+    """Normals of N texels, a `mifit.optim.minimize.Problem` over their offsets (2 N,).
+
+    Parameters
+    ----------
+    normals : (N, 3), tangents : (N, 2, 3)
+        Base normals and tangents in which corrections are smoothed and measured.
+    neighbours : (N, 4)
+        `core.uv.texel_neighbours`.
+    views : sequence of NormalView
+    laplacian_weight, magnitude_weight : float
+        w1, w2, for images in linear 0..1 and unit normals.
+    prior : (N, 2), optional
+        Offsets of the correction that the magnitude term pulls to; zero by default.
+    """
+
+    def __init__(
+        self,
+        normals: NDArray,
+        tangents: NDArray,
+        neighbours: NDArray,
+        views: Sequence[NormalView],
+        laplacian_weight: float,
+        magnitude_weight: float,
+        prior: NDArray | None = None,
+    ) -> None:
+        self.normals, self.tangents, self.neighbours, self.views = normals, tangents, neighbours, views
+        self.w1, self.w2 = laplacian_weight, magnitude_weight
+        self.prior = np.zeros_like(normals) if prior is None else bend(normals, tangents, prior) - normals
+
+    def energies(self, x: NDArray) -> dict[str, float]:
+        """Energy per term."""
+        n = bend(self.normals, self.tangents, x.reshape(-1, 2))
+        data = 0.0
+        for view in self.views:
+            rows = view.weight > 0
+            residual = (view.colour - view.shade(n)[0])[rows].astype(np.float64)
+            data += float((view.weight[rows] * (residual**2).sum(1)).sum())
+        delta = n - self.normals
+        rough = np.sqrt(graph_laplacian(delta, self.neighbours) ** 2 + L1_FLOOR**2).sum() if self.w1 else 0.0
+        magnitude = ((delta - self.prior) ** 2).sum()
+        return {"data": data, "laplacian": float(self.w1 * rough), "magnitude": float(self.w2 * magnitude)}
+
+    def linearize(self, x: NDArray) -> NormalSystem:
+        """Gradient and blocks at x."""
+        offsets = x.reshape(-1, 2)
+        n = bend(self.normals, self.tangents, offsets)
+        turns = bend_jacobian(self.normals, self.tangents, offsets)
+        gradient, blocks = np.zeros((len(n), 2)), np.zeros((len(n), 2, 2))
+        for view in self.views:
+            image, slopes = view.shade(n, [turns[:, 0], turns[:, 1]])
+            rows = (view.weight > 0)[:, None]
+            residual = np.where(rows, view.colour - image, 0.0)
+            columns = np.where(rows[..., None], np.stack(slopes, axis=1), 0.0)
+            weighted = view.weight[:, None, None] * columns
+            gradient -= np.einsum("nac,nc->na", weighted, residual)
+            blocks += np.einsum("nac,nbc->nab", weighted, columns)
+        delta = n - self.normals
+        blocks += self.w2 * np.einsum("nac,nbc->nab", turns, turns)
+        pull, stiffness = self.w2 * (delta - self.prior), np.zeros_like(delta)
+        if self.w1:
+            # w |c| <= w / 2 (c^2 / |c0| + |c0|): the majorant's Hessian is w / |c0|.
+            curvature = graph_laplacian(delta, self.neighbours)
+            stiffness = 0.5 * self.w1 / np.sqrt(curvature**2 + L1_FLOOR**2)
+            pull = pull + graph_laplacian(stiffness * curvature, self.neighbours)
+        gradient += np.einsum("nac,nc->na", turns, pull)
+        return NormalSystem(gradient.ravel(), blocks, turns, stiffness, self.neighbours)
+
+
+@dataclass(frozen=True)
+class NormalSystem:
+    """Normal equations: a 2 x 2 block per texel, and the Laplacian that ties neighbours.
+
+    Attributes
+    ----------
+    gradient : (2 N,)
+    blocks : (N, 2, 2)
+    turns : (N, 2, 3)
+        Derivatives of the normals by the offsets.
+    stiffness : (N, 3)
+        Weight of each component of the Laplacian.
+    neighbours : (N, 4)
+    """
+
+    gradient: NDArray[np.float64]
+    blocks: NDArray[np.float64]
+    turns: NDArray[np.float64]
+    stiffness: NDArray[np.float64]
+    neighbours: NDArray[np.int64]
+
+    def product(self, step: NDArray) -> NDArray[np.float64]:
+        """H times a vector (2 N,)."""
+        offsets = step.reshape(-1, 2)
+        out = np.einsum("nab,nb->na", self.blocks, offsets)
+        if self.stiffness.any():
+            bent = graph_laplacian(np.einsum("nac,na->nc", self.turns, offsets), self.neighbours)
+            out += np.einsum("nac,nc->na", self.turns, graph_laplacian(self.stiffness * bent, self.neighbours))
+        return out.ravel()
+
+    def solve(self, damping: float, frozen: NDArray[np.bool_], gradient: NDArray | None = None) -> NDArray[np.float64]:
+        """Damped step by conjugate gradients, preconditioned by the diagonal blocks of the whole matrix."""
+        own = self.blocks.copy()
+        for component in range(3):
+            around = self.stiffness[self.neighbours, component].sum(1) + 16.0 * self.stiffness[:, component]
+            turn = self.turns[..., component]
+            own += around[:, None, None] * turn[:, :, None] * turn[:, None, :]
+        lift = damping * np.einsum("naa->na", self.blocks) + 1e-12
+        own[:, [0, 1], [0, 1]] += lift
+        inverse, free, size = np.linalg.inv(own), ~frozen, len(frozen)
+
+        def apply(step: NDArray) -> NDArray:
+            moved = np.where(free, step, 0.0)
+            return np.where(free, self.product(moved) + lift.ravel() * moved, step)
+
+        def precondition(right: NDArray) -> NDArray:
+            return np.where(free, np.einsum("nab,nb->na", inverse, right.reshape(-1, 2)).ravel(), right)
+
+        right = np.where(free, -(self.gradient if gradient is None else gradient), 0.0)
+        matrix, near = (ssl.LinearOperator((size, size), each) for each in (apply, precondition))
+        return np.asarray(ssl.cg(matrix, right, rtol=SOLVED, maxiter=60, M=near)[0])
+
+    def covariance_diagonal(self) -> NDArray[np.float64]:
+        """Diagonal of the inverse of the texels' own blocks: with the neighbours held."""
+        return np.einsum("naa->na", np.linalg.inv(self.blocks + 1e-12 * np.eye(2))).ravel()
+
+
+def graph_laplacian(values: NDArray, neighbours: NDArray) -> NDArray:
+    """Degree times values (N, 3) less the neighbours' (N, 4): symmetric."""
+    return 4.0 * values - values[neighbours].sum(1)
 
 
 def check_maps(reflectance: ReflectanceEstimate) -> int:

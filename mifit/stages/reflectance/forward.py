@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.formation import Appearance
-from mifit.appearance.illumination import Illumination, Light
+from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
 from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, VertexTransfer
@@ -58,7 +57,7 @@ class Forward:
         return self.appearance.lobe
 
     @property
-    def lights(self) -> tuple[Light, ...]:
+    def lights(self) -> tuple[DistantLight, ...]:
         """The compact lights."""
         return self.appearance.illumination.lights
 
@@ -81,7 +80,7 @@ class Forward:
         """The same with another lobe."""
         return replace(self, appearance=replace(self.appearance, lobe=lobe))
 
-    def with_lights(self, lights: tuple[Light, ...]) -> Forward:
+    def with_lights(self, lights: tuple[DistantLight, ...]) -> Forward:
         """The same with other compact lights."""
         return replace(self, appearance=replace(self.appearance, illumination=Illumination.dark(self.order, lights)))
 
@@ -91,7 +90,7 @@ class Forward:
         ``light`` (K, 3) matters to models that turn with the lighting alone.
         """
         n, j = seen.weight.shape
-        found = self.under(light).transfers(*_flat(seen), self.occlusion(seen), _points(seen))
+        found = self.under(light).transfers(*_flat(seen), self.occlusion(seen))
         return found[0].reshape(n, j, -1), self._gloss(found[1].reshape(n, j, -1))
 
     def shade(self, seen: Observations, light: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -102,7 +101,7 @@ class Forward:
         for start in range(0, n, step):
             rows = slice(start, start + step)
             part = seen.take(rows)
-            d, s = appearance.shade(*_flat(part), self.occlusion(part), _points(part))
+            d, s = appearance.shade(*_flat(part), self.occlusion(part))
             diffuse[rows], specular[rows] = d.reshape(-1, j, 3), s.reshape(-1, j, 3)
         return diffuse, self._gloss(specular)
 
@@ -116,7 +115,7 @@ class Forward:
         steps = [self.appearance.trace(mesh, _surface_points(seen, t)) for t, mesh in enumerate(self.meshes)]
         transfer = None
         if self.model.needs_shadows:
-            transfer = VertexTransfer.joined([cast(VertexTransfer, s.transfer) for s in steps], seen.step)
+            transfer = VertexTransfer.joined([s.transfer for s in steps if s.transfer is not None], seen.step)
         visible = tuple(
             np.stack(bits, axis=1)[:, seen.step].ravel() for bits in zip(*(s.visible for s in steps), strict=True)
         )
@@ -146,11 +145,6 @@ class Forward:
 def _flat(seen: Observations) -> tuple[NDArray, NDArray]:
     """Normals and views (N * J, 3)."""
     return seen.image_normal.reshape(-1, 3), seen.view.reshape(-1, 3)
-
-
-def _points(seen: Observations) -> NDArray:
-    """World positions (N * J, 3)."""
-    return seen.point[:, seen.step].reshape(-1, 3)
 
 
 def _surface_points(seen: Observations, step: int) -> MeshPoints:

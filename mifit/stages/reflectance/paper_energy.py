@@ -1,0 +1,166 @@
+"""The paper's objective of stage 2 as it stands, and its minimum.
+
+    E(l, C_d, C_s) = E_O + lambda_S E_S + lambda_H E_H
+
+E_O are squared residuals of all measured pixels, E_S those of what differs between the views of a time, E_H the L1
+norm of the Laplacians of the diffuse offset and of the specular map. No weight is robust and there is no other prior.
+Lighting for the maps and maps for the lighting take turns, each the minimum of the whole objective.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.appearance.formation import form_image
+from mifit.config import ReflectanceConfig
+from mifit.optim import Outcome
+from mifit.progress import Progress
+from mifit.stages.observations import Observations, Surface
+from mifit.stages.reflectance.als import Fitted, lighting_of_subset, solve_texels
+from mifit.stages.reflectance.forward import Forward
+from mifit.stages.reflectance.lighting import LightingSolution
+from mifit.stages.reflectance.maps import laplacian
+
+ROUNDS = 20
+"""Rounds at the most."""
+LENGTHS = (3.0, 1.0, 0.3, 0.1)
+"""Step lengths of the lighting that are tried: alternation creeps, so the longer step is right more often than not."""
+SETTLED = 1e-3
+"""Part of the objective by which the last round may still lower it."""
+
+
+def fit_paper(
+    surface: Surface, forward: Forward, albedo: NDArray, config: ReflectanceConfig, seed: int, progress: Progress
+) -> Fitted:
+    """Minimise the objective over lighting and maps; parameters as in `als.fit_als`.
+
+    Under a model whose highlight turns with the lighting, its direction is held in a step, which is shortened until it
+    lowers the objective.
+    """
+    found, prior = lighting_of_subset(surface, forward, albedo, config, seed)
+    solved = solve_texels(surface, forward, found, prior, config, progress)
+    terms = energies(surface, forward, found.light, found.ambient, solved.maps, albedo, config)
+    history = {name: [value] for name, value in terms.items()}
+    outcome = Outcome.MAX_ITERATIONS
+    for _ in range(ROUNDS):
+        light, ambient = exact_lighting(surface, forward, found, solved.maps, config)
+        before = sum(terms.values())
+        for length in LENGTHS:
+            trial = replace(
+                found,
+                light=found.light + length * (light - found.light),
+                ambient=max(found.ambient + length * (ambient - found.ambient), 0.0),
+            )
+            trial_maps = solve_texels(surface, forward, trial, prior, config, progress, start=solved.maps)
+            terms = energies(surface, forward, trial.light, trial.ambient, trial_maps.maps, albedo, config)
+            if sum(terms.values()) < before:
+                break
+        else:  # no step lowers the objective, however short
+            outcome = Outcome.STALLED
+            break
+        found, solved = trial, trial_maps
+        for name, value in terms.items():
+            history[name].append(value)
+        if before - sum(terms.values()) < SETTLED * before:
+            outcome = Outcome.CONVERGED
+            break
+    return Fitted(forward.under(found.light, found.ambient), solved, history, outcome)
+
+
+def energies(
+    surface: Surface,
+    forward: Forward,
+    light: NDArray,
+    ambient: float,
+    maps: NDArray,
+    albedo: NDArray,
+    config: ReflectanceConfig,
+) -> dict[str, float]:
+    """Data, specular difference and smoothness terms (paper, section 5), weighted by their lambdas.
+
+    Every measured pixel has the weight of its area, clipped ones have none.
+
+    Parameters
+    ----------
+    surface : Surface
+    forward : Forward
+    light : (K, 3)
+        The lighting unknowns.
+    ambient : float
+    maps : (S, S, 4)
+        Diffuse and specular albedo.
+    albedo : (N, 3)
+        Diffuse albedo of the model, from which the offset is counted.
+    config : ReflectanceConfig
+        Its lambdas.
+    """
+    values = maps.reshape(-1, 4)[surface.texels.index]
+    data = difference = 0.0
+    for chunk in surface.chunks():
+        seen = surface.observe(chunk)
+        diffuse_light, specular_light = forward.shade(seen, light)
+        weight = seen.measured[..., None]
+        x, y = values[chunk, None, :3], values[chunk, 3, None, None]
+        residual = seen.colour - form_image(np.float32(ambient), x, diffuse_light, y, specular_light)
+        data += float((weight * residual**2).sum())
+        for a, b in surface.pairs:
+            both = np.minimum(weight[:, a], weight[:, b])
+            reflected = y[:, 0] * (specular_light[:, a] - specular_light[:, b])
+            difference += float((both * (seen.colour[:, a] - seen.colour[:, b] - reflected) ** 2).sum())
+    offset = maps.copy()
+    offset[..., :3] -= surface.texels.to_map(albedo.astype(maps.dtype))
+    rough = np.abs(laplacian(offset))[surface.texels.mask].sum(0)
+    return {
+        "data": data,
+        "difference": config.specular_difference_weight * difference,
+        "smoothness": float(config.smoothness_weight * (rough[:3].sum() + config.specular_smoothness * rough[3])),
+    }
+
+
+def exact_lighting(
+    surface: Surface, forward: Forward, found: LightingSolution, maps: NDArray, config: ReflectanceConfig
+) -> tuple[NDArray[np.float64], float]:
+    """Lighting, and for models that have it ambient, that minimise data and difference terms for the maps given.
+
+    A highlight's direction stays that of ``found``.
+    """
+    k = forward.unknowns
+    system, right = np.zeros((3 * k + 1, 3 * k + 1)), np.zeros(3 * k + 1)
+    values = maps.reshape(-1, 4)[surface.texels.index]
+    for chunk in surface.chunks(8 * k):
+        seen = surface.observe(chunk)
+        diffuse, specular = forward.transfers(seen, found.light)
+        ambient = np.full((*diffuse.shape[:2], 1), float(forward.model.has_ambient), np.float32)
+        glossy = np.concatenate([values[chunk, 3][:, None, None] * specular, 0.0 * ambient], axis=-1)
+        for c in range(3):
+            rows = glossy + np.concatenate([values[chunk, c][:, None, None] * diffuse, ambient], axis=-1)
+            at = np.append(np.arange(c * k, (c + 1) * k), 3 * k)
+            square, side = lighting_equations(seen, surface.pairs, c, rows, glossy, config.specular_difference_weight)
+            system[np.ix_(at, at)] += square
+            right[at] += side
+    system += 1e-9 * float(np.trace(system)) / len(system) * np.eye(len(system))
+    solution = np.linalg.solve(system, right)
+    if solution[-1] < 0.0:
+        solution = np.append(np.linalg.solve(system[:-1, :-1], right[:-1]), 0.0)
+    return np.asarray(solution[:-1].reshape(3, k).T), float(solution[-1])
+
+
+def lighting_equations(
+    seen: Observations, pairs: NDArray, channel: int, rows: NDArray, glossy: NDArray, difference: float
+) -> tuple[NDArray, NDArray]:
+    """Normal equations of one channel's data and difference terms.
+
+    ``rows`` (N, J, K) are the derivatives of the image, ``glossy`` those of its specular part.
+    """
+    colour, weight = seen.colour[..., channel], seen.measured
+    flat = rows.reshape(-1, rows.shape[-1])
+    weighted = flat * weight.reshape(-1, 1)
+    system, right = weighted.T @ flat, weighted.T @ colour.ravel()
+    for a, b in pairs:
+        step = glossy[:, a] - glossy[:, b]
+        both = (difference * np.minimum(weight[:, a], weight[:, b]))[:, None] * step
+        system, right = system + both.T @ step, right + both.T @ (colour[:, a] - colour[:, b])
+    return system, right
