@@ -159,10 +159,9 @@ def test_the_papers_objective_falls_to_its_end(variant, shading):
     config = ReflectanceConfig(texture_size=24, shading=shading, robust=False, smoothness_weight=1e-4)
     found = infer(scene, config)
     total = np.sum([found.report.energies[k] for k in ("data", "difference", "smoothness")], axis=0)
-    assert (np.diff(total) < 0).all() and found.report.outcome in ("converged", "stalled")
+    assert (np.diff(total) < 0).all() and len(total) > 5
     assert found.report.details["objective"]["total"] == pytest.approx(total[-1], rel=1e-3)
-    if shading == "paper":  # the images' own: what is left is the smoothness of the maps
-        assert total[-1] < 0.3 * total[0]
+    assert total[-1] < 0.1 * total[0]
 
 
 @pytest.mark.parametrize(

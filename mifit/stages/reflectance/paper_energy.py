@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mifit.appearance.formation import form_image
 from mifit.config import ReflectanceConfig
+from mifit.core.sh import LUMINANCE
 from mifit.optim import Outcome
 from mifit.progress import Progress
 from mifit.stages.observations import Observations, Surface
@@ -37,8 +38,7 @@ def fit_paper(
 ) -> Fitted:
     """Minimise the objective over lighting and maps; parameters as in `als.fit_als`.
 
-    Under a model whose highlight turns with the lighting, its direction is held in a step, which is shortened until it
-    lowers the objective.
+    Under a model that turns with the lighting a step can be too long: it is shortened until it lowers the objective.
     """
     found, prior = lighting_of_subset(surface, forward, albedo, config, seed)
     solved = solve_texels(surface, forward, found, prior, config, progress)
@@ -125,20 +125,27 @@ def exact_lighting(
 ) -> tuple[NDArray[np.float64], float]:
     """Lighting, and for models that have it ambient, that minimise data and difference terms for the maps given.
 
-    A highlight's direction stays that of ``found``.
+    Where the model turns with the lighting this is a Gauss-Newton step, whose length is to be tried.
     """
-    k = forward.unknowns
+    k, turns = forward.unknowns, forward.model.turns
     system, right = np.zeros((3 * k + 1, 3 * k + 1)), np.zeros(3 * k + 1)
     values = maps.reshape(-1, 4)[surface.texels.index]
-    for chunk in surface.chunks(8 * k):
-        seen = surface.observe(chunk)
+    for chunk in surface.chunks((32 if turns else 8) * k):
+        seen, y = surface.observe(chunk), values[chunk, 3][:, None, None]
         diffuse, specular = forward.transfers(seen, found.light)
-        ambient = np.full((*diffuse.shape[:2], 1), float(forward.model.has_ambient), np.float32)
-        glossy = np.concatenate([values[chunk, 3][:, None, None] * specular, 0.0 * ambient], axis=-1)
+        slopes = [y * slope for slope in _turning(forward, seen, found.light)] if turns else []
         for c in range(3):
-            rows = glossy + np.concatenate([values[chunk, c][:, None, None] * diffuse, ambient], axis=-1)
-            at = np.append(np.arange(c * k, (c + 1) * k), 3 * k)
-            square, side = lighting_equations(seen, surface.pairs, c, rows, glossy, config.specular_difference_weight)
+            own = np.arange(c * k, (c + 1) * k)
+            glossy = np.zeros((*diffuse.shape[:2], 3 * k + 1), np.float32)
+            glossy[..., own] = y * specular
+            for band, slope in enumerate(slopes):
+                glossy[..., [band + 1, k + band + 1, 2 * k + band + 1]] += slope[..., c, None] * np.float32(LUMINANCE)
+            rows = glossy.copy()
+            rows[..., own] += values[chunk, c][:, None, None] * diffuse
+            rows[..., -1] = float(forward.model.has_ambient)
+            at = np.arange(3 * k + 1) if turns else np.append(own, 3 * k)
+            given = rows[..., at], glossy[..., at], config.specular_difference_weight
+            square, side = lighting_equations(seen, surface.pairs, c, *given)
             system[np.ix_(at, at)] += square
             right[at] += side
     system += 1e-9 * float(np.trace(system)) / len(system) * np.eye(len(system))
@@ -146,6 +153,21 @@ def exact_lighting(
     if solution[-1] < 0.0:
         solution = np.append(np.linalg.solve(system[:-1, :-1], right[:-1]), 0.0)
     return np.asarray(solution[:-1].reshape(3, k).T), float(solution[-1])
+
+
+def _turning(forward: Forward, seen: Observations, light: NDArray) -> list[NDArray[np.float32]]:
+    """Derivatives (N, J, 3) of the specular radiance by the luminance of each linear coefficient, by differences.
+
+    They are those of the highlight's direction, which is the same for the lighting at any scale: so the right-hand side
+    of the normal equations stays as it is.
+    """
+    reach, found = 1e-2 * float(np.linalg.norm(light[1:4] @ LUMINANCE)), []
+    for band in range(3):
+        change = np.zeros_like(light)
+        change[band + 1] = reach
+        ahead, behind = (forward.transfers(seen, light + sign * change)[1] for sign in (1.0, -1.0))
+        found.append(((ahead - behind) @ light.astype(np.float32)) * np.float32(0.5 / reach))
+    return found
 
 
 def lighting_equations(
