@@ -303,7 +303,7 @@ class NormalProblem:
         return NormalSystem(gradient.ravel(), blocks, turns, stiffness, self.neighbours)
 
 
-@dataclass(frozen=True)
+@dataclass
 class NormalSystem:
     """Normal equations: a 2 x 2 block per texel, and the Laplacian that ties neighbours.
 
