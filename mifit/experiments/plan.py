@@ -119,13 +119,6 @@ class Outputs:
 
 
 @settings
-class Jobs:
-    """How many runs at a time."""
-
-    jobs: int = number(1, "processes at a time on one machine", least=1, most=1024)
-
-
-@settings
 class Experiment:
     """One run: either ``fit`` with ``evaluate`` and ``relight``, or ``render`` with ``reference``."""
 
@@ -140,16 +133,9 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Run:
-    """One point of a sweep.
+    """One point of a sweep: all settings with absolute paths, and the keys that the sweep sets with their values.
 
-    Attributes
-    ----------
-    experiment : Experiment
-        All settings, paths absolute.
-    swept : dict
-        The keys that the sweep sets and their values.
-    digest : str
-        Digest of the settings, the inputs' contents and mifit's version.
+    ``digest`` is that of the settings, the inputs' contents and mifit's version.
     """
 
     experiment: Experiment
@@ -170,15 +156,7 @@ def _plain(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Plan:
-    """A validated experiment file.
-
-    Attributes
-    ----------
-    name : str
-    runs : tuple of Run
-    jobs : int
-        Processes at a time on one machine.
-    """
+    """A validated experiment file; ``jobs`` are processes at a time on one machine."""
 
     name: str
     runs: tuple[Run, ...]
@@ -186,20 +164,11 @@ class Plan:
 
 
 def load_plan(path: str | Path, overrides: Sequence[str] = (), seed: int = 0) -> Plan:
-    """Read and validate an experiment file: every run of the sweep, every input that it names.
+    """The validated content of an experiment file: every run of the sweep, every input that it names.
 
-    Parameters
-    ----------
-    path : path
-    overrides : sequence of str
-        ``KEY=VALUE`` with a dotted key and a TOML value (a bare word is a string).
-    seed : int
-        Seed of the runs where the file gives none.
-
-    Raises
-    ------
-    InputError
-        The file, a key, a value, a sweep or an input is not what it must be.
+    ``overrides`` are ``KEY=VALUE`` with a dotted key and a TOML value (a bare word is a string); ``seed`` is that of
+    the runs where the file gives none. InputError where the file, a key, a value, a sweep or an input is not what it
+    must be.
     """
     path = Path(path)
     check_file(path, MAX_SETTINGS_BYTES, "experiment file")
@@ -210,7 +179,9 @@ def load_plan(path: str | Path, overrides: Sequence[str] = (), seed: int = 0) ->
             raise InputError(f"--set {override}: expected KEY=VALUE, such as --set fit.reflectance.exponent=8")
         _assign(document, key.strip(), _toml_value(value.strip()), f"--set {override}")
     sweep = document.pop("sweep", {})
-    jobs = from_mapping(Jobs, {"jobs": document.pop("jobs", 1)}, str(path)).jobs
+    jobs = document.pop("jobs", 1)
+    if isinstance(jobs, bool) or not isinstance(jobs, int) or not 1 <= jobs <= 1024:
+        raise InputError(f"{path}: jobs: found {jobs!r}, expected a whole number from 1 to 1024")
     document.setdefault("name", path.stem)
     points = []
     for swept in _points(_with_captures(sweep, path), str(path)):
@@ -300,20 +271,17 @@ def _flatten(table: dict, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield f"{prefix}{key}", value
 
 
-SYNTHETIC_CAMERAS = ("left", "right", "third")
-"""Those of `synth.compose.place_cameras`."""
-
-
 def _resolved(e: Experiment, folder: Path, where: str) -> Experiment:
     """Check how the parts go together, and make paths absolute (relative ones are from the file's folder)."""
-    if (e.fit is None) == (e.render is None):
-        raise InputError(f"{where}: expected one of the tables [fit] and [render]")
-    if e.fit is None and (e.evaluate or e.relight):
-        raise InputError(f"{where}: [evaluate] and [relight] need [fit]")
-    if e.render is None and e.reference:
-        raise InputError(f"{where}: [reference] needs [render]")
-    if e.fit and (e.fit.capture is None) == (e.fit.synth is None):
-        raise InputError(f"{where}: fit: expected one of 'capture' and 'synth'")
+    refused = {
+        "expected one of the tables [fit] and [render]": (e.fit is None) == (e.render is None),
+        "[evaluate] and [relight] need [fit]": e.fit is None and (e.evaluate or e.relight),
+        "[reference] needs [render]": e.render is None and e.reference,
+        "fit: expected one of 'capture' and 'synth'": e.fit and (e.fit.capture is None) == (e.fit.synth is None),
+    }
+    for message, found in refused.items():
+        if found:
+            raise InputError(f"{where}: {message}")
     if e.fit and e.evaluate and e.evaluate.camera in e.fit.cameras:
         raise InputError(
             f"{where}: evaluate.camera: found {e.evaluate.camera!r}, which fit.cameras names too; "
@@ -326,9 +294,10 @@ def _resolved(e: Experiment, folder: Path, where: str) -> Experiment:
     if e.relight and e.relight.synth:
         named.append(("relight.camera", e.relight.camera))
     for key, name in named:
-        if name not in SYNTHETIC_CAMERAS:
-            known = ", ".join(SYNTHETIC_CAMERAS)
-            raise InputError(f"{where}: {key}: found {name!r}, expected one of {known}, as synthetic captures have")
+        if name not in ("left", "right", "third"):  # `synth.compose.place_cameras`
+            raise InputError(
+                f"{where}: {key}: found {name!r}, expected left, right or third, as synthetic captures have"
+            )
     e = _absolute(e, folder)
     if e.relight and e.relight.synth and (e.relight.capture is not None or e.relight.synth.env != e.relight.env):
         raise InputError(f"{where}: relight.synth: expected its 'env' to be relight.env, and no 'capture'")

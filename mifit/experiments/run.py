@@ -33,8 +33,6 @@ from mifit.experiments.tables import draw, over_subjects, runs_table, subjects_t
 from mifit.progress import Progress, silent
 from mifit.render.variant import set_fitting_variant
 
-FORMAT_VERSION = 1
-
 
 def run_experiment(
     path: str | Path,
@@ -45,28 +43,21 @@ def run_experiment(
     seed: int = 0,
     progress: Progress = silent,
 ) -> str:
-    """Run an experiment file, or what is left of it.
+    """The table of all runs of an experiment file in Markdown, once those that are left of it have run.
 
     Parameters
     ----------
     path : path
-        Experiment file.
     overrides : sequence of str
         ``KEY=VALUE`` settings that replace the file's.
     out : path, optional
-        Folder for the runs and the table; default ``out/NAME``.
+        Folder for the runs, ``summary.md`` and ``summary.json``; default ``out/NAME``.
     dask : str, optional
         Address of a Dask scheduler whose workers see the same files; default: processes of this machine.
     variant : str
         Mitsuba variant of the runs.
     seed : int
         Seed where the file gives none.
-    progress : Progress
-
-    Returns
-    -------
-    str
-        The table of all runs in Markdown, also written as ``summary.md`` and ``summary.json``.
 
     Raises
     ------
@@ -164,7 +155,7 @@ def execute(run: Run, folder: str, experiment_folder: str, variant: str) -> None
     job = _execute_fit if run.experiment.fit else _execute_render
     metrics = job(run.experiment, where, Path(experiment_folder), active)
     record = {
-        "format_version": FORMAT_VERSION,
+        "format_version": 1,
         "digest": run.digest,
         "swept": run.swept,
         "settings": dataclasses.asdict(run.experiment),

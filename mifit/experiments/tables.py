@@ -14,21 +14,14 @@ from mifit.core.files import replacing
 
 SUBJECTS = ("fit.capture", "fit.synth.seed")
 """Swept keys whose values are subjects: figures are averaged over them."""
-CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
 class Group:
     """One setting of a sweep over all its subjects.
 
-    Attributes
-    ----------
-    settings : dict
-        Swept keys other than `SUBJECTS`, with their values.
-    subjects : int
-        How many there are.
-    metrics : dict
-        Metric -> (mean, half the width of its confidence interval), None for the half width of a single subject.
+    ``settings`` are the swept keys other than `SUBJECTS`; ``metrics`` have for each metric its mean and half the width
+    of its 95 % confidence interval, None for a single subject.
     """
 
     settings: dict[str, Any]
@@ -37,17 +30,10 @@ class Group:
 
 
 def over_subjects(rows: Sequence[dict[str, Any]]) -> list[Group]:
-    """Mean and Student's t interval at `CONFIDENCE` of each metric over the subjects of every setting.
+    """Means and Student's t intervals over the subjects of every setting, in the order of the runs.
 
-    Parameters
-    ----------
-    rows : sequence of dict
-        A run each: ``swept`` and ``metrics``.
-
-    Returns
-    -------
-    list of Group
-        In the order of the runs; empty where no run names a subject. A metric that a subject lacks is left out.
+    ``rows`` are runs with ``swept`` and ``metrics``. Empty where no run names a subject; a metric that a subject lacks
+    is left out.
     """
     found: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
@@ -66,11 +52,9 @@ def _settings(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def interval(values: Sequence[float]) -> tuple[float, float | None]:
-    """Mean, and half the width of its confidence interval; None for one value."""
-    if len(values) < 2:
-        return float(values[0]), None
-    half = stats.t.ppf(0.5 * (1 + CONFIDENCE), len(values) - 1) * stats.sem(values)
-    return float(np.mean(values)), float(half)
+    """Mean, and half the width of its 95 % confidence interval; None for one value."""
+    half = float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values)) if len(values) > 1 else None
+    return float(np.mean(values)), half
 
 
 def runs_table(rows: Sequence[dict[str, Any]]) -> list[str]:
@@ -90,7 +74,7 @@ def subjects_table(groups: Sequence[Group]) -> list[str]:
         | {k: f"{m:.4g}" if half is None else f"{m:.4g} ± {half:.2g}" for k, (m, half) in group.metrics.items()}
         for group in groups
     ]
-    return ["", f"Mean and {CONFIDENCE:.0%} confidence interval over subjects:", "", *_markdown(settings, cells)]
+    return ["", "Mean and 95% confidence interval over subjects:", "", *_markdown(settings, cells)]
 
 
 def _markdown(left: Sequence[dict[str, str]], right: Sequence[dict[str, str]]) -> list[str]:
