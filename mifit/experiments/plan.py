@@ -296,7 +296,7 @@ def _resolved(e: Experiment, folder: Path, where: str) -> Experiment:
     for key, name in named:
         if name not in ("left", "right", "third"):  # `synth.compose.place_cameras`
             raise InputError(
-                f"{where}: {key}: found {name!r}, expected left, right or third, as synthetic captures have"
+                f"{where}: {key}: found {name!r}, expected one of left, right, third, as synthetic captures have"
             )
     e = _absolute(e, folder)
     if e.relight and e.relight.synth and (e.relight.capture is not None or e.relight.synth.env != e.relight.env):
