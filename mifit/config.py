@@ -23,8 +23,6 @@ from mifit.errors import InputError
 T = TypeVar("T")
 Name = Annotated[str, pydantic.Field(strict=True, pattern=r"^[^\x00]+$")]
 Index = Annotated[int, pydantic.Field(strict=True, ge=0)]
-_LONGEST_VALUE = 60  # characters of a refused value that a message repeats
-_MOST_ERRORS = 3
 
 
 def number(
@@ -403,7 +401,7 @@ def expectation(field: FieldInfo) -> str:
 
 def _message(where: str, cls: type, error: pydantic.ValidationError, table: str = "") -> str:
     """One line for all that is wrong, or for the first few; ``table``: the name of what is made."""
-    found = [_line(cls, e, [table] if table else []) for e in error.errors(include_url=False)[:_MOST_ERRORS]]
+    found = [_line(cls, e, [table] if table else []) for e in error.errors(include_url=False)[:3]]
     return (f"{where}: " if where else "") + "; ".join(dict.fromkeys(found))
 
 
@@ -471,4 +469,4 @@ def _shown(value: Any) -> str:
 
 
 def _shorter(text: str) -> str:
-    return text if len(text) <= _LONGEST_VALUE else text[:_LONGEST_VALUE] + "..."
+    return text if len(text) <= 60 else text[:60] + "..."

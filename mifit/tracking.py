@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 
 MEMORY = 4
 """Frames whose corrections make the prior of the next."""
-LOST_PIXELS = 6.0
-"""Median distance of visible landmarks from the model's, beyond which a frame counts as lost."""
 
 
 @dataclass(frozen=True)
@@ -254,7 +252,7 @@ def _follow(
     failure: ConvergenceError | None = None
     try:
         first = fit(last)
-        if error(first) <= LOST_PIXELS:
+        if error(first) <= 6.0:  # pixels, in the median
             return first, False
     except ConvergenceError as found:
         failure = found

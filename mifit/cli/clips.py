@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from mifit.capture.sources import Source
     from mifit.progress import Progress
 
-MOMENTS = 24
-"""Moments of long clips that are looked at; those that tell most are fitted."""
 ORIGIN = "origin.json"
 
 
@@ -101,7 +99,7 @@ def _make(arguments: Namespace, paths: Sequence[Path], folder: Path) -> None:
     elif arguments.calibration:
         kinds["transforms" if arguments.calibration.suffix == ".json" else "calibration"] = arguments.calibration
     length = aligned(sources, starts)[0].length
-    every = arguments.every or max(-(-length // MOMENTS), 1)
+    every = arguments.every or max(-(-length // 24), 1)
     import_capture(folder, **kinds, every=every, starts=starts, progress=progress)
     if arguments.board:
         shutil.copytree(folder.with_name("calibration"), folder / "calibration")

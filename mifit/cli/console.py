@@ -13,9 +13,6 @@ from typing import TextIO
 from mifit.core.process import set_decoding_context
 from mifit.progress import Progress, silent
 
-LINE_SECONDS = 5.0
-"""On a stream that is no terminal, at most one line of progress per label in this time."""
-
 
 def console_progress(quiet: bool = False, stream: TextIO | None = None) -> Progress:
     """Progress callable for the command line; silent when ``quiet``."""
@@ -65,7 +62,7 @@ def _lines(out: TextIO) -> Progress:
         if done == 0 or label not in started:
             started[label] = now
         last = done >= total
-        if not last and now - spoken.get(label, -LINE_SECONDS) < LINE_SECONDS:
+        if not last and now - spoken.get(label, -5.0) < 5.0:
             return
         spoken[label] = now
         print(f"{label}: {done}/{total}, {now - started[label]:.1f} s", file=out, flush=True)

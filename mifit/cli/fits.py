@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 
 DEMO: dict[str, Any] = {"model": "builtin:coarse", "width": 340, "height": 240, "spp": 32, "timesteps": 3}
 """Size of the capture that ``mifit demo`` makes: small enough for seconds, large enough to show a face."""
-DEMO_TEXELS = 256
-"""Side of its maps: a texel covers less than a pixel of that capture; 512 would add 0.15 dB and three tenths
-to the time."""
 
 
 def demo(arguments: Namespace) -> None:
@@ -78,7 +75,7 @@ def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> No
         capture,
         mifit.MorphableModel.load(DEMO["model"]),
         cameras=cameras,
-        config=FitConfig(reflectance=ReflectanceConfig(texture_size=DEMO_TEXELS)),
+        config=FitConfig(reflectance=ReflectanceConfig(texture_size=256)),
         seed=arguments.seed,
         progress=progress,
         force=True,

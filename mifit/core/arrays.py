@@ -9,6 +9,7 @@ memory it gives back when something else needs the room.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import io
 import math
 import os
@@ -17,9 +18,9 @@ import tempfile
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.lib import format as npy
@@ -30,6 +31,7 @@ from mifit.core.image import to_8_bit
 from mifit.core.limits import MAX_MODEL_BYTES, MAX_UNPACKING, UNPACKING_SLACK
 from mifit.errors import InputError
 
+T = TypeVar("T")
 _DAMAGE = (
     zipfile.BadZipFile, zlib.error, OSError, ValueError, EOFError, KeyError, struct.error,
     NotImplementedError, RuntimeError, SyntaxError, TypeError, MemoryError, tokenize.TokenError,
@@ -259,6 +261,38 @@ def read_ply(path: str | Path) -> dict[str, NDArray]:
     except Exception as error:  # whatever a damaged file makes the reader raise
         raise InputError(f"{path}: not a mesh that mifit wrote ({error}); fit again, or restore the file") from None
     return {**out, "faces": faces}
+
+
+class Recent(Generic[T]):
+    """The last few things that were made, by what they were made of."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._kept: dict[Hashable, T] = {}
+
+    def get(self, key: Hashable, make: Callable[[], T]) -> T:
+        """What was made of ``key`` before, if it is among the last, else what ``make`` returns."""
+        found = self._kept.pop(key) if key in self._kept else make()
+        self._kept[key] = found
+        while len(self._kept) > self._count:
+            del self._kept[next(iter(self._kept))]
+        return found
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._kept.clear()
+
+
+def content_key(*values: Any) -> bytes:
+    """Digest of arrays, by shape, type and content, and of plain values."""
+    digest = hashlib.blake2b()
+    for value in values:
+        if isinstance(value, np.ndarray):
+            digest.update(f"{value.shape}{value.dtype}".encode())
+            digest.update(np.ascontiguousarray(value).tobytes())
+        else:
+            digest.update(repr(value).encode())
+    return digest.digest()
 
 
 def same(a: Any, b: Any) -> bool:

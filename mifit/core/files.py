@@ -23,7 +23,6 @@ from mifit.errors import InputError
 FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
 """Error numbers that say that there is no room for what is written."""
 
-_BLOCK = 2**20
 _MACHINE = re.sub(r"[^A-Za-z0-9-]", "-", platform.node()) or "here"
 _PART = re.compile(r"\..+\." + re.escape(_MACHINE) + r"-(\d+)\.part(\.[^.]+)?")
 
@@ -132,7 +131,7 @@ def file_digest(path: str | Path, limit: int, what: str = "file") -> bytes:
     """SHA-256 of a file's content, read block by block; InputError as `opened` raises it."""
     result = hashlib.sha256()
     with opened(path, limit, what) as (stream, _):
-        while block := stream.read(_BLOCK):
+        while block := stream.read(2**20):
             result.update(block)
     return result.digest()
 

@@ -28,9 +28,6 @@ from scipy.sparse.linalg import splu
 from mifit.core.mesh import edges, face_cross, normalize
 from mifit.core.uv import TexelMap
 
-MIN_COTANGENT = 0.05
-"""Cotangent weights below are raised: obtuse and degenerate triangles would make the system indefinite."""
-
 
 class MeshUpdater:
     """Moves the free vertices of a mesh so that its faces take wanted normals.
@@ -156,7 +153,8 @@ def _cotangents(vertices: NDArray, faces: NDArray) -> NDArray:
         u, v = b - a, c - a
         area = np.linalg.norm(np.cross(u, v), axis=1)
         out[:, k] = np.sum(u * v, axis=1) / np.maximum(area, 1e-12)
-    return 0.5 * np.clip(out, MIN_COTANGENT, 1.0 / MIN_COTANGENT)
+    # Raised where small: obtuse and degenerate triangles would make the system indefinite.
+    return 0.5 * np.clip(out, 0.05, 20.0)
 
 
 def face_average(texels: TexelMap, values: NDArray, n_faces: int) -> NDArray[np.float64]:
@@ -220,10 +218,6 @@ def displacement(texels: TexelMap, faces: NDArray, vertices: NDArray, moved: NDA
     return np.sum(at * normals, axis=1)
 
 
-GROUND = 1e-8
-"""Pull to zero, relative to the membrane's own stiffness: decides for pieces of which nothing is known."""
-
-
 def membrane(
     vertices: NDArray,
     faces: NDArray,
@@ -260,7 +254,7 @@ def factored_membrane(
     """`membrane` as a function of the values alone: nearly all of its time goes into what doesn't depend on them."""
     weighted = where.T @ sp.diags(np.asarray(weight, dtype=np.float64))
     flat = cotangent_laplacian(np.asarray(vertices, dtype=np.float64), faces)
-    floor = GROUND * float(flat.diagonal().max())
+    floor = 1e-8 * float(flat.diagonal().max())
     system = weighted @ where + stiffness * (flat + floor * sp.identity(len(vertices)))
     factor = splu(sp.csc_matrix(system))
     return lambda values: factor.solve(np.asarray(weighted @ values, dtype=np.float64))

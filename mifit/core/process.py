@@ -75,13 +75,6 @@ def one_blas_thread() -> Iterator[None]:
         yield
 
 
-TRIM, MAP = -1, -3
-"""glibc's ``M_TRIM_THRESHOLD`` and ``M_MMAP_THRESHOLD``."""
-KEPT = 1 << 30
-LARGEST = 1 << 25
-"""Arrays of more bytes still come from the system and go back to it."""
-
-
 def keep_freed_memory() -> bool:
     """Keep what is freed for the arrays that come next; for programs that own their process. True where it took effect.
 
@@ -92,7 +85,8 @@ def keep_freed_memory() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError, TypeError):  # another C library
         return False
-    return bool(mallopt(TRIM, KEPT)) and bool(mallopt(MAP, LARGEST))
+    trim, map_above = -1, -3  # glibc's M_TRIM_THRESHOLD and M_MMAP_THRESHOLD
+    return bool(mallopt(trim, 1 << 30)) and bool(mallopt(map_above, 1 << 25))
 
 
 _around: Callable[[], AbstractContextManager[None]] = nullcontext

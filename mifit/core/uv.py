@@ -15,15 +15,12 @@ the viewer. Spherical coordinates about a fixed axis have two poles on the head;
 
 from __future__ import annotations
 
-import hashlib
-from collections import OrderedDict
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-KEPT_MAPS, LARGEST_KEPT = 8, 1 << 20
-"""Maps whose texels are remembered, for the stages of a fit that read the same one, and texels of the largest."""
+from mifit.core.arrays import Recent, content_key
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,7 @@ class TexelMap:
         return out.reshape(self.size, self.size)
 
 
-_kept: OrderedDict[bytes, TexelMap] = OrderedDict()
+_maps = Recent[TexelMap](4)  # stages read the same few
 
 
 def rasterize_uv(uv: NDArray, faces_uv: NDArray, size: int, face_mask: NDArray | None = None) -> TexelMap:
@@ -82,17 +79,8 @@ def rasterize_uv(uv: NDArray, faces_uv: NDArray, size: int, face_mask: NDArray |
     face_mask : (F,) bool, optional
         Faces to rasterise; all by default. Faces that reach outside [0, 1] are clipped to the map.
     """
-    digest = hashlib.blake2b(str(size).encode())
-    for array in (uv, faces_uv, *([] if face_mask is None else [face_mask])):
-        digest.update(f"{array.shape}{array.dtype}".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    key = digest.digest()
-    found = _kept.pop(key, None) or _rasterize(uv, faces_uv, size, face_mask)
-    if len(found.index) <= LARGEST_KEPT:
-        _kept[key] = found
-    while len(_kept) > KEPT_MAPS:
-        _kept.popitem(last=False)
-    return found
+    key = content_key(size, uv, faces_uv, face_mask)
+    return _maps.get(key, lambda: _rasterize(uv, faces_uv, size, face_mask))
 
 
 def _rasterize(uv: NDArray, faces_uv: NDArray, size: int, face_mask: NDArray | None) -> TexelMap:

@@ -27,10 +27,6 @@ if TYPE_CHECKING:
 
 _KINDS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
-DIELECTRIC_F0 = 0.04
-"""Reflectance at normal incidence of glTF's dielectric, which KHR_materials_specular scales."""
-STILL = 1e-4
-"""Metres at full weight by which a vertex moves so little that a morph target leaves it out."""
 SKIN, REST = range(2)
 """Materials, in their order."""
 
@@ -127,7 +123,8 @@ def write_glb(
     full = np.where((low == 0) & np.isfinite(high) & (high > 0), high, 1.0)  # coefficient of a weight of 1
     weights = np.asarray(geometry.expression[i], dtype=np.float64) / full
     targets = (model.expression * (scale * metre * full)).astype(np.float32)
-    targets *= (np.linalg.norm(targets, axis=1, keepdims=True) > STILL).astype(np.float32)
+    # Targets leave out vertices that move by less than a tenth of a millimetre at full weight.
+    targets *= (np.linalg.norm(targets, axis=1, keepdims=True) > 1e-4).astype(np.float32)
     # Base plus weighted targets is the fitted shape, to rounding.
     base = posed - targets @ weights if len(weights) else posed
 
@@ -269,7 +266,7 @@ def _skin(
                 # Reflectance is specularFactor at grazing angles, and that times 0.04 colours along the normal.
                 "specularFactor": min(lobe.factor() * peak * grazing, 1.0),
                 "specularTexture": {"index": 2},
-                "specularColorFactor": [1.0 / (DIELECTRIC_F0 * grazing)] * 3,
+                "specularColorFactor": [1.0 / (0.04 * grazing)] * 3,
             }
         },
     }

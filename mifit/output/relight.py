@@ -33,10 +33,6 @@ if TYPE_CHECKING:
 AGREEMENT = 30.0
 """PSNR in dB between fast and path-traced views below which a person is warned. Five measured environments gave 31.6 to
 36.9 dB on a fitted head, the least under a bare lamp at 256 samples a pixel."""
-MAP_ROWS = 512
-"""Rows to which an environment is reduced; finer light than 0.35 degrees makes no difference on skin."""
-
-
 Lighting = str | Path | NDArray | SHLighting | Illumination
 """What a face can be put under: an environment file or image, spherical harmonics, or everything that lights it."""
 Exposure = float | Literal["auto"]
@@ -90,14 +86,14 @@ def _level(lighting: SHLighting) -> float:
 
 
 def _environment(source: str | Path | NDArray) -> NDArray[np.float32]:
-    """A lat-long image of linear radiance, checked, of at most `MAP_ROWS` rows."""
+    """A lat-long image of linear radiance, checked, of at most 512 rows: finer light makes no difference on skin."""
     if isinstance(source, (str, Path)):
         image = read_environment(source)
     else:
         image = check_environment("environment", np.asarray(source, np.float32))
-    if image.shape[0] > MAP_ROWS:
-        width = round(image.shape[1] * MAP_ROWS / image.shape[0])
-        image = np.asarray(cv2.resize(image, (width, MAP_ROWS), interpolation=cv2.INTER_AREA), np.float32)
+    if image.shape[0] > 512:
+        width = round(image.shape[1] * 512 / image.shape[0])
+        image = np.asarray(cv2.resize(image, (width, 512), interpolation=cv2.INTER_AREA), np.float32)
     return image
 
 

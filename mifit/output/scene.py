@@ -38,9 +38,6 @@ SAMPLES = Parameter("spp", 64)
 Skin = Callable[[Mapping[str, dict[str, Any]]], Mapping[str, Any]]
 """Makes a BSDF's dictionary of those of the maps' textures."""
 
-STEEPEST = 4.0
-"""Largest slope of a normal correction: 76 degrees."""
-
 
 def write_scene(
     result: Reconstruction,
@@ -213,7 +210,7 @@ def _slopes(
     bent = normalize(texels.from_map(normal_object) @ rotation.T)
     height = np.maximum(np.sum(bent * n, axis=1), 1e-3)
     pair = np.stack([np.sum(bent * s, axis=1), np.sum(bent * np.cross(n, s), axis=1)], axis=1) / height[:, None]
-    pair *= np.minimum(1.0, STEEPEST / np.maximum(np.linalg.norm(pair, axis=1, keepdims=True), 1e-9))
+    pair *= np.minimum(1.0, 4.0 / np.maximum(np.linalg.norm(pair, axis=1, keepdims=True), 1e-9))  # 76 degrees
     flat = np.zeros((size, size, 3), dtype=np.float32)
     flat[..., :2] = texels.to_map(pair.astype(np.float32))
     return flat

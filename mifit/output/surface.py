@@ -25,10 +25,6 @@ if TYPE_CHECKING:
     from mifit.result import Reconstruction
 
 
-STIFFNESS = 1e-3
-"""Of the membrane, beside vertices whose albedo is known."""
-
-
 @dataclass(frozen=True)
 class SurfaceMaps:
     """Maps of the faces that have a place in the atlas, padded across seams; row 0 at v = 1.
@@ -152,4 +148,4 @@ def _continuation(model: MorphableModel, whole: bool) -> tuple[NDArray, NDArray,
     if len(known) == count:
         return known, uv[known], lambda values: values
     where = sp.csr_matrix((np.ones(len(known)), (np.arange(len(known)), known)), (len(known), count))
-    return known, uv[known], factored_membrane(model.mean, model.faces, where, np.ones(len(known)), STIFFNESS)
+    return known, uv[known], factored_membrane(model.mean, model.faces, where, np.ones(len(known)), 1e-3)

@@ -39,13 +39,6 @@ if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
-SAMPLES, KEPT = 60000, 8000
-"""Points drawn on the true mesh, and those kept of the ones that all fitted views see."""
-LEAST_COSINE = 0.25
-"""Between the surface and a view that sees it: no flatter."""
-NEAREST = 24
-"""Faces with the nearest middles, among which the nearest point of a mesh is looked for."""
-
 
 @dataclass(frozen=True)
 class TrueMesh:
@@ -151,9 +144,9 @@ class SurfacePoints:
 def points_seen(
     mesh: TrueMesh, capture: Capture, cameras: Sequence[str], timestep: int, seed: int = 0
 ) -> SurfacePoints:
-    """Points of the face, drawn evenly over the true surface, that all cameras see not too flat."""
+    """Points of the face, drawn evenly over the true surface, that all cameras see at a cosine of 0.25 or more."""
     whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    position, face = trimesh.sample.sample_surface(whole, SAMPLES, seed=seed)
+    position, face = trimesh.sample.sample_surface(whole, 60000, seed=seed)
     position, keep, scene = np.asarray(position), np.ones(len(face), bool), SurfaceScene(mesh.vertices, mesh.faces)
     for name in cameras:
         view = capture.camera(name)
@@ -161,8 +154,8 @@ def points_seen(
         pixel = np.clip(view.project(position).astype(int), 0, (view.width - 1, view.height - 1))
         inside = face_region(landmarks_of(capture, name, timestep), view)[pixel[:, 1], pixel[:, 0]]
         flat = -np.sum(whole.face_normals[face] * away, axis=1)
-        keep &= inside & (flat > LEAST_COSINE) & scene.visible_from(position, view.position)
-    position, face = position[keep][:KEPT], face[keep][:KEPT]
+        keep &= inside & (flat > 0.25) & scene.visible_from(position, view.position)
+    position, face = position[keep][:8000], face[keep][:8000]
     if not len(face):
         raise InputError(f"{capture.path}: cameras {', '.join(cameras)} see no point of the true mesh together")
     weights = trimesh.triangles.points_to_barycentric(whole.triangles[face], position)
@@ -184,7 +177,7 @@ def landmarks_of(capture: Capture, camera: str, timestep: int) -> NDArray[np.flo
 def nearest_points(points: NDArray, vertices: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Distance (N,) to the nearest point of a mesh, its face and its barycentric weights, for points (N, 3)."""
     triangles = np.asarray(vertices, np.float64)[faces]
-    count = min(NEAREST, len(triangles))
+    count = min(24, len(triangles))  # faces with the nearest middles
     near = cKDTree(triangles.mean(1)).query(points, count)[1].reshape(-1, count)
     found = trimesh.triangles.closest_point(triangles[near].reshape(-1, 3, 3), np.repeat(points, count, 0))
     found = found.reshape(-1, count, 3)

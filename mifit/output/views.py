@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.result import Method, Reconstruction
 
-BACKDROP = 0.35
-"""Linear grey behind the head on sheets and in animations."""
 CODECS = ("vp09", "mp4v")
 """Video codecs by preference: browsers play VP9; every OpenCV can write MPEG-4."""
 
@@ -221,8 +219,8 @@ def write_moving_pictures(
 
 
 def on_backdrop(image: NDArray) -> NDArray:
-    """Lay a linear image with coverage on grey."""
-    return image[..., :3] * image[..., 3:] + BACKDROP * (1 - image[..., 3:])
+    """A linear image with coverage, on grey of 0.35."""
+    return image[..., :3] * image[..., 3:] + 0.35 * (1 - image[..., 3:])
 
 
 def sheet(rows: Sequence[Sequence[NDArray]]) -> NDArray:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.arrays import aligned, on_device
+from mifit.core.arrays import Recent
 from mifit.core.camera import Camera
 from mifit.core.mesh import lengths
 from mifit.errors import InputError
@@ -22,8 +23,6 @@ MESH_BUFFERS = (MESH_POSITIONS, MESH_FACES, MESH_TEXCOORDS, MESH_NORMALS)
 SHADOW_EPSILON = 1e-3
 """Part of a ray's far end, relative to the scene's diagonal, in which hits count as the surface point itself."""
 
-KEPT_VIEWS, LARGEST_KEPT = 4, 1 << 20
-"""Cameras that a scene remembers what they see of it, and pixels of the largest."""
 _Hits = tuple[tuple[slice, slice], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 """Pixels, and for each of them face, two barycentric weights and depth."""
 
@@ -135,7 +134,7 @@ class SurfaceScene:
         self._parameters = mi.traverse(self.rays)
         self._key = next(k for k in self._parameters.keys() if k.endswith(MESH_POSITIONS))
         self._diagonal = _diagonal(vertices)
-        self._kept: dict[tuple, _Hits] = {}
+        self._kept = Recent[_Hits](4)
 
     def update(self, vertices: NDArray) -> None:
         """Move the mesh to new positions (V, 3) and rebuild what rays are traced against."""
@@ -148,7 +147,7 @@ class SurfaceScene:
         self._parameters.update()
         self.vertices = vertices
         self._diagonal = _diagonal(vertices)
-        self._kept = {}
+        self._kept.clear()
 
     def gbuffer(self, camera: Camera) -> GBuffer:
         """Intersect the rays through all pixel centres of an undistorted camera.
@@ -174,13 +173,16 @@ class SurfaceScene:
 
     def _hits(self, camera: Camera) -> _Hits:
         """What a camera's rays hit; the last ones are kept, since stages, pictures and masks ask for the same."""
+        if camera.width * camera.height > 1 << 20:  # four of them would fill the memory
+            return self._traced(camera)
+        key = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        full = (*key, camera.rotation.tobytes(), camera.position.tobytes())
+        return self._kept.get(full, lambda: self._traced(camera))
+
+    def _traced(self, camera: Camera) -> _Hits:
         import drjit as dr
         import mitsuba as mi
 
-        key = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-        full = (*key, camera.rotation.tobytes(), camera.position.tobytes())
-        if full in self._kept:
-            return self._kept[full]
         box = self._box(camera)
         part = tuple(len(range(size)[side]) for side, size in zip(box, (camera.height, camera.width), strict=True))
         if not all(part):
@@ -197,12 +199,7 @@ class SurfaceScene:
         u, v = (np.where(valid, np.array(x, dtype=np.float32), np.float32(0)) for x in hit.prim_uv)
         depth = np.full(t.shape, np.inf, np.float32)
         np.multiply(t, camera.rotation[2] @ directions, out=depth, where=valid, casting="same_kind")
-        found: _Hits = (box, face.reshape(part), u.reshape(part), v.reshape(part), depth.reshape(part))
-        while self._kept and len(self._kept) >= KEPT_VIEWS:
-            self._kept.pop(next(iter(self._kept)))
-        if t.size <= LARGEST_KEPT:
-            self._kept[full] = found
-        return found
+        return box, face.reshape(part), u.reshape(part), v.reshape(part), depth.reshape(part)
 
     def _box(self, camera: Camera) -> tuple[slice, slice]:
         """Rows and columns of the pixels that can show the mesh."""

@@ -14,9 +14,6 @@ from mifit.render.description import Parameter, to_mitsuba
 MITSUBA_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
 """OpenCV's camera axes (x right, y down) to Mitsuba's (x left, y up); both look along +z."""
 
-SQUARE = 1e-6
-"""Relative difference of the focal lengths up to which pixels count as square: a thousandth of a pixel in 1000."""
-
 
 def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str = "multijitter") -> dict[str, Any]:
     """The sensor of an undistorted camera, as a plain dictionary (`render.description`).
@@ -39,7 +36,7 @@ def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str =
     """
     if any(camera.distortion):
         raise InputError(f"camera {camera.name}: found lens distortion, expected an undistorted camera")
-    if abs(camera.fx / camera.fy - 1.0) <= SQUARE:
+    if abs(camera.fx / camera.fy - 1.0) <= 1e-6:  # a thousandth of a pixel in 1000
         lens: dict[str, Any] = {
             "type": "perspective",
             "fov": math.degrees(2.0 * math.atan(0.5 * camera.width / camera.fx)),

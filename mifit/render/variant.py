@@ -26,9 +26,6 @@ LLVM_SUPPORTED = 19
 FITTING_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 """Variants that the stages run under; the plugins render under any."""
 
-LEAST_THREADS = 2
-"""With one thread, as on a machine with one processor, Mitsuba 3.9 waits for ever when it reads or writes EXR."""
-
 _ENVIRONMENT = "DRJIT_LIBLLVM_PATH"
 _TRIAL = """
 import drjit as dr
@@ -182,8 +179,9 @@ def set_variant(name: str = "auto") -> str:
                 f"start a new process, where {llvm.path} will be used"
             )
     mi.set_variant(name)
-    if dr.thread_count() < LEAST_THREADS or OURS in os.environ:
-        dr.set_thread_count(max(LEAST_THREADS, threads()))
+    # With one thread, as on a machine with one processor, Mitsuba 3.9 waits for ever when it reads or writes EXR.
+    if dr.thread_count() < 2 or OURS in os.environ:
+        dr.set_thread_count(max(2, threads()))
     return name
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections import OrderedDict
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.occlusion import OccludingMesh
+from mifit.core.arrays import Recent, content_key
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize
 from mifit.render.gbuffer import SurfaceScene
@@ -81,9 +80,7 @@ def trace_mesh(
     return VisibleSurface((camera.height, camera.width), k, index[front], face[front], *single)
 
 
-KEPT_MESHES = 8
-"""Meshes whose shadows are remembered: the timesteps of a result whose views are drawn one after the other."""
-_kept: OrderedDict[bytes, OccludingMesh] = OrderedDict()
+_meshes = Recent[OccludingMesh](8)  # the timesteps of a result whose views are drawn one after the other
 
 
 def occluding_mesh(vertices: NDArray, faces: NDArray) -> OccludingMesh:
@@ -96,13 +93,5 @@ def occluding_mesh(vertices: NDArray, faces: NDArray) -> OccludingMesh:
 
     # A fit holds its vertices in double precision, its result in single: the same mesh, whose shadows are traced once.
     vertices = np.asarray(vertices, dtype=np.float64)
-    digest = hashlib.blake2b((mi.variant() or "").encode())
-    for array in (vertices, faces):
-        digest.update(f"{array.shape}{array.dtype}".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    key = digest.digest()
-    mesh = _kept.pop(key, None) or OccludingMesh(SurfaceScene(np.array(vertices), np.array(faces)))
-    _kept[key] = mesh
-    while len(_kept) > KEPT_MESHES:
-        _kept.popitem(last=False)
-    return mesh
+    key = content_key(mi.variant(), vertices, faces)
+    return _meshes.get(key, lambda: OccludingMesh(SurfaceScene(np.array(vertices), np.array(faces))))

@@ -11,7 +11,7 @@ from mifit.render import visible as occluders
 
 @pytest.fixture(autouse=True)
 def nothing_kept(variant: str) -> None:
-    occluders._kept.clear()
+    occluders._meshes.clear()
 
 
 def test_equal_arrays_share_a_mesh_and_its_shadows() -> None:
@@ -37,5 +37,4 @@ def test_a_moved_mesh_is_another_one_and_the_callers_array_may_change() -> None:
 def test_only_the_last_are_kept() -> None:
     ball = trimesh.creation.icosphere(1)
     made = [occluders.occluding_mesh(np.array(ball.vertices) * (1 + k), np.array(ball.faces)) for k in range(10)]
-    assert len(occluders._kept) == occluders.KEPT_MESHES
-    assert list(occluders._kept.values()) == made[-occluders.KEPT_MESHES :]
+    assert list(occluders._meshes._kept.values()) == made[-8:]

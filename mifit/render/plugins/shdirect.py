@@ -7,12 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from mifit.core.arrays import Recent
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
-
-LIGHT_SAMPLES = 16
-"""Points of a compact light that has an extent."""
-KEPT_LOBES = 8
 
 
 def make() -> type:
@@ -84,7 +81,7 @@ def make() -> type:
             self.hide = bool(props.get("hide_emitters", False))
             self._traced: dict[str, Any] = {}
             self._hits = FirstHits()
-            self._lobes: dict[tuple[float, int, bool], kernels.PreparedLobe] = {}
+            self._lobes = Recent[kernels.PreparedLobe](8)
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             if dr.is_jit_v(mi.Float):
@@ -257,10 +254,8 @@ def make() -> type:
             if dr.width(exponent) != 1 or dr.grad_enabled(exponent) or recording():
                 return kernels.prepare_exponent(exponent, order, normalized, fresnel)
             key = float(np.ravel(exponent)[0]), order, normalized
-            if key not in self._lobes:
-                last = dict(list(self._lobes.items())[1 - KEPT_LOBES :])
-                self._lobes = {**last, key: kernels.prepare_exponent(exponent, order, normalized)}
-            return replace(self._lobes[key], fresnel=fresnel)
+            lobe = self._lobes.get(key, lambda: kernels.prepare_exponent(exponent, order, normalized))
+            return replace(lobe, fresnel=fresnel)
 
         def _emitters(self, scene: Any) -> tuple[Any, list[Any]]:
             """The scene's `shenv`, of which there is one, and its other emitters, none of them an environment."""
@@ -277,7 +272,7 @@ def make() -> type:
         def _direct(self, scene: Any, light: Any, si: Any, active: Any) -> Any:
             """What the points reflect of a compact light that they see, averaged over a fixed pattern on it."""
             context, bsdf = mi.BSDFContext(), si.bsdf()
-            count = 1 if mi.has_flag(light.flags(), mi.EmitterFlags.Delta) else LIGHT_SAMPLES
+            count = 1 if mi.has_flag(light.flags(), mi.EmitterFlags.Delta) else 16
             total = mi.Color3f(0.0)
             for k in range(count):
                 at = mi.Point2f((k + 0.5) / count, (k * 0.6180339887498949 + 0.5) % 1.0)
