@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, from_mapping
 from mifit.core.arrays import Rows
 from mifit.core.diagnostics import Diagnostic
-from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
+from mifit.core.estimate import GeometryEstimate, NormalsEstimate, Report
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.process import one_blas_thread
 from mifit.core.uv import TexelMap, bend, rasterize_uv, tangent_plane, transport, unbend
@@ -51,17 +51,8 @@ MEMORY = 4
 class TrackedFrame:
     """One timestep as tracking leaves it.
 
-    Attributes
-    ----------
-    timestep : int
-    geometry : GeometryEstimate
-        Of this timestep alone.
-    normal_object : (S, S, 3) float32
-        Unit normals in object space; zero outside the covered texels.
-    seconds : float
-    refound : bool
-        The last pose led nowhere and landmarks found the face again.
-    warnings : tuple of Diagnostic
+    ``geometry`` is that of this timestep alone; ``normal_object`` (S, S, 3) has unit normals in object space, zero
+    outside the covered texels; ``refound``: the last pose led nowhere and landmarks found the face again.
     """
 
     timestep: int
@@ -74,61 +65,56 @@ class TrackedFrame:
 
 def track(
     capture: Capture,
-    model: MorphableModel,
-    geometry: GeometryEstimate,
-    reflectance: ReflectanceEstimate,
-    normals: NormalsEstimate | None,
-    cameras: Sequence[str],
+    result: Reconstruction,
     timesteps: Sequence[int],
     config: NormalsConfig | None = None,
     geometry_config: GeometryConfig | None = None,
-    fitted: Sequence[int] | None = None,
     seed: int = 0,
     progress: Progress = silent,
 ) -> Iterator[TrackedFrame]:
-    """Follow a fitted face through further timesteps, one frame at a time.
+    """Follow a fitted face through further timesteps; yields each frame as soon as it is done.
+
+    The caller may stop at any frame and go on later with the frames so far.
 
     Parameters
     ----------
-    capture, model
-        Images, and the model that was fitted.
-    geometry, reflectance, normals
-        Results of the three stages, and of timesteps tracked before.
-    cameras : sequence of str
-        Cameras to read; no other camera of the capture is touched.
+    capture : Capture
+        Only images of the result's cameras are read.
+    result : Reconstruction
+        With reflectance; timesteps tracked before count as frames so far.
     timesteps : sequence of int
         Timesteps to track, in this order.
     config, geometry_config : optional
         Settings of stages 3 and 1.
-    fitted : sequence of int, optional
-        Timesteps of ``geometry`` that were fitted jointly and give the reference texture; all by default.
     seed : int
     progress : Progress
         ``done`` counts frames.
 
-    Yields
-    ------
-    TrackedFrame
-        As soon as it is done; the caller may stop at any frame and go on later with the frames so far.
-
     Raises
     ------
     InputError
-        A timestep that the fit has or the capture lacks, or no camera.
+        A timestep that the result has or the capture lacks, or a result without reflectance.
     ConvergenceError
         A frame in which neither the last pose nor the landmarks find the face.
     """
     config, geometry_config = config or NormalsConfig(), geometry_config or GeometryConfig()
-    check_timesteps(capture.timesteps, geometry.timesteps, timesteps)
+    model, geometry, reflectance, normals = result.model, result.geometry, result.reflectance, result.normals
+    if reflectance is None:
+        raise InputError("track: found a result without reflectance, expected one of 'mifit fit' with all stages")
+    for timestep in timesteps:
+        if timestep not in capture.timesteps:
+            known = ", ".join(map(str, capture.timesteps))
+            raise InputError(f"timestep {timestep}: not in the capture; it has {known}")
+        if timestep in geometry.timesteps:
+            raise InputError(f"timestep {timestep}: the result has it already; name timesteps that weren't fitted")
+    cameras = [camera.name for camera in result.cameras]
     texels = rasterize_uv(model.uv, model.faces_uv, check_maps(reflectance), model.face_mask)
-    follower = Follower(capture, model, geometry, cameras, geometry_config, fitted, seed)
+    follower = Follower(capture, model, geometry, cameras, geometry_config, result.fitted, seed)
     memory = _Memory(model, texels)
     if normals is not None:
         for timestep in [t for t in geometry.timesteps if t in normals.timesteps][-MEMORY:]:
-            memory.add(
-                geometry.at((timestep,)),
-                texels.from_map(normals.normal_object[normals.timesteps.index(timestep)]),
-            )
+            refined = normals.normal_object[normals.timesteps.index(timestep)]
+            memory.add(geometry.at((timestep,)), texels.from_map(refined))
     progress("track", 0, len(timesteps))
     for done, timestep in enumerate(timesteps):
         began = time.perf_counter()
@@ -140,23 +126,14 @@ def track(
             warnings.append(Diagnostic("face-unseen", text))
         memory.add(found, frame.normal_object)
         progress("track", done + 1, len(timesteps))
-        yield TrackedFrame(
-            timestep,
-            found,
-            texels.to_map(frame.normal_object),
-            time.perf_counter() - began,
-            refound,
-            tuple(warnings),
-        )
+        seconds = time.perf_counter() - began
+        yield TrackedFrame(timestep, found, texels.to_map(frame.normal_object), seconds, refound, tuple(warnings))
 
 
 class Follower:
     """Pose and expression of further timesteps, each found from where the last one ended.
 
-    Parameters
-    ----------
-    capture, model, geometry, cameras, geometry_config, fitted, seed
-        As in `track`.
+    ``fitted`` are the timesteps of ``geometry`` that give the reference texture; all by default.
     """
 
     def __init__(
@@ -211,15 +188,6 @@ class Follower:
             warnings.append(Diagnostic("face-lost", text, "note"))
         self._last = found
         return found, refound, warnings
-
-
-def check_timesteps(known: Sequence[int], fitted: Sequence[int], wanted: Sequence[int]) -> None:
-    """Refuse timesteps that can't be tracked; InputError names them."""
-    for timestep in wanted:
-        if timestep not in known:
-            raise InputError(f"timestep {timestep}: not in the capture; it has {', '.join(map(str, known))}")
-        if timestep in fitted:
-            raise InputError(f"timestep {timestep}: the result has it already; name timesteps that weren't fitted")
 
 
 def landmark_error(
@@ -294,69 +262,29 @@ def track_into(
     capture: Capture,
     timesteps: Sequence[int],
     config: NormalsConfig | None = None,
-    geometry_config: GeometryConfig | None = None,
     seed: int = 0,
     resume: bool = False,
     progress: Progress = silent,
 ) -> Reconstruction:
-    """Track timesteps and write each into the result folder as it is done.
+    """The result with further timesteps, each written into its folder as it is done; errors as of `track`.
 
-    Parameters
-    ----------
-    folder : path
-        Folder of ``result``; extended in place.
-    result : Reconstruction
-        With reflectance.
-    capture, timesteps, config, geometry_config, seed, progress
-        As in `track`.
-    resume : bool
-        Keep the timesteps that an earlier run has tracked from the same images; those whose images, masks, landmarks
-        or cameras have changed since, and all after the first of them, are tracked anew. Without it all are.
+    With ``resume`` the timesteps that an earlier run has tracked from the same images are kept; those whose images,
+    masks, landmarks or cameras have changed since, and all after the first of them, are tracked anew. Without it all
+    are.
 
-    Returns
-    -------
-    Reconstruction
-        With the new timesteps.
-
-    Raises
-    ------
-    InputError
-        As in `track`, or a result without reflectance.
-
-    Notes
-    -----
-    The files of a frame are written before ``result.json`` names it, and ``result.json`` is replaced as a whole, so
-    a run that is killed leaves a folder with the frames finished so far. Frames depend on those before alone:
-    going on later gives what an uninterrupted run gives. Meshes and normals of a long sequence lie in a file that is
-    mapped (`core.arrays`), so that memory doesn't grow with the frames.
+    The files of a frame are written before ``result.json`` names it, so a run that is killed leaves a folder with the
+    frames finished so far. Frames depend on those before alone: going on later gives what an uninterrupted run gives.
+    Large arrays of a long sequence lie in a file that is mapped (`core.arrays`), so that memory doesn't grow with it.
     """
-    reflectance = result.reflectance
-    if reflectance is None:
-        raise InputError(f"{folder}: found a result without reflectance, expected one of 'mifit fit' with all stages")
-    tracked, fitted = result.tracked, result.fitted
-    names = [camera.name for camera in result.cameras]
-    digests = {t: capture.digest(names, [t]) for t in timesteps}
+    digests = {t: capture.digest([camera.name for camera in result.cameras], [t]) for t in timesteps}
     if resume:
         timesteps = _not_yet(result, timesteps, digests)
-    result = _without(result, [t for t in tracked if t in timesteps])
+    result = _without(result, [t for t in result.tracked if t in timesteps])
     folder = Path(folder)
-    refiner = None if result.mesh is None else mesh_refiner(result)
+    refiner = None if result.mesh is None or result.reflectance is None else mesh_refiner(result)
     with locked(folder):
         result, room = _with_room(result, len(timesteps))
-        for frame in track(
-            result.seen(capture),
-            result.model,
-            result.geometry,
-            reflectance,
-            result.normals,
-            names,
-            timesteps,
-            config,
-            geometry_config,
-            fitted,
-            seed,
-            progress,
-        ):
+        for frame in track(result.seen(capture), result, timesteps, config, seed=seed, progress=progress):
             result = extend(result, frame, refiner, digests[frame.timestep], room)
             add_timestep(result, folder, frame.timestep)
     return result
@@ -384,37 +312,30 @@ def _not_yet(result: Reconstruction, timesteps: Sequence[int], digests: Mapping[
     return [t for t in timesteps if t not in kept or (changed and t > min(changed))]
 
 
-@dataclass(frozen=True)
-class _Room:
-    """Where the large arrays of further timesteps are written; None for those that have no place of their own."""
+PER_TIMESTEP: dict[str, tuple[str, ...]] = {
+    "geometry": ("vertices", "expression", "rotation", "translation"),
+    "normals": ("normal_object",),
+    "mesh": ("vertices", "displacement"),
+}
+"""Arrays of a result's estimates that have a row for each timestep."""
+Room = dict[tuple[str, str], Rows]
+"""Where further rows of these arrays are written."""
 
-    vertices: Rows | None = None
-    normals: Rows | None = None
-    refined: Rows | None = None
-    displacement: Rows | None = None
 
-
-def _with_room(result: Reconstruction, count: int) -> tuple[Reconstruction, _Room]:
-    """A result whose large arrays lie where ``count`` further timesteps have room behind them."""
-
-    def moved(array: NDArray) -> tuple[Rows, NDArray]:
-        rows = Rows(len(array) + count, array.shape[1:], array.dtype)
-        return rows, rows.extend(array)
-
-    vertices, kept = moved(result.geometry.vertices)
-    result = replace(result, geometry=replace(result.geometry, vertices=kept))
-    refined = displacement = None
-    if result.normals is None:
-        assert result.reflectance is not None
-        normals = Rows(count, result.reflectance.diffuse.shape, np.float32)
-    else:
-        normals, kept = moved(result.normals.normal_object)
-        result = replace(result, normals=replace(result.normals, normal_object=kept))
-    if result.mesh is not None:
-        refined, meshes = moved(result.mesh.vertices)
-        displacement, kept = moved(result.mesh.displacement)
-        result = replace(result, mesh=replace(result.mesh, vertices=meshes, displacement=kept))
-    return result, _Room(vertices, normals, refined, displacement)
+def _with_room(result: Reconstruction, count: int) -> tuple[Reconstruction, Room]:
+    """A result whose arrays lie where ``count`` further timesteps have room behind them."""
+    room: Room = {}
+    if result.normals is None and result.reflectance is not None:
+        empty = np.zeros((0, *result.reflectance.diffuse.shape), np.float32)
+        result = replace(result, normals=NormalsEstimate((), empty, Report("converged")))
+    for part, names in PER_TIMESTEP.items():
+        estimate = getattr(result, part)
+        for name in names if estimate is not None else ():
+            array = getattr(estimate, name)
+            room[part, name] = Rows(len(array) + count, array.shape[1:], array.dtype)
+            estimate = replace(estimate, **{name: room[part, name].extend(array)})
+        result = replace(result, **{part: estimate})
+    return result, room
 
 
 def extend(
@@ -422,86 +343,53 @@ def extend(
     frame: TrackedFrame,
     refiner: MeshRefiner | None = None,
     digest: str = "",
-    room: _Room | None = None,
+    room: Room | None = None,
 ) -> Reconstruction:
-    """A result with one more timestep; its normals' report lists it under ``tracked``, with the images' digest.
+    """A result with one more timestep, whose images have a digest.
 
     With a refiner its refined mesh is made too. With ``room``, in which the result's arrays lie, they aren't copied.
     """
-
-    room = room or _Room()
-
-    def longer(array: NDArray, row: NDArray, rows: Rows | None) -> NDArray:
-        return np.concatenate([array, row[None]]) if rows is None else rows.add(row)
-
-    a, b = result.geometry, frame.geometry
-    geometry = replace(
-        a,
-        timesteps=(*a.timesteps, frame.timestep),
-        vertices=longer(a.vertices, b.vertices[0], room.vertices),
-        expression=np.concatenate([a.expression, b.expression]),
-        rotation=np.concatenate([a.rotation, b.rotation]),
-        translation=np.concatenate([a.translation, b.translation]),
-    )
+    rows = {name: getattr(frame.geometry, name)[0] for name in PER_TIMESTEP["geometry"]}
+    parts: dict[str, Any] = {"geometry": _longer(result.geometry, "geometry", frame.timestep, rows, room)}
     before = result.normals or NormalsEstimate((), frame.normal_object[None][:0], Report("converged"))
-    report = replace(
-        before.report,
-        seconds=before.report.seconds + frame.seconds,
-        warnings=(*before.report.warnings, *frame.warnings),
+    seconds, warnings = before.report.seconds + frame.seconds, (*before.report.warnings, *frame.warnings)
+    parts["normals"] = replace(
+        _longer(before, "normals", frame.timestep, {"normal_object": frame.normal_object}, room),
+        report=replace(before.report, seconds=seconds, warnings=warnings),
+        tracked={**before.tracked, frame.timestep: digest},
     )
-    normals = NormalsEstimate(
-        (*before.timesteps, frame.timestep),
-        longer(before.normal_object, frame.normal_object, room.normals),
-        report,
-        {**before.tracked, frame.timestep: digest},
-    )
-    mesh = result.mesh
-    if mesh is not None and refiner is not None:
+    if result.mesh is not None and refiner is not None:
         vertices, height, _ = refiner.refine(frame.geometry, frame.timestep, frame.normal_object)
-        mesh = replace(
-            mesh,
-            timesteps=(*mesh.timesteps, frame.timestep),
-            vertices=longer(mesh.vertices, vertices, room.refined),
-            displacement=longer(mesh.displacement, height, room.displacement),
-        )
-    return replace(result, geometry=geometry, normals=normals, mesh=mesh)
+        rows = {"vertices": vertices, "displacement": height}
+        parts["mesh"] = _longer(result.mesh, "mesh", frame.timestep, rows, room)
+    return replace(result, **parts)
+
+
+def _longer(estimate: Any, part: str, timestep: int, rows: Mapping[str, NDArray], room: Room | None) -> Any:
+    """An estimate with a row of each of its arrays for one more timestep."""
+    arrays = {
+        name: np.concatenate([getattr(estimate, name), row[None]]) if room is None else room[part, name].add(row)
+        for name, row in rows.items()
+    }
+    return replace(estimate, timesteps=(*estimate.timesteps, timestep), **arrays)
 
 
 def _without(result: Reconstruction, dropped: Sequence[int]) -> Reconstruction:
     """A result less some of its tracked timesteps."""
-    if not dropped or result.normals is None:
-        return result
-
-    def kept(array: NDArray, timesteps: Sequence[int]) -> NDArray:
-        rows = [i for i, t in enumerate(timesteps) if t not in dropped]
-        return Rows(len(rows), array.shape[1:], array.dtype).extend(array[i] for i in rows)
-
-    def left(timesteps: Sequence[int]) -> tuple[int, ...]:
-        return tuple(t for t in timesteps if t not in dropped)
-
-    geometry, normals, mesh = result.geometry, result.normals, result.mesh
-    if mesh is not None:
-        mesh = replace(
-            mesh,
-            timesteps=left(mesh.timesteps),
-            vertices=kept(mesh.vertices, mesh.timesteps),
-            displacement=kept(mesh.displacement, mesh.timesteps),
-        )
-    parts: dict[str, Any] = {
-        name: kept(getattr(geometry, name), geometry.timesteps)
-        for name in ("expression", "rotation", "translation", "vertices")
-    }
-    return replace(
-        result,
-        geometry=replace(geometry, timesteps=left(geometry.timesteps), **parts),
-        normals=NormalsEstimate(
-            left(normals.timesteps),
-            kept(normals.normal_object, normals.timesteps),
-            normals.report,
-            {t: digest for t, digest in normals.tracked.items() if t not in dropped},
-        ),
-        mesh=mesh,
-    )
+    parts: dict[str, Any] = {}
+    for part, names in PER_TIMESTEP.items() if dropped else ():
+        estimate = getattr(result, part)
+        if estimate is not None:
+            kept = [i for i, t in enumerate(estimate.timesteps) if t not in dropped]
+            arrays: dict[str, Any] = {}
+            for name in names:
+                array = getattr(estimate, name)
+                arrays[name] = Rows(len(kept), array.shape[1:], array.dtype).extend(array[i] for i in kept)
+            parts[part] = replace(estimate, timesteps=tuple(estimate.timesteps[i] for i in kept), **arrays)
+    if parts.get("normals") is not None:
+        left = {t: digest for t, digest in parts["normals"].tracked.items() if t not in dropped}
+        parts["normals"] = replace(parts["normals"], tracked=left)
+    return replace(result, **parts)
 
 
 class CarriedTangents:

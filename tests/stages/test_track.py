@@ -55,9 +55,12 @@ def first(scene):
 
 
 def run(scene, timesteps=(1, 2, 3), normals=None, **options):
+    from mifit.result import Reconstruction
     from mifit.tracking import track
 
-    return track(scene, scene.model, first(scene), scene.reflectance, normals, CAMERAS, timesteps, CONFIG, **options)
+    cameras = tuple(scene.cameras[c] for c in CAMERAS)
+    result = Reconstruction(scene.model, first(scene), scene.reflectance, normals, cameras=cameras)
+    return track(scene, result, timesteps, CONFIG, **options)
 
 
 def test_frames_come_one_at_a_time_from_the_last(scene, fit_truth):
