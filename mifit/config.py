@@ -84,20 +84,10 @@ def settings(cls: type[T]) -> type[T]:
 
 
 def from_mapping(cls: type[T], values: Any, where: str) -> T:
-    """Build settings from nested dictionaries; missing keys keep their defaults.
+    """Settings of a class made by `settings`, from nested dictionaries; missing keys keep their defaults.
 
-    Parameters
-    ----------
-    cls : type
-        A class made by `settings`.
-    values : dict
-    where : str
-        File or option that the values come from, for messages.
-
-    Raises
-    ------
-    InputError
-        An unknown key (the nearest known one is named) or a value of the wrong type or out of range.
+    ``where`` is the file or option that the values come from, for messages. InputError for an unknown key (the nearest
+    known one is named) or a value of the wrong type or out of range.
     """
     if not isinstance(values, dict):
         raise InputError(f"{where}: found {_shown(values)}, expected a table of settings for {cls.__name__}")

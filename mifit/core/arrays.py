@@ -51,20 +51,13 @@ def npz_keys(path: Path) -> list[str] | None:
 
 
 def read_npz(path: str | Path, keys: Iterable[str] | None = None) -> dict[str, NDArray]:
-    """Read arrays of an ``.npz`` file.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    keys : iterable of str, optional
-        Arrays to read where present; all by default.
+    """Arrays of an ``.npz`` file, those of ``keys`` that are there, or all.
 
     Raises
     ------
     InputError
-        Not an archive, truncated, an array's header disagrees with its size, an object array (which could
-        run code), or more data than a file of this size can honestly hold.
+        Not an archive, truncated, an array's header disagrees with its size, an object array (which could run code), or
+        more data than a file of this size can honestly hold.
     """
     path = Path(path)
     wanted = None if keys is None else set(keys)
@@ -128,20 +121,9 @@ IN_MEMORY = 64 * 2**20
 
 
 class Rows:
-    """Rows of one shape that come one after the other.
+    """Rows of one shape that come one after the other, at most ``count``.
 
-    Parameters
-    ----------
-    count : int
-        Number of rows there will be at most.
-    shape : tuple of int
-        Of one row.
-    dtype : DTypeLike
-
-    Raises
-    ------
-    InputError
-        No room on the disk; it is reserved now, for all rows.
+    InputError where the disk has no room; it is reserved at once, for all rows.
     """
 
     def __init__(self, count: int, shape: tuple[int, ...], dtype: DTypeLike) -> None:
@@ -208,19 +190,11 @@ def write_ply(
     albedo: NDArray,
     viewer_colours: bool = True,
 ) -> None:
-    """Write a triangle mesh, whole or not at all.
+    """Write a triangle mesh with normals (N, 3) and texture coordinates (N, 2), whole or not at all.
 
-    Parameters
-    ----------
-    vertices, normals : (N, 3)
-        Stored as float32.
-    faces : (F, 3) int
-    uv : (N, 2)
-        Properties ``u v``, v = 0 at the last row of a map.
-    albedo : (N, 3)
-        Linear reflectance 0..1: properties ``r g b``, float32, what Mitsuba reads as ``vertex_color``.
-    viewer_colours : bool
-        Also writes ``red green blue``, 8-bit sRGB, what mesh viewers show and Mitsuba warns of.
+    Properties ``u v`` have v = 0 at the last row of a map. ``albedo`` (N, 3), linear reflectance 0..1, is ``r g b``,
+    float32, what Mitsuba reads as ``vertex_color``; ``viewer_colours`` adds ``red green blue``, 8-bit sRGB, what mesh
+    viewers show and Mitsuba warns of.
     """
     from trimesh import Trimesh
     from trimesh.exchange.ply import export_ply
@@ -238,17 +212,10 @@ def write_ply(
 
 
 def read_ply(path: str | Path) -> dict[str, NDArray]:
-    """Read a PLY file that `write_ply` wrote.
+    """``vertices``, ``normals``, ``albedo`` (N, 3), ``uv`` (N, 2) float32 and ``faces`` (F, 3) int32 of a file of
+    `write_ply`.
 
-    Returns
-    -------
-    dict
-        ``vertices``, ``normals``, ``albedo`` (N, 3) float32, ``uv`` (N, 2) float32, ``faces`` (F, 3) int32.
-
-    Raises
-    ------
-    InputError
-        The file is missing, cut short or of another layout.
+    InputError where it is missing, cut short or of another layout.
     """
     from trimesh.exchange.ply import load_ply
 

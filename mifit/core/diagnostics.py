@@ -13,19 +13,11 @@ SEVERITIES: tuple[Severity, ...] = ("fault", "warning", "note")
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """One finding.
+    """One finding: ``code`` says what it is, for programs, in words with hyphens, such as ``"camera-mirrored"``.
 
-    Attributes
-    ----------
-    code : str
-        What it is, for programs: words with hyphens, e.g. ``"camera-mirrored"``.
-    text : str
-        One sentence or two: the figure found, what was expected, the remedy.
-    severity : {"fault", "warning", "note"}
-        ``"fault"``: the capture is wrong, and this names how; ``"warning"``: the result may be wrong; ``"note"``: a
-        choice of the fit that a person may want to know of.
-    camera : str or None
-        The camera that it concerns; None where it isn't one camera's.
+    ``text`` is a sentence or two: the figure found, what was expected, the remedy. ``"fault"``: the capture is wrong,
+    and this names how; ``"warning"``: the result may be wrong; ``"note"``: a choice of the fit that a person may want
+    to know of. ``camera`` is the one that it concerns, if it is one camera's.
     """
 
     code: str

@@ -179,16 +179,8 @@ def check_no_links(folder: str | Path, path: str | Path) -> None:
 def at_place(folder: str | Path, name: str, make: bool = False) -> Iterator[tuple[str | Path, int | None]]:
     """Yield the last part of ``name`` and a descriptor of the folder that it is in, for functions with ``dir_fd``.
 
-    The folders between are below ``folder`` and no links, also if somebody changes them meanwhile.
-
-    Parameters
-    ----------
-    folder : path
-        Where the user said to write; it may be a link itself.
-    name : str
-        A path below it, with ``/``.
-    make : bool
-        Make folders that are missing.
+    ``name`` is a path below ``folder``, with ``/``; the folders between are no links, also if somebody changes them
+    meanwhile; ``make`` makes those that are missing.
 
     Raises
     ------

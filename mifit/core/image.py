@@ -33,16 +33,8 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".hdr")
 class Image:
     """A decoded image file.
 
-    Attributes
-    ----------
-    pixels : (H, W, 3) float32
-        Linear Rec. 709.
-    alpha : (H, W) float32 or None
-        Coverage, 0..1, where the file has it.
-    clipped : (H, W) bool
-        Pixels with a channel at the largest code value of an integer format.
-    bits : int
-        Bits per channel in the file: 8, 16 or 32 (floating point).
+    ``pixels`` (H, W, 3) are linear Rec. 709; ``alpha`` (H, W) is coverage 0..1, where the file has it; ``clipped`` (H,
+    W) pixels have a channel at the largest code value of an integer format; ``bits`` per channel are 8, 16 or 32.
     """
 
     pixels: NDArray[np.float32]

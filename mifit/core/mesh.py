@@ -130,23 +130,11 @@ def part_of(mesh: SplitMesh, selected: NDArray[np.bool_]) -> SplitMesh:
 def tangents(
     vertices: NDArray, normals: NDArray, uv: NDArray, faces: NDArray
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Per-vertex tangents by MikkTSpace's rules for a mesh that is already split at its seams.
+    """Per-vertex unit tangents (N, 3) by MikkTSpace's rules for a mesh split at its seams, and the sign (N,) of
+    bitangents.
 
-    Every corner's face tangent is projected onto the plane of its vertex normal, normalised, weighted by the
-    corner's angle in that plane, and summed over the faces around the vertex.
-
-    Parameters
-    ----------
-    vertices, normals : (N, 3)
-    uv : (N, 2)
-    faces : (F, 3)
-
-    Returns
-    -------
-    tangent : (N, 3) float32
-        Unit length, perpendicular to the normal.
-    sign : (N,) float32
-        Bitangent = sign * cross(normal, tangent).
+    Every corner's face tangent is projected onto the plane of its vertex normal, normalised, weighted by the corner's
+    angle in that plane, and summed over the faces around the vertex. Bitangent = sign * cross(normal, tangent).
     """
     p, t = vertices[faces].astype(np.float64), uv[faces].astype(np.float64)
     e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
@@ -180,23 +168,11 @@ def _unit(v: NDArray) -> NDArray:
 def tangent_space_map(
     normal_object: NDArray, vertices: NDArray, normals: NDArray, mesh: SplitMesh, face_mask: NDArray
 ) -> NDArray[np.float32]:
-    """Turn object-space normals into MikkTSpace tangent space (OpenGL: green is up in texture space).
+    """Object-space normals (S, S, 3) in MikkTSpace tangent space (OpenGL: green is up in texture space).
 
-    Parameters
-    ----------
-    normal_object : (S, S, 3)
-        Unit normals; zero where there is none.
-    vertices, normals : (N, 3)
-        The split mesh in the same space.
-    mesh : SplitMesh
-    face_mask : (F,) bool
-        Faces that the map belongs to.
-
-    Returns
-    -------
-    (S, S, 3) float32
-        Unit vectors in the interpolated, unnormalised frame as MikkTSpace wants it; (0, 0, 1) where the input
-        is zero and outside the charts.
+    Unit vectors in the interpolated, unnormalised frame as MikkTSpace wants it; (0, 0, 1) where the input is zero and
+    outside the charts. ``vertices`` and ``normals`` (N, 3) are those of the split mesh in the same space;
+    ``face_mask`` (F,) says which faces the map belongs to.
     """
     size = normal_object.shape[0]
     texels = rasterize_uv(mesh.uv, mesh.faces, size, face_mask)

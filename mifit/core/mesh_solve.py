@@ -32,15 +32,9 @@ from mifit.core.uv import TexelMap
 class MeshUpdater:
     """Moves the free vertices of a mesh so that its faces take wanted normals.
 
-    Parameters
-    ----------
-    vertices : (V, 3), faces : (F, 3)
-        Reference mesh, e.g. a model's mean shape; only its edge weights are used.
-    free : (V,) bool
-        Vertices that may move; all others, such as those at the boundary of the face area, stay.
-    position_weight : float
-        Trust in positions relative to normals, per unit of length: detail much smaller than
-        ``1 / sqrt(position_weight)`` comes from the normals, larger shape from the positions.
+    ``vertices`` (V, 3) and ``faces`` (F, 3) are a reference mesh, of which only edge weights are used; ``free`` (V,)
+    vertices may move. ``position_weight`` is the weight of positions relative to normals, per unit of length: detail
+    much smaller than ``1 / sqrt(position_weight)`` comes from the normals, larger shape from the positions.
     """
 
     def __init__(self, vertices: NDArray, faces: NDArray, free: NDArray[np.bool_], position_weight: float) -> None:
@@ -63,28 +57,12 @@ class MeshUpdater:
     def settle(
         self, vertices: NDArray, normals: NDArray, iterations: int, tolerance: float
     ) -> tuple[NDArray[np.float64], float]:
-        """Iterate until the positions stand.
+        """Positions (V, 3) for wanted unit face normals (F, 3), and the relative change in the last iteration.
 
         Faces whose wanted normal is zero keep their own. No face turns by more than a right angle from where it was:
-        displacements that would do so are halved around it.
-
-        Parameters
-        ----------
-        vertices : (V, 3)
-            Trusted positions.
-        normals : (F, 3)
-            Wanted unit face normals.
-        iterations : int
-            At the most.
-        tolerance : float
-            Stop when an iteration moves the vertices by no more than this part of their displacement, both as root of
-            mean squares.
-
-        Returns
-        -------
-        vertices : (V, 3)
-        change : float
-            That part in the last iteration.
+        displacements that would do so are halved around it. It ends after ``iterations``, or when one moves the
+        vertices by no more than ``tolerance`` of their displacement from the given ``vertices``, both as root of mean
+        squares.
         """
         trusted = np.asarray(vertices, dtype=np.float64)
         if self._factor is None:
@@ -175,22 +153,11 @@ def rotate_between(start: NDArray, end: NDArray, vectors: NDArray) -> NDArray[np
 def wanted_face_normals(
     vertices: NDArray, faces: NDArray, texels: TexelMap, base: NDArray, refined: NDArray
 ) -> NDArray[np.float64]:
-    """Face normals that a refined normal map asks of a mesh.
+    """(F, 3) face normals that a refined normal map asks of a mesh, zero for faces without a texel.
 
-    The map's base is interpolated from vertex normals and so isn't the face's own normal; each face's normal is
-    turned by the rotation that takes the average base normal of its texels to the average refined one. A map equal
-    to its base asks for no change.
-
-    Parameters
-    ----------
-    vertices : (V, 3), faces : (F, 3)
-    texels : TexelMap
-    base, refined : (N, 3)
-        Unit normals per covered texel, in the space of the vertices.
-
-    Returns
-    -------
-    (F, 3), zero for faces without a texel.
+    The map's base is interpolated from vertex normals and so isn't the face's own normal; each face's normal is turned
+    by the rotation that takes the average ``base`` normal (N, 3) of its texels to the average ``refined`` one. A map
+    equal to its base asks for no change.
     """
     own = normalize(face_cross(np.asarray(vertices, dtype=np.float64), faces))
     before = face_average(texels, base, len(faces))
@@ -226,24 +193,11 @@ def membrane(
     weight: NDArray,
     stiffness: float,
 ) -> NDArray[np.float64]:
-    """Vertex values that fit known ones and otherwise are as flat as possible.
+    """Vertex values (V, C) that fit known ones and otherwise are as flat as possible.
 
     Minimises ``sum_i weight_i |(where x)_i - values_i|^2 + stiffness * tr(x' L x)`` with the cotangent Laplacian L of
-    the mesh: an elastic sheet over the surface, whatever the atlas. A piece of the mesh without known values gets 0.
-
-    Parameters
-    ----------
-    vertices : (V, 3), faces : (F, 3)
-        The mesh that says how far apart vertices are; only its shape counts, not its size.
-    where : (N, V) sparse
-        Interpolation from vertices to the points where values are known.
-    values : (N, C), weight : (N,)
-    stiffness : float
-        Weight of the sheet: the values about a vertex are followed where their weights are well above it.
-
-    Returns
-    -------
-    (V, C) float64
+    the mesh: an elastic sheet over the surface, whatever the atlas. ``where`` (N, V) interpolates from vertices to the
+    points where ``values`` (N, C) are known. A piece of the mesh without known values gets 0.
     """
     return factored_membrane(vertices, faces, where, weight, stiffness)(values)
 

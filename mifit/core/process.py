@@ -24,17 +24,9 @@ VARIABLES = (OURS, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS",
 
 
 def set_threads(count: int) -> None:
-    """Use so many threads; before ``set_variant``, which gives Dr.Jit its number.
+    """Use so many threads, at least 1; before ``set_variant``, which gives Dr.Jit its number.
 
-    Parameters
-    ----------
-    count : int
-        At least 1. Dr.Jit takes 2 where 1 is asked for: with one it waits for itself when images are read.
-
-    Raises
-    ------
-    InputError
-        A count below 1.
+    Dr.Jit takes 2 where 1 is asked for: with one it waits for itself when images are read.
     """
     if count < 1:
         raise InputError(f"threads: found {count}, expected a whole number of at least 1")

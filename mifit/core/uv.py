@@ -25,18 +25,10 @@ from mifit.core.arrays import Recent, content_key
 
 @dataclass(frozen=True)
 class TexelMap:
-    """Surface points of the texels of one square map.
+    """Surface points of the texels of one square map of ``size`` texels a side.
 
-    Attributes
-    ----------
-    size : int
-        Texels along one side.
-    index : (N,) int64
-        Flat index (row * size + column) of each covered texel, ascending.
-    face : (N,) int32
-        Face index of each covered texel.
-    weights : (N, 3) float32
-        Barycentric weights of the face's three corners.
+    ``index`` (N,) is the flat index (row * size + column) of each covered texel, ascending; ``face`` (N,) its face, and
+    ``weights`` (N, 3) the barycentric weights of the face's corners.
     """
 
     size: int
@@ -66,18 +58,10 @@ _maps = Recent[TexelMap](4)  # stages read the same few
 
 
 def rasterize_uv(uv: NDArray, faces_uv: NDArray, size: int, face_mask: NDArray | None = None) -> TexelMap:
-    """Find the face and the barycentric weights under the centre of every texel.
+    """The face and the barycentric weights under the centre of every texel.
 
-    Parameters
-    ----------
-    uv : (T, 2) float
-        Texture vertices in [0, 1].
-    faces_uv : (F, 3) int
-        Texture-vertex indices per face.
-    size : int
-        Map side in texels.
-    face_mask : (F,) bool, optional
-        Faces to rasterise; all by default. Faces that reach outside [0, 1] are clipped to the map.
+    ``uv`` (T, 2) are texture vertices in [0, 1], ``faces_uv`` (F, 3) their indices per face; ``face_mask`` (F,) selects
+    faces. Faces that reach outside [0, 1] are clipped to the map.
     """
     key = content_key(size, uv, faces_uv, face_mask)
     return _maps.get(key, lambda: _rasterize(uv, faces_uv, size, face_mask))

@@ -72,15 +72,9 @@ class DenseSystem:
 class ArrowSystem:
     """Normal equations of parameters shared by all blocks and parameters of each block alone.
 
-    H is an arrow: a shared block, and per block t a local block and its coupling to the shared one; blocks don't
-    see one another. Eliminating the local parameters (Schur complement) costs one small Cholesky per block.
-    Parameters are ordered shared first, then block by block.
-
-    Parameters
-    ----------
-    shared : (S, S), shared_gradient : (S,)
-    local : sequence of (P_t, P_t), local_gradient : sequence of (P_t,)
-    coupling : sequence of (S, P_t)
+    H is an arrow: ``shared`` (S, S), and per block t ``local`` (P_t, P_t) and its ``coupling`` (S, P_t) to the shared
+    one; blocks don't see one another. Eliminating the local parameters (Schur complement) costs one small Cholesky per
+    block. Parameters are ordered shared first, then block by block.
     """
 
     def __init__(

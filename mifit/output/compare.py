@@ -134,22 +134,13 @@ def _channel_scale(a: NDArray, b: NDArray) -> NDArray:
 def separation(
     diffuse: NDArray, specular: NDArray, true_diffuse: NDArray, true_specular: NDArray, region: Region
 ) -> dict[str, float]:
-    """How well diffuse and specular reflection are separated in one view.
+    """How well diffuse and specular reflection are separated in one view, over skin (`pass_region`).
 
-    Parameters
-    ----------
-    diffuse, specular, true_diffuse, true_specular : (H, W, 3)
-        Linear radiance; the true images in the same exposure as the photograph.
-    region : (H, W) bool
-        Skin, see `pass_region`.
-
-    Returns
-    -------
-    dict
-        ``correlation``: of the specular images' luminance (Pearson); ``error``: RMS error of it after the best factor,
-        over its RMS; both again ``_smooth``, after a blur of 3 pixels; ``error_flat``: that of an even specular image;
-        ``share``, ``share_truth``: mean specular over mean of both; ``diffuse_psnr``: PSNR in dB of the diffuse image
-        after one factor per channel; ``diffuse_psnr_unseparated``: that of the whole true image.
+    Images (H, W, 3) are linear radiance, the true ones in the photograph's exposure. ``correlation``: of the specular
+    images'     luminance (Pearson); ``error``: RMS error of it after the best factor, over its RMS; both again
+    ``_smooth``, after a blur of 3 pixels; ``error_flat``: that of an even specular image; ``share``, ``share_truth``:
+    mean specular over mean of both; ``diffuse_psnr``: PSNR in dB of the diffuse image after one factor per channel;
+    ``diffuse_psnr_unseparated``: that of the whole true image.
     """
     if not region.any():
         raise InputError("separation: the region is empty, expected skin in the view")

@@ -37,12 +37,8 @@ def visible_surface(result: Reconstruction, camera: Camera, timestep: int, overs
 class SampledMaterial:
     """Surface properties under every sample of a `VisibleSurface`: what no light changes.
 
-    Attributes
-    ----------
-    normal, base : (N, 3) float32
-        Unit, world space: the refined ones and the mesh's.
-    diffuse : (N, 3), specular : (N,) float32
-        Albedo, 0..1.
+    ``normal`` and ``base`` (N, 3) are unit, world space: the refined ones and the mesh's; ``diffuse`` (N, 3) and
+    ``specular`` (N,) are albedo, 0..1.
     """
 
     normal: NDArray[np.float32]

@@ -81,15 +81,7 @@ def draw_landmarks(
 ) -> NDArray[np.uint8]:
     """Mark detected landmarks (rings) and the fitted model's (dots), joined by a line where both are visible.
 
-    Parameters
-    ----------
-    photograph : (H, W, 3) uint8
-    camera : Camera
-    detected : (68, 2) or None
-        Pixel coordinates with the first pixel's centre at 0.5.
-    visible : (68,) bool
-    fitted : (68, 3)
-        World positions of the fitted model's landmarks.
+    ``detected`` (68, 2) are pixels with the first pixel's centre at 0.5; ``fitted`` (68, 3) are world positions.
     """
     out = np.ascontiguousarray(photograph)
     shift = 4

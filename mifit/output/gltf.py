@@ -92,25 +92,16 @@ def write_glb(
 ) -> None:
     """Write one timestep as a ``.glb`` file, whole or not at all.
 
-    The head is in metres, in object space, under a node that holds its pose; the fitted cameras stand beside it.
-    Faces with a place in the atlas have the maps: base colour, tangent-space normals, and the specular albedo through
-    KHR_materials_specular. glTF has GGX lobes, so the Blinn-Phong exponent m becomes alpha = sqrt(2 / (m + 2)), the
-    usual relation, and roughness = sqrt(alpha). The other faces have vertex colours. The model's expressions
-    are morph targets, with the timestep's coefficients as weights. Recovered lighting is in the scene's ``extras``:
-    glTF has no spherical harmonics. Node and mesh are called as the file. Morph targets have ARKit's names where the
-    model has its shapes; where a coefficient runs from 0 to a bound, the weight runs from 0 to 1. They hold only the
-    vertices that they move.
+    The head is in metres, in object space, under a node that holds its pose; node and mesh are called as the file, and
+    the fitted cameras stand beside it. Faces with a place in the atlas have the maps: base colour, tangent-space
+    normals, and the specular albedo through KHR_materials_specular. glTF has GGX lobes, so the Blinn-Phong
+    exponent m becomes alpha = sqrt(2 / (m + 2)), and roughness = sqrt(alpha). The other faces have vertex colours.
+    Expressions are morph targets that hold only the vertices that they move, with ARKit's names where the model has
+    its shapes and the timestep's coefficients as weights; a coefficient from 0 to a bound is a weight from 0 to 1.
+    Recovered lighting is in the scene's ``extras``: glTF has no spherical harmonics.
 
-    Parameters
-    ----------
-    result : Reconstruction
-    path : path
-    timestep : int, optional
-        Whose mesh and normal map it has; default: the first that is animated, or else that was fitted.
-    animate : sequence of int, optional
-        Timesteps to play as an animation of the pose and of the expressions' weights.
-    fps : float
-        Animated timesteps per second.
+    ``timestep`` is by default the first that is animated, or else that was fitted; ``animate`` names timesteps to play
+    as an animation of the pose and of the expressions' weights, ``fps`` a second.
     """
     model, geometry = result.model, result.geometry
     timestep = (animate or result.timesteps)[0] if timestep is None else timestep

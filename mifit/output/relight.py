@@ -127,15 +127,11 @@ def write_relit(  # noqa: PLR0913
 ) -> dict[str, Any]:
     """Write views of the first timestep under a measured environment.
 
-    ``NAME.png`` (RGBA) is a camera's view, or ``NAME_NNN.png`` where the light is turned several times;
-    ``relight.png`` shows several cameras side by side; ``relight.json`` holds what is returned.
+    ``NAME.png`` (RGBA) is a camera's view, or ``NAME_NNN.png`` where the light is turned several times; ``relight.png``
+    shows several cameras side by side; ``relight.json`` holds what is returned.
 
     Parameters
     ----------
-    result : Reconstruction
-    environment : path
-    folder : path
-        Made when it is missing.
     cameras : sequence of Camera
         Default: the fitted ones.
     rotations : sequence of float
@@ -143,14 +139,11 @@ def write_relit(  # noqa: PLR0913
     exposure : float or "auto"
         As in `Reconstruction.relight`.
     video : path, optional
-        ``.mp4`` or ``.webp`` to write the turning light to, in place of images; cameras are side by side.
-    fps : float
-        Rotations per second of the video.
+        ``.mp4`` or ``.webp`` to write the turning light to, ``fps`` rotations per second, in place of images.
     integrator, samples, seed
         ``local`` traces no paths; ``path`` traces so many per pixel. See `Reconstruction.render`.
     check : bool
         Compare both integrators in one small view: the first camera's at a quarter of the size.
-    progress : Progress
 
     Returns
     -------
@@ -236,34 +229,17 @@ def evaluate_relit(
     samples: int = 64,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Compare a relit reconstruction with photographs of the same head, in the same poses, under that environment.
+    """Errors of a relit result against photographs of the same head, in the same poses, under that environment.
 
     The two captures' exposures are not known to each other, so each method gets one factor on its brightness: the
-    least-squares one over the cameras that were fitted, in the new capture. The judged camera must be another one.
-
-    Parameters
-    ----------
-    result : Reconstruction
-        Fitted to the head under another lighting.
-    environment, rotate
-        As in `Reconstruction.relight`.
-    capture : Capture
-        The head under the environment.
-    camera : str
-        Camera to judge by.
-    integrator, samples, seed
-        As in `Reconstruction.render`.
+    least-squares one over the cameras that were fitted, in the new capture. InputError where the judged camera was
+    fitted, or a camera or timestep is missing in the capture.
 
     Returns
     -------
     dict
         ``camera``, ``timesteps``, ``region_pixels`` and ``methods``: PSNR (dB), RMSE (0..255) in 8-bit sRGB over the
         fitted model's face area, and the exposure, for ``diffuse`` and ``full``.
-
-    Raises
-    ------
-    InputError
-        The judged camera was fitted, or a camera or timestep is missing in the capture.
     """
     if camera in [c.name for c in result.cameras]:
         raise InputError(f"camera {camera}: was fitted; expected another one to judge by")

@@ -46,34 +46,18 @@ def write_scene(
     cameras: Sequence[Camera] | None = None,
     method: Method = "full",
 ) -> None:
-    """Write ``NAME.xml`` with mifit's plugins, ``NAME_stock.xml`` for plain Mitsuba, and their files.
+    """Write ``NAME.xml`` with mifit's plugins, ``NAME_stock.xml`` for plain Mitsuba, and their files in ``NAME_files``.
 
-    Both read meshes and maps from the folder ``NAME_files`` beside them. Faces with a place in the atlas have the
-    maps; others have vertex albedo that continues them. In ``NAME.xml`` the skin is ``blinnphong`` with the fitted
-    lobe's rise and the refined normals as slopes, and the light is ``shenv``. In ``NAME_stock.xml`` the skin blends
-    ``diffuse`` with a ``roughconductor`` of Beckmann roughness sqrt(2 / (m + 2)), which doesn't rise, under a
-    ``normalmap``, and the light is a lat-long ``envmap``. A relit reconstruction has its environment as ``envmap`` in
-    both. A compact light is a stock
-    ``directional`` or, where it is near, ``point`` emitter in both. The ambient term stands for light that local
-    shading leaves out, such as interreflection, so a path-traced scene doesn't have it. A camera whose pixels aren't
-    square is mifit's ``pinhole`` in ``NAME.xml``; in ``NAME_stock.xml`` it has square ones
-    (`Camera.with_square_pixels`).
+    Faces with a place in the atlas have the maps; others have vertex albedo that continues them. In ``NAME.xml`` the
+    skin is ``blinnphong`` with the refined normals as slopes, and the light is ``shenv``. In ``NAME_stock.xml`` the
+    skin blends ``diffuse`` with a ``roughconductor`` of Beckmann roughness sqrt(2 / (m + 2)), which doesn't rise,
+    under a ``normalmap``, and the light is a lat-long ``envmap``, as it is in both of a relit result. A compact light
+    is a stock ``directional`` emitter. The ambient term stands for light that local shading leaves out, such as
+    interreflection, so a path-traced scene doesn't have it. A camera whose pixels aren't square is mifit's ``pinhole``
+    in ``NAME.xml`` and has square ones (`Camera.with_square_pixels`) in the other.
 
-    Parameters
-    ----------
-    result : Reconstruction
-    path : path
-        ``.xml`` file.
-    timestep : int
-    cameras : sequence of Camera, optional
-        Sensors in this order; default: the fitted cameras.
-    method : {"full", "diffuse", "pca"}
-        What to leave out, see `Reconstruction.render`.
-
-    Raises
-    ------
-    InputError
-        A camera with lens distortion; nothing is written then.
+    ``cameras`` are the sensors in this order, the fitted ones by default; ``method`` is that of
+    `Reconstruction.render`. InputError for a camera with lens distortion; nothing is written then.
     """
     path = Path(path)
     cameras = result.cameras if cameras is None else cameras

@@ -65,7 +65,7 @@ def score(
     model: MorphableModel | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Compare the files of a folder with a capture's photographs and truth.
+    """Figures of the files of a folder, named as the module says, against a capture's photographs and truth.
 
     Regions are those of the photograph's landmarks: ``face`` (their hull), ``skin`` (without eyes and inner mouth;
     where the capture has a true mesh, what the fitted cameras see of it) and ``whole`` (all that the true mesh covers;
@@ -73,22 +73,17 @@ def score(
 
     Parameters
     ----------
-    capture : Capture
-    folder : path
-        Named as the module says.
     fitted : sequence of str, optional
         Cameras that the program was given; default: the first two. Views of others count as held out.
     model : MorphableModel, optional
         Gives the triangles of a truth that has vertices alone.
-    progress : Progress
 
     Returns
     -------
     dict
-        ``views``: per camera, and for ``held_out`` together, by region ``{"psnr", "psnr_matched", "rmse", "ssim",
-        "flip", "pixels"}`` (dB, dB after one factor per channel, 0..255, 0..1); ``relit``: PSNR per environment and
-        their mean; ``passes``: per camera what `output.compare.separation` gives; ``meshes``: distances (mm) from true
-        points that all fitted cameras see; ``ignored``: files without a meaning.
+        ``views``: per camera, and for ``held_out`` together, by region what `output.compare.Errors.figures` gives;
+        ``relit``: PSNR per environment and their mean; ``passes``: per camera what `output.compare.separation` gives;
+        ``meshes``: distances (mm) from true points that all fitted cameras see; ``ignored``: files without a meaning.
 
     Raises
     ------

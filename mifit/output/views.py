@@ -34,16 +34,9 @@ CODECS = ("vp09", "mp4v")
 def orbit_camera(
     result: Reconstruction, timestep: int, degrees: float, pitch: float = 0.0, distance: float | None = None
 ) -> Camera:
-    """A camera that looks at the face from an angle about the vertical; 0 is straight from the front.
+    """A camera that looks at the face from an angle about the vertical; see `Reconstruction.orbit`.
 
-    Image size, focal length and distance are those of the fitted cameras; positive angles move the camera to
-    its right, so that it sees the head's left side, and a positive ``pitch`` upwards. The vertical is the fitted
-    cameras' mean up axis.
-
-    Raises
-    ------
-    InputError
-        The result has no cameras, or ``distance`` isn't positive.
+    The vertical is the fitted cameras' mean up axis.
     """
     if not result.cameras:
         raise InputError("this result has no cameras, so there is no image size to render at; give one to render()")
@@ -73,21 +66,8 @@ def write_turntable(
 ) -> None:
     """Write views about the vertical axis with and without specular, as in the paper's figure of novel views.
 
-    Writes ``full_NN.png`` and ``diffuse_NN.png`` (RGBA) per step, ``turntable.png`` with one row per method, and
-    ``turntable.webp``, an animation. A result of stage 1 alone gives ``pca_NN.png``.
-
-    Parameters
-    ----------
-    result : Reconstruction
-    folder : path
-        Made when it is missing.
-    start, stop : float
-        First and last angle in degrees.
-    steps : int
-        Number of views.
-    timestep : int, optional
-        Default: the first that was fitted.
-    progress : Progress
+    ``full_NN.png`` and ``diffuse_NN.png`` (RGBA) per step between the angles in degrees, ``turntable.png`` with one
+    row per method, and ``turntable.webp``, an animation. A result of stage 1 alone gives ``pca_NN.png``.
     """
     folder = Path(folder)
     timestep = result.timesteps[0] if timestep is None else timestep
@@ -119,8 +99,6 @@ def write_sequence(
 
     Parameters
     ----------
-    result : Reconstruction
-        Fitted, tracked or relit.
     path : path
         ``.mp4``, or ``.webp`` for an animated picture.
     start, stop : float
@@ -129,9 +107,6 @@ def write_sequence(
         Default: all in order of time.
     methods : sequence of str, optional
         Shown side by side; default: the best that the result has.
-    fps : float
-        Frames per second.
-    progress : Progress
 
     Raises
     ------
@@ -166,25 +141,9 @@ def write_overlay(
     fps: float = 12.0,
     progress: Progress = silent,
 ) -> None:
-    """Write a video of one camera: the input, and beside it the input under the render.
+    """Write ``.mp4`` of one camera at the timesteps of a result: the input, and beside it the input under the render.
 
-    Parameters
-    ----------
-    result : Reconstruction
-    capture : Capture
-        Its images of ``camera``, at the timesteps of the result.
-    camera : str
-        Any camera of the capture.
-    path : path
-        ``.mp4``.
-    fps : float
-        Frames per second.
-    progress : Progress
-
-    Raises
-    ------
-    InputError
-        The capture has no such camera, or not all timesteps.
+    InputError where the capture has no such camera, or not all timesteps.
     """
     capture = result.seen(capture)
     view, steps = capture.camera(camera), sorted(result.timesteps)
@@ -257,14 +216,8 @@ def write_moving(path: str | Path, frames: Iterable[NDArray], fps: float) -> Non
 def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> None:
     """Write 8-bit RGB frames (H, W, 3) of one size as ``.mp4``, whole or not at all.
 
-    Odd sizes lose their last row or column: video codecs halve the resolution of colour.
-
-    Raises
-    ------
-    InputError
-        A rate that isn't positive, another suffix, or no frame.
-    MifitError
-        OpenCV has no codec for it.
+    Odd sizes lose their last row or column: video codecs halve the resolution of colour. InputError for a rate that
+    isn't positive, another suffix or no frame; MifitError where OpenCV has no codec.
     """
     import cv2
 

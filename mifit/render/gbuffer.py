@@ -54,20 +54,10 @@ class GBuffer:
 def make_mesh(
     vertices: NDArray, faces: NDArray, uv: NDArray | None = None, normals: NDArray | None = None, bsdf: Any = None
 ) -> Any:
-    """Build an ``mi.Mesh`` from arrays, with one UV pair and normal per vertex where given.
+    """An ``mi.Mesh`` from arrays, with one UV pair and normal per vertex where given; without normals it is shaded
+    flat.
 
-    Parameters
-    ----------
-    vertices : (V, 3), faces : (F, 3)
-        Positions and corner indices, counter-clockwise outward.
-    uv : (V, 2), normals : (V, 3), optional
-        Without normals the mesh is shaded flat.
-    bsdf : mi.BSDF, optional
-
-    Raises
-    ------
-    InputError
-        Wrong shapes, indices out of range or positions that are not finite.
+    InputError for wrong shapes, indices out of range or positions that are not finite.
     """
     import mitsuba as mi
 
@@ -103,26 +93,9 @@ def make_mesh(
 
 
 class SurfaceScene:
-    """A mesh that rays can be sent at.
+    """A mesh that rays can be sent at: ``vertices`` (V, 3) in world space and ``faces`` (F, 3).
 
-    Parameters
-    ----------
-    vertices : (V, 3) float
-        World space.
-    faces : (F, 3) int
-        Corner indices.
-
-    Attributes
-    ----------
-    vertices, faces
-        The mesh as it is now.
-    rays : mi.Scene
-        What rays are sent at.
-
-    Raises
-    ------
-    InputError
-        Wrong shapes, indices out of range or positions that are not finite.
+    ``rays`` is the ``mi.Scene``. InputError for wrong shapes, indices out of range or positions that are not finite.
     """
 
     def __init__(self, vertices: NDArray, faces: NDArray) -> None:
@@ -215,22 +188,11 @@ class SurfaceScene:
         return slice(*ends[0]), slice(*ends[1])
 
     def visible_from(self, points: NDArray, origin: NDArray) -> NDArray[np.bool_]:
-        """Whether nothing of the mesh lies between surface points and an origin outside the mesh.
+        """(N,) bool: nothing of the mesh lies between surface points (N, 3) and an origin (3,) outside the mesh.
 
-        The far end of each ray, ``SHADOW_EPSILON`` of the scene's diagonal, is left out, so that a point isn't
-        hidden by its own surface. A point that faces away is hidden by what lies in front of it; at silhouettes
-        the caller should test the normal as well.
-
-        Parameters
-        ----------
-        points : (N, 3)
-            World space, on the mesh.
-        origin : (3,)
-            World space, e.g. a camera's position.
-
-        Returns
-        -------
-        (N,) bool
+        The far end of each ray, ``SHADOW_EPSILON`` of the scene's diagonal, is left out, so that a point isn't hidden
+        by its own surface. A point that faces away is hidden by what lies in front of it; at silhouettes the caller
+        should test the normal as well.
         """
         import mitsuba as mi
 
@@ -247,22 +209,11 @@ class SurfaceScene:
         return ~np.array(hit).astype(bool)
 
     def open_towards(self, points: NDArray, normals: NDArray, directions: NDArray) -> NDArray[np.uint32]:
-        """Which distant directions surface points see past the mesh.
+        """(N,) uint32 whose bit d says whether a surface point sees the distant direction d past the mesh.
 
-        Rays start off the surface by ``SHADOW_EPSILON`` of the scene's diagonal along the normal. A direction
-        below the horizon counts as hidden.
-
-        Parameters
-        ----------
-        points, normals : (N, 3)
-            World space, on the mesh; unit.
-        directions : (D, 3)
-            Unit vectors, at most 32.
-
-        Returns
-        -------
-        (N,) uint32
-            Bit d tells of direction d.
+        Rays start off the surface by ``SHADOW_EPSILON`` of the scene's diagonal along the normal. A direction below
+        the horizon counts as hidden. ``points`` and unit ``normals`` are (N, 3), unit ``directions`` (D, 3), at most
+        32.
         """
         import drjit as dr
         import mitsuba as mi

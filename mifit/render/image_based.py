@@ -74,7 +74,7 @@ def image_based(
     blends: Sequence[Blend] = ("cosine",),
     oversampling: int = 1,
 ) -> ImageBased:
-    """Render one view of one timestep from the photographs of other views.
+    """One view of one timestep from the photographs of other views.
 
     Parameters
     ----------
@@ -84,22 +84,14 @@ def image_based(
         Undistorted cameras whose photographs give the colours.
     camera : Camera
         Undistorted camera of the wanted view.
-    timestep : int
     vertices : (V, 3), faces : (F, 3)
-        Mesh in the capture's world space.
-    scene : SurfaceScene, optional
-        The mesh, where one was made of it already.
+        Mesh in the capture's world space; ``scene`` is one of it, where there is one.
     moments : dict of timestep to (V, 3), optional
         Timesteps whose photographs give the colours, with the mesh's vertices then; ``timestep`` alone by default.
     blends : sequence of {"cosine", "nearest", "angle"}
     oversampling : int
         Samples per pixel along each side; a pixel is the mean of its samples that hit, and has a face (that of one of
         them) or is seen where all of its samples do.
-
-    Raises
-    ------
-    InputError
-        A fitted camera or the timestep is not in the capture.
     """
     surface = trace_mesh(vertices, faces, camera, oversampling, scene)
     face, wanted, count = surface.face, surface.view, len(surface.face)

@@ -20,18 +20,11 @@ from mifit.render.sensor import make_sensor
 
 @dataclass(frozen=True)
 class Material:
-    """Two microfacet lobes over a rough diffuse base.
+    """Two microfacet lobes over a rough diffuse base, as maps with row 0 at v = 1.
 
-    Attributes
-    ----------
-    albedo : (S, S, 3)
-        Base colour, linear, row 0 at v = 1 (as all maps).
-    gloss : (S, S)
-        Weight of the glossy lobe against the dry one, 0..1.
-    roughness : (S, S)
-        Roughness of the dry lobe; the glossy one has 0.6 of it.
-    bump : (S, S)
-        Relief along the normal, in scene units.
+    ``albedo`` (S, S, 3) is linear; ``gloss`` (S, S) the weight of the glossy lobe against the dry one, 0..1;
+    ``roughness`` that of the dry lobe, of which the glossy one has 0.6; ``bump`` relief along the normal, in scene
+    units.
     """
 
     albedo: NDArray[np.float32]
@@ -42,16 +35,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Surface:
-    """A mesh to render.
-
-    Attributes
-    ----------
-    vertices : (V, 3), normals : (V, 3), uv : (V, 2)
-        One UV pair per vertex: meshes are split along UV seams.
-    faces : (F, 3)
-    material : str
-        Name of a material.
-    """
+    """A mesh to render, split along UV seams, and the name of its material."""
 
     vertices: NDArray
     normals: NDArray
@@ -65,7 +49,6 @@ class PathTracer:
 
     Parameters
     ----------
-    materials : dict of str to Material
     environment : (H, W, 3)
         Lat-long radiance in Mitsuba's ``envmap`` layout: row 0 up, u = 0 along -z, u = 1/4 along +x.
     max_depth : int
@@ -95,20 +78,9 @@ class PathTracer:
     def render(
         self, surfaces: Sequence[Surface], cameras: Sequence[Camera], spp: int, seed: int
     ) -> list[NDArray[np.float32]]:
-        """Render the surfaces from each camera.
+        """Views (H, W, 4) from each camera: linear radiance on black, and coverage.
 
-        Parameters
-        ----------
-        surfaces : sequence of Surface
-        cameras : sequence of Camera
-        spp : int
-            Samples per pixel, at least; rounded up to the next k * k or k * (k + 1), which stratify well.
-        seed : int
-
-        Returns
-        -------
-        list of (H, W, 4) float32
-            Linear radiance on black, and coverage.
+        ``spp`` samples per pixel at the least, rounded up to the next k * k or k * (k + 1), which stratify well.
         """
         import drjit as dr
         import mitsuba as mi

@@ -14,21 +14,10 @@ from mifit.render.plugins import register_plugins
 
 
 def load_scene(source: str | Path | Mapping[str, Any], **parameters: Any) -> Any:
-    """Load a Mitsuba scene from an XML file or a dictionary, with mifit's plugins registered.
+    """A Mitsuba scene from an XML file or a dictionary, with mifit's plugins registered.
 
     Equal objects are not merged, so parameters keep the names that the scene gives them. The ``radius`` of each
-    ``shenv`` is set to hold the scene.
-
-    Parameters
-    ----------
-    source : path or dict
-        An XML file, or a scene dictionary (``{"type": "scene", ...}``).
-    **parameters
-        Values for the ``$name`` parameters of an XML file.
-
-    Returns
-    -------
-    mi.Scene
+    ``shenv`` is set to hold the scene. ``parameters`` are values for the ``$name`` parameters of an XML file.
 
     Raises
     ------
@@ -85,21 +74,9 @@ def _one_line(message: str) -> str:
 def render_scene(
     path: str | Path, parameters: Mapping[str, Any], spp: int, seed: int = 0, sensor: int = 0
 ) -> NDArray[np.float32]:
-    """Render a scene file that may use mifit's plugins.
+    """What a scene file's film holds, (H, W, C): linear radiance on black, and coverage where it has alpha.
 
-    Parameters
-    ----------
-    path : path
-        Mitsuba XML.
-    parameters : mapping
-        Values of the file's ``<default>`` names.
-    spp, seed, sensor : int
-        Samples per pixel, seed of the sampler, and which of the scene's sensors.
-
-    Returns
-    -------
-    (H, W, C) float32
-        What the sensor's film holds: linear radiance on black, and coverage where it has alpha.
+    ``parameters`` are values of the file's ``<default>`` names, ``sensor`` says which of the scene's sensors.
     """
     import mitsuba as mi
 

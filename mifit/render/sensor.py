@@ -18,21 +18,9 @@ MITSUBA_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
 def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str = "multijitter") -> dict[str, Any]:
     """The sensor of an undistorted camera, as a plain dictionary (`render.description`).
 
-    Square pixels give Mitsuba's ``perspective``, others mifit's ``pinhole``; see `Camera.with_square_pixels` for
-    what programs without that plugin can be given.
-
-    Parameters
-    ----------
-    camera : Camera
-    spp : int or Parameter
-        Samples per pixel.
-    sampler : str
-        Mitsuba plugin that draws them.
-
-    Raises
-    ------
-    InputError
-        The camera has lens distortion.
+    Square pixels give Mitsuba's ``perspective``, others mifit's ``pinhole``; see `Camera.with_square_pixels` for what
+    programs without that plugin can be given. ``sampler`` is the plugin that draws ``spp`` samples per pixel.
+    InputError for a camera with lens distortion.
     """
     if any(camera.distortion):
         raise InputError(f"camera {camera.name}: found lens distortion, expected an undistorted camera")

@@ -12,7 +12,6 @@ import glob
 import os
 import platform
 import re
-import subprocess
 import sys
 from dataclasses import dataclass
 from importlib import metadata
@@ -21,32 +20,19 @@ from mifit.core.process import OURS, threads
 from mifit.errors import UnknownVariantError, VariantError
 
 LLVM_SUPPORTED = 19
-"""From this major version on LLVM is used as found; an older one must survive a trial in a process of its own."""
+"""The first major version that works with this Dr.Jit; older ones may end the process."""
 
 FITTING_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 """Variants that the stages run under; the plugins render under any."""
 
 _ENVIRONMENT = "DRJIT_LIBLLVM_PATH"
-_TRIAL = """
-import drjit as dr
-from drjit.llvm import Float
-x = dr.arange(Float, 9)
-assert dr.all(dr.minimum(x, dr.opaque(Float, 3)) + dr.maximum(x, dr.opaque(Float, 3)) == x + 3)
-"""
 
 
 @dataclass(frozen=True)
 class Llvm:
-    """A libLLVM on this machine.
+    """A libLLVM on this machine; ``error`` says why it can't be used, and is empty where it can.
 
-    Attributes
-    ----------
-    path : str
-        File to load.
-    version : int or None
-        Major version; None where neither the library nor its name tells it (then it is older than 16).
-    error : str
-        Why it can't be used; empty when it can.
+    The major version is None where neither the library nor its name tells it: then it is older than 16.
     """
 
     path: str
@@ -55,43 +41,24 @@ class Llvm:
 
 
 def find_llvm() -> list[Llvm]:
-    """List the libLLVM files on this machine, newest first, without loading them.
-
-    Versions are those of the file names; Dr.Jit's own search covers fewer folders.
-    """
-    if sys.platform == "darwin":
-        patterns = [
-            "/opt/homebrew/Cellar/llvm*/*/lib/libLLVM.dylib",
-            "/opt/homebrew/opt/llvm*/lib/libLLVM.dylib",
-            "/usr/local/Cellar/llvm*/*/lib/libLLVM.dylib",
-            f"{sys.prefix}/lib/libLLVM*.dylib",
-        ]
-    elif sys.platform == "win32":
-        patterns = [
-            rf"{os.environ.get('ProgramFiles', 'C:')}\LLVM\bin\LLVM-C.dll",
-            rf"{sys.prefix}\Library\bin\LLVM-C*.dll",
-        ]
-    else:
-        machine = platform.machine()
-        folders = [
-            *os.environ.get("LD_LIBRARY_PATH", "").split(":"),
-            f"{sys.prefix}/lib",
-            f"{os.environ.get('CONDA_PREFIX', sys.prefix)}/lib",
-            f"/usr/lib/{machine}-linux-gnu",
-            "/usr/lib/llvm*/lib",
-            "/usr/lib/llvm/*/lib*",
-            "/usr/lib64",
-            "/usr/lib64/llvm*/lib*",
-            "/usr/lib/wsl/lib",
-            "/usr/lib",
-            "/usr/local/lib",
-        ]
-        patterns = [f"{folder}/libLLVM*.so*" for folder in folders if folder]
-    files: dict[str, str] = {}
-    for pattern in patterns:
-        for path in sorted(glob.glob(pattern)):
-            files.setdefault(os.path.realpath(path), path)
-    found = [Llvm(real, _version_of_name(real)) for real in files]
+    """The libLLVM files on this machine, newest first by their names; Dr.Jit's own search covers fewer folders."""
+    linux = [
+        *os.environ.get("LD_LIBRARY_PATH", "").split(":"),
+        f"{sys.prefix}/lib",
+        f"{os.environ.get('CONDA_PREFIX', sys.prefix)}/lib",
+        f"/usr/lib/{platform.machine()}-linux-gnu",
+        *("/usr/lib/llvm*/lib", "/usr/lib/llvm/*/lib*", "/usr/lib64", "/usr/lib64/llvm*/lib*", "/usr/lib/wsl/lib"),
+        *("/usr/lib", "/usr/local/lib"),
+    ]
+    patterns = [
+        *(f"{folder}/libLLVM*.so*" for folder in linux if folder),
+        *(f"{folder}/lib/libLLVM*.dylib" for folder in ("/opt/homebrew/Cellar/llvm*/*", "/opt/homebrew/opt/llvm*")),
+        *(f"{folder}/lib/libLLVM*.dylib" for folder in ("/usr/local/Cellar/llvm*/*", sys.prefix)),
+        rf"{os.environ.get('ProgramFiles', 'C:')}\LLVM\bin\LLVM-C.dll",
+        rf"{sys.prefix}\Library\bin\LLVM-C*.dll",
+    ]
+    files = {os.path.realpath(path) for pattern in patterns for path in sorted(glob.glob(pattern))}
+    found = [Llvm(path, _version_of_name(path)) for path in sorted(files)]
     return sorted(found, key=lambda llvm: -(llvm.version or 0))
 
 
@@ -138,17 +105,9 @@ def install_hint() -> str:
 
 
 def set_variant(name: str = "auto") -> str:
-    """Activate a Mitsuba variant; the program calls this once, the library never does.
+    """Activate a Mitsuba variant and return its name; the program calls this once, the library never does.
 
-    Parameters
-    ----------
-    name : str
-        A Mitsuba variant, or ``"auto"``: ``cuda_ad_rgb`` where CUDA works, else ``llvm_ad_rgb``.
-
-    Returns
-    -------
-    str
-        The variant that is active now.
+    ``"auto"`` is ``cuda_ad_rgb`` where CUDA works, else ``llvm_ad_rgb``.
 
     Raises
     ------
@@ -172,7 +131,7 @@ def set_variant(name: str = "auto") -> str:
         loaded = dr.detail.llvm_version()[0]
         if not dr.has_backend(dr.JitBackend.LLVM) or loaded < 0:
             raise VariantError(f"variant {name}: Dr.Jit could not load {llvm.path}; {install_hint()}")
-        if loaded < LLVM_SUPPORTED and loaded != llvm.version:
+        if loaded < LLVM_SUPPORTED:
             # Another package brought its own LLVM into the process before Dr.Jit looked for one.
             raise VariantError(
                 f"variant {name}: found LLVM {loaded} loaded already, version {LLVM_SUPPORTED} or newer is needed; "
@@ -186,15 +145,7 @@ def set_variant(name: str = "auto") -> str:
 
 
 def set_fitting_variant(name: str = "auto") -> str:
-    """`set_variant` for programs that fit: the plugins run under any variant, the stages under ``*_ad_rgb`` alone.
-
-    Raises
-    ------
-    UnknownVariantError
-        The variant can't fit.
-    VariantError
-        As in `set_variant`.
-    """
+    """`set_variant` for programs that fit: the stages run under ``*_ad_rgb`` alone, `UnknownVariantError` says so."""
     if name not in ("auto", *FITTING_VARIANTS):
         raise UnknownVariantError(f"variant: found {name!r}, expected auto or one of {', '.join(FITTING_VARIANTS)}")
     return set_variant(name)
@@ -212,14 +163,7 @@ def check_active_variant() -> None:
 
 
 def doctor() -> list[dict]:
-    """What of the set-up works.
-
-    Returns
-    -------
-    list of dict
-        Each with ``check`` (str), ``ok`` (bool), ``required`` (bool: the pipeline can't run without it),
-        ``found`` (str) and ``fix`` (str, the one command that mends it, or empty).
-    """
+    """What of the set-up works: entries with ``check``, ``ok``, ``required``, ``found`` and ``fix``, a command."""
     checks = [_package("mitsuba", "3.9.1", "3.10"), _package("drjit", "1.5", "1.6")]
     llvm = check_llvm()
     found = "none" if not llvm.path else f"{llvm.path} (LLVM {llvm.version or 'older than 16'})"
@@ -285,7 +229,7 @@ def _version_of_name(path: str) -> int | None:
 
 
 def _usable(llvm: Llvm) -> Llvm:
-    """Load a library to see that it can be loaded and which version it is; try an old one in a child process."""
+    """Load a library to see that it can be loaded and which version it is."""
     try:
         library = ctypes.CDLL(llvm.path)
     except OSError as error:
@@ -297,14 +241,5 @@ def _usable(llvm: Llvm) -> Llvm:
         version = major.value
     if version is not None and version >= LLVM_SUPPORTED:
         return Llvm(llvm.path, version)
-    if version is not None and version > 16 and _survives_trial(llvm.path):
-        return Llvm(llvm.path, version)
     found = f"LLVM {version}" if version else "an LLVM older than 16"
     return Llvm(llvm.path, version, f"is {found}, version {LLVM_SUPPORTED} or newer is needed")
-
-
-def _survives_trial(path: str) -> bool:
-    """Whether a child process that compiles a kernel with this library lives."""
-    environment = {**os.environ, _ENVIRONMENT: path}
-    trial = subprocess.run([sys.executable, "-c", _TRIAL], env=environment, capture_output=True, timeout=60)
-    return trial.returncode == 0

@@ -212,17 +212,9 @@ def replacing_files(folder: Path, only: bool = False, force: bool = False) -> It
     """Yield a folder for new files that take the places of the old ones when the block ends well, all of them.
 
     When the block raises, everything stays as it was. When the process is killed the next one that writes into the
-    folder either drops the new files or, if all were there, moves the rest to their places.
-
-    Parameters
-    ----------
-    folder : path
-        Claimed and locked meanwhile.
-    only : bool
-        Files that mifit wrote earlier and that aren't among the new ones go; what the user has changed or added stays
-        in any case.
-    force : bool
-        As in `claim`.
+    folder either drops the new files or, if all were there, moves the rest to their places. The folder is claimed and
+    locked meanwhile. With ``only``, files that mifit wrote earlier and that aren't among the new ones go; what the
+    user has changed or added stays in any case.
     """
     with locked(folder, force):
         new = folder / MARK / _NEW
