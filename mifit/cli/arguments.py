@@ -83,10 +83,7 @@ def use_variant(arguments: Namespace) -> str:
 def tell(arguments: Namespace, found: Iterable[Diagnostic]) -> int:
     """Print diagnostics on standard error, a line each, the worst first; notes not with ``--quiet``.
 
-    Returns
-    -------
-    int
-        Exit code of the command: 3 with ``--strict`` where one of them is a named fault, else 0.
+    Returns the command's exit code: 3 with ``--strict`` where one of them is a named fault, else 0.
     """
     found = worst_first(found)
     for one in found:

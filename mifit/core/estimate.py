@@ -26,19 +26,9 @@ if TYPE_CHECKING:
 class Report:
     """How a stage ended.
 
-    Attributes
-    ----------
-    outcome : str
-        ``"converged"``, ``"max_iterations"``, ``"diverged"`` or another value of ``optim.Outcome``; ``"inconsistent"``
-        where the images contradict one another or the capture has a named fault.
-    energies : dict of str to list of float
-        Energy per term over the iterations (same length each).
-    seconds : float
-        Wall time of the stage.
-    warnings : tuple of Diagnostic
-        Things a person should know.
-    details : dict
-        Further figures of the stage; JSON values only.
+    ``outcome`` is a value of ``optim.Outcome``, or ``"inconsistent"`` where the images contradict one another or the
+    capture has a named fault; ``energies`` per term over the iterations (same length each); ``seconds`` of wall time;
+    ``details`` are further figures for people, JSON values only.
     """
 
     outcome: str
@@ -172,13 +162,8 @@ class ReflectanceEstimate:
 class NormalsEstimate:
     """Stage 3: refined normals per timestep.
 
-    Attributes
-    ----------
-    timesteps : tuple of int
-    normal_object : (T, S, S, 3) float32
-        Unit normals in object space; (0, 0, 0) outside the covered texels.
-    tracked : dict of int to str
-        Timesteps that were tracked after the fit, each with the digest of the images that it was tracked in.
+    ``normal_object`` (T, S, S, 3) are unit normals in object space, (0, 0, 0) outside the covered texels. ``tracked``
+    has the timesteps that were tracked after the fit, each with the digest of the images that it was tracked in.
     """
 
     timesteps: tuple[int, ...]
@@ -191,11 +176,8 @@ class NormalsEstimate:
 class ResidualEstimate:
     """What the images of fitted timesteps show beyond reflectance and light (`stages.find_residual`).
 
-    Attributes
-    ----------
-    timesteps : tuple of int
-    radiance : (T, S, S, 3) float32
-        Linear, added to what the model shows of a texel, alike towards all sides; either sign, 0 where nothing is seen.
+    ``radiance`` (T, S, S, 3) is linear, added to what the model shows of a texel, alike towards all sides; either
+    sign, 0 where nothing is seen.
     """
 
     timesteps: tuple[int, ...]
@@ -211,17 +193,9 @@ class ResidualEstimate:
 class MeshEstimate:
     """Meshes with the refined normals as shape, on one topology.
 
-    Attributes
-    ----------
-    timesteps : tuple of int
-    vertices : (T, V', 3) float32
-        World space. With subdivision the model's vertices come first.
-    faces, faces_uv : (F', 3) int32
-    uv : (T', 2) float32
-    displacement : (T, S, S) float32
-        Distance from the fitted mesh along its normals, capture units; 0 outside the covered texels.
-    subdivisions : int
-        Times that every face of the model was split into four.
+    ``vertices`` (T, V', 3) are world space; with subdivision (``subdivisions`` times) the model's vertices come first.
+    ``displacement`` (T, S, S) is the distance from the fitted mesh along its normals, capture units; 0 outside the
+    texels.
     """
 
     timesteps: tuple[int, ...]

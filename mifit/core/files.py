@@ -77,12 +77,8 @@ def _is_same(path: str | Path, other: str) -> bool:
 def opened(path: str | Path, limit: int, what: str = "file") -> Iterator[tuple[BinaryIO, int]]:
     """Open an input file of at most ``limit`` bytes; yields the stream and its size.
 
-    A pipe, a device or a folder is refused without waiting for it, and a file that is too large before it is read.
-
-    Raises
-    ------
-    InputError
-        The file is missing, can't be read, is no regular file, or larger than the limit.
+    A pipe, a device or a folder is refused without waiting for it, and a file that is too large before it is read, by
+    InputError, as is one that is missing or can't be read.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
@@ -158,14 +154,9 @@ _RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{port}{i}" for port in ("COM", "LPT
 
 
 def check_no_links(folder: str | Path, path: str | Path) -> None:
-    """Refuse to write through symbolic links below ``folder``: a folder from elsewhere may point anywhere.
+    """Refuse to write ``path`` through symbolic links below ``folder``: a folder from elsewhere may point anywhere.
 
-    Parameters
-    ----------
-    folder : path
-        Where the user said to write; it may be a link itself.
-    path : path
-        What will be written, below ``folder``.
+    ``folder`` is where the user said to write; it may be a link itself.
     """
     folder, path = Path(folder), Path(path)
     inside = folder
@@ -219,13 +210,9 @@ def at_place(folder: str | Path, name: str, make: bool = False) -> Iterator[tupl
 def replacing(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` (same suffix) that takes its place when the block ends well.
 
-    The folder is made when it is missing. When the block raises, the temporary file goes and ``path`` stays
-    as it was. A process that is killed can't clean up: the next one that writes into the folder does it.
-
-    Raises
-    ------
-    InputError
-        The disk is full, the place can't be written, or `overwriting` forbids it; the message names ``path``.
+    The folder is made when it is missing. When the block raises, the temporary file goes and ``path`` stays as it was.
+    A process that is killed can't clean up: the next one that writes into the folder does it. InputError, which names
+    ``path``: the disk is full, the place can't be written, or `overwriting` forbids it.
     """
     path = Path(path)
     check_overwriting(path)
@@ -274,12 +261,8 @@ def _room(path: Path, temporary: Path) -> Iterator[None]:
 def cache_folder() -> Path:
     """Where mifit keeps what it makes once: ``MIFIT_CACHE``, else ``mifit`` in the user's cache folder.
 
-    Variables that are empty count as unset.
-
-    Raises
-    ------
-    InputError
-        A variable that isn't an absolute path: the place would depend on where a program runs.
+    Variables that are empty count as unset. InputError for one that isn't an absolute path: the place would depend on
+    where a program runs.
     """
     named, base = os.environ.get("MIFIT_CACHE"), os.environ.get("XDG_CACHE_HOME")
     try:

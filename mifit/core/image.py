@@ -70,13 +70,7 @@ _TABLE_8 = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
 
 
 def read_image(path: str | Path) -> NDArray[np.float32]:
-    """Read an image file to linear float32 (H, W, 3); see `load_image` for alpha, clipping and bit depth.
-
-    Raises
-    ------
-    InputError
-        The file is missing, not an image, truncated, CMYK or larger than `mifit.core.limits.MAX_PIXELS`.
-    """
+    """Linear float32 (H, W, 3) of an image file; see `load_image` for alpha, clipping, bit depth and errors."""
     return load_image(path).pixels
 
 
@@ -84,11 +78,7 @@ def load_image(path: str | Path) -> Image:
     """Read an image file with its alpha, clipped pixels and bit depth.
 
     Grey images become three equal channels. CMYK is refused: without its ink profile the colours would be a guess.
-
-    Raises
-    ------
-    InputError
-        The file is missing, not an image, truncated, CMYK or larger than `mifit.core.limits.MAX_PIXELS`.
+    InputError for a file that is missing, not an image, truncated, or larger than `mifit.core.limits.MAX_PIXELS`.
     """
     return decode_image(read_bytes(path, MAX_IMAGE_BYTES, "image file"), path)
 
@@ -328,20 +318,10 @@ def check_environment(name: str | Path, image: NDArray[np.float32]) -> NDArray[n
 
 
 def write_image(path: str | Path, linear: ArrayLike) -> None:
-    """Write linear colour to a file, whole or not at all; missing folders are made.
+    """Write linear colour, (H, W), (H, W, 1), (H, W, 3) or with alpha (H, W, 4), to a file, whole or not at all.
 
-    Parameters
-    ----------
-    path : path
-        ``.png`` is written as 8-bit sRGB (alpha as it is), ``.jpg`` likewise at quality 95, ``.exr`` as linear
-        float32, ``.hdr`` as linear RGBE.
-    linear : (H, W), (H, W, 1), (H, W, 3) or (H, W, 4)
-        Grey, colour, or colour with alpha.
-
-    Raises
-    ------
-    InputError
-        An array of another shape, a suffix that isn't known, or alpha in a format without it.
+    ``.png`` is 8-bit sRGB (alpha as it is), ``.jpg`` likewise at quality 95, ``.exr`` linear float32, ``.hdr`` linear
+    RGBE; missing folders are made. InputError for another shape or suffix, or alpha in a format without it.
     """
     pixels = np.asarray(linear, dtype=np.float32)
     if pixels.ndim == 3 and pixels.shape[2] == 1:

@@ -99,13 +99,8 @@ class MeshPart(NamedTuple):
 class SplitMesh:
     """A mesh with one vertex per pair of position and texture coordinate.
 
-    Attributes
-    ----------
-    origin : (N,) int64
-        Vertex of the model that each split vertex is at.
-    uv : (N, 2) float32
-    faces : (F, 3) int32
-        In the order of the model's faces.
+    ``origin`` (N,) is the vertex of the model that each split vertex is at, ``uv`` (N, 2) its texture coordinate;
+    ``faces`` (F, 3) are in the order of the model's.
     """
 
     origin: NDArray[np.int64]
@@ -208,15 +203,9 @@ class MaskedMesh(TexturedMesh, Protocol):
 
 @dataclass(frozen=True)
 class Topology:
-    """A mesh with its faces split.
+    """A mesh with its faces split: ``faces`` and ``faces_uv`` (F', 3), ``uv`` (T', 2), ``face_mask`` (F',).
 
-    Attributes
-    ----------
-    faces, faces_uv : (F', 3) int32
-    uv : (T', 2) float32
-    face_mask : (F',) bool
-    matrix : (V', V) sparse
-        Values at the mesh's vertices -> values at these; the mesh's come first, unchanged.
+    ``matrix`` (V', V) gives values at its vertices of those at the mesh's, which come first, unchanged.
     """
 
     faces: NDArray[np.int32]

@@ -16,19 +16,9 @@ Mask = NDArray[np.bool_] | None
 
 
 def rmse(image: Image, reference: Image, mask: Mask = None) -> float:
-    """Root-mean-square difference over the pixels of a region and all channels.
+    """Root-mean-square difference of equal images over a region's pixels and all channels, in their units.
 
-    Parameters
-    ----------
-    image, reference : (H, W, C) or (H, W)
-        Same shape, any real type; the result is in their units.
-    mask : (H, W) bool, optional
-        Region; the whole image by default.
-
-    Raises
-    ------
-    InputError
-        Shapes differ, or the region is empty.
+    InputError where shapes differ, or the region is empty.
     """
     return math.sqrt(mean_squared_error(image, reference, mask))
 
@@ -92,23 +82,9 @@ def flip(
     """Mean FLIP error (Andersson et al. 2020) over a region: 0 for equal images, at most 1.
 
     Colours are blurred by the eye's contrast sensitivity and compared where they are perceptually even; edges and
-    points are compared beside them. The constants are the paper's.
-
-    Parameters
-    ----------
-    image, reference : (H, W, 3) or (H, W)
-        sRGB codes, 0..peak.
-    mask : (H, W) bool, optional
-        Region; the whole image by default. A pixel's error depends on its neighbours, also on those outside.
-    peak : float
-        Code of white.
-    pixels_per_degree : float
-        Pixels in a degree of the field of view; default: a screen of 3840 pixels seen from its own width.
-
-    Raises
-    ------
-    InputError
-        Shapes differ, or the region is empty.
+    points are compared beside them. The constants are the paper's. Images are sRGB codes, 0..peak. A pixel's error
+    depends on its neighbours, also on those outside the region. ``pixels_per_degree`` of the field of view are by
+    default those of a screen of 3840 pixels seen from its own width.
     """
     a, b, region = _checked(image, reference, mask)
     margin = len(_support(_widest(pixels_per_degree))) // 2  # no filter reaches further

@@ -14,16 +14,9 @@ from numpy.typing import NDArray
 class Photometry:
     """Factors that the linear colours of images are divided by when a capture is read (`Capture.with_photometry`).
 
-    Attributes
-    ----------
-    gain : dict of camera name to (r, g, b)
-        Each camera's linear colours over the first camera's: exposure and white balance. A camera that isn't named
-        has gain 1.
-    exposure : dict of (camera name, timestep) to float
-        An image's linear colours over those of its camera's first timestep. An image that isn't named has 1.
+    ``gain`` is each camera's (r, g, b) over the first camera's: exposure and white balance; ``exposure`` an image's
+    factor, by camera and timestep, over those of its camera's first timestep. What isn't named has 1.
 
-    Examples
-    --------
     >>> Photometry({"right": (1.2, 1.0, 0.9)}, {("right", 3): 0.5}).factor("right", 3)
     array([0.6 , 0.5 , 0.45], dtype=float32)
     """

@@ -47,15 +47,12 @@ def run_experiment(
 
     Parameters
     ----------
-    path : path
     overrides : sequence of str
         ``KEY=VALUE`` settings that replace the file's.
     out : path, optional
         Folder for the runs, ``summary.md`` and ``summary.json``; default ``out/NAME``.
     dask : str, optional
         Address of a Dask scheduler whose workers see the same files; default: processes of this machine.
-    variant : str
-        Mitsuba variant of the runs.
     seed : int
         Seed where the file gives none.
 

@@ -38,19 +38,10 @@ class Outcome(Enum):
 class Solution:
     """What `minimize` returns.
 
-    Attributes
-    ----------
-    value : (n,) float64
-        Best parameters found.
-    outcome : Outcome
-    energies : dict of str to list of float
-        Energy per term at the start and after each accepted step.
-    system : System
-        Linearisation at ``value`` when the run converged, else at the last linearised point; its
-        ``covariance_diagonal`` gives the uncertainty of the parameters. None if it diverged at the start.
-    iterations, evaluations, rejected : int
-        Linearisations, energy evaluations and rejected steps.
-    seconds : float
+    ``value`` (n,) are the best parameters found; ``energies`` per term at the start and after each accepted step;
+    ``system`` the linearisation at ``value`` when the run converged, else at the last linearised point, None if it
+    diverged at the start; its ``covariance_diagonal`` gives the uncertainty of the parameters. ``iterations`` count
+    linearisations, ``evaluations`` energies and ``rejected`` steps.
     """
 
     value: NDArray
@@ -97,7 +88,8 @@ def minimize(
 ) -> Solution:
     """Minimise a sum of squares, with optional bounds, by Levenberg and Marquardt's method.
 
-    Damping follows Nielsen's rule, see `trust`.
+    Damping follows Nielsen's rule, see `trust`. A parameter at a bound whose gradient points outwards is frozen for
+    the step; one that would cross a bound is put on it and the others are solved for again.
 
     Parameters
     ----------
@@ -105,8 +97,6 @@ def minimize(
     start : (n,)
         Clipped to the bounds.
     lower, upper : (n,), optional
-        Bounds. A parameter at a bound whose gradient points outwards is frozen for the step; one that would cross
-        a bound is put on it and the others are solved for again.
     max_iterations : int
         Linearisations.
     step_tolerance : float
@@ -174,16 +164,8 @@ def trust(predicted: float, actual: float, size: float, rejections: int) -> tupl
     """Whether to take a step, and the size (one over the damping) of the next, by the ratio of the energy's decreases.
 
     Nielsen's rule (Madsen, Nielsen, Tingleff, "Methods for non-linear least squares problems", 2004): the damping
-    shrinks smoothly with the ratio, at most by 3, and grows by 2, 4, 8, ... over successive rejections.
-
-    Parameters
-    ----------
-    predicted, actual : float
-        Decrease by the linear model, and as evaluated (NaN when not finite).
-    size : float
-        Size the step was made with.
-    rejections : int
-        Steps rejected in a row before this one.
+    shrinks smoothly with the ratio, at most by 3, and grows by 2, 4, 8, ... over successive ``rejections``.
+    ``predicted`` is the decrease by the linear model, ``actual`` the evaluated one (NaN when not finite).
     """
     ratio = actual / predicted if predicted > 0 else -1.0
     if ratio >= 1e-4:  # False for NaN

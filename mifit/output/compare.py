@@ -137,7 +137,7 @@ def separation(
     """How well diffuse and specular reflection are separated in one view, over skin (`pass_region`).
 
     Images (H, W, 3) are linear radiance, the true ones in the photograph's exposure. ``correlation``: of the specular
-    images'     luminance (Pearson); ``error``: RMS error of it after the best factor, over its RMS; both again
+    images' luminance (Pearson); ``error``: RMS error of it after the best factor, over its RMS; both again
     ``_smooth``, after a blur of 3 pixels; ``error_flat``: that of an even specular image; ``share``, ``share_truth``:
     mean specular over mean of both; ``diffuse_psnr``: PSNR in dB of the diffuse image after one factor per channel;
     ``diffuse_psnr_unseparated``: that of the whole true image.

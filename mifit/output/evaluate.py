@@ -34,21 +34,11 @@ Region = Literal["face", "skin", "truth"]
 class Comparison:
     """One view of one timestep beside the photograph, in 8-bit sRGB.
 
-    Attributes
-    ----------
-    timestep : int
-    photograph : (H, W, 3) uint8
-    region : (H, W) bool
-        Pixels that count, the same for all methods.
-    renders : dict of method to (H, W, 4) uint8
-        Colour and coverage; colour is 0 where the model covers nothing.
-    baseline : dict of name to (H, W, 3) uint8
-        Image-based rendering from the fitted views on the fitted mesh (`render.image_based`) by several blends, the
-        first one ``image_based``; empty where it isn't asked for.
-    seen : (H, W) bool, optional
-        Pixels of the region whose point a fitted view sees: those that the baseline is compared on.
-    landmark_pixels : float, optional
-        Of a timestep that wasn't fitted: how far the head that its landmarks placed lies beside them.
+    ``region`` (H, W) are pixels that count, the same for all methods; ``renders`` (H, W, 4) by method are colour, 0
+    where the model covers nothing, and coverage. ``baseline`` (H, W, 3) is image-based rendering from the fitted views
+    on the fitted mesh (`render.image_based`) by several blends, the first one ``image_based``; ``seen`` (H, W) the
+    pixels of the region whose point a fitted view sees, those that it is compared on. Of a timestep that wasn't fitted
+    ``landmark_pixels`` says how far the head that its landmarks placed lies beside them.
     """
 
     timestep: int
@@ -160,14 +150,11 @@ def _figures(errors: Mapping[str, Errors]) -> dict[str, Any]:
 
 
 def separation_of(result: Reconstruction, capture: Capture, camera: str) -> dict[str, float]:
-    """How well a result's diffuse and specular image of the first timestep agree with the truth's.
+    """How well a result's diffuse and specular image of the first timestep agree with the truth's; see
+    `compare.separation`.
 
-    The result is rendered without its residual, which is neither. See `output.compare.separation`.
-
-    Raises
-    ------
-    InputError
-        No passes in the truth, a first timestep that wasn't fitted, or a fit without reflectance.
+    The result is rendered without its residual, which is neither. InputError where the truth has no passes, the first
+    timestep wasn't fitted, or a fit is without reflectance.
     """
     truth, timestep = true_passes(capture, camera), capture.timesteps[0]
     if truth is None:

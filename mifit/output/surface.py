@@ -29,14 +29,8 @@ if TYPE_CHECKING:
 class SurfaceMaps:
     """Maps of the faces that have a place in the atlas, padded across seams; row 0 at v = 1.
 
-    Attributes
-    ----------
-    diffuse : (S, S, 3) float32
-        Linear albedo 0..1.
-    specular : (S, S) float32
-        Specular albedo 0..1.
-    normal : (S, S, 3) float32
-        Unit normals in object space of one timestep.
+    ``diffuse`` (S, S, 3) and ``specular`` (S, S) are linear albedo 0..1; ``normal`` (S, S, 3) are unit normals in
+    object space of one timestep.
     """
 
     diffuse: NDArray[np.float32]
@@ -73,14 +67,11 @@ def surface_maps(result: Reconstruction, timestep: int, skin: bool = False) -> S
 
 
 def vertex_materials(result: Reconstruction, skin: bool = False) -> NDArray[np.float32]:
-    """Diffuse and specular albedo at the vertices: the maps' where there are maps, continued over the other faces.
+    """(V, 4) diffuse and specular albedo at the vertices: the maps' where there are maps, continued over the other
+    faces.
 
+    Linear, 0..1. The diffuse part is the fitted model's albedo plus an offset that is a membrane over the mesh.
     ``skin`` as in `surface_maps`.
-
-    Returns
-    -------
-    (V, 4) float32
-        Linear, 0..1. The diffuse part is the fitted model's albedo plus an offset that is a membrane over the mesh.
     """
     model, geometry, reflectance = result.model, result.geometry, result.reflectance
     albedo = np.asarray(geometry.vertex_albedo, dtype=np.float64)

@@ -42,15 +42,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrueMesh:
-    """The true surface of one timestep.
-
-    Attributes
-    ----------
-    vertices : (V, 3), faces : (F, 3)
-        World space.
-    face_mask : (F,) bool
-        Face area; all faces where the truth doesn't say.
-    """
+    """The true surface of one timestep in world space; ``face_mask`` (F,) is the face area, all where the truth doesn't say."""
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]

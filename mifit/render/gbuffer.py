@@ -31,14 +31,8 @@ _Hits = tuple[tuple[slice, slice], NDArray[np.int32], NDArray[np.float32], NDArr
 class GBuffer:
     """What each pixel's central ray hits first.
 
-    Attributes
-    ----------
-    face : (H, W) int32
-        Face index; -1 where nothing is hit.
-    weights : (H, W, 3) float32
-        Barycentric weights of the face's three corners; 0 where nothing is hit.
-    depth : (H, W) float32
-        Distance along the camera's z axis in the scene's units; infinite where nothing is hit.
+    ``face`` (H, W), -1 where nothing is hit; ``weights`` (H, W, 3) of the face's corners; ``depth`` (H, W) along the
+    camera's z axis in the scene's units, infinite where nothing is hit.
     """
 
     face: NDArray[np.int32]

@@ -36,15 +36,9 @@ BLENDS: tuple[Blend, ...] = ("cosine", "nearest", "angle")
 class ImageBased:
     """One view as the fitted photographs show it.
 
-    Attributes
-    ----------
-    colours : dict of blend to (H, W, 3) float32
-        Linear; 0 where nothing is hit.
-    face : (H, W) int32
-        Face of the mesh whose front is seen; -1 where none is.
-    seen : (H, W) bool
-        Pixels whose point of the mesh at least one fitted view sees. Elsewhere the colour is that of the fitted
-        view that faces the point best, whatever hides it.
+    ``colours`` (H, W, 3) by blend are linear, 0 where nothing is hit; ``face`` (H, W) is the face whose front is seen,
+    -1 where none is; ``seen`` (H, W) are pixels whose point at least one fitted view sees. Elsewhere the colour is
+    that of the fitted view that faces the point best, whatever hides it.
     """
 
     colours: dict[Blend, NDArray[np.float32]]

@@ -16,20 +16,11 @@ from mifit.render.gbuffer import SurfaceScene
 
 @dataclass(frozen=True)
 class VisibleSurface:
-    """What a camera sees of a mesh, supersampled.
+    """What a camera sees of a mesh in an image of ``shape`` with ``oversampling`` samples along each side of a pixel.
 
-    Attributes
-    ----------
-    shape : (int, int)
-        Height and width of the image.
-    oversampling : int
-        Samples along one side of a pixel.
-    index : (N,) int64
-        Flat sample index (row * width * oversampling + column) of every covered sample.
-    face : (N,) int32, weights : (N, 3) float32
-        Where on the mesh each sample lies.
-    points, view : (N, 3) float32
-        World positions and unit vectors towards the camera.
+    ``index`` (N,) is the flat number (row * width * oversampling + column) of every covered sample, ``face`` (N,) and
+    ``weights`` (N, 3) where on the mesh it lies, ``points`` (N, 3) its world position and ``view`` (N, 3) the unit
+    vector towards the camera.
     """
 
     shape: tuple[int, int]

@@ -32,11 +32,8 @@ _FOLDERS = (MARK, "geometry", "refined", "maps", "masks")
 def check_ours(folder: Path, force: bool = False) -> None:
     """Refuse a folder that holds what mifit did not write.
 
-    Raises
-    ------
-    InputError
-        A file; a link where a result has a folder, or in ``.mifit``; or without ``force`` a folder that isn't empty and
-        has neither the mark nor a result in it.
+    InputError for a file; a link where a result has a folder, or in ``.mifit``; or without ``force`` a folder that
+    isn't empty and has neither the mark nor a result in it.
     """
     if not os.path.lexists(folder):
         return
@@ -68,12 +65,7 @@ def claim(folder: Path, force: bool = False) -> None:
 def locked(folder: Path, force: bool = False) -> Iterator[None]:
     """Claim a folder, keep others from writing into it, and finish what an interrupted write left in it.
 
-    Who holds the lock may take it again.
-
-    Raises
-    ------
-    InputError
-        Another one writes into it, or as `claim`.
+    Who holds the lock may take it again. InputError where another one writes into it, or as `claim`.
     """
     from filelock import FileLock, Timeout
 
@@ -103,13 +95,7 @@ def locked(folder: Path, force: bool = False) -> Iterator[None]:
 
 
 def finish(folder: Path) -> None:
-    """Finish an interrupted write into a result; called by what is about to read it and then to write into it.
-
-    Raises
-    ------
-    InputError
-        The folder isn't ours, or another process writes into it.
-    """
+    """Finish an interrupted write into a result; called by what is about to read it and then to write into it."""
     if _interrupted(folder):
         with locked(folder):
             pass
@@ -119,10 +105,7 @@ def finish(folder: Path) -> None:
 def unchanging(folder: Path) -> Iterator[None]:
     """Read a result in the block as one write has left it; nothing is written.
 
-    Raises
-    ------
-    InputError
-        A write was interrupted, or another process writes meanwhile.
+    InputError where a write was interrupted, or another process writes meanwhile.
     """
 
     def state() -> dict[str, str]:
@@ -186,10 +169,7 @@ def remove_written(folder: Path, names: Iterable[str]) -> None:
 def clear(folder: Path) -> None:
     """Delete a folder that holds nothing but what mifit wrote; one that is missing is clear.
 
-    Raises
-    ------
-    InputError
-        Files that mifit did not write, or that were changed since; nothing is deleted then.
+    InputError for files that mifit did not write, or that were changed since; nothing is deleted then.
     """
     if not os.path.lexists(folder):
         return

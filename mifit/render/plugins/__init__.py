@@ -12,15 +12,7 @@ _CLASSES: dict[str, dict[str, type]] = {}
 def register_plugins() -> dict[str, type]:
     """Register ``blinnphong``, ``shenv``, ``shdirect`` and ``pinhole`` with the current variant; harmless to repeat.
 
-    Returns
-    -------
-    dict of str to type
-        The plugin classes of this variant by name.
-
-    Raises
-    ------
-    VariantError
-        No variant is active.
+    Returns the classes of this variant by name. VariantError where no variant is active.
     """
     import mitsuba as mi
 
