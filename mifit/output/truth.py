@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrueMesh:
-    """The true surface of one timestep in world space; ``face_mask`` (F,) is the face area, all where the truth doesn't say."""
+    """The true surface of one timestep in world space; ``face_mask`` (F,): the face area, or all of it."""
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
