@@ -74,7 +74,7 @@ def traced(
         )
         cameras = compose.place_cameras(WIDTH, HEIGHT)
         cameras[:2] = [
-            compose._camera(camera.name, WIDTH, HEIGHT, camera.fx, compose.DISTANCE, angle, 0.0)
+            compose.camera_at(camera.name, WIDTH, HEIGHT, angle, 0.0)
             for camera, angle in zip(cameras, angles, strict=False)
         ]
         compose._write_capture(out, subject, cameras, light().astype(np.float32), SPP, lambda done: None)

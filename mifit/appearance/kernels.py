@@ -229,9 +229,7 @@ def dominant_direction(coefficients: Sequence[Any]) -> Any:
     return dr.select(length > floor, d * dr.rsqrt(dr.maximum(length, floor)), mi.Vector3f(0.0, 0.0, 1.0))
 
 
-def light_transfer(
-    n: Any, v: Any, lobe: PreparedLobe, directions: Sequence[Any], visible: Any
-) -> tuple[Any, Any]:
+def light_transfer(n: Any, v: Any, lobe: PreparedLobe, directions: Sequence[Any], visible: Any) -> tuple[Any, Any]:
     """Radiance of a white diffuse and of a fully specular point per unit of a compact light's colour.
 
     Nothing is band limited here: cosine and lobe are those of the light's own directions, and shadows are traced.

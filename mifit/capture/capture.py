@@ -25,8 +25,6 @@ from mifit.errors import InputError
 
 CACHE_BYTES = 256 * 2**20
 """Decoded images that a capture keeps at most."""
-MIN_VALUE, MAX_VALUE = -0.1, 1e6
-"""Linear values that count as light: noise goes below 0, skies reach 1e5 (white is 1). Others are damage, as NaN is."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +36,8 @@ class Frame:
     image : (H, W, 3) float32
         Linear Rec. 709, gain applied; 0 where not valid.
     valid : (H, W) bool
-        Inside the stored image, the mask file and the alpha channel, and a number between `MIN_VALUE` and `MAX_VALUE`.
+        Inside the stored image, the mask file and the alpha channel, and a number that is light.
+        Noise goes down to -0.1, skies reach 1e5 (white is 1); others are damage, as NaN is.
     clipped : (H, W) bool
         At the largest code value in some channel (touched by such a pixel after undistortion): no measurement.
     landmarks : (68, 2) float64 or None
@@ -286,7 +285,7 @@ class Capture:
         view = self.views[shot.camera]
         found = load_image(shot.image)
         _check_size(found.pixels.shape[:2], view, shot.image)
-        light = (found.pixels >= MIN_VALUE) & (found.pixels <= MAX_VALUE)  # NaN is neither
+        light = (found.pixels >= -0.1) & (found.pixels <= 1e6)  # NaN is neither
         valid: NDArray[np.bool_] = np.asarray(light.all(axis=-1))
         if found.alpha is not None:
             valid &= found.alpha >= 0.5

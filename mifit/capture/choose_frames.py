@@ -19,19 +19,30 @@ from mifit.errors import InputError
 if TYPE_CHECKING:
     from mifit.capture import Capture
 
-BLURRED = 0.5
-"""Sharpness below this part of the median."""
-BLINK = 0.6
-"""Opening of the eyes below this part of the median."""
-DISAGREEING = 3.0
-"""Median distance to the epipolar lines above this many times the median of all frames, and above `PIXELS`."""
-PIXELS = 1.0
-SIDE = 128
-"""Pixels across a face at which its sharpness is measured: the same whatever the size of the images."""
 RIGID = (27, 28, 29, 30, 33, 36, 39, 42, 45)
 """Landmarks that expressions move least: the ridge and base of the nose, the corners of the eyes."""
 EYES = ((37, 41, 38, 40, 36, 39), (43, 47, 44, 46, 42, 45))
 """Upper and lower lids, twice, and the corners of both eyes."""
+
+
+@dataclass(frozen=True)
+class FrameLimits:
+    """What a frame is left out for.
+
+    Attributes
+    ----------
+    sharpness : float
+        Below this part of the median.
+    opening : float
+        Of the eyes, below this part of the median.
+    disagreement, pixels : float
+        Median distance to the epipolar lines above this many times the median of all frames, and above these pixels.
+    """
+
+    sharpness: float = 0.5
+    opening: float = 0.6
+    disagreement: float = 3.0
+    pixels: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -70,6 +81,7 @@ def choose_frames(
     count: int,
     timesteps: Sequence[int] | None = None,
     beside: Sequence[int] = (),
+    limits: FrameLimits = FrameLimits(),
 ) -> FrameChoice:
     """Choose the timesteps of a capture that tell most about a face.
 
@@ -88,6 +100,7 @@ def choose_frames(
         Those to choose from; default: all.
     beside : sequence of int
         Timesteps that are taken already: those that are chosen lie far from them too, and are others.
+    limits : FrameLimits
 
     Raises
     ------
@@ -108,11 +121,11 @@ def choose_frames(
     for i, t in enumerate(int(t) for t in steps):
         if t in left_out or t in beside:
             continue
-        if sharp[i] < BLURRED * np.nanmedian(sharp):
+        if sharp[i] < limits.sharpness * np.nanmedian(sharp):
             left_out[t] = f"blurred: {sharp[i] / np.nanmedian(sharp):.0%} of the usual sharpness"
-        elif opening[i] < BLINK * np.nanmedian(opening):
+        elif opening[i] < limits.opening * np.nanmedian(opening):
             left_out[t] = f"eyes closed: {opening[i] / np.nanmedian(opening):.0%} of the usual opening"
-        elif apart[i] > max(DISAGREEING * float(np.nanmedian(apart)), PIXELS):
+        elif apart[i] > max(limits.disagreement * float(np.nanmedian(apart)), limits.pixels):
             left_out[t] = f"views disagree: landmarks {apart[i]:.1f} pixels off the other view's lines"
     good = np.array([i for i, t in enumerate(steps) if int(t) not in left_out])
     if not len(good):  # better the worst frames than none
@@ -165,7 +178,7 @@ def _landmarks(capture: Capture, camera: str, steps: NDArray) -> NDArray[np.floa
 
 
 def _sharpness(capture: Capture, cameras: Sequence[str], timestep: int, points: NDArray) -> float:
-    """Least over the cameras of the share of fine detail in the face's contrast; NaN without landmarks."""
+    """Least over the cameras of the share of fine detail in the face's contrast, 128 pixels across; NaN without one."""
     found = []
     for name, p in zip(cameras, points, strict=True):
         if not np.isfinite(p).all():
@@ -176,7 +189,7 @@ def _sharpness(capture: Capture, cameras: Sequence[str], timestep: int, points: 
         if (high - low).min() < 8:
             continue
         crop = np.sqrt(np.maximum(image[low[1] : high[1], low[0] : high[0]], 0.0)).astype(np.float32)
-        scale = SIDE / max(crop.shape)
+        scale = 128 / max(crop.shape)
         if scale < 1.0:
             crop = cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         fine = crop - cv2.GaussianBlur(crop, (0, 0), 1.5)

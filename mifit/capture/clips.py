@@ -25,12 +25,6 @@ SOUND_RATE = 2000
 """Values of a sound's envelope per second."""
 MOTION_RATE = 480
 """Values per second between which the motion of frames is interpolated."""
-MOTION_WIDTH = 160
-"""Width in pixels of the pictures whose motion is measured."""
-LEAST_OVERLAP = 1.0
-"""Seconds that two clips share at the least; of shorter clips half of the shorter one."""
-CERTAIN_SOUND, CERTAIN_MOTION = 0.3, 0.6
-"""Correlation from which a lag is taken; motion has fewer values to agree on."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +50,14 @@ FIRST = Start(0.0, "none", 1.0)
 
 
 def synchronise(videos: Sequence[Video], progress: Progress = silent) -> list[Start]:
-    """Starts of clips, the first one's at 0: by sound where all have sound and it can be read, else by motion."""
+    """Starts of clips, the first one's at 0: by sound where all have sound and it can be read, else by motion.
+
+    Sounds count from a correlation of 0.3 on, motions, which have fewer values to agree on, from 0.6.
+    """
     sounds = [sound for sound in (_sound(video.path) for video in videos) if sound is not None]
     if len(sounds) == len(videos):
         found = [lag(sounds[0], sound, SOUND_RATE) for sound in sounds[1:]]
-        if min((r for _, r in found), default=1.0) >= CERTAIN_SOUND:
+        if min((r for _, r in found), default=1.0) >= 0.3:
             return [FIRST, *(Start(-seconds, "sound", r) for seconds, r in found)]
     motions = []
     for k, video in enumerate(videos):
@@ -68,11 +65,14 @@ def synchronise(videos: Sequence[Video], progress: Progress = silent) -> list[St
         motions.append(_motion(video))
     progress("Synchronising", len(videos), len(videos))
     found = [lag(motions[0], motion, MOTION_RATE) for motion in motions[1:]]
-    return [FIRST, *(Start(-s, "motion", r) if r >= CERTAIN_MOTION else Start(0.0, "none", r) for s, r in found)]
+    return [FIRST, *(Start(-s, "motion", r) if r >= 0.6 else Start(0.0, "none", r) for s, r in found)]
 
 
 def lag(first: NDArray, second: NDArray, rate: float) -> tuple[float, float]:
-    """Seconds by which what happens comes later in the second signal, and the correlation there."""
+    """Seconds by which what happens comes later in the second signal, and the correlation there.
+
+    The signals share a second at the least, or half of the shorter one.
+    """
     a, b = (np.asarray(x, dtype=np.float64) - np.mean(x) for x in (first, second))
     ones = np.ones(len(a)), np.ones(len(b))
     product = correlate(b, a, method="fft")
@@ -80,7 +80,7 @@ def lag(first: NDArray, second: NDArray, rate: float) -> tuple[float, float]:
     # All of the shorter signal, and of the longer one what it lies beside: a few moments alike are no match.
     energy = (a @ a) * within[0] if len(a) <= len(b) else (b @ b) * within[1]
     shared = correlate(ones[1], ones[0], method="fft")
-    least = min(LEAST_OVERLAP * rate, 0.5 * min(len(a), len(b)))
+    least = min(rate, 0.5 * min(len(a), len(b)))
     score = np.where(shared >= least, product / np.sqrt(np.maximum(energy, 1e-12 * energy.max() + 1e-30)), -1.0)
     peak = int(score.argmax())
     shift = 0.0
@@ -141,8 +141,8 @@ def _small_frames(video: Video) -> Iterator[NDArray[np.float32]]:
             if not there:
                 return
             grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-            height = max(round(MOTION_WIDTH * grey.shape[0] / grey.shape[1]), 1)
-            yield cv2.resize(grey, (MOTION_WIDTH, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+            height = max(round(160 * grey.shape[0] / grey.shape[1]), 1)
+            yield cv2.resize(grey, (160, height), interpolation=cv2.INTER_AREA).astype(np.float32)
     finally:
         reader.release()
 

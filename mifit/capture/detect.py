@@ -6,7 +6,6 @@ import itertools
 import os
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +98,7 @@ def _keep_landmarks(folder: Path) -> Path | None:
 
 def _run(
     capture: Capture, detector: Detector, progress: Progress
-) -> tuple[dict[tuple[str, int], NDArray[np.float64]], dict[tuple[str, int], dict[str, Any]]]:
+) -> tuple[dict[tuple[str, int], NDArray[np.float64]], dict[tuple[str, int], dict[str, list]]]:
     """Landmarks per image in coordinates of the stored images (NaN where no face is found), and what else is known."""
     points, more = {}, {}
     for i, (key, shot) in enumerate(capture.shots.items()):

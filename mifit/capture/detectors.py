@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-from pathlib import Path
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +12,7 @@ from mifit.capture.face_mesh import FaceMesh
 from mifit.capture.face_networks import missing
 from mifit.errors import InputError, MifitError
 
-DETECTORS = ("mediapipe", "face-alignment", "lbf:FOLDER")
+DETECTORS = ("mediapipe", "face-alignment")
 
 
 class Detector(Protocol):
@@ -37,26 +35,22 @@ def open_detector(name: str | None = None) -> Detector:
     Parameters
     ----------
     name : str, optional
-        ``mediapipe``, ``face-alignment``, or ``lbf:FOLDER`` with ``lbfmodel.yaml`` and a face finder in the folder
-        (``*.xml``, a Haar cascade, or ``*.onnx``, YuNet). By default face-alignment, the paper's detector, where it is
-        installed, else MediaPipe.
+        ``mediapipe`` or ``face-alignment``; by default the latter, the paper's detector, where it is installed, else
+        MediaPipe.
 
     Raises
     ------
     InputError
-        An unknown name, or files of the detector that are missing.
+        An unknown name, or a package that is missing.
     MifitError
         The detector doesn't start.
     """
     if name is None:
         name = "face-alignment" if importlib.util.find_spec("face_alignment") else "mediapipe"
-    kind, _, folder = name.partition(":")
-    if kind == "mediapipe":
+    if name == "mediapipe":
         return FaceMesh()
-    if kind == "face-alignment":
+    if name == "face-alignment":
         return FaceAlignment()
-    if kind == "lbf" and folder:
-        return Lbf(Path(folder))
     raise InputError(f"detector: found {name!r}, expected one of {', '.join(DETECTORS)}")
 
 
@@ -93,56 +87,3 @@ class FaceAlignment:
             return None
         faces = [np.asarray(points, dtype=np.float64)[:, :2] for points in found]
         return max(faces, key=lambda points: float(np.prod(np.ptp(points, axis=0)))) + 0.5
-
-
-class Lbf:
-    """OpenCV's Facemark LBF (Ren et al. 2014) with a model file and a face finder from the user."""
-
-    name, scatter = "lbf", 0.0
-
-    def __init__(self, folder: Path) -> None:
-        model = folder / "lbfmodel.yaml"
-        finders = sorted([*folder.glob("*.xml"), *folder.glob("*.onnx")]) if folder.is_dir() else []
-        if not model.is_file() or not finders:
-            raise InputError(
-                f"{folder}: found {int(model.is_file())} lbfmodel.yaml and {len(finders)} face finders, expected both "
-                "(a Haar cascade .xml or a YuNet .onnx)"
-            )
-        try:
-            self._facemark = cv2.face.createFacemarkLBF()
-            self._facemark.loadModel(str(model))
-            self._find = _yunet(finders[0]) if finders[0].suffix == ".onnx" else _cascade(finders[0])
-        except (cv2.error, AttributeError) as error:
-            raise InputError(f"{folder}: OpenCV can't load its files ({' '.join(str(error).split())[-120:]})") from None
-
-    def detect(self, image: NDArray[np.uint8]) -> NDArray[np.float64] | None:
-        """See `Detector.detect`; the largest face counts."""
-        bgr = np.ascontiguousarray(image[..., ::-1])
-        boxes = self._find(bgr)
-        if not len(boxes):
-            return None
-        box = max(boxes, key=lambda b: int(b[2]) * int(b[3]))
-        ok, found = self._facemark.fit(bgr, np.array([box], dtype=np.int32))
-        return np.asarray(found[0], dtype=np.float64).reshape(68, 2) + 0.5 if ok else None
-
-
-def _cascade(path: Path) -> Any:
-    try:
-        cascade = cv2.CascadeClassifier(str(path))
-        empty = cascade.empty()
-    except (cv2.error, SystemError):
-        empty = True
-    if empty:
-        raise InputError(f"{path}: not a readable Haar cascade; expected one as OpenCV ships them")
-    return lambda image: cascade.detectMultiScale(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), 1.1, 3)
-
-
-def _yunet(path: Path) -> Any:
-    finder = cv2.FaceDetectorYN.create(str(path), "", (320, 320))
-
-    def find(image: NDArray) -> Any:
-        finder.setInputSize((image.shape[1], image.shape[0]))
-        boxes = finder.detect(image)[1]
-        return [] if boxes is None else boxes[:, :4].astype(int)
-
-    return find

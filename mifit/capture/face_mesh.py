@@ -29,21 +29,8 @@ of three captures. Their median error is 1.5 per cent, but neighbours share it a
 that a sum over all points must weigh less than if they were independent."""
 POINTS, IRIS = 468, 5
 """Points of the mesh, and of each iris."""
-SCORE, PRESENCE = 0.3, 0.9
-"""Probability from which the finder's boxes are tried, and from which the mesh network's face is one."""
 MARGIN, EYE_MARGIN = 1.5, 2.3
 """Squares about a face and an eye, relative to the larger side of their points: what the networks were trained on."""
-TURNS = (35.0, -35.0, 90.0, -90.0, 180.0)
-"""Degrees by which an image without an upright face is turned."""
-UPRIGHT = np.radians(30.0)
-"""Angle of the eyes up to which a face stands upright: the finder was trained on such faces, and in one that lies it
-finds something else."""
-ROUNDS = 3
-"""Runs of the mesh network, each about the points of the last."""
-JITTER = (-0.2, 0.0, 0.2)
-"""Radians by which the last square is turned."""
-STRIDE = 4
-"""Pixels between the finder's anchors."""
 EYE_CORNERS = ((33, 133), (263, 362))
 EYE_CONTOURS = (
     (33, 7, 163, 144, 145, 153, 154, 155, 133, 246, 161, 160, 159, 158, 157, 173),
@@ -52,9 +39,6 @@ EYE_CONTOURS = (
 """Mesh points on the rim of each eye, as the iris network lists them."""
 LIDS = (((37, 41, 160, 144), (38, 40, 158, 153)), ((43, 47, 385, 380), (44, 46, 387, 373)))
 """Of each eye, two landmarks on the upper lid with those below them, and the mesh points of the rim at both."""
-CLOSED = 0.12
-"""Opening of an eye, relative to its width, below which the lids are closed: the iris network has 0.05 to 0.10 on
-closed lids and 0.2 to 0.4 on open ones, the table of landmarks, which is fitted on open eyes, 0.22 and more on both."""
 SIDES, TOP_CHIN = (234, 454), (10, 152)
 """Mesh points at the ears, and at the hairline and chin."""
 
@@ -109,13 +93,17 @@ class Face:
 
     @property
     def landmarks(self) -> NDArray[np.float64]:
-        """(68, 2) iBUG points; those on closed lids lie as far apart as the iris network has them."""
+        """(68, 2) iBUG points; those on closed lids lie as far apart as the iris network has them.
+
+        That network has lids that are closed 0.05 to 0.10 of the eye's width apart and open ones 0.2 to 0.4; the table
+        of landmarks, which is fitted on open eyes, 0.22 and more on both.
+        """
         flat = self.points[:, :2]
         marks = landmark_map() @ flat
         for pairs, (one, other) in zip(LIDS, EYE_CORNERS, strict=True):
             gaps = [flat[above] - flat[below] for _, _, above, below in pairs]
             width = float(np.linalg.norm(flat[one] - flat[other]))
-            if np.mean([np.linalg.norm(gap) for gap in gaps]) < CLOSED * width:
+            if np.mean([np.linalg.norm(gap) for gap in gaps]) < 0.12 * width:
                 for (upper, lower, _, _), gap in zip(pairs, gaps, strict=True):
                     middle = 0.5 * (marks[upper] + marks[lower])
                     marks[upper], marks[lower] = middle + 0.5 * gap, middle - 0.5 * gap
@@ -189,7 +177,7 @@ def _windows(image: NDArray) -> Iterator[list[_Square]]:
     height, width = image.shape[:2]
     middle, side = np.array([width / 2, height / 2]), float(max(height, width))
     yield [_Square(middle, side, 0.0)]
-    yield [_Square(middle, side, np.radians(turn)) for turn in TURNS]
+    yield [_Square(middle, side, np.radians(turn)) for turn in (35.0, -35.0, 90.0, -90.0, 180.0)]
     for part in (0.6, 0.35):
         reach = part * side
         columns, rows = (
@@ -242,24 +230,27 @@ class FaceMesh:
         return None
 
     def _upright(self, image: NDArray, window: _Square, box: _Box) -> Face | None:
-        """The face in a box; None where it lies in the window that it was found in: then it is something else."""
+        """The face in a box; None where its eyes lie aslant in the window that it was found in.
+
+        The finder was trained on upright faces, and in one that lies it finds something else.
+        """
         face = self._settle(image, box.square)
         if face is None:
             return None
         turned = np.angle(np.exp(1j * (face.angle - window.angle)))
-        return face if abs(turned) < UPRIGHT else None
+        return face if abs(turned) < np.radians(30.0) else None
 
     def _boxes(self, image: NDArray, window: _Square) -> list[_Box]:
-        """The likeliest faces of a part of an image, at most two."""
+        """The likeliest faces of a part of an image, at most two, of a probability of 0.3 and more."""
         size = self._find.size
-        cells = size // STRIDE
+        cells = size // 4  # one of the finder's anchors
         out = self._find(2.0 * window.cut(image, size) - 1.0)
         score = 1.0 / (1.0 + np.exp(-np.clip(out[cells * cells], -80, 80)))
         raw = out[cells * cells * 16].reshape(-1, 16)
         found: list[_Box] = []
         taken: list[NDArray] = []
         for i in np.argsort(-score)[:50]:
-            if score[i] < SCORE or len(found) == 2:
+            if score[i] < 0.3 or len(found) == 2:
                 break
             anchor = (np.array([i % cells, i // cells]) + 0.5) / cells
             centre, extent = raw[i, :2] / size + anchor, raw[i, 2:4] / size
@@ -282,12 +273,12 @@ class FaceMesh:
         The last round is a mean over the square a little turned and mirrored: the network's error is partly one of how
         the face lies in its input.
         """
-        for _ in range(ROUNDS - 1):
+        for _ in range(2):
             points, presence = self._look(image, square)
-            if presence < PRESENCE:
+            if presence < 0.9:
                 return None
             square = _Square.about(points[:, :2], points[EYE_CORNERS[0][0], :2], points[EYE_CORNERS[1][0], :2], MARGIN)
-        turned = [replace(square, angle=square.angle + turn) for turn in JITTER]
+        turned = [replace(square, angle=square.angle + turn) for turn in (-0.2, 0.0, 0.2)]
         looks = [self._look(image, one, mirrored) for one in turned for mirrored in (False, True)]
         mean = np.mean([points for points, _ in looks], axis=0)
         return Face(self._with_eyes(image, mean), min(presence for _, presence in looks))

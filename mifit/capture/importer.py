@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, TypedDict
 
 from mifit.capture.capture import Capture
 from mifit.capture.clips import aligned
@@ -19,6 +20,9 @@ from mifit.core.limits import MAX_IMAGE_BYTES
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 
 @dataclass(frozen=True)
 class Material:
@@ -30,18 +34,24 @@ class Material:
     units: str
 
 
+class Selection(TypedDict, total=False):
+    """Which frames are kept, see `import_capture`, and who is told how far it is."""
+
+    every: int
+    start: int
+    count: int | None
+    starts: Sequence[float]
+    progress: Progress
+
+
 def import_capture(
     out: str | Path,
     videos: Sequence[str | Path] = (),
     calibration: str | Path | None = None,
     images: Sequence[str | Path] = (),
     transforms: str | Path | None = None,
-    every: int = 1,
-    start: int = 0,
-    count: int | None = None,
     units: str | None = None,
-    starts: Sequence[float] = (),
-    progress: Progress = silent,
+    **options: Unpack[Selection],
 ) -> Path:
     """Make a capture folder from what a lab has.
 
@@ -97,16 +107,16 @@ def import_capture(
             views = read_stereo(calibration, [source.name for source in sources], [source.size for source in sources])
         return Material(sources, views, {}, units or "cm")
 
-    return import_material(out, gather, every, start, count, units, starts, progress)
+    return import_material(out, gather, units, **options)
 
 
 def import_material(
     out: str | Path,
     gather: Callable[[], Material],
+    units: str | None = None,
     every: int = 1,
     start: int = 0,
     count: int | None = None,
-    units: str | None = None,
     starts: Sequence[float] = (),
     progress: Progress = silent,
 ) -> Path:

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,7 +102,7 @@ def _check_spread(path: Path, points: NDArray[np.float64]) -> None:
         )
 
 
-def write_landmarks(path: str | Path, landmarks: Landmarks, more: Mapping[str, Any] | None = None) -> None:
+def write_landmarks(path: str | Path, landmarks: Landmarks, more: Mapping[str, object] | None = None) -> None:
     """Write the JSON form, whole or not at all; ``more`` is what else a detector found, JSON values by name."""
     text = json.dumps(
         {
@@ -118,7 +117,7 @@ def write_landmarks(path: str | Path, landmarks: Landmarks, more: Mapping[str, A
 
 
 def _read_json(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
-    data: Any = json.loads(read_text(path, MAX_SETTINGS_BYTES, "landmark file"))
+    data = json.loads(read_text(path, MAX_SETTINGS_BYTES, "landmark file"))
     if isinstance(data, list):
         data = {"points": data}
     if not isinstance(data, dict) or "points" not in data:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -58,12 +57,9 @@ class Undistortion:
     def of(cls, camera: Camera) -> Undistortion:
         """Compute the look-up for a camera; the undistorted image keeps size and intrinsics."""
         matrix, size = opencv_matrix(camera), (camera.width, camera.height)
-        maps: Any = cv2.initUndistortRectifyMap(
-            matrix, np.array(camera.distortion), np.eye(3), matrix, size, cv2.CV_32FC1
-        )
-        x, y = maps
+        x, y = cv2.initUndistortRectifyMap(matrix, np.array(camera.distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
         inside = (x >= 0) & (x <= camera.width - 1) & (y >= 0) & (y <= camera.height - 1)
-        return cls(x, y, inside & _one_to_one(camera, x, y))
+        return cls(np.asarray(x, np.float32), np.asarray(y, np.float32), inside & _one_to_one(camera, x, y))
 
     def apply(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Undistort an image (H, W) or (H, W, C), bilinear; 0 outside the stored image."""

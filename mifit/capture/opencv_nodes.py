@@ -17,12 +17,13 @@ from mifit.core.files import read_text
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 
-MAX_DEPTH = 16
-"""Nesting of YAML collections; OpenCV's matrices are two deep."""
 _FIELDS = ("rows", "cols", "dt")
 
 
-def read_nodes(path: Path) -> dict[str, NDArray[np.float64] | float]:
+Nodes = dict[str, NDArray[np.float64] | float]
+
+
+def read_nodes(path: Path) -> Nodes:
     """Matrices and numbers at a file's top level by name; strings, lists and maps are left out.
 
     Raises
@@ -34,7 +35,7 @@ def read_nodes(path: Path) -> dict[str, NDArray[np.float64] | float]:
     if not text.startswith(("%YAML", "<?xml", "<opencv_storage")):
         raise _unreadable(path, f"it starts with {text[:12]!r}, expected %YAML or <?xml")
     xml = text.startswith("<")
-    found: dict[str, NDArray[np.float64] | float] = {}
+    found: Nodes = {}
     for name, matrix, value in _xml(text, path) if xml else _yaml(text, path):
         if matrix is not None:
             found[name] = _matrix(*matrix, f"{path}: {name}")
@@ -59,8 +60,8 @@ def _yaml(text: str, path: Path) -> Iterator[Entry]:
         depth = 0
         for event in yaml.parse(text, Loader=_Loader):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > MAX_DEPTH:
-                raise _unreadable(path, f"nested more than {MAX_DEPTH} deep")
+            if depth > 16:  # OpenCV's matrices are two deep
+                raise _unreadable(path, "nested more than 16 deep")
             if isinstance(event, yaml.AliasEvent):
                 raise _unreadable(path, "an alias, which OpenCV never writes")
         documents = list(yaml.load_all(text, Loader=_Loader))  # OpenCV appends as another document

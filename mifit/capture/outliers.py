@@ -7,14 +7,8 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
 
-TEMPORAL_FLOOR = 0.05
-EPIPOLAR_FLOOR = 0.02
-"""Smallest deviation that counts, as a part of the face's width; expressions and detector noise stay below."""
-SIGMAS = 4.5
-"""Deviation that counts, in robust standard deviations of all landmarks of a camera."""
 
-
-def temporal_outliers(points: NDArray) -> NDArray[np.bool_]:
+def temporal_outliers(points: NDArray, floor: float = 0.05) -> NDArray[np.bool_]:
     """Landmarks that jump: far from where the frames before and after put them.
 
     The neighbours are moved onto each frame by the similarity that fits best, so head motion doesn't count.
@@ -23,6 +17,8 @@ def temporal_outliers(points: NDArray) -> NDArray[np.bool_]:
     ----------
     points : (T, 68, 2)
         Landmarks over time; NaN where there are none.
+    floor : float
+        Smallest jump that counts, as a part of the face's width: expressions and a detector's noise stay below.
 
     Returns
     -------
@@ -37,10 +33,12 @@ def temporal_outliers(points: NDArray) -> NDArray[np.bool_]:
             continue
         # the nearer of two neighbours, so that a jump counts in its own frame only
         residual[t] = np.min([np.linalg.norm(_align(points[s], points[t]) - points[t], axis=1) for s in around], axis=0)
-    return _beyond(residual, TEMPORAL_FLOOR * _widths(points))
+    return _beyond(residual, floor * _widths(points))
 
 
-def epipolar_outliers(first: NDArray, second: NDArray, cameras: tuple[Camera, Camera]) -> NDArray[np.bool_]:
+def epipolar_outliers(
+    first: NDArray, second: NDArray, cameras: tuple[Camera, Camera], floor: float = 0.02
+) -> NDArray[np.bool_]:
     """Landmarks of two views that can't be the same point of space.
 
     Parameters
@@ -48,6 +46,8 @@ def epipolar_outliers(first: NDArray, second: NDArray, cameras: tuple[Camera, Ca
     first, second : (T, 68, 2)
         Undistorted landmarks of two cameras; NaN where there are none.
     cameras : two Camera
+    floor : float
+        As of `temporal_outliers`.
 
     Returns
     -------
@@ -62,7 +62,7 @@ def epipolar_outliers(first: NDArray, second: NDArray, cameras: tuple[Camera, Ca
         distance = np.maximum(
             value / np.linalg.norm(line_b[..., :2], axis=2), value / np.linalg.norm(line_a[..., :2], axis=2)
         )
-    return _beyond(distance, EPIPOLAR_FLOOR * np.fmax(_widths(first), _widths(second)))
+    return _beyond(distance, floor * np.fmax(_widths(first), _widths(second)))
 
 
 def fundamental_matrix(first: Camera, second: Camera) -> NDArray[np.float64]:
@@ -83,11 +83,12 @@ def _widths(points: NDArray) -> NDArray[np.float64]:
 
 
 def _beyond(residual: NDArray, floor: NDArray) -> NDArray[np.bool_]:
+    """Above the floor and 4.5 robust standard deviations of all landmarks of a camera."""
     seen = residual[np.isfinite(residual)]
     if not len(seen):
         return np.zeros(residual.shape, dtype=bool)
     with np.errstate(invalid="ignore"):
-        return np.asarray(residual > np.fmax(floor, SIGMAS * 1.4826 * np.median(seen)))
+        return np.asarray(residual > np.fmax(floor, 4.5 * 1.4826 * np.median(seen)))
 
 
 def _align(source: NDArray, target: NDArray) -> NDArray[np.float64]:

@@ -14,16 +14,13 @@ from mifit.errors import InputError
 
 JAW = 17
 """The first landmarks lie on the jaw's outline, which slides over the head as it turns: they count less."""
-JAW_WEIGHT = 0.3
 NOISE = 0.004
 """Standard deviation of a landmark as a part of the image's longer side."""
-FOCAL_DEVIATION = 0.02, 0.5
-"""Deviation of the logarithm of an unknown focal length from the others', for images of their size and not."""
 
 
 def landmark_weights(indices: NDArray) -> NDArray[np.float64]:
     """Weights of landmarks of these numbers: less for the jaw's."""
-    return np.where(indices < JAW, JAW_WEIGHT, 1.0)
+    return np.where(indices < JAW, 0.3, 1.0)
 
 
 def resect_camera(
@@ -38,7 +35,7 @@ def resect_camera(
     points : (N, 3), pixels : (N, 2), weights : (N,)
         World space; undistorted pixels; weights of their distances.
     focal : float
-        Expected focal length in pixels, where the view has none.
+        Expected focal length in pixels, where the view has none: to 2 % if ``same``, else to half of it.
     same : bool
         Whether its images have the size of those that ``focal`` is from.
 
@@ -62,7 +59,7 @@ def resect_camera(
         return np.asarray(zoom(x) * np.array((fx, fy)) * p[:, :2] / np.maximum(p[:, 2:], 1e-6) + (cx, cy) - pixels)
 
     def residuals(x: NDArray) -> NDArray:
-        return np.append((off(x) * (weights / noise)[:, None]).ravel(), x[6] / FOCAL_DEVIATION[not same])
+        return np.append((off(x) * (weights / noise)[:, None]).ravel(), x[6] / (0.02, 0.5)[not same])
 
     start = np.concatenate([turn.ravel(), shift.ravel(), [0.0]])
     x = least_squares(residuals, start, loss="soft_l1", x_scale="jac", max_nfev=200).x

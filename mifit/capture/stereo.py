@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.capture.lens import opencv_matrix
-from mifit.capture.opencv_nodes import read_nodes
+from mifit.capture.opencv_nodes import Nodes, read_nodes
 from mifit.capture.transforms import View, nearest_rotation
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.core.files import replacing
@@ -87,7 +86,7 @@ def write_stereo(path: str | Path, first: Camera, second: Camera) -> None:
         file.release()
 
 
-def _matrix(found: dict[str, Any], keys: tuple[str, ...], path: Path, shape: tuple[int, int]) -> NDArray[np.float64]:
+def _matrix(found: Nodes, keys: tuple[str, ...], path: Path, shape: tuple[int, int]) -> NDArray[np.float64]:
     for key in keys:
         if found.get(key) is not None:
             matrix = np.asarray(found[key], dtype=np.float64)
@@ -99,7 +98,7 @@ def _matrix(found: dict[str, Any], keys: tuple[str, ...], path: Path, shape: tup
     raise InputError(f"{path}: found keys {', '.join(found) or 'none'}, expected {keys[0]} {shape[0]} x {shape[1]}")
 
 
-def _distortion(found: dict[str, Any], keys: tuple[str, ...], path: Path) -> tuple[float, ...]:
+def _distortion(found: Nodes, keys: tuple[str, ...], path: Path) -> tuple[float, ...]:
     values = next((found[key] for key in keys if found.get(key) is not None), np.zeros((1, 4)))
     coefficients = np.asarray(values, dtype=np.float64).ravel()
     if len(coefficients) > 8 and not coefficients[8:].any():
@@ -109,7 +108,7 @@ def _distortion(found: dict[str, Any], keys: tuple[str, ...], path: Path) -> tup
     return tuple(coefficients.tolist()) if coefficients.any() else ()
 
 
-def _check_size(found: dict[str, Any], sizes: Sequence[tuple[int, int]], path: Path) -> None:
+def _check_size(found: Nodes, sizes: Sequence[tuple[int, int]], path: Path) -> None:
     expected = found.get("image_width"), found.get("image_height")
     for size in sizes:
         if None not in expected and size != expected:

@@ -27,8 +27,6 @@ from mifit.errors import InputError
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0}
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 MIN_SIDE = 16
-MAX_DISTORTION = 1e4
-"""Magnitude of a lens coefficient: those of rational models reach tens."""
 MASK_KEYS = ("mask_path", "fg_mask_path")
 """Ours and nerfstudio's, VHAP's."""
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -150,7 +148,7 @@ def write_transforms(path: str | Path, views: Iterable[View], shots: Iterable[Sh
     frames = []
     for shot in shots:
         view = by_name[shot.camera]
-        entry: dict[str, Any] = {"file_path": _relative(shot.image, path.parent)}
+        entry: dict[str, object] = {"file_path": _relative(shot.image, path.parent)}
         if shot.landmarks is not None:
             entry["landmark_path"] = _relative(shot.landmarks, path.parent)
         if shot.mask is not None:
@@ -169,7 +167,7 @@ def write_transforms(path: str | Path, views: Iterable[View], shots: Iterable[Sh
     write_text(path, json.dumps(document, indent=1) + "\n")
 
 
-def update_frames(path: str | Path, changes: Mapping[tuple[str, int], Mapping[str, Any]]) -> None:
+def update_frames(path: str | Path, changes: Mapping[tuple[str, int], Mapping[str, object]]) -> None:
     """Set keys of some images' entries in a ``transforms.json``; all else in it stays, keys unknown to mifit too.
 
     Parameters
@@ -220,7 +218,7 @@ def _load(path: Path) -> dict[str, Any]:
     return document
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     text = "nothing" if value is None else repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
@@ -326,8 +324,8 @@ def _view(entry: _Entry, name: str) -> View:
 def _distortion(entry: _Entry) -> tuple[float, ...]:
     values = [entry.number(key) if key in entry else 0.0 for key in DISTORTION_KEYS]
     for key, value in zip(DISTORTION_KEYS, values, strict=True):
-        if abs(value) > MAX_DISTORTION:
-            raise entry.fail(key, f"a coefficient within {MAX_DISTORTION:g}")
+        if abs(value) > 1e4:  # those of rational models reach tens
+            raise entry.fail(key, "a coefficient within 10000")
     if not any(values):
         return ()
     used = 8 if any(values[5:]) else 5 if values[4] else 4

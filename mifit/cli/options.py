@@ -121,7 +121,7 @@ calibrate  captures.calibrate  cameras from a calibration board, or of a capture
 
 landmarks  captures.landmarks  detect 68 landmarks in every image and write them into the capture
     capture     path  capture folder, or its transforms.json
-    --detector  text  mediapipe, face-alignment or lbf:FOLDER; default: the first that is there
+    --detector  text  mediapipe or face-alignment; default: face-alignment where it is installed
 
 demo  fits.demo  fit a small capture made on the spot, judge it on the held-out view, write a report
     --out  path=out/demo  folder to write (default: out/demo)

@@ -10,19 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from mifit.extras.board_camera import Watched
+from mifit.extras.board_camera import SETTINGS, Watched
 from mifit.extras.boards import Board
 
 LENS, POSE = 9, 6
 """Unknowns of a lens (fx, fy, cx, cy, k1, k2, p1, p2, k3) and of a pose (rotation vector, translation)."""
-PRIORS = 8
-"""Residuals of a lens's prior."""
-CENTRE, ASPECT = 0.03, 0.01
-"""Deviations beforehand of the principal point from the image's middle, in longer sides, and of fy / fx from 1."""
-RADIAL, TANGENTIAL = 0.5, 0.003
-"""Of k1, k2, k3 and of p1, p2 from 0: what a board in the middle of the image doesn't tell stays near a plain lens."""
-LEAST_NOISE = 0.05
-"""Deviation of a board's points from where they are found, pixels, at the least."""
 
 
 def adjust(
@@ -48,7 +40,7 @@ def adjust(
     poses : list of (4, 4)
     """
     every = [error for one in watched for error in one.errors.values()]
-    noise = max(float(np.median(every)) / np.sqrt(2.0), LEAST_NOISE)
+    noise = max(float(np.median(every)) / np.sqrt(2.0), SETTINGS.least_noise)
     count, points = len(watched), board.points
     frames = sorted({i for one in watched for i in one.used})
     blocks = [(c, frames.index(i), found) for c, one in enumerate(watched) for i, found in one.used.items()]
@@ -74,7 +66,7 @@ def adjust(
     def system(x: NDArray) -> tuple[NDArray, NDArray]:
         """Residuals and their derivatives by the scaled unknowns."""
         x = x * scale
-        out = np.zeros(ends[-1] + PRIORS * count)
+        out = np.zeros(ends[-1] + (LENS - 1) * count)
         slopes = np.zeros((len(out), len(x)))
         for row, (c, f, found) in zip(rows, blocks, strict=True):
             at, board = first + POSE * c, first + POSE * (count + f)
@@ -90,7 +82,10 @@ def adjust(
             if c:
                 slopes[row, at : at + POSE] = by[:, :6] @ by_camera
         for c, one in enumerate(watched):
-            row, columns = slice(ends[-1] + PRIORS * c, ends[-1] + PRIORS * (c + 1)), slice(LENS * c, LENS * (c + 1))
+            row, columns = (
+                slice(ends[-1] + (LENS - 1) * c, ends[-1] + (LENS - 1) * (c + 1)),
+                slice(LENS * c, LENS * (c + 1)),
+            )
             value, slope = _unlikely(x[columns], one.size)
             out[row], slopes[row, columns] = noise * value, noise * slope
         return out, slopes * scale
@@ -127,15 +122,15 @@ def _intrinsics(lens: NDArray) -> NDArray[np.float64]:
 
 
 def _unlikely(lens: NDArray, size: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(PRIORS,) how far a lens lies from a plain one, in deviations, and (PRIORS, LENS) its derivative."""
+    """(LENS - 1,) how far a lens lies from a plain one, in deviations, and (LENS - 1, LENS) its derivative."""
     fx, fy, cx, cy = lens[:4]
-    off = np.array([cx - 0.5 * (size[0] - 1), cy - 0.5 * (size[1] - 1)]) / (CENTRE * max(size))
-    bends = np.array([RADIAL, RADIAL, TANGENTIAL, TANGENTIAL, RADIAL])
-    slope = np.zeros((PRIORS, LENS))
-    slope[[0, 1], [2, 3]] = 1.0 / (CENTRE * max(size))
-    slope[2, :2] = np.array([-fy / fx**2, 1.0 / fx]) / ASPECT
+    off = np.array([cx - 0.5 * (size[0] - 1), cy - 0.5 * (size[1] - 1)]) / (SETTINGS.centre * max(size))
+    bends = np.array([SETTINGS.radial, SETTINGS.radial, SETTINGS.tangential, SETTINGS.tangential, SETTINGS.radial])
+    slope = np.zeros((LENS - 1, LENS))
+    slope[[0, 1], [2, 3]] = 1.0 / (SETTINGS.centre * max(size))
+    slope[2, :2] = np.array([-fy / fx**2, 1.0 / fx]) / SETTINGS.aspect
     slope[3:, 4:] = np.diag(1.0 / bends)
-    return np.concatenate([off, [(fy / fx - 1.0) / ASPECT], lens[4:] / bends]), slope
+    return np.concatenate([off, [(fy / fx - 1.0) / SETTINGS.aspect], lens[4:] / bends]), slope
 
 
 def _vector(pose: NDArray) -> NDArray[np.float64]:

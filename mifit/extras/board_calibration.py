@@ -25,29 +25,9 @@ from mifit.core.files import file_name, write_bytes, write_text
 from mifit.core.image import decode_image, encode_png, to_8_bit
 from mifit.errors import InputError
 from mifit.extras.board_adjustment import adjust
-from mifit.extras.board_camera import (
-    BAD_ERROR,
-    CONTRADICTS,
-    GRID,
-    LEAST_FRAMES,
-    MAX_LOOKED_AT,
-    OUTLIER,
-    Watched,
-    calibrate_one,
-    covered_cells,
-    look,
-)
+from mifit.extras.board_camera import CONTRADICTS, SETTINGS, Watched, calibrate_one, covered_cells, look
 from mifit.extras.boards import Board
 from mifit.progress import Progress, silent
-
-LEAST_SHARED = 3
-LOOKS = 12
-"""Frames in which markers of other dictionaries are looked for."""
-OUT_OF_STEP = 0.5
-"""Error in pixels, at the least, of frames that are left out for what other cameras show: a tilted board that is found
-a little off still tells more than it harms."""
-WEAK_COVERAGE, WEAK_FOCAL = 0.4, 0.005
-"""Warn below this part of covered cells and above this relative deviation of the focal length."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +86,11 @@ def calibrate_boards(
             "cameras can't agree on its corners; use an even and an odd number of squares, or a ChArUco board"
         )
     board = recognise(board, sources[0])
-    total = sum(min(source.length, MAX_LOOKED_AT) for source in sources)
+    total = sum(min(source.length, SETTINGS.most_searched) for source in sources)
     watched, done = [], 0
     for source in sources:
         found, left_out = look(source, board, done, total, progress)
-        done += min(source.length, MAX_LOOKED_AT)
+        done += min(source.length, SETTINGS.most_searched)
         watched.append(calibrate_one(source, board, found, left_out))
     progress("Looking for the board", total, total)
     relative, pair_errors = _relative_poses(watched, board)
@@ -127,10 +107,10 @@ def calibrate_boards(
 
 
 def recognise(board: Board, source: Source) -> Board:
-    """The board with the dictionary whose markers a camera's images show most of, where it was not named."""
+    """The board with the dictionary whose markers a dozen of a camera's images show most of, where it was not named."""
     if board.kind != "charuco" or board.named:
         return board
-    every = range(0, source.length, max(source.length // LOOKS, 1))
+    every = range(0, source.length, max(source.length // 12, 1))
     pictures = [
         np.asarray(cv2.cvtColor(to_8_bit(decode_image(content, source.name).pixels), cv2.COLOR_RGB2GRAY), np.uint8)
         for _, content in source.files(every)
@@ -177,8 +157,8 @@ def coverage_picture(seen: Watched) -> NDArray[np.uint8]:
     picture = np.full((height, width, 3), 40, dtype=np.uint8)
     for (row, column), covered in np.ndenumerate(covered_cells(seen)):
         low, high = (
-            (column * width // GRID, row * height // GRID),
-            ((column + 1) * width // GRID, (row + 1) * height // GRID),
+            (column * width // SETTINGS.cells, row * height // SETTINGS.cells),
+            ((column + 1) * width // SETTINGS.cells, (row + 1) * height // SETTINGS.cells),
         )
         cv2.rectangle(picture, low, high, (60, 100, 60) if covered else (90, 50, 50), -1)
         cv2.rectangle(picture, low, high, (30, 30, 30), 1)
@@ -198,20 +178,21 @@ def _relative_poses(watched: Sequence[Watched], board: Board) -> tuple[list[NDAr
             (len(_shared(watched[a], watched[b])), a, b) for a in poses for b in range(len(watched)) if b not in poses
         ]
         count, a, b = max(options)
-        if count < LEAST_SHARED:
+        if count < SETTINGS.least_shared:
             raise InputError(
                 f"{watched[b].name}: sees the board together with {watched[a].name} in {count} frames, expected "
-                f"at least {LEAST_SHARED}; show it to both at once, and check that the videos are synchronised"
+                f"at least {SETTINGS.least_shared}; show it to both at once, and check that the videos are synchronised"
             )
         turn, shift, error = _pair(watched[a], watched[b], board)
         between = np.eye(4)
         between[:3, :3], between[:3, 3] = turn, shift
         poses[b] = between @ poses[a]
         errors[f"{watched[a].name}, {watched[b].name}"] = error
-        if error > BAD_ERROR:
+        if error > SETTINGS.most_error:
             raise InputError(
                 f"{watched[b].name}: the board seen with {watched[a].name} gives an error of {error:.2f} pixels, "
-                f"expected at most {BAD_ERROR:g}; the videos aren't synchronous, a camera moved, or one is mirrored"
+                f"expected at most {SETTINGS.most_error:g}; the videos aren't synchronous, a camera moved, or one is "
+                "mirrored"
             )
     return [poses[i] for i in range(len(watched))], errors
 
@@ -227,7 +208,10 @@ def _together(
         watched, poses = adjust(watched, poses, board)
         kept = [_consistent(seen) for seen in watched]
         shared = [len(_shared(a, b)) for k, b in enumerate(kept) for a in kept[:k]]
-        few = any(len(seen.used) < LEAST_FRAMES for seen in kept) or min(shared, default=LEAST_SHARED) < LEAST_SHARED
+        few = (
+            any(len(seen.used) < SETTINGS.least_frames for seen in kept)
+            or min(shared, default=SETTINGS.least_shared) < SETTINGS.least_shared
+        )
         if few or all(len(a.used) == len(b.used) for a, b in zip(kept, watched, strict=True)):
             return watched, poses
         watched = kept
@@ -235,7 +219,7 @@ def _together(
 
 def _consistent(seen: Watched) -> Watched:
     """One camera's frames without those whose error stands out."""
-    limit = max(OUTLIER * float(np.median(list(seen.errors.values()))), OUT_OF_STEP)
+    limit = max(SETTINGS.outlier * float(np.median(list(seen.errors.values()))), SETTINGS.out_of_step)
     bad = {i: error for i, error in seen.errors.items() if error > limit}
     reasons = {i: CONTRADICTS.format(error, limit) for i, error in bad.items()}
     used = {i: found for i, found in seen.used.items() if i not in bad}
@@ -268,12 +252,12 @@ def _pair(a: Watched, b: Watched, board: Board) -> tuple[NDArray, NDArray, float
 def _warnings(watched: Sequence[Watched]) -> tuple[str, ...]:
     found = []
     for seen in watched:
-        if seen.coverage < WEAK_COVERAGE:
+        if seen.coverage < SETTINGS.weak_coverage:
             found.append(
                 f"{seen.name}: the board covers {100 * seen.coverage:.0f} % of the image, so distortion elsewhere is a "
                 "guess; show it near the edges and corners too"
             )
-        if seen.focal_deviation > WEAK_FOCAL:
+        if seen.focal_deviation > SETTINGS.weak_focal:
             found.append(
                 f"{seen.name}: the focal length is known to {100 * seen.focal_deviation:.1f} % only; tilt the board"
             )

@@ -18,22 +18,62 @@ from mifit.errors import InputError
 from mifit.extras.boards import Board, BoardPoints, edge_width
 from mifit.progress import Progress
 
-MAX_LOOKED_AT = 300
-"""Frames of a video in which the board is looked for, spread evenly."""
-MAX_USED = 40
-"""Frames that a camera is calibrated from; more add time and little else."""
-LEAST_FRAMES = 6
-LEAST_PART = 0.4
-"""Part of the board's points below which it is only partly seen."""
-MAX_BLUR, BLUR_FACTOR = 4.0, 1.6
-"""Edges wider than this many pixels, or than this many times those of a camera's sharper frames, are blurred."""
-OUTLIER, LEAST_OUTLIER = 3.0, 0.3
-"""Frames whose error is this many times the median, and at least so many pixels, are left out."""
 CONTRADICTS = "contradicts the others: error {:.2f} pixels, {:.2f} is the limit"
-GRID = 6
-"""Cells across and down of the picture of coverage."""
-BAD_FOCAL, BAD_ERROR = 0.03, 2.0
-"""Refuse beyond this relative deviation of the focal length and this error in pixels."""
+
+
+@dataclass(frozen=True)
+class BoardSettings:
+    """Numbers of a calibration from a board.
+
+    Attributes
+    ----------
+    most_searched, most_used : int
+        Frames of a video in which the board is looked for, spread evenly; frames that a camera is calibrated from.
+    least_frames, least_shared : int
+        Frames that a camera, and a pair of cameras, needs.
+    least_part : float
+        Part of the board's points below which it is only partly seen.
+    most_blur, blur_factor : float
+        Edges wider than this, pixels, or than this many times those of a camera's sharper frames, are blurred.
+    outlier, least_outlier, out_of_step : float
+        Frames whose error is this many times the median are left out: from so many pixels on for a camera alone, and
+        for what other cameras show (a tilted board that is found a little off still tells more than it harms).
+    cells : int
+        Cells across and down of the picture of coverage.
+    most_focal_deviation, most_error : float
+        Refused beyond: relative deviation of the focal length, error in pixels.
+    weak_coverage, weak_focal : float
+        Warned of: part of covered cells below this, relative deviation of the focal length above this.
+    centre, aspect, radial, tangential : float
+        Deviations beforehand of a lens: principal point from the image's middle, in longer sides; fy / fx from 1; k1,
+        k2, k3 and p1, p2 from 0.
+    least_noise : float
+        Deviation of a board's points from where they are found, pixels, at the least.
+    """
+
+    most_searched: int = 300
+    most_used: int = 40
+    least_frames: int = 6
+    least_shared: int = 3
+    least_part: float = 0.4
+    most_blur: float = 4.0
+    blur_factor: float = 1.6
+    outlier: float = 3.0
+    least_outlier: float = 0.3
+    out_of_step: float = 0.5
+    cells: int = 6
+    most_focal_deviation: float = 0.03
+    most_error: float = 2.0
+    weak_coverage: float = 0.4
+    weak_focal: float = 0.005
+    centre: float = 0.03
+    aspect: float = 0.01
+    radial: float = 0.5
+    tangential: float = 0.003
+    least_noise: float = 0.05
+
+
+SETTINGS = BoardSettings()
 
 
 @dataclass(frozen=True)
@@ -71,10 +111,10 @@ class Watched:
 
 
 def covered_cells(seen: Watched) -> NDArray[np.bool_]:
-    """(GRID, GRID) cells of the image in which the board was seen."""
-    covered = np.zeros((GRID, GRID), dtype=bool)
+    """(SETTINGS.cells, SETTINGS.cells) cells of the image in which the board was seen."""
+    covered = np.zeros((SETTINGS.cells, SETTINGS.cells), dtype=bool)
     for found in seen.used.values():
-        cell = np.clip((found.pixels / seen.size * GRID).astype(int), 0, GRID - 1)
+        cell = np.clip((found.pixels / seen.size * SETTINGS.cells).astype(int), 0, SETTINGS.cells - 1)
         covered[cell[:, 1], cell[:, 0]] = True
     return covered
 
@@ -83,7 +123,7 @@ def look(
     source: Source, board: Board, done: int, total: int, progress: Progress
 ) -> tuple[dict[int, tuple[BoardPoints, float]], dict[int, str]]:
     """Boards found and their blur by frame, and frames without one that can be used, with the reason."""
-    every = -(-source.length // MAX_LOOKED_AT)
+    every = -(-source.length // SETTINGS.most_searched)
     found: dict[int, tuple[BoardPoints, float]] = {}
     left_out: dict[int, str] = {}
     for k, (_, content) in enumerate(source.files(range(0, source.length, every))):
@@ -92,7 +132,7 @@ def look(
         codes = to_8_bit(decode_image(content, f"{source.name}: frame {i}").pixels)
         grey = np.asarray(cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         seen = board.find(grey)
-        wanted = max(6, round(LEAST_PART * len(board.points)))
+        wanted = max(6, round(SETTINGS.least_part * len(board.points)))
         if len(seen) >= wanted:
             found[i] = seen, edge_width(grey, seen)
         elif board.kind != "chessboard" and len(board.find(np.ascontiguousarray(grey[:, ::-1]))) >= wanted:
@@ -111,17 +151,17 @@ def calibrate_one(
     if found:
         sharp = float(np.percentile([width for _, width in found.values()], 25))
         for i, (_, width) in list(found.items()):
-            if width > max(min(MAX_BLUR, BLUR_FACTOR * sharp), 2.0):
+            if width > max(min(SETTINGS.most_blur, SETTINGS.blur_factor * sharp), 2.0):
                 left_out[i] = f"blurred: edges {width:.1f} pixels wide, {sharp:.1f} in sharp frames"
                 del found[i]
     used = {i: seen for i, (seen, _) in found.items()}
     chosen = _varied(used, source.size)
     spare = {i: "like other frames" for i in used if i not in chosen}
     while True:
-        if len(chosen) < LEAST_FRAMES:
+        if len(chosen) < SETTINGS.least_frames:
             raise InputError(_too_few(source, board, len(chosen), left_out))
         matrix, distortion, deviation, errors = _solve({i: used[i] for i in chosen}, board, source.size)
-        limit = max(OUTLIER * float(np.median(list(errors.values()))), LEAST_OUTLIER)
+        limit = max(SETTINGS.outlier * float(np.median(list(errors.values()))), SETTINGS.least_outlier)
         bad = [i for i, error in errors.items() if error > limit]
         if not bad:
             break
@@ -132,11 +172,12 @@ def calibrate_one(
     seen = Watched(
         source.name, source.size, matrix, distortion, focal, {i: used[i] for i in chosen}, errors, {**left_out, **spare}
     )
-    if seen.error > BAD_ERROR or focal > BAD_FOCAL:
+    if seen.error > SETTINGS.most_error or focal > SETTINGS.most_focal_deviation:
         raise InputError(
             f"{source.name}: found an error of {seen.error:.2f} pixels, a focal length known to {100 * focal:.1f} %, "
-            f"expected at most {BAD_ERROR:g} pixels and {100 * BAD_FOCAL:g} %; hold the board at different angles and "
-            "distances, up to the image's corners, and check --board against the printed one"
+            f"expected at most {SETTINGS.most_error:g} pixels and {100 * SETTINGS.most_focal_deviation:g} %; hold the "
+            "board at different angles and distances, up to the image's corners, and check --board against the printed "
+            "one"
         )
     return seen
 
@@ -148,20 +189,21 @@ def _too_few(source: Source, board: Board, count: int, left_out: dict[int, str])
     told = ", ".join(f"{n} {reason}" for reason, n in sorted(reasons.items(), key=lambda item: -item[1]))
     return (
         f"{source.name}: found {count} frames that can be used of {count + len(left_out)} ({told or 'none else'}), "
-        f"expected at least {LEAST_FRAMES} with the whole board, sharp, not mirrored; looked for {board.describe()}"
+        f"expected at least {SETTINGS.least_frames} with the whole board, sharp, not mirrored; looked for "
+        f"{board.describe()}"
     )
 
 
 def _varied(found: dict[int, BoardPoints], size: tuple[int, int]) -> list[int]:
-    """At most `MAX_USED` frames in which the board's place, size and tilt differ most, the first at the most points."""
+    """At most ``most_used`` frames in which the board's place, size and tilt differ most, the fullest first."""
     keys = sorted(found)
-    if len(keys) <= MAX_USED:
+    if len(keys) <= SETTINGS.most_used:
         return keys
     features = np.array([_feature(found[i], size) for i in keys])
     features /= features.std(axis=0) + 1e-9
     chosen = [int(np.argmax([len(found[i]) for i in keys]))]
     nearest = np.linalg.norm(features - features[chosen[0]], axis=1)
-    while len(chosen) < MAX_USED:
+    while len(chosen) < SETTINGS.most_used:
         chosen.append(int(np.argmax(nearest)))
         nearest = np.minimum(nearest, np.linalg.norm(features - features[chosen[-1]], axis=1))
     return sorted(keys[k] for k in chosen)

@@ -244,8 +244,8 @@ class _Problem:
             shared[of, :, first : first + 6] = _by_pose(turned[of], projected.turned[of], move)
             shared[of, :, face : face + k] = by_point[of] @ self.modes[seen.point[of]]
         shared = np.concatenate([shared[..., :head_at] @ self.freedom.design, shared[..., head_at:]], axis=2)
-        rows, columns = np.arange(at[:, :2].size).reshape(-1, 2, 1), 3 * seen.point[:, None, None] + np.arange(3)
-        places = np.broadcast_to(rows, by_point.shape).ravel(), np.broadcast_to(columns, by_point.shape).ravel()
+        rows, own = np.arange(at[:, :2].size).reshape(-1, 2, 1), 3 * seen.point[:, None, None] + np.arange(3)
+        places = np.broadcast_to(rows, by_point.shape).ravel(), np.broadcast_to(own, by_point.shape).ravel()
         points = sp.csr_matrix((by_point.ravel(), places), (rows.size, bundle.points.size))
         jacobian = sp.hstack([sp.csr_matrix(shared.reshape(rows.size, -1)), points]).tocsr()
         weighted = sp.diags(np.repeat(self.weights(projected.residual)[1], 2)) @ jacobian
@@ -258,7 +258,7 @@ class _Problem:
         return _System((jacobian.T @ weighted + prior).tocsr(), gradient, columns)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _System:
     """Normal equations as `mifit.optim` wants them; no unknown is bounded, and points come last."""
 

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.core.mesh import interpolate
 from mifit.core.process import one_blas_thread
-from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.core.uv import rasterize_uv
 from mifit.extras.bundle import AdjustedBundle, Bundle, Freedom, Sightings, adjust_bundle
 from mifit.extras.calibrate_heads import FOCAL_PRIOR, HeadCalibration, calibrate_heads
-from mifit.extras.tracks import FEWEST_IMAGES, Tracks, follow_points, unwrap_image
+from mifit.extras.tracks import FEWEST_IMAGES, focal_of, follow_points, sightings_of, unwrap_image
 from mifit.progress import Progress, silent
 from mifit.stages.surface.views import texture_size
 
@@ -29,20 +29,11 @@ if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
-MODES = 30
-"""Identity modes that may move with the cameras when those are estimated from landmarks."""
-LARGEST_MAP = 320
-"""Side of the unwrapped images, texels, at most."""
-MATCH_DEVIATION = 0.3
-"""Pixels that a match errs by along an axis, for images whose longer side has `MATCH_SIDE` pixels."""
-MATCH_SIDE = 680.0
 FEWEST_TRACKS = 200
 MOST_TIMESTEPS = 6
 """Timesteps that are matched, spread evenly over more: cameras keep still, and each has its expression to find."""
 LARGEST_DEVIATION = 0.02
 """Relative deviation of a focal length beyond which matches don't decide it; real errors are larger."""
-LARGEST_RESIDUAL = 4.0
-"""Median residual, in deviations of a match, beyond which tracks aren't those of one head."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +67,7 @@ def calibrate_capture(
 ) -> DenseCalibration:
     """An uncalibrated capture with cameras estimated from landmarks and the model's, then from dense matches."""
     scale = model.unit_mm / capture.unit_mm
-    mean, modes = model.mean[model.landmarks], model.identity[model.landmarks][..., :MODES]
+    mean, modes = model.mean[model.landmarks], model.identity[model.landmarks][..., :30]
     start = calibrate_heads(capture, scale * mean, scale * modes, cameras, timesteps)
     return calibrate_densely(start, model, cameras, timesteps, progress)
 
@@ -126,32 +117,35 @@ def calibrate_densely(
     total = images + 2
     progress("match views", 0, total)
     vertices = _vertices(start, model)
-    world = [vertices @ pose[:3, :3].T + pose[:3, 3] for pose in start.heads_in_world()]
+    world = [vertices @ pose[:3, :3].T + pose[:3, 3] for pose in OPENGL_FROM_OPENCV @ start.heads]
     views = [capture.camera(name) for name in cameras]
     texels = rasterize_uv(model.uv, model.faces_uv, _size(model, world[0], views), model.face_mask)
     unwrapped = []
     for j, timestep in enumerate(timesteps):
-        for i, camera in enumerate(views):
+        for camera in views:
             frame = capture.frame(camera.name, timestep)
-            usable = frame.valid & ~frame.clipped
-            unwrapped.append(unwrap_image(frame.image, usable, camera, world[j], model.faces, texels, (i, j)))
+            unwrapped.append(unwrap_image(frame, camera, world[j], model.faces, texels))
             progress("match views", len(unwrapped), total)
     tracks = follow_points(unwrapped)
     progress("match views", images + 1, total)
     if len(tracks.texel) < FEWEST_TRACKS:
         count = f"{len(tracks.texel)} points are found in {FEWEST_IMAGES} or more images"
         return _left(start, cameras, f"{count}, expected {FEWEST_TRACKS}; add timesteps where the head turns")
-    place = np.array([(one.camera, one.timestep) for one in unwrapped])[tracks.image]
-    adjusted = _adjust(start, model, vertices, texels, views, unknown, tracks, place)
+    step, which = np.divmod(tracks.image, len(views))
+    seen = sightings_of(tracks, views, which, step)
+    at = np.searchsorted(texels.index, tracks.texel)
+    points = np.asarray(interpolate(vertices, model.faces, texels.face[at], texels.weights[at]), dtype=np.float64)
+    corners, weights = model.faces[texels.face[at]], texels.weights[at].astype(np.float64)
+    modes = np.einsum("nc,ncik->nik", weights, model.expression[corners].astype(np.float64))
+    adjusted = _adjust(start, views, unknown, seen, points, modes * (model.unit_mm / capture.unit_mm))
     progress("match views", total, total)
-    side = max(max(view.width, view.height) for view in views)
     if adjusted.deviation > LARGEST_DEVIATION:
         found = f"matches give it to {_percent(adjusted.deviation)} only"
         return _left(start, cameras, f"{found}, expected {_percent(LARGEST_DEVIATION)}; add timesteps where it turns")
-    if adjusted.residual > LARGEST_RESIDUAL * MATCH_DEVIATION * max(side / MATCH_SIDE, 1.0):
+    if adjusted.residual > 4.0 * seen.deviation:  # not the tracks of one head
         found = f"matches are {adjusted.residual:.1f} pixels from those of a moving head"
         return _left(start, cameras, f"{found}; views may be out of step")
-    return _calibration(start, vertices, model, texels, tracks, views, adjusted)
+    return _calibration(start, views, points, adjusted)
 
 
 def _left(start: HeadCalibration, cameras: Sequence[str], why: str) -> DenseCalibration:
@@ -176,62 +170,37 @@ def _size(model: MorphableModel, world: NDArray, views: Sequence[Camera]) -> int
     """Side of the map that holds about what the images show."""
     centre = world.mean(axis=0)
     pixel = min(float(np.linalg.norm(centre - view.position)) / view.fx for view in views)
-    return texture_size(model, world, pixel, LARGEST_MAP)
+    return texture_size(model, world, pixel, 320)
 
 
 def _adjust(
     start: HeadCalibration,
-    model: MorphableModel,
-    vertices: NDArray,
-    texels: TexelMap,
     views: Sequence[Camera],
     unknown: NDArray[np.bool_],
-    tracks: Tracks,
-    place: NDArray,
+    seen: Sightings,
+    points: NDArray,
+    modes: NDArray,
 ) -> AdjustedBundle:
+    """Points (N, 3) on the head that landmarks gave, and expression modes there (N, 3, K), are where it starts."""
     side = np.array([max(view.width, view.height) for view in views], dtype=np.float64)
-    _, group = np.unique(side[unknown], return_inverse=True)
     numbers = np.full(len(views), -1)
-    numbers[unknown] = group
-    count = group.max() + 1
-    focal = np.array([math.sqrt(view.fx * view.fy) for view in views])
-    centre = np.array([(view.cx, view.cy) for view in views])
-    square = np.array([(f / view.fx, f / view.fy) for f, view in zip(focal, views, strict=True)])
-    for g in range(count):
+    sides, numbers[unknown] = np.unique(side[unknown], return_inverse=True)
+    focal = np.array([focal_of(view) for view in views])
+    for g in range(len(sides)):
         focal[numbers == g] = focal[numbers == g].mean()
-    seen = Sightings(
-        (tracks.pixels - centre[place[:, 0]]) * square[place[:, 0]],
-        tracks.point,
-        place[:, 0],
-        place[:, 1],
-        MATCH_DEVIATION * max(float(side.max()) / MATCH_SIDE, 1.0),
-    )
-    at = np.searchsorted(texels.index, tracks.texel)
-    corners, weights = model.faces[texels.face[at]], texels.weights[at].astype(np.float64)
-    modes = np.einsum("nc,ncik->nik", weights, model.expression[corners].astype(np.float64))
-    modes *= model.unit_mm / start.capture.unit_mm
     bundle = Bundle(
         focal,
         np.array([view.world_to_camera @ OPENGL_FROM_OPENCV for view in views]),  # the first is the world's frame
         start.heads,
-        np.asarray(interpolate(vertices, model.faces, texels.face[at], texels.weights[at]), dtype=np.float64),
+        points,
         np.zeros((len(start.heads), modes.shape[2])),
     )
-    expected = np.array([FOCAL_PRIOR[0] * side[numbers == g][0] for g in range(count)])
-    return adjust_bundle(bundle, seen, Freedom.of_focals(numbers, focal, expected, FOCAL_PRIOR[1]), modes)
+    return adjust_bundle(bundle, seen, Freedom.of_focals(numbers, focal, FOCAL_PRIOR[0] * sides, FOCAL_PRIOR[1]), modes)
 
 
 def _calibration(
-    start: HeadCalibration,
-    vertices: NDArray,
-    model: MorphableModel,
-    texels: TexelMap,
-    tracks: Tracks,
-    views: Sequence[Camera],
-    adjusted: AdjustedBundle,
+    start: HeadCalibration, views: Sequence[Camera], first: NDArray, adjusted: AdjustedBundle
 ) -> DenseCalibration:
-    at = np.searchsorted(texels.index, tracks.texel)
-    first = interpolate(vertices, model.faces, texels.face[at], texels.weights[at])
     bundle = adjusted.bundle
     # images alone leave the scale open; medians, as a few points may have gone anywhere
     sizes = [np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1)) for p in (first, bundle.points)]
@@ -246,7 +215,7 @@ def _calibration(
     lengths = ", ".join(dict.fromkeys(f"{bundle.focal[k]:.0f}" for k in free))
     before = ", ".join(dict.fromkeys(f"{views[k].fx:.0f}" for k in free))
     note = (
-        f"focal length {lengths} pixels (+- {_percent(adjusted.deviation)}) is from {len(tracks.texel)} dense matches, "
+        f"focal length {lengths} pixels (+- {_percent(adjusted.deviation)}) is from {len(first)} dense matches, "
         f"residual {adjusted.residual:.2f} pixels; landmarks gave {before}"
     )
     if not adjusted.settled:

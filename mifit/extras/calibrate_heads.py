@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -26,14 +25,8 @@ from mifit.capture.transforms import update_frames
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.errors import InputError
 
-FOCAL_RANGE = (0.6, 8.0)
-"""Focal lengths that are searched, in multiples of the longer image side."""
-
 FOCAL_PRIOR = (1.8, 0.7)
 """Portrait lenses, loosely: focal length in multiples of the longer image side, and deviation of its logarithm."""
-
-_WEIGHT = np.concatenate([np.full(17, 0.3), np.ones(31), np.full(20, 0.4)])
-"""Jaw contours slide and mouths move; brows, nose and eyes carry the pose."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +47,6 @@ class HeadCalibration:
     heads: NDArray[np.float64]
     shape: NDArray[np.float64]
 
-    def heads_in_world(self) -> NDArray[np.float64]:
-        """(T, 4, 4) from the model's frame to the world's."""
-        return np.asarray(OPENGL_FROM_OPENCV @ self.heads)
-
 
 @dataclass(frozen=True)
 class _Problem:
@@ -71,11 +60,6 @@ class _Problem:
     side: NDArray[np.float64]  # (C,) longer image sides
     known: NDArray[np.float64]  # (C,) focal lengths, NaN where they are looked for
     noise: float  # standard deviation of a landmark in pixels
-
-    @property
-    def shared_focal(self) -> bool:
-        """Whether one focal length serves all cameras that lack one: equal image sizes suggest equal cameras."""
-        return bool(np.ptp(self.side) == 0)
 
 
 def calibrate_heads(
@@ -137,6 +121,7 @@ def _gather(
 ) -> _Problem:
     points = np.zeros((len(names), len(steps), COUNT, 2))
     weight = np.zeros(points.shape[:3])
+    counted = np.repeat([0.3, 1.0, 0.4], [17, 31, 20])  # jaw contours slide, mouths move
     for i, name in enumerate(names):
         for j, step in enumerate(steps):
             marks = capture.landmarks(name, step)
@@ -146,7 +131,7 @@ def _gather(
                     f"{capture.path}: camera {name!r}, timestep {step}: found {count} visible landmarks, expected at "
                     f"least {MIN_VISIBLE} to estimate an uncalibrated camera; run mifit landmarks, or leave it out"
                 )
-            points[i, j], weight[i, j] = marks.points, marks.visible * _WEIGHT
+            points[i, j], weight[i, j] = marks.points, marks.visible * counted
     views = [capture.views[name] for name in names]
     centre = [(v.width / 2, v.height / 2) if v.intrinsics is None else v.intrinsics[2:] for v in views]
     known = [np.nan if v.intrinsics is None else math.sqrt(v.intrinsics[0] * v.intrinsics[1]) for v in views]
@@ -161,9 +146,9 @@ def _gather(
 
 def _solve(problem: _Problem) -> tuple[NDArray, list[NDArray[np.float64]], NDArray, NDArray]:
     """Focal lengths (C,), world-to-camera matrices, head poses (T, 4, 4) and shape coefficients (K,)."""
-    grid = np.geomspace(*FOCAL_RANGE, 12)
-    starts = [_start(problem, factor) for factor in (grid if np.isnan(problem.known).any() else (1.0,))]
-    _, best = min(starts, key=lambda start: start[0])
+    factors = np.geomspace(0.6, 8.0, 12) if np.isnan(problem.known).any() else np.ones(1)  # of the longer image side
+    starts = [_start(problem, factor) for factor in factors]
+    best = min(starts, key=lambda x: float(np.sum(np.sqrt(1 + _residuals(x, problem) ** 2))))
     solution = least_squares(
         _residuals, best, args=(problem,), loss="soft_l1", x_scale="jac", ftol=1e-6, xtol=1e-6, max_nfev=40
     )
@@ -171,25 +156,22 @@ def _solve(problem: _Problem) -> tuple[NDArray, list[NDArray[np.float64]], NDArr
     return focal, [pose @ OPENGL_FROM_OPENCV for pose in cameras], heads, shape
 
 
-def _start(problem: _Problem, factor: float) -> tuple[float, NDArray[np.float64]]:
-    """Pose of the mean shape in every image for one guess of the focal lengths, and how well it explains them."""
+def _start(problem: _Problem, factor: float) -> NDArray[np.float64]:
+    """Unknowns from the pose of the mean shape in every image, for one guess of the focal lengths."""
     count, steps = problem.points.shape[:2]
-    focal = np.where(np.isnan(problem.known), factor * problem.side, problem.known)
-    heads = np.zeros((count, steps, 4, 4))
-    for i in range(count):
-        matrix = np.array([[focal[i], 0, problem.centre[i, 0]], [0, focal[i], problem.centre[i, 1]], [0, 0, 1]])
-        for j in range(steps):
-            seen = problem.weight[i, j] > 0
-            heads[i, j] = _pnp(problem.mean[seen], problem.points[i, j, seen], matrix)
-    relative = [_mean_pose(heads[i] @ np.linalg.inv(heads[0])) for i in range(count)]
-    log_focal = np.log(focal / problem.side)
     free = np.isnan(problem.known)
-    parts = [log_focal[free][:1] if problem.shared_focal else log_focal[free]]
-    parts += [_pack_pose(pose) for pose in relative[1:]]
-    parts += [_pack_pose(heads[0, j]) for j in range(steps)]
-    x = np.concatenate([*parts, np.zeros(problem.modes.shape[2])])
-    residual = _residuals(x, problem)
-    return float(np.sum(np.sqrt(1 + residual**2) - 1)), x
+    focal = np.where(free, factor * problem.side, problem.known)
+    heads = np.zeros((count, steps, 4, 4))
+    for i, j in np.ndindex(count, steps):
+        matrix = np.array([[focal[i], 0, problem.centre[i, 0]], [0, focal[i], problem.centre[i, 1]], [0, 0, 1]])
+        seen = problem.weight[i, j] > 0
+        heads[i, j] = _pnp(problem.mean[seen], problem.points[i, j, seen], matrix)
+    relative = [heads[i] @ np.linalg.inv(heads[0]) for i in range(1, count)]
+    vectors = [Rotation.from_matrix(poses[:, :3, :3]).mean().as_rotvec() for poses in relative]
+    vectors += list(Rotation.from_matrix(heads[0, :, :3, :3]).as_rotvec())
+    shifts = [*(np.median(poses[:, :3, 3], axis=0) for poses in relative), *heads[0, :, :3, 3]]
+    focals = np.full(_focals(problem), math.log(factor))
+    return np.concatenate([focals, np.hstack([vectors, shifts]).ravel(), np.zeros(problem.modes.shape[2])])
 
 
 def _pnp(points: NDArray, pixels: NDArray, matrix: NDArray) -> NDArray[np.float64]:
@@ -202,35 +184,23 @@ def _pnp(points: NDArray, pixels: NDArray, matrix: NDArray) -> NDArray[np.float6
     return pose
 
 
-def _mean_pose(poses: NDArray) -> NDArray[np.float64]:
-    mean = np.eye(4)
-    mean[:3, :3] = Rotation.from_matrix(poses[:, :3, :3]).mean().as_matrix()
-    mean[:3, 3] = np.median(poses[:, :3, 3], axis=0)
-    return mean
-
-
-def _pack_pose(pose: NDArray) -> NDArray[np.float64]:
-    return np.concatenate([Rotation.from_matrix(pose[:3, :3]).as_rotvec(), pose[:3, 3]])
-
-
-def _unpack_poses(values: NDArray) -> NDArray[np.float64]:
-    poses = np.tile(np.eye(4), (len(values), 1, 1))
-    if len(values):
-        poses[:, :3, :3] = Rotation.from_rotvec(values[:, :3]).as_matrix()
-        poses[:, :3, 3] = values[:, 3:]
-    return poses
+def _focals(problem: _Problem) -> int:
+    """Unknown focal lengths: one for all cameras that lack one where all images have one size."""
+    unknown = int(np.isnan(problem.known).sum())
+    return min(unknown, 1) if np.ptp(problem.side) == 0 else unknown
 
 
 def _unpack(x: NDArray, problem: _Problem) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Variables -> focal lengths (C,), camera poses (C, 4, 4), head poses (T, 4, 4), shape coefficients (K,)."""
     count, steps = problem.points.shape[:2]
-    free = np.isnan(problem.known)
-    n = (1 if problem.shared_focal else int(free.sum())) if free.any() else 0
+    free, n = np.isnan(problem.known), _focals(problem)
     focal = problem.known.copy()
     focal[free] = np.exp(x[:n]) * problem.side[free]
-    poses = _unpack_poses(x[n : n + 6 * (count - 1 + steps)].reshape(-1, 6))
+    values = x[n : n + 6 * (count - 1 + steps)].reshape(-1, 6)
+    poses = np.tile(np.eye(4), (len(values), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_rotvec(values[:, :3]).as_matrix(), values[:, 3:]
     cameras = np.concatenate([np.eye(4)[None], poses[: count - 1]])
-    return focal, cameras, poses[count - 1 :], x[n + 6 * (count - 1 + steps) :]
+    return focal, cameras, poses[count - 1 :], x[n + values.size :]
 
 
 def _residuals(x: NDArray, problem: _Problem) -> NDArray[np.float64]:
@@ -316,7 +286,7 @@ def _places(
 def write_cameras(path: str | Path, capture: Capture, cameras: Sequence[Camera]) -> None:
     """Write intrinsics and poses of some cameras into a capture's ``transforms.json``; all else in it stays."""
     by_name = {camera.name: camera for camera in cameras}
-    changes: dict[tuple[str, int], dict[str, Any]] = {}
+    changes: dict[tuple[str, int], dict[str, object]] = {}
     for key in (shot for shot in capture.shots if shot[0] in by_name):
         camera = by_name[key[0]]
         inverse = np.linalg.inv(camera.world_to_camera) @ OPENGL_FROM_OPENCV

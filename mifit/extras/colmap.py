@@ -30,8 +30,6 @@ _MODELS = {  # COLMAP's number; where fx, fy, cx, cy and OpenCV's distortion coe
     "OPENCV": (4, (0, 1, 2, 3), (4, 5, 6, 7)),
     "FULL_OPENCV": (6, (0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11)),
 }
-MAX_NAME = 4096
-POINT_BYTES = 24
 
 _Camera = tuple[int, int, tuple[float, float, float, float], tuple[float, ...]]
 _CameraEntry = tuple[str, str, str, tuple[float, ...]]
@@ -163,17 +161,17 @@ def _binary_images(path: Path) -> Iterator[_ImageEntry]:
             name = b""
             while not name.endswith(b"\0"):
                 character = stream.read(1)
-                if not character or len(name) > MAX_NAME:
-                    raise InputError(f"{where}: found no end of its name, expected at most {MAX_NAME} bytes")
+                if not character or len(name) > 4096:
+                    raise InputError(f"{where}: found no end of its name, expected at most {4096} bytes")
                 name += character
             try:
                 text = name[:-1].decode("utf-8")
             except UnicodeDecodeError:
                 raise InputError(f"{where}: its name is no UTF-8 text") from None
             (points,) = _take(stream, "<Q", path)
-            if points * POINT_BYTES > size - stream.tell():
+            if points * 24 > size - stream.tell():
                 raise InputError(f"{where}: claims {points} points, more than the file holds: truncated or damaged")
-            stream.seek(points * POINT_BYTES, 1)
+            stream.seek(points * 24, 1)
             yield where, tuple(map(float, pose)), str(key), text
 
 

@@ -13,11 +13,10 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mifit.capture.capture import Capture
 from mifit.capture.transforms import Shot, View, write_transforms
-from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
+from mifit.core.camera import Camera
 from mifit.core.files import replacing_folder
 from mifit.core.image import load_image
 from mifit.errors import InputError
@@ -100,16 +99,6 @@ def read_camera(path: Path, name: str, width: int, height: int) -> Camera:
     if look is None or field is None:
         raise InputError(f"{path}: found no {'LookAt' if look is None else 'float fov'}, expected a pbrt v3 scene")
     eye, target, up = np.array(list(map(float, look.groups()))).reshape(3, 3)
-    focal = 0.5 * min(width, height) / math.tan(math.radians(0.5 * float(field[1])))
-    pose = np.asarray(np.linalg.inv(_camera_to_world(eye, target, up) @ OPENGL_FROM_OPENCV), dtype=np.float64)
-    return Camera(name, width, height, focal, focal, width / 2, height / 2, pose)
-
-
-def _camera_to_world(eye: NDArray, target: NDArray, up: NDArray) -> NDArray[np.float64]:
-    """OpenGL axes: x right, y up, looking down -z."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :4] = np.stack([right, np.cross(right, forward), -forward, eye], axis=1)
-    return pose
+    ratio = width / min(width, height)
+    fov = 2.0 * math.degrees(math.atan(ratio * math.tan(math.radians(0.5 * float(field[1])))))
+    return Camera.look_at(eye, target, up, width, height, fov, name)

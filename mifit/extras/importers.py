@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from mifit.capture.importer import Material, import_material, match_views, scene_material, sources_of
+from mifit.capture.importer import Material, Selection, import_material, match_views, scene_material, sources_of
 from mifit.capture.sources import ImageFiles, Source
 from mifit.errors import InputError
 from mifit.extras.colmap import read_colmap
@@ -13,7 +14,9 @@ from mifit.extras.metashape import read_metashape
 from mifit.extras.nersemble import read_nersemble
 from mifit.extras.photos import PhotoFolders, group_photos, view_name
 from mifit.extras.realitycapture import read_realitycapture
-from mifit.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 REGISTRATIONS = ("colmap", "metashape", "realitycapture")
 """Sources of cameras that name photographs."""
@@ -29,12 +32,8 @@ def import_from(
     videos: Sequence[str | Path] = (),
     images: Sequence[str | Path] = (),
     photos: str | Path | None = None,
-    every: int = 1,
-    start: int = 0,
-    count: int | None = None,
     units: str | None = None,
-    starts: Sequence[float] = (),
-    progress: Progress = silent,
+    **options: Unpack[Selection],
 ) -> Path:
     """Make a capture folder from cameras of another program or a data set; else as `mifit.capture.import_capture`.
 
@@ -51,11 +50,10 @@ def import_from(
         Pixels in place of the photographs, for cameras of these names; not for ``vhap`` and ``nersemble``.
     photos : path, optional
         Folder of the photographs; default: beside the model.
-    every, start, count : int
     units : str, optional
         Default: cm for ``colmap``, else metres.
-    starts : sequence of float
-    progress : Progress
+    **options
+        ``every``, ``start``, ``count``, ``starts`` and ``progress``.
 
     Raises
     ------
@@ -78,7 +76,7 @@ def import_from(
             return Material(sequence.sources, sequence.views, sequence.annotated, unit)
         return _registered(kind, where, sources_of(videos, images), photos, unit)
 
-    return import_material(out, gather, every, start, count, units, starts, progress)
+    return import_material(out, gather, units, **options)
 
 
 def _registered(kind: str, where: Path, sources: list[Source], photos: str | Path | None, units: str) -> Material:

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -39,10 +39,12 @@ from mifit.output.views import on_backdrop, orbit_camera
 from mifit.progress import Progress
 from mifit.result import METHODS, Method, Reconstruction
 
+if TYPE_CHECKING:
+    import viser
+    from websockets.asyncio.server import Request, Response, ServerConnection
+
 ROWS = (160, 600)
 """Rows of a picture while something moves, and when it rests."""
-REST = 0.3
-"""Seconds without a change after which the full picture is rendered."""
 MAX_UPLOAD_BYTES = 256 * 2**20
 """An environment that a browser sends: 16384 x 8192 pixels in a Radiance file, half of that in an EXR."""
 MAX_CLIENTS = 8
@@ -177,10 +179,10 @@ def _guarded(host: str) -> Iterator[None]:
     from websockets.asyncio import server as websockets
 
     serve_any = websockets.serve
-    sockets: weakref.WeakSet[Any] = weakref.WeakSet()
+    sockets: weakref.WeakSet[ServerConnection] = weakref.WeakSet()
 
     def serve(*arguments: Any, process_request: Any, **options: Any) -> Any:
-        def answer(connection: Any, request: Any) -> Any:
+        def answer(connection: ServerConnection, request: Request) -> Response | None:
             hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
             try:
                 ours = len(hosts) == 1 and len(origins) < 2 and is_of_our_page(hosts[0], (*origins, None)[0], host)
@@ -273,7 +275,7 @@ class LiveView:
                 self._coarse.add(client)
                 self._send(handle, ROWS[0])
                 self._rested = now
-            elif client in self._coarse and now - self._rested > REST:
+            elif client in self._coarse and now - self._rested > 0.3:  # seconds
                 self._coarse.discard(client)
                 self._send(handle, ROWS[1])
 
@@ -347,23 +349,24 @@ class LiveView:
         if before is not None:
             before.unlink(missing_ok=True)
 
-    def _connected(self, client: Any) -> None:
+    def _connected(self, client: viser.ClientHandle) -> None:
         self._place(client)
         client.camera.on_update(lambda _: self._ask(client.client_id))
         self._ask(client.client_id)
 
-    def _gone(self, client: Any) -> None:
+    def _gone(self, client: viser.ClientHandle) -> None:
         self._changed.pop(client.client_id, None)
         self._coarse.discard(client.client_id)
 
-    def _place(self, client: Any) -> None:
+    def _place(self, client: viser.ClientHandle | None) -> None:
         """Put a browser's camera in front of the face."""
+        assert client is not None
         camera = client.camera
         camera.position = self._start.position  # first: it takes the point looked at along
         camera.up_direction, camera.look_at = self._up, self._centre
         camera.fov = 2 * np.arctan(0.5 * self._start.height / self._start.fy)
 
-    def _send(self, client: Any, rows: int) -> None:
+    def _send(self, client: viser.ClientHandle, rows: int) -> None:
         try:
             seen = client.camera
             camera = browser_camera(seen.wxyz, seen.position, seen.fov, seen.aspect, rows)

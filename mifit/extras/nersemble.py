@@ -23,8 +23,6 @@ from mifit.core.image import SUFFIXES
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 
-CALIBRATED_SIZE = (2200, 3208)
-"""Width and height of the images that the cameras were calibrated with."""
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv")
 
 
@@ -136,7 +134,7 @@ def _parameters(file: Path) -> tuple[dict[str, np.ndarray], np.ndarray, tuple[in
         pose = _matrix(value, (4, 4), where)
         pose[:3, :3] = nearest_rotation(pose[:3, :3], where)
         poses[str(name)] = pose
-    size = tuple(document.get(key, default) for key, default in zip(("width", "height"), CALIBRATED_SIZE, strict=True))
+    size = tuple(document.get(key, default) for key, default in zip(("width", "height"), (2200, 3208), strict=True))
     if not all(isinstance(side, int) and 0 < side < 10**6 for side in size):
         raise InputError(f"{file}: width, height: found {size}, expected pixels")
     return poses, matrix, (int(size[0]), int(size[1]))

@@ -18,8 +18,6 @@ MAX_SHIFT = 0.05
 """Pixels that a term which OpenCV's lens model lacks may move a point of the image before it is refused."""
 MAX_NUMBER = 1e30
 """No pose and no lens has numbers beyond it; their squares are numbers still."""
-FAR, FAR_SPREADS = 1e5, 1e4
-"""Distance of the cameras from the origin, and in multiples of their spread, beyond which coordinates aren't local."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +140,8 @@ def opencv_lens(
 def local(photos: Sequence[Photo], where: str) -> tuple[Photo, ...]:
     """The photographs, once it is clear that their coordinates are local ones and not those of the Earth.
 
+    Those of the Earth lie 1e5 from the origin and more, and 1e4 times as far as the cameras from one another.
+
     Raises
     ------
     InputError
@@ -153,7 +153,7 @@ def local(photos: Sequence[Photo], where: str) -> tuple[Photo, ...]:
     places = np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in poses if pose is not None])
     distance = float(np.linalg.norm(places, axis=1).max())
     spread = float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
-    if distance > max(FAR, FAR_SPREADS * spread):
+    if distance > max(1e5, 1e4 * spread):
         raise InputError(
             f"{where}: found cameras {distance:.4g} from the origin and {spread:.4g} around their middle, expected "
             "local coordinates; export them without a geographic coordinate system"

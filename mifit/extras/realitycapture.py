@@ -24,8 +24,6 @@ from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 from mifit.extras.photos import Photo, local, opencv_lens, parse_numbers, view_name
 
-FILM = 36.0
-"""Millimetres that focal lengths refer to."""
 MODELS = ("perspective", "brown3", "brown4", "brown3t2", "brown4t2")
 NAMESPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 COLUMNS = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
@@ -135,7 +133,7 @@ def _photo(
         raise InputError(f"{where}: found focal length {length:g} and aspect ratio {aspect:g}, expected positive ones")
     width, height = size(name)
     longer = max(width, height)
-    fx = length / FILM * longer
+    fx = length / 36.0 * longer  # of a film 36 mm wide
     k1, k2, k3, k4, t1, t2 = map(float, brown)
     distortion = opencv_lens(
         where, (width, height), fx, (k1, k2, k3, k4), (t2, t1), {"the skew": 0.5 * abs(skew) * height * aspect}

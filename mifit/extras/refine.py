@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 MOST = 16
 """Frames that enter, fitted ones included."""
-DISAGREES = 3.0
-"""Times that a frame may differ from what the fit predicts, relative to the fitted frames."""
 
 
 @one_blas_thread()
@@ -148,7 +146,7 @@ def _followed(
             failed[timestep] = "the face isn't found in it"
             continue
         times = _difference(result, capture, one) / max(usual, 1e-6)
-        if times > DISAGREES:
+        if times > 3.0:  # relative to the fitted frames
             failed[timestep] = f"it differs {times:.1f} times as much from the fit as the fitted frames: its light?"
         else:
             found.append(one)

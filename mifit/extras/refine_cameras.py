@@ -23,8 +23,8 @@ from mifit.core.mesh import interpolate
 from mifit.core.process import one_blas_thread
 from mifit.core.uv import rasterize_uv
 from mifit.extras.bundle import AdjustedBundle, Bundle, Freedom, Sightings, adjust_bundle
-from mifit.extras.calibrate_densely import MATCH_DEVIATION, MATCH_SIDE, MOST_TIMESTEPS
-from mifit.extras.tracks import follow_points, unwrap_image
+from mifit.extras.calibrate_densely import MOST_TIMESTEPS
+from mifit.extras.tracks import Tracks, focal_of, follow_points, image_scale, sightings_of, unwrap_image
 from mifit.progress import Progress, silent
 from mifit.stages.geometry.parameters import cross_matrix
 from mifit.stages.surface.views import texture_size
@@ -33,21 +33,42 @@ if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
-FEWEST_MATCHES = 200
-"""Used ones, and as many left out, below which nothing is adjusted."""
-SHARED_ERROR = 0.1
-"""Smooth error that all matches share, pixels: whatever their number, together they weigh as one of this deviation."""
-LEFT_PIXELS = 0.5
-"""Residual of matches left out beyond which it isn't the cameras' poses and focal lengths that are off, or not alone.
 
-These two lengths are for images whose longer side has `MATCH_SIDE` pixels or fewer."""
-BETTER = 0.95
-"""Part of the residual of matches left out that an adjustment must leave at most to be kept."""
-FARTHEST = 3.0
-"""Deviations of the prior beyond which a calibration isn't adjusted: it is another one."""
-FOCAL_DEVIATION, TURN_DEGREES, SHIFT_DEVIATION = 0.005, 0.5, 0.005
-"""What a calibration may be off by: a focal length, relative; an orientation about each axis; a position along each
-axis, as a part of its distance to the head."""
+@dataclass(frozen=True)
+class CalibrationLimits:
+    """What a calibration may be off by, and what matches must show of it.
+
+    Lengths are for images whose longer side has `MATCH_SIDE` pixels or fewer.
+
+    Attributes
+    ----------
+    focal, turn_degrees, shift : float
+        Deviations of the prior: of a focal length, relative; of an orientation about each axis; of a position along
+        each axis, as a part of its distance to the head.
+    shared_error : float
+        Smooth error that all matches share, pixels: whatever their number, together they weigh as one of this
+        deviation.
+    fewest : int
+        Matches, as many used as left out, below which nothing is adjusted.
+    residual : float
+        Of matches left out, pixels, beyond which it isn't poses and focal lengths that are off, or not alone.
+    better : float
+        Part of the residual of matches left out that an adjustment must leave at most to be kept.
+    farthest : float
+        Deviations of the prior beyond which a calibration isn't adjusted: it is another one.
+    """
+
+    focal: float = 0.005
+    turn_degrees: float = 0.5
+    shift: float = 0.005
+    shared_error: float = 0.1
+    fewest: int = 200
+    residual: float = 0.5
+    better: float = 0.95
+    farthest: float = 3.0
+
+
+LIMITS = CalibrationLimits()
 
 
 @dataclass(frozen=True)
@@ -119,32 +140,32 @@ def refine_cameras(
     -------
     RefinedCameras
         No cameras where the calibration stays: it can't be adjusted, the adjustment disagrees with it by more than
-        `FARTHEST` deviations or didn't settle, or matches that were left out don't agree better.
+        ``farthest`` deviations or didn't settle, or matches that were left out don't agree better.
 
     Notes
     -----
-    The prior is Gaussian, with `FOCAL_DEVIATION`, `TURN_DEGREES` and `SHIFT_DEVIATION` of each camera. All cameras
-    move: of rigs that explain matches alike the one that differs least from the calibration is taken, so that the
-    world frame, and with it cameras that weren't fitted, stay valid.
+    The prior is Gaussian, see `CalibrationLimits`. All cameras move: of rigs that explain matches alike the one that
+    differs least from the calibration is taken, so that the world frame, and with it cameras that weren't fitted, stay
+    valid.
     """
     if not capture.calibrated:
         return _kept("the capture is uncalibrated: its cameras are estimates already", {})
     if len(cameras) < 2:
         return _kept("one camera has nothing to be matched with", {})
     views = [capture.camera(name) for name in cameras]
-    scale = max(max(max(view.width, view.height) for view in views) / MATCH_SIDE, 1.0)
-    matches = _match(capture, model, geometry, views, MATCH_DEVIATION * scale, progress)
+    scale = image_scale(views)
+    matches = _match(capture, model, geometry, views, progress)
     used = matches.block % 2 == 0
     counts = {"matches": int(used.sum()), "matches_left_out": int((~used).sum())}
-    if min(counts.values()) < FEWEST_MATCHES:
+    if min(counts.values()) < LIMITS.fewest:
         found = f"{len(used)} points of the face are matched between them"
-        return _kept(f"{found}, expected at least {2 * FEWEST_MATCHES}; more timesteps help", counts)
+        return _kept(f"{found}, expected at least {2 * LIMITS.fewest}; more timesteps help", counts)
     taken, left = matches.some(used), matches.some(~used)
     centre = geometry.vertices[:, np.unique(model.faces[model.face_mask])].reshape(-1, 3).mean(axis=0)
     poses = np.array([view.world_to_camera for view in views])
-    focal = np.array([_focal(view) for view in views])
+    focal = np.array([focal_of(view) for view in views])
     precision = calibration_precision(poses, np.array([np.linalg.norm(view.position - centre) for view in views]))
-    together = used.sum() * (SHARED_ERROR * scale / taken.seen.deviation) ** 2
+    together = used.sum() * (LIMITS.shared_error * scale / taken.seen.deviation) ** 2
     calibrated = Bundle(focal, poses, np.eye(4)[None], taken.points, np.zeros((1, 0)))
     before = _triangulated(taken, calibrated)
     adjusted = adjust_bundle(before.bundle, taken.seen, Freedom.of_prior(together * precision))
@@ -163,13 +184,16 @@ def refine_cameras(
     before_after = f"{judged[0]:.2f} pixels off with it, {judged[1]:.2f} with adjusted cameras"
     if not adjusted.settled:
         return _kept("the adjustment to dense matches hasn't settled", details)
-    if farthest > FARTHEST:
+    if farthest > LIMITS.farthest:
         found = f"dense matches are off by {farthest:.1f} of the deviations that a calibration is taken to have"
-        return _kept(f"{found}, expected at most {FARTHEST:g}; calibrate the cameras anew", details)
-    if judged[1] > LEFT_PIXELS * scale:
-        found = f"dense matches are {before_after}, expected at most {LEFT_PIXELS * scale:.2g}"
+        return _kept(f"{found}, expected at most {LIMITS.farthest:g}; calibrate the cameras anew", details)
+    if judged[1] > LIMITS.residual * scale:
+        found = f"dense matches are {before_after}, expected at most {LIMITS.residual * scale:.2g}"
         return _kept(f"{found}; the cameras may be out of step, or their lenses distort otherwise", details)
-    if judged[1] > BETTER * judged[0] or judged[0] ** 2 - judged[1] ** 2 < (0.5 * SHARED_ERROR * scale) ** 2:
+    if (
+        judged[1] > LIMITS.better * judged[0]
+        or judged[0] ** 2 - judged[1] ** 2 < (0.5 * LIMITS.shared_error * scale) ** 2
+    ):
         return _kept(f"matches that were left out are {before_after}", details, doubtful=False)
     away = ", in ".join(f"{name} by {way['at_head_mm']:.1f}" for name, way in details["moved"].items())
     finding = f"the calibration is off: dense matches are {before_after}, which shift the head in {away} mm"
@@ -192,49 +216,36 @@ def _match(
     model: MorphableModel,
     geometry: GeometryEstimate,
     views: Sequence[Camera],
-    deviation: float,
     progress: Progress,
 ) -> _Matches:
-    """Points of the face that several views show at a timestep, pixels with this deviation."""
+    """Points of the face that several views show at a timestep."""
     steps = np.unique(np.linspace(0, len(geometry.timesteps) - 1, MOST_TIMESTEPS).round().astype(int))
     centre = geometry.vertices[0].mean(axis=0)
-    length = min(float(np.linalg.norm(centre - view.position)) / _focal(view) for view in views)
+    length = min(float(np.linalg.norm(centre - view.position)) / focal_of(view) for view in views)
     size = texture_size(model, geometry.vertices[0].astype(np.float64), length, 1024)
     texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
-    middle = np.array([(view.cx, view.cy) for view in views])
-    square = np.array([(_focal(view) / view.fx, _focal(view) / view.fy) for view in views])
-    block, pixels, number, camera, points = [], [], [], [], []
-    count = 0
+    block, points, found, count = [], [], [], 0
     for done, k in enumerate(steps):
         progress("match views", done, len(steps))
         vertices = geometry.vertices[k].astype(np.float64)
-        unwrapped = []
-        for i, view in enumerate(views):
-            frame = capture.frame(view.name, geometry.timesteps[k])
-            usable = frame.valid & ~frame.clipped
-            unwrapped.append(unwrap_image(frame.image, usable, view, vertices, model.faces, texels, (i, 0)))
-        tracks = follow_points(unwrapped, 2, 10000)
+        frames = [(capture.frame(view.name, geometry.timesteps[k]), view) for view in views]
+        tracks = follow_points([unwrap_image(*frame, vertices, model.faces, texels) for frame in frames], 2, 10000)
         at = np.searchsorted(texels.index, tracks.texel)
         row, column = np.divmod(tracks.texel, size)
         block.append(row // 32 + column // 32)
         points.append(interpolate(vertices, model.faces, texels.face[at], texels.weights[at]))
-        pixels.append((tracks.pixels - middle[tracks.image]) * square[tracks.image])
-        number.append(tracks.point + count)
-        camera.append(tracks.image)
+        found.append(replace(tracks, point=tracks.point + count))
         count += len(tracks.texel)
     progress("match views", len(steps), len(steps))
-    where, seen_by = np.concatenate(number), np.concatenate(camera)
-    seen = Sightings(np.concatenate(pixels), where, seen_by, np.zeros_like(seen_by), deviation)
+    columns = (np.concatenate([getattr(one, name) for one in found]) for name in ("texel", "point", "image", "pixels"))
+    every = Tracks(*columns)
+    seen = sightings_of(every, views, every.image, np.zeros_like(every.image))
     return _Matches(seen, np.concatenate(points).astype(np.float64), np.concatenate(block))
-
-
-def _focal(view: Camera) -> float:
-    return math.sqrt(view.fx * view.fy)
 
 
 def _moved(view: Camera, focal: float, pose: NDArray) -> Camera:
     """A camera at another pose, with another focal length and pixels as they were."""
-    factor = focal / _focal(view)
+    factor = focal / focal_of(view)
     return replace(view, fx=view.fx * factor, fy=view.fy * factor, world_to_camera=pose)
 
 
@@ -249,7 +260,7 @@ def _movement(before: Camera, after: Camera, centre: NDArray, unit_mm: float) ->
         "position_mm": float(np.linalg.norm(after.position - before.position)) * unit_mm,
         "at_head_mm": float(np.linalg.norm(after.project(centre) - before.project(centre)))
         * distance
-        / _focal(before)
+        / focal_of(before)
         * unit_mm,
     }
 
@@ -264,11 +275,11 @@ def calibration_precision(poses: NDArray, distances: NDArray) -> NDArray[np.floa
     distances : (C,)
         From the cameras to the head.
     """
-    found = [FOCAL_DEVIATION**-2.0 * np.eye(len(poses))]
+    found = [LIMITS.focal**-2.0 * np.eye(len(poses))]
     for shift, distance in zip(poses[:, :3, 3], distances, strict=True):
         # A camera that turns about its centre shifts its pose: the centre moves by -(shift + translation x turn).
         moved = np.eye(6)
         moved[3:, :3] = cross_matrix(shift)
-        deviation = np.repeat([np.radians(TURN_DEGREES), SHIFT_DEVIATION * distance], 3)
+        deviation = np.repeat([np.radians(LIMITS.turn_degrees), LIMITS.shift * distance], 3)
         found.append(moved.T @ np.diag(deviation**-2.0) @ moved)
     return np.asarray(block_diag(*found))

@@ -7,6 +7,7 @@ inverse search, 2016) between unwrapped images, there and back.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,29 +15,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.capture import Frame
 from mifit.core.camera import Camera
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, bilinear
+from mifit.extras.bundle import Sightings
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.surface.views import shows_surface
 
-LEAST_COSINE = 0.25
-"""Cosine between view and normal below which texels aren't tracked."""
-DETAIL = 6.0
-"""Standard deviation in texels of the window whose mean and contrast are divided out."""
-BORDER = 5
-"""Side of the squares of texels that must all be visible."""
-THERE_AND_BACK = 0.5
-"""Texels that a flow may end beside its start when it is followed back."""
-WINDOW = 11
-"""Side of the windows in texels whose correlation confirms a match."""
-LEAST_CORRELATION = 0.8
 FEWEST_IMAGES = 3
 """Images that must show a point: two can't contradict one another but across epipolar lines."""
-MOST_STARTS = 8
-"""Images from which tracks start."""
-MOST_TRACKS = 2000
 MOST_SIGHTINGS = 20000
+MATCH_SIDE = 680.0
+"""Longer side of images that lengths in pixels are for; in proportion for larger ones."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +36,6 @@ class Unwrapped:
 
     Attributes
     ----------
-    camera, timestep : int
-        Positions among the cameras and timesteps.
     detail : (S, S) uint8
         Local contrast, 128 where nothing is seen.
     seen : (S, S) bool
@@ -55,8 +44,6 @@ class Unwrapped:
         Where in the image each texel lies.
     """
 
-    camera: int
-    timestep: int
     detail: NDArray[np.uint8]
     seen: NDArray[np.bool_]
     pixels: NDArray[np.float32]
@@ -83,52 +70,55 @@ class Tracks:
     pixels: NDArray[np.float64]
 
 
-def unwrap_image(
-    image: NDArray,
-    usable: NDArray[np.bool_],
-    camera: Camera,
-    vertices: NDArray,
-    faces: NDArray,
-    texels: TexelMap,
-    place: tuple[int, int],
-) -> Unwrapped:
-    """Bring an image (H, W, 3), linear, into UV space.
+def unwrap_image(frame: Frame, camera: Camera, vertices: NDArray, faces: NDArray, texels: TexelMap) -> Unwrapped:
+    """A frame of a camera in UV space, through a mesh (V, 3) in world space with faces (F, 3).
 
-    Parameters
-    ----------
-    image : (H, W, 3)
-    usable : (H, W) bool
-        Pixels that are measurements.
-    camera : Camera
-    vertices : (V, 3)
-        World space.
-    faces : (F, 3)
-    texels : TexelMap
-    place : (int, int)
-        Camera and timestep, as in `Unwrapped`.
+    Texels that are seen at a cosine below 0.25 count as hidden, as do those within two of others that are.
     """
     scene = SurfaceScene(vertices, faces)
     position = interpolate(vertices, faces, texels.face, texels.weights)
     normal = normalize(interpolate(vertex_normals(vertices, faces), faces, texels.face, texels.weights))
-    pixels = camera.project(position)
-    at = np.nan_to_num(pixels, nan=-1.0) - 0.5
+    at = np.nan_to_num(camera.project(position), nan=-1.0) - 0.5
     cosine = (normalize(camera.position - position) * normal).sum(1)
-    seen = (cosine > LEAST_COSINE) & scene.visible_from(position, camera.position)
+    seen = (cosine > 0.25) & scene.visible_from(position, camera.position)
     seen &= ((at > 0) & (at < (camera.width - 1, camera.height - 1))).all(axis=1)
-    shown = (usable & shows_surface(scene, camera)).astype(np.float32)
+    shown = (frame.valid & ~frame.clipped & shows_surface(scene, camera)).astype(np.float32)
     seen &= bilinear(shown, at[:, 0], at[:, 1]) > 0.99
-    grey = image.mean(axis=2)
+    grey = frame.image.mean(axis=2)
     floor = 0.1 * float(np.median(grey[shown > 0])) if (shown > 0).any() else 1.0
     brightness = np.log(np.maximum(grey, 0.0) + max(floor, 1e-6)).astype(np.float32)
     mask = texels.to_map(seen)
     detail = _detail(texels.to_map(bilinear(brightness, at[:, 0], at[:, 1])), mask)
-    inner = cv2.erode(mask.astype(np.uint8), np.ones((BORDER, BORDER), np.uint8)) > 0
-    return Unwrapped(*place, detail, inner, texels.to_map(at.astype(np.float32) + np.float32(0.5)))
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    return Unwrapped(detail, inner, texels.to_map(at.astype(np.float32) + np.float32(0.5)))
+
+
+def sightings_of(tracks: Tracks, views: Sequence[Camera], camera: NDArray, timestep: NDArray) -> Sightings:
+    """What a bundle adjustment takes of tracks; ``camera`` and ``timestep`` are those of the sightings' images.
+
+    A match errs by 0.3 pixels along an axis.
+    """
+    focal, pixel = (np.array([value(v) for v in views]) for value in (focal_of, lambda v: (v.fx, v.fy)))
+    centre = np.array([(view.cx, view.cy) for view in views])
+    pixels = (tracks.pixels - centre[camera]) * (focal[:, None] / pixel)[camera]
+    return Sightings(pixels, tracks.point, camera, timestep, 0.3 * image_scale(views))
+
+
+def focal_of(view: Camera) -> float:
+    """Focal length in pixels made square."""
+    return math.sqrt(view.fx * view.fy)
+
+
+def image_scale(views: Sequence[Camera]) -> float:
+    """What lengths in pixels are to be multiplied by for images larger than `MATCH_SIDE`."""
+    return max(max(max(view.width, view.height) for view in views) / MATCH_SIDE, 1.0)
 
 
 def _detail(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Mean and contrast within about 6 texels divided out."""
+
     def blur(image: NDArray) -> NDArray:
-        return cv2.GaussianBlur(image, (0, 0), DETAIL)
+        return cv2.GaussianBlur(image, (0, 0), 6.0)
 
     share = np.maximum(blur(mask.astype(np.float32)), 1e-3)
     beside = np.where(mask, values - blur(np.where(mask, values, 0.0)) / share, 0.0)
@@ -136,11 +126,11 @@ def _detail(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.
     return np.where(mask, np.clip(128.0 + 45.0 * beside / (contrast + 0.01), 0, 255), 128.0).astype(np.uint8)
 
 
-def follow_points(images: Sequence[Unwrapped], fewest: int = FEWEST_IMAGES, most: int = MOST_TRACKS) -> Tracks:
-    """Points that at least ``fewest`` images show; about ``most`` starts, at most `MOST_SIGHTINGS`."""
+def follow_points(images: Sequence[Unwrapped], fewest: int = FEWEST_IMAGES, most: int = 2000) -> Tracks:
+    """Points that at least ``fewest`` images show; about ``most`` starts from 8 images, at most `MOST_SIGHTINGS`."""
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setFinestScale(0)
-    starts = np.unique(np.linspace(0, len(images) - 1, min(len(images), MOST_STARTS)).round().astype(int))
+    starts = np.unique(np.linspace(0, len(images) - 1, min(len(images), 8)).round().astype(int))
     covered = sum(int(images[a].seen.sum()) for a in starts)
     stride = max(1, int(np.sqrt(covered / most)))
     texel, sightings, count = [], [], 0
@@ -181,9 +171,12 @@ def _flow(method: cv2.DISOpticalFlow, first: NDArray[np.uint8], second: NDArray[
 def _matched(
     one: Unwrapped, other: Unwrapped, there: NDArray, back: NDArray, row: NDArray, column: NDArray
 ) -> NDArray[np.intp]:
-    """Which of the texels the other image shows too, by the flow there and back and by correlation."""
+    """Which of the texels the other image shows too.
+
+    The flow there and back ends within half a texel of its start, and windows of 11 texels correlate by 0.8.
+    """
     x, y = column + there[row, column, 0], row + there[row, column, 1]
-    closed = np.abs(there[row, column] + bilinear(back, x, y)).max(axis=1) < THERE_AND_BACK
+    closed = np.abs(there[row, column] + bilinear(back, x, y)).max(axis=1) < 0.5
     closed &= bilinear(other.seen.astype(np.float32), x, y) > 0.99
     grid_y, grid_x = np.indices(one.seen.shape, dtype=np.float32)
     first = one.detail.astype(np.float32)
@@ -192,9 +185,9 @@ def _matched(
     )
 
     def mean(image: NDArray) -> NDArray:
-        return cv2.blur(image, (WINDOW, WINDOW))
+        return cv2.blur(image, (11, 11))
 
     a, b = mean(first), mean(second)
     spread = (mean(first * first) - a * a) * (mean(second * second) - b * b)
     correlation = (mean(first * second) - a * b) / np.sqrt(np.maximum(spread, 1.0))
-    return np.flatnonzero(closed & (correlation[row, column] > LEAST_CORRELATION))
+    return np.flatnonzero(closed & (correlation[row, column] > 0.8))

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mifit.core.files import replacing
-from mifit.core.mesh import vertex_normals
+from mifit.core.files import write_bytes
+from mifit.core.image import encode_png, linear_to_srgb
+from mifit.core.mesh import face_cross, vertex_normals
 from mifit.errors import InputError
 from mifit.morphable.model import MorphableModel
 from mifit.morphable.openings import lacks_eyes
 
 _LIGHTS = (((0.35, 0.55, 0.8), 0.75), ((-0.7, 0.1, 0.5), 0.25))
-_AMBIENT = 0.16
-"""Directions and weights of the lights of pictures, and what comes from everywhere."""
+"""Directions and weights of the lights of pictures."""
 
 
 def model_info(model: MorphableModel) -> str:
@@ -40,15 +41,9 @@ def model_info(model: MorphableModel) -> str:
         ("unit", f"{model.unit_mm:g} mm"),
         ("size", " x ".join(f"{s:.0f}" for s in size) + " mm"),
         ("identity", spread(model.identity, model.unit_mm) + (" mm" if model.n_identity else "")),
-        (
-            "expression",
-            expression + (f" mm, {bounded} bounded" if model.n_expression else ""),
-        ),
+        ("expression", expression + (f" mm, {bounded} bounded" if model.n_expression else "")),
         ("albedo", spread(model.albedo_modes, 1.0)),
-        (
-            "mean albedo",
-            " ".join(f"{c:.3f}" for c in skin),
-        ),
+        ("mean albedo", " ".join(f"{c:.3f}" for c in skin)),
         ("symmetry", "known" if model.symmetry is not None else "unknown"),
         *(("notice", n) for n in notices(model)),
     ]
@@ -83,15 +78,10 @@ def save_preview(model: MorphableModel, path: str | Path, modes: int = 4) -> Non
     for kind in ("identity", "expression", "albedo"):
         count = getattr(model, f"n_{kind}")
         for k in range(min(modes, count)):
-            c = np.zeros(k + 1)
-            pair = []
-            for sigma in (-2.0, 2.0):
-                value = sigma
-                if kind == "expression":
-                    value = float(np.clip(sigma, *model.expression_bounds[k]))
-                c[k] = value
-                given = {"identity": None, "expression": None, "albedo": None} | {kind: c.copy()}
-                pair.append(sketch(model, given["identity"], given["expression"], given["albedo"], yaw=20))
+            limits = model.expression_bounds[k] if kind == "expression" else (-np.inf, np.inf)
+            pair = [
+                sketch(model, **{kind: np.eye(k + 1)[k] * np.clip(sigma, *limits)}, yaw=20) for sigma in (-2.0, 2.0)
+            ]
             columns.append([*pair, np.ones_like(pair[0])])
     sheet = np.concatenate([np.concatenate(column, axis=0) for column in columns], axis=1)
     save_png(sheet, path)
@@ -99,14 +89,9 @@ def save_preview(model: MorphableModel, path: str | Path, modes: int = 4) -> Non
 
 def save_png(image: NDArray, path: str | Path) -> None:
     """Write an sRGB image in 0..1 as an 8-bit PNG, whole or not at all."""
-    import cv2
-
     if Path(path).suffix.lower() != ".png":
         raise InputError(f"{path}: found suffix '{Path(path).suffix}', expected .png")
-    bytes_ = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
-    with replacing(path) as temporary:
-        if not cv2.imwrite(str(temporary), bytes_[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9]):
-            raise InputError(f"{path}: cannot write")
+    write_bytes(path, encode_png((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)))
 
 
 def sketch(
@@ -142,39 +127,13 @@ def sketch(
     angle = np.radians(-yaw)
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     v = (vertices - centre) @ turn.T
-    n = vertex_normals(v, model.faces)
-    light = _AMBIENT + sum(w * np.clip(n @ (np.array(d) / np.linalg.norm(d)), 0, 1) for d, w in _LIGHTS)
-    shaded = colour * light[:, None]
-    xy = np.stack([v[:, 0], -v[:, 1]], axis=1) * (size / extent) + size / 2
-    image = _splat(xy, v[:, 2], model.faces, shaded, size)
-    return np.where(image <= 0.0031308, 12.92 * image, 1.055 * np.maximum(image, 1e-9) ** (1 / 2.4) - 0.055).astype(
-        np.float32
-    )
-
-
-def _splat(xy: NDArray, z: NDArray, faces: NDArray, colour: NDArray, size: int) -> NDArray:
-    """Rasterise triangles that face the viewer, nearest on top; linear colour on white."""
-    corner = xy[faces]
-    a, b, c = (corner[:, i] for i in range(3))
-    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    front = np.flatnonzero(area < 0)  # y points down: counter-clockwise outside is negative here
-    corner, area, faces = corner[front], area[front], faces[front]
-    low = np.clip(np.ceil(corner.min(1) - 0.5), 0, size).astype(np.int64)
-    high = np.clip(np.floor(corner.max(1) - 0.5) + 1, 0, size).astype(np.int64)
-    extent = np.maximum(high - low, 0)
-    count = extent[:, 0] * extent[:, 1]
-    t = np.repeat(np.arange(len(faces)), count)
-    k = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    x, y = low[t, 0] + k % extent[t, 0], low[t, 1] + k // extent[t, 0]
-    a, b, c = (corner[t, i] for i in range(3))
-    px, py = x + 0.5, y + 0.5
-    w1 = ((px - a[:, 0]) * (c[:, 1] - a[:, 1]) - (py - a[:, 1]) * (c[:, 0] - a[:, 0])) / area[t]
-    w2 = ((b[:, 0] - a[:, 0]) * (py - a[:, 1]) - (b[:, 1] - a[:, 1]) * (px - a[:, 0])) / area[t]
-    w = np.stack([1 - w1 - w2, w1, w2], axis=1)
-    inside = (w >= -1e-9).all(1)
-    t, x, y, w = t[inside], x[inside], y[inside], w[inside]
-    depth = (z[faces[t]] * w).sum(1)
-    order = np.argsort(depth, kind="stable")  # painted from far to near: the last write stays
-    image = np.ones((size, size, 3))
-    image[y[order], x[order]] = (colour[faces[t]] * w[..., None]).sum(1)[order]
+    normals = vertex_normals(v, model.faces)
+    light = 0.16 + sum(w * np.clip(normals @ (np.array(d) / np.linalg.norm(d)), 0, 1) for d, w in _LIGHTS)
+    corners = (np.stack([v[:, 0], -v[:, 1]], axis=1) * (size / extent) + size / 2 - 0.5)[model.faces]
+    shaded = linear_to_srgb((colour * light[:, None])[model.faces].mean(1))
+    image = np.ones((size, size, 3), dtype=np.float32)
+    front = face_cross(v, model.faces)[:, 2] > 0
+    for face in np.argsort(v[model.faces, 2].mean(1)):  # from far to near
+        if front[face]:
+            cv2.fillConvexPoly(image, np.round(corners[face] * 16).astype(int), shaded[face].tolist(), shift=4)
     return image

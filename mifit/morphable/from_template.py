@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -13,12 +11,11 @@ from mifit.morphable.builtin.identity import deformation_modes
 from mifit.morphable.model import MorphableModel, provides
 
 _EXPRESSION_KERNELS = ((22.0, 40, (1.2, 1.5, 1.2)), (11.0, 90, (0.5, 0.7, 0.5)))
-_N_EXPRESSION = 30
 
 
 @provides("from_template")
 def model_of_template(
-    mesh: Any, landmarks: ArrayLike | None, kernels: tuple | None, unit_mm: float, modes: int, name: str
+    mesh: object, landmarks: ArrayLike | None, kernels: tuple | None, unit_mm: float, modes: int, name: str
 ) -> MorphableModel:
     """See ``MorphableModel.from_template``; raises InputError for a mesh that is no face surface."""
     if isinstance(mesh, (tuple, list)) and len(mesh) == 2:
@@ -44,7 +41,7 @@ def model_of_template(
     for q in p:
         near = np.minimum(near, ((points - q) ** 2).sum(1))
     window = np.exp(-0.5 * near / 14.0**2).astype(np.float32)
-    expression = deformation_modes(centred, where, _N_EXPRESSION, _EXPRESSION_KERNELS, (), stretch=(0.0, 0.0, 0.0))
+    expression = deformation_modes(centred, where, 30, _EXPRESSION_KERNELS, (), stretch=(0.0, 0.0, 0.0))
     return complete(
         name,
         vertices.astype(np.float32),

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from mifit.morphable.topology import farthest_points
 
-MIRROR = np.array([-1.0, 1.0, 1.0])
-
 
 def kernel(x: NDArray, y: NDArray, scale: float) -> NDArray:
     """exp(-|x - y|^2 / (2 scale^2)) for points (N, 3) and (M, 3) -> (N, M)."""
@@ -52,7 +50,7 @@ def field_modes(
 
     def covariance(a: NDArray, b: NDArray) -> NDArray:
         k = kernel(a, b, scale)
-        return k if parity == 0 else 0.5 * (k + parity * kernel(a, b * MIRROR, scale))
+        return k if parity == 0 else 0.5 * (k + parity * kernel(a, b * (-1.0, 1.0, 1.0), scale))
 
     values, vectors = np.linalg.eigh(covariance(z, z))
     keep = values > 1e-5 * values[-1]

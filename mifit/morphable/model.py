@@ -18,9 +18,6 @@ from mifit.core.mesh import face_cross
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 
-_LANDMARKS = 68
-MAPPED_SIZE = 512
-"""Texels along the side of the map in which faces that share a place are looked for."""
 _PROVIDED: dict[str, Callable[..., Any]] = {}
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -121,7 +118,7 @@ class MorphableModel:
             "albedo_modes": ((v, 3, None), np.float32),
             "uv": ((None, 2), np.float32),
             "faces_uv": ((f, 3), np.int32),
-            "landmarks": ((_LANDMARKS,), np.int32),
+            "landmarks": ((68,), np.int32),
             "face_mask": ((f,), np.bool_),
             "symmetry": ((v,), np.int32),
             "expression_bounds": ((ke, 2), np.float32),
@@ -283,7 +280,7 @@ class MorphableModel:
         corners = self.uv[self.faces_uv]
         own = self.face_mask | ((corners >= -1e-6) & (corners <= 1.0 + 1e-6)).all(axis=(1, 2))
         order = np.flatnonzero(own)
-        maps = [rasterize_uv(self.uv, self.faces_uv[rows], MAPPED_SIZE) for rows in (order, order[::-1])]
+        maps = [rasterize_uv(self.uv, self.faces_uv[rows], 512) for rows in (order, order[::-1])]
         first, last = order[maps[0].face], order[::-1][maps[1].face]
         inner = (maps[0].weights.min(axis=1) > 1e-4) & (maps[1].weights.min(axis=1) > 1e-4)
         shared = np.concatenate([first[inner & (first != last)], last[inner & (first != last)]])

@@ -20,6 +20,7 @@ from scipy.optimize import least_squares
 from mifit.core.mesh import face_cross
 from mifit.errors import InputError
 from mifit.morphable.model import MorphableModel
+from mifit.morphable.topology import adjacency, closed_borders
 
 RADIUS_MM = 12.0
 """Of an eyeball; people differ by less than a millimetre."""
@@ -34,25 +35,17 @@ MOUTH_ALBEDO = (0.12, 0.03, 0.025)
 TEETH_MM, MOUTH_LINES = 2.0, 8
 """Distance of the sheet between the lips behind their rims, about that of front teeth, and its lines from either lip to
 the middle. Farther back photographs from two sides would paint the teeth at two places, in the shade of the lips."""
-CORNER_ALBEDO = (0.4, 0.17, 0.14)
-"""Of the tissue that closes what is open between lids and ball, in the corners of the eye."""
 BEHIND_MM = 0.01
 """Distance of the rims of sheet and corners behind those of lips and lids."""
 STRIP = 0.09
 """Height of the strip at the bottom of the maps that holds eyes and mouth; what was there moves up."""
 MARGIN = 0.004
-SMALLEST_RIM = 8
-"""Vertices around an eye or the mouth at the least."""
 SMALLEST = 50
 """Vertices of an eyeball at the least: more than those of a rim, each of which the tissue in the corners meets."""
 EYES, CORNERS, INNER_LIPS = (slice(36, 42), slice(42, 48)), ((36, 39), (45, 42)), slice(60, 68)
 """iBUG points; corners from the outer to the inner one."""
-SAME_MM = 0.01
-"""Distance between vertices that were added and those that would be."""
 SUFFIX = "+eyes"
 """After a model's file: with these pieces."""
-VERSION = 3
-"""Of the pieces; a result that was made with others has another model."""
 
 
 @dataclass(frozen=True)
@@ -68,30 +61,6 @@ class _Piece:
     mirror: NDArray[np.int64]  # of a vertex in the piece that mirrors this one
 
 
-def holes(model: MorphableModel) -> list[NDArray[np.int64]]:
-    """Vertices of each closed border of the mesh, in order."""
-    return closed_borders(model.faces)
-
-
-def closed_borders(faces: NDArray) -> list[NDArray[np.int64]]:
-    """Vertices of each closed border of some faces (F, 3), in order."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
-    codes = edges.min(axis=1) * (int(faces.max()) + 1) + edges.max(axis=1)
-    _, first, count = np.unique(codes, return_index=True, return_counts=True)
-    following = dict(edges[first[count == 1]].tolist())
-    found = []
-    for start in list(following):
-        if start not in following:
-            continue
-        loop, vertex = [start], following.pop(start)
-        while vertex != start and vertex in following:
-            loop.append(vertex)
-            vertex = following.pop(vertex)
-        if vertex == start and len(loop) > 2:
-            found.append(np.array(loop))
-    return found
-
-
 def eyeballs(model: MorphableModel) -> list[NDArray[np.int64]]:
     """Vertices of each eyeball: pieces of the mesh that are joined to nothing else and lie at an eye.
 
@@ -100,10 +69,7 @@ def eyeballs(model: MorphableModel) -> list[NDArray[np.int64]]:
     list of (n,) int64
         Empty for a model without eyes.
     """
-    corners = model.faces.astype(np.int64)
-    links = sp.coo_matrix((np.ones(corners.size), (corners.ravel(), np.roll(corners, 1, axis=1).ravel())))
-    links.resize(model.n_vertices, model.n_vertices)
-    piece = sp.csgraph.connected_components(links, directed=False)[1]
+    piece = sp.csgraph.connected_components(adjacency(model.faces, model.n_vertices), directed=False)[1]
     sizes = np.bincount(piece)
     low, high = (np.full((len(sizes), 3), sign * np.inf) for sign in (1.0, -1.0))
     np.minimum.at(low, piece, model.mean)
@@ -129,7 +95,7 @@ def eyeball_faces(model: MorphableModel) -> NDArray[np.bool_]:
 
 def lacks_eyes(model: MorphableModel) -> bool:
     """Whether both eyes are holes, without an eyeball behind."""
-    return not eyeballs(model) and len(_openings(model)[0]) == 2
+    return not eyeballs(model) and len(openings(model)[0]) == 2
 
 
 def with_eyes(model: MorphableModel) -> MorphableModel:
@@ -143,47 +109,34 @@ def with_eyes(model: MorphableModel) -> MorphableModel:
     InputError
         The model has no hole at an eye.
     """
-    eyes, mouth = _openings(model) if not eyeballs(model) else ([], None)
+    eyes, mouth = openings(model) if not eyeballs(model) else ([], None)
     if len(eyes) < 2:
         raise InputError(f"{model.name}: found {len(eyes)} eyes that are holes, expected 2; it has eyes, or is no skin")
     pieces = _pieces(model, eyes, mouth)
-    uv = model.uv.astype(np.float64) * (1.0, 1.0 - STRIP) + (0.0, STRIP)
-    faces: list[NDArray] = [model.faces]
-    faces_uv: list[NDArray] = [model.faces_uv]
-    uvs, mirror = [uv], []
-    mean: list[NDArray] = [model.mean]
-    albedo: list[NDArray] = [model.mean_albedo]
-    identity, expression = [model.identity], [model.expression]
-    count, textured = model.n_vertices, len(uv)
-    starts = np.cumsum([count, *(len(piece.points) for piece in pieces)])
-    for k, piece in enumerate(pieces):
-        mean.append(piece.points)
-        identity.append(_carried(piece.identity, model.identity))
-        expression.append(_carried(piece.expression, model.expression))
-        faces.append(piece.faces + starts[k])
-        faces_uv.append(piece.faces + textured)
-        textured += len(piece.uv)
-        uvs.append(piece.uv)
-        albedo.append(piece.albedo)
-        mirror.append(piece.mirror + starts[(1, 0, 3, 2, 4)[k]])
-    added = int(starts[-1] - count)
-    symmetry = None if model.symmetry is None else np.concatenate([model.symmetry, *mirror])
+    own, sizes = model.n_vertices, [len(piece.points) for piece in pieces]
+    starts = own + np.cumsum([0, *sizes])
+    placed = list(zip(pieces, starts, strict=False))
+    mirror = [piece.mirror + starts[(1, 0, 3, 2, 4)[k]] for k, piece in enumerate(pieces)]
+    faces = np.concatenate([piece.faces + start for piece, start in placed])
     modes = model.albedo_modes
+    uv = model.uv.astype(np.float64) * (1.0, 1.0 - STRIP) + (0.0, STRIP)
     found = replace(
         model,
         name=f"{model.name} with eyes",
-        mean=np.concatenate(mean),
-        identity=np.concatenate(identity),
-        expression=np.concatenate(expression),
-        faces=np.concatenate(faces),
-        faces_uv=np.concatenate(faces_uv),
-        uv=np.concatenate(uvs),
-        mean_albedo=np.concatenate(albedo),
-        albedo_modes=np.concatenate([modes, np.zeros((added, *modes.shape[1:]), modes.dtype)]),
-        face_mask=np.concatenate([model.face_mask, np.zeros(sum(map(len, faces[1:])), bool)]),
-        symmetry=symmetry,
+        mean=np.concatenate([model.mean, *(piece.points for piece in pieces)]),
+        identity=np.concatenate([model.identity, *(_carried(piece.identity, model.identity) for piece in pieces)]),
+        expression=np.concatenate(
+            [model.expression, *(_carried(piece.expression, model.expression) for piece in pieces)]
+        ),
+        faces=np.concatenate([model.faces, faces]),
+        faces_uv=np.concatenate([model.faces_uv, faces - own + len(uv)]),
+        uv=np.concatenate([uv, *(piece.uv for piece in pieces)]),
+        mean_albedo=np.concatenate([model.mean_albedo, *(piece.albedo for piece in pieces)]),
+        albedo_modes=np.concatenate([modes, np.zeros((sum(sizes), *modes.shape[1:]), modes.dtype)]),
+        face_mask=np.concatenate([model.face_mask, np.zeros(len(faces), bool)]),
+        symmetry=None if model.symmetry is None else np.concatenate([model.symmetry, *mirror]),
         # The ball's centre is searched for, whose last digit differs between machines.
-        fingerprint=f"{model.digest}-eyes{VERSION}",
+        fingerprint=f"{model.digest}-eyes3",
     )
     if model.source:
         found._set("_source", model.source + SUFFIX)
@@ -204,11 +157,11 @@ def skin_weights(model: MorphableModel) -> sp.csr_matrix | None:
     kept |= {name: getattr(model, name)[own] for name in ("faces", "faces_uv", "face_mask")}
     symmetry = None if model.symmetry is None else model.symmetry[:count]
     skin = replace(model, **kept, albedo_modes=model.albedo_modes[:count], symmetry=symmetry, fingerprint="")
-    eyes, mouth = _openings(skin)
+    eyes, mouth = openings(skin)
     pieces = _pieces(skin, eyes, mouth) if len(eyes) == 2 else []
     added = np.concatenate([np.zeros((0, 3)), *(piece.points for piece in pieces)])
     rest = model.mean[count:]
-    if len(added) != len(rest) or np.abs(added - rest).max(initial=0.0) * model.unit_mm > SAME_MM:
+    if len(added) != len(rest) or np.abs(added - rest).max(initial=0.0) * model.unit_mm > 0.01:
         return None  # eyes of the model's own
     return sp.vstack([sp.identity(count), *(piece.identity for piece in pieces)]).tocsr()
 
@@ -236,10 +189,10 @@ def leading_faces(model: MorphableModel, count: int) -> NDArray[np.bool_] | None
     return np.logical_not(whole)
 
 
-def _openings(model: MorphableModel) -> tuple[list[NDArray[np.int64]], NDArray[np.int64] | None]:
+def openings(model: MorphableModel) -> tuple[list[NDArray[np.int64]], NDArray[np.int64] | None]:
     """Borders around the eyes, at x < 0 and x > 0, and around the mouth."""
     marks = model.mean[model.landmarks].astype(np.float64)
-    borders = [loop for loop in holes(model) if len(loop) >= SMALLEST_RIM]
+    borders = [loop for loop in closed_borders(model.faces) if len(loop) >= 8]  # vertices around an eye or the mouth
 
     def at(part: slice) -> NDArray[np.int64] | None:
         centre, extent = marks[part].mean(axis=0), float(np.ptp(marks[part][:, 0]))
@@ -301,7 +254,7 @@ def _corner(model: MorphableModel, loop: NDArray, corner: NDArray, width: float)
     first = np.arange(n)
     faces = np.stack([first, np.roll(first, -1), np.full(n, n)], axis=1)
     forward = np.tile([0.0, 0.0, 1.0], (n + 1, 1))
-    uv, albedo = corner + 0.5 * width * (1.0 + disc), np.tile(CORNER_ALBEDO, (n + 1, 1))
+    uv, albedo = corner + 0.5 * width * (1.0 + disc), np.tile((0.4, 0.17, 0.14), (n + 1, 1))
     return _Piece(points, rows, rows, _facing(points, faces, forward), uv, albedo, np.arange(n + 1))
 
 

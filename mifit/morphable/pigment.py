@@ -114,7 +114,7 @@ def region_masks(points: NDArray, landmarks: NDArray) -> dict[str, NDArray[np.fl
     brows = np.zeros(len(points))
     for first in (17, 22):
         brow = p[first : first + 5] - (0.0, 1.5 * eye, 0.0)  # detectors mark the brow's upper edge
-        brows = np.maximum(brows, np.exp(-0.5 * (_polyline_distance(points, brow) / (2.6 * eye)) ** 3))
+        brows = np.maximum(brows, np.exp(-0.5 * (polyline_distance(points, brow) / (2.6 * eye)) ** 3))
     masks["brows"] = brows
 
     masks["cheeks"] = np.maximum(
@@ -126,7 +126,7 @@ def region_masks(points: NDArray, landmarks: NDArray) -> dict[str, NDArray[np.fl
     masks["nose"] = np.maximum(_bump(points, p[30], 11 * eye), 0.8 * _bump(points, p[[31, 35]].mean(0), 12 * eye))
     sockets = np.zeros(len(points))
     for ring in EYES_AND_MOUTH[:2]:
-        sockets = np.maximum(sockets, np.exp(-0.5 * (_polyline_distance(points, p[[*ring, ring[0]]]) / (6 * eye)) ** 2))
+        sockets = np.maximum(sockets, np.exp(-0.5 * (polyline_distance(points, p[[*ring, ring[0]]]) / (6 * eye)) ** 2))
     masks["sockets"] = sockets * (1 - brows)
 
     outline = np.concatenate([p[3:14, :2], p[[35, 33, 31], :2]])
@@ -149,7 +149,7 @@ def _bump(points: NDArray, centre: NDArray, radius: float) -> NDArray:
     return np.exp(-0.5 * ((points - centre) ** 2).sum(1) / radius**2)
 
 
-def _polyline_distance(points: NDArray, line: NDArray) -> NDArray:
+def polyline_distance(points: NDArray, line: NDArray) -> NDArray:
     """Distance of points (N, D) from a polyline (M, D)."""
     best = np.full(len(points), np.inf)
     for a, b in itertools.pairwise(line):
@@ -167,5 +167,5 @@ def _inside(points: NDArray, polygon: NDArray, softness: float) -> NDArray:
         with np.errstate(divide="ignore", invalid="ignore"):
             x = a[0] + (points[:, 1] - a[1]) * (b[0] - a[0]) / (b[1] - a[1])
         inside ^= crosses & (points[:, 0] < x)
-    distance = _polyline_distance(points, np.vstack([polygon, polygon[:1]]))
+    distance = polyline_distance(points, np.vstack([polygon, polygon[:1]]))
     return _step(np.where(inside, distance, -distance), -softness, softness)

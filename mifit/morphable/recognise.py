@@ -45,10 +45,6 @@ KINDS: dict[str, Callable[[Path], MorphableModel]] = {
 """Every kind of model file and its loader; ``mifit model convert --kind`` takes these names."""
 
 
-FLATTEST = 0.02
-"""Depth of a face's landmarks relative to their height, root mean squares; heads have 0.3 and more."""
-
-
 def fetched_model(name: str) -> Path:
     """Where ``mifit model fetch`` puts a model, whether it is there or not."""
     return cache_folder() / "models" / f"{name}.npz"
@@ -97,7 +93,7 @@ def load_model(path: str | Path, kind: str | None = None) -> MorphableModel:
 def _refuse_flat(model: MorphableModel) -> None:
     points = model.mean[model.landmarks].astype(np.float64)
     extent = np.linalg.svd(points - points.mean(0), compute_uv=False) * model.unit_mm / len(points) ** 0.5
-    if extent[2] < FLATTEST * extent[0]:
+    if extent[2] < 0.02 * extent[0]:  # heads have 0.3 and more
         found = " x ".join(f"{length:.3g}" for length in extent)
         raise InputError(f"{model.name}: the landmarks spread by {found} mm, in a plane; expected a face")
 

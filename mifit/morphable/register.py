@@ -21,16 +21,13 @@ class Registration:
     ----------
     identity : (Ki,) float64
         Coefficients in standard deviations.
-    scale : float
-        Millimetres per millimetre: 1 unless the similarity was asked for.
     rotation : (3, 3), translation : (3,)
-        ``target = scale * rotation @ model + translation`` in mm.
+        ``target = rotation @ model + translation`` in mm.
     vertices : (V, 3) float64
         The fitted model in the target's space, in mm.
     """
 
     identity: NDArray[np.float64]
-    scale: float
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
     vertices: NDArray[np.float64]
@@ -112,7 +109,7 @@ def register(
         turn = Rotation.from_rotvec(step[len(c) : len(c) + 3]).as_matrix()
         rotation, translation = turn @ rotation, turn @ translation + step[len(c) + 3 :]
     shape = mean + unit * (model.identity_jacobian @ c.astype(np.float32)).reshape(-1, 3)
-    return Registration(c, 1.0, rotation, translation, shape @ rotation.T + translation)
+    return Registration(c, rotation, translation, shape @ rotation.T + translation)
 
 
 def rigid_between(source: NDArray, target: NDArray) -> tuple[NDArray, NDArray]:

@@ -58,17 +58,23 @@ def adjacency(faces: NDArray, n_vertices: int, lengths_of: NDArray | None = None
     )
 
 
-def boundary_loops(faces: NDArray, n_vertices: int) -> list[NDArray]:
-    """Vertex sets of the connected boundaries, largest first."""
-    e, count = edges(faces)
-    b = e[count == 1]
-    if not len(b):
-        return []
-    graph = sp.coo_matrix((np.ones(len(b)), (b[:, 0], b[:, 1])), shape=(n_vertices, n_vertices))
-    label = csgraph.connected_components(graph, directed=False)[1]
-    on = np.unique(b)
-    loops = [on[label[on] == k] for k in np.unique(label[on])]
-    return sorted(loops, key=len, reverse=True)
+def closed_borders(faces: NDArray) -> list[NDArray[np.int64]]:
+    """Vertices of each closed border of some faces (F, 3), in order."""
+    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    codes = sides.min(axis=1) * (int(faces.max()) + 1) + sides.max(axis=1)
+    _, first, count = np.unique(codes, return_index=True, return_counts=True)
+    following = dict(sides[first[count == 1]].tolist())
+    found = []
+    for start in list(following):
+        if start not in following:
+            continue
+        loop, vertex = [start], following.pop(start)
+        while vertex != start and vertex in following:
+            loop.append(vertex)
+            vertex = following.pop(vertex)
+        if vertex == start and len(loop) > 2:
+            found.append(np.array(loop))
+    return found
 
 
 def opening_faces(mean: NDArray, faces: NDArray, landmarks: NDArray) -> NDArray[np.bool_]:
@@ -81,10 +87,11 @@ def opening_faces(mean: NDArray, faces: NDArray, landmarks: NDArray) -> NDArray[
     n = len(mean)
     out = np.zeros(len(faces), dtype=bool)
     graph = adjacency(faces, n)
+    loops = closed_borders(faces)
     for ring in EYES_AND_MOUTH:
         points = mean[landmarks[list(ring)]]
         centre, width = points.mean(0), np.ptp(points, axis=0).max()
-        for loop in boundary_loops(faces, n):
+        for loop in loops:
             if np.linalg.norm(mean[loop] - centre, axis=1).max() > width:
                 continue
             hops = csgraph.dijkstra(graph, indices=loop, unweighted=True, min_only=True, limit=20)

@@ -9,6 +9,7 @@ from scipy.sparse.linalg import spsolve
 
 from mifit.core.mesh import edges
 from mifit.errors import InputError
+from mifit.morphable.topology import adjacency, closed_borders
 
 
 def unwrap(mean: NDArray, faces: NDArray, mask: NDArray) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
@@ -19,35 +20,10 @@ def unwrap(mean: NDArray, faces: NDArray, mask: NDArray) -> tuple[NDArray[np.flo
     into charts by xatlas. Faces outside the mask get one spare texture vertex in the corner.
     """
     used = faces[mask]
-    loops = _directed_loops(used)
-    chart = _disc(mean, used, loops) if loops is not None else None
-    if chart is None:
-        uv, corners = _xatlas(mean, used)
-    else:
-        uv, corners = chart
+    uv, corners = _disc(mean, used, closed_borders(used)) or _xatlas(mean, used)
     faces_uv = np.full(faces.shape, len(uv), dtype=np.int32)
     faces_uv[mask] = corners
     return np.vstack([uv, [[0.0, 0.0]]]).astype(np.float32), faces_uv
-
-
-def _directed_loops(faces: NDArray) -> list[NDArray] | None:
-    """Border loops in order, or None where the border isn't made of simple loops."""
-    e = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
-    key = np.int64(faces.max()) + 1
-    border = e[~np.isin(e[:, 0] * key + e[:, 1], e[:, 1] * key + e[:, 0])]
-    following = dict(border.tolist())
-    if len(following) != len(border):
-        return None
-    loops = []
-    while following:
-        start, here = next(iter(following.items()))
-        loop = []
-        while here is not None:
-            loop.append(start)
-            del following[start]
-            start, here = here, following.get(here)
-        loops.append(np.array(loop))
-    return loops
 
 
 def _disc(mean: NDArray, faces: NDArray, loops: list[NDArray]) -> tuple[NDArray, NDArray] | None:
@@ -55,9 +31,7 @@ def _disc(mean: NDArray, faces: NDArray, loops: list[NDArray]) -> tuple[NDArray,
     vertices, local = np.unique(faces, return_inverse=True)
     local = local.reshape(-1, 3)
     e, count = edges(local)
-    pieces = sp.csgraph.connected_components(
-        sp.coo_matrix((np.ones(len(e)), (e[:, 0], e[:, 1])), shape=(len(vertices),) * 2), directed=False
-    )[0]
+    pieces = sp.csgraph.connected_components(adjacency(local, len(vertices)), directed=False)[0]
     if not loops or count.max() > 2 or pieces != 1 or len(vertices) - len(e) + len(faces) != 2 - len(loops):
         return None
     index = {int(v): k for k, v in enumerate(vertices)}

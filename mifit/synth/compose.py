@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ from mifit.core.mesh import MeshPart, SplitMesh, split_at_seams, vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
+from mifit.morphable.openings import RADIUS_MM, eyeballs, openings
 from mifit.progress import Progress, silent
 from mifit.render.gbuffer import SurfaceScene
 from mifit.render.pathtrace import Material, PathTracer, Surface
@@ -140,42 +142,30 @@ def synthesize(  # noqa: PLR0913
         subject = dataclasses.replace(subject, landmark_bias=landmark_bias)
         light = studio_environment(seed + i) if radiance is None else radiance
         start = i * (timesteps + 1)
-        _write_capture(
-            folder,
-            subject,
-            cameras,
-            light,
-            lamp,
-            spp,
-            _shifted(progress, start, total),
-        )
+        advance = partial(_advance, progress, start, total)
+        _write_capture(folder, subject, cameras, light, lamp, spp, advance)
     return out
 
 
-def _shifted(progress: Progress, start: int, total: int) -> Callable[[int], None]:
-    return lambda done: progress("Rendering", start + done, total)
+def _advance(progress: Progress, start: int, total: int, done: int) -> None:
+    progress("Rendering", start + done, total)
 
 
 def place_cameras(width: int, height: int, distance: float = DISTANCE) -> list[Camera]:
     """Cameras left, right (20 degrees off) and third (above the middle), in centimetres, looking at the origin."""
-    focal = 1530.0 * min(width / 680, height / 480)
-    return [
-        _camera(name, width, height, focal, distance, azimuth, elevation)
-        for name, azimuth, elevation in (("left", -20.0, 0.0), ("right", 20.0, 0.0), ("third", 3.0, 9.0))
-    ]
+    places = (("left", -20.0, 0.0), ("right", 20.0, 0.0), ("third", 3.0, 9.0))
+    return [camera_at(name, width, height, azimuth, elevation, distance) for name, azimuth, elevation in places]
 
 
-def _camera(
-    name: str, width: int, height: int, focal: float, distance: float, azimuth: float, elevation: float
+def camera_at(
+    name: str, width: int, height: int, azimuth: float, elevation: float, distance: float = DISTANCE
 ) -> Camera:
+    """A camera that looks at the origin from degrees to the right of and above the nose."""
+    focal = 1530.0 * min(width / 680, height / 480)
     a, e = math.radians(azimuth), math.radians(elevation)
-    position = distance * np.array([math.sin(a) * math.cos(e), math.sin(e), math.cos(a) * math.cos(e)])
-    forward = -position / distance
-    right = np.array([math.cos(a), 0.0, -math.sin(a)])
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ position
-    return Camera(name, width, height, focal, focal, width / 2, height / 2, pose)
+    eye = distance * np.array([math.sin(a) * math.cos(e), math.sin(e), math.cos(a) * math.cos(e)])
+    fov = 2.0 * math.degrees(math.atan(0.5 * width / focal))
+    return Camera.look_at(eye, width=width, height=height, fov=fov, name=name)
 
 
 @dataclass(frozen=True)
@@ -203,9 +193,10 @@ def _draw_subject(
     skin: dict[str, SkinMaps] = {}
     parts: dict[str, SplitMesh] = {}
     rest = ~model.face_mask
-    for i, ball in enumerate(head.own_eyeballs(model)):
-        parts[f"eye{i}"] = head.split_eyeball(model, ball)
-        rest &= ~ball
+    for i, ball in enumerate(eyeballs(model)):
+        chosen = np.isin(model.faces[:, 0], ball)
+        parts[f"eye{i}"] = head.split_eyeball(model, chosen)
+        rest &= ~chosen
     for name, chosen in (("face", model.face_mask), ("rest", rest)):
         if not chosen.any():
             continue
@@ -216,14 +207,8 @@ def _draw_subject(
         parts[name] = split_at_seams(MeshPart(faces, faces_uv, uv))
     neutral = head.neutral_shape(model, seed, outside)
     centre = neutral[model.landmarks[27:48]].mean(axis=0) - np.array([0.0, 0.0, 55.0 / model.unit_mm])
-    eyes = (
-        []
-        if "eye0" in parts
-        else [
-            head.eye_centre(neutral[loop] * model.unit_mm) / model.unit_mm
-            for loop in head.eye_openings(neutral, model.faces, model.landmarks)
-        ]
-    )
+    rims = [] if "eye0" in parts else openings(model)[0]
+    eyes = [head.eye_centre(neutral[rim] * model.unit_mm) / model.unit_mm for rim in rims]
     poses = head.draw_motion(model, timesteps, seed, scale, centre, motion)
     return _Subject(model, seed, neutral, poses, scale, skin, parts, eyes, 0.0)
 
@@ -313,23 +298,27 @@ def _surfaces(subject: _Subject, pose: head.HeadPose, world: NDArray) -> list[Su
     ]
     unit, uv, faces = head.sphere()
     for centre in subject.eyes:
-        offset = unit * (head.EYE_RADIUS / subject.model.unit_mm)
+        offset = unit * (RADIUS_MM / subject.model.unit_mm)
         placed = subject.scale * (centre + offset) @ pose.rotation.T + pose.translation
         surfaces.append(Surface(placed, unit @ pose.rotation.T, uv, faces, "eye"))
     return surfaces
 
 
 def _exposure(tracer: PathTracer, subject: _Subject, camera: Camera) -> float:
-    """Factor that puts the brightest skin, highlights aside, near the upper end of the sensor's range."""
-    small = dataclasses.replace(
-        camera,
-        width=camera.width // 4,
-        height=camera.height // 4,
-        **{key: getattr(camera, key) / 4 for key in ("fx", "fy", "cx", "cy")},
-    )
+    """`exposure_of` a quick render of the first timestep."""
     pose = subject.poses[0]
     surfaces = _surfaces(subject, pose, _world_vertices(subject, pose))
-    image = tracer.render(surfaces, [small], 16, seed=subject.seed)[0]
+    return exposure_of(tracer.render(surfaces, [camera.resized(0.25)], 16, seed=subject.seed)[0])
+
+
+def exposure_of(image: NDArray) -> float:
+    """Factor that puts the brightest skin of an RGBA image, highlights aside, near the sensor's upper end.
+
+    Raises
+    ------
+    InputError
+        Nothing in it is lit.
+    """
     seen = image[image[..., 3] > 0.9]
     level = float(np.percentile(seen[:, :3].max(axis=1), 97)) if len(seen) else 0.0
     if not 0 < level < math.inf:
@@ -345,12 +334,6 @@ def expose(radiance: NDArray, rng: np.random.Generator) -> NDArray[np.float32]:
 
 
 def _write_maps(path: Path, maps: SkinMaps) -> None:
+    halves = {name: getattr(maps, name).astype(np.float16) for name in ("albedo", "specular", "roughness", "bump")}
     with replacing(path) as temporary:
-        np.savez_compressed(
-            temporary,
-            albedo=maps.albedo.astype(np.float16),
-            specular=maps.specular.astype(np.float16),
-            roughness=maps.roughness.astype(np.float16),
-            bump=maps.bump.astype(np.float16),
-            cover=maps.cover,
-        )
+        np.savez_compressed(temporary, cover=maps.cover, **halves)  # type: ignore[arg-type]

@@ -7,16 +7,13 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from mifit.core.mesh import SplitMesh, edges, vertex_normals
+from mifit.core.mesh import SplitMesh, vertex_normals
 from mifit.morphable import MorphableModel
+from mifit.morphable.openings import RADIUS_MM
 from mifit.synth.procedural import smooth_noise
 
-EYE_RADIUS = 12.0
-"""Millimetres."""
 IRIS_COLOURS = np.array([[0.10, 0.045, 0.02], [0.16, 0.10, 0.04], [0.14, 0.20, 0.28], [0.12, 0.18, 0.12]])
 """Brown, hazel, blue, green; linear."""
 
@@ -48,9 +45,6 @@ def neutral_shape(model: MorphableModel, seed: int, outside: float = OUTSIDE) ->
 
 
 Motion = Literal["poses", "talk", "turn"]
-FRAMES_A_SECOND = 30.0
-TALKING_MODES = 6
-"""Expressions that speech is made of: those that move the mouth most and the rest of the face least."""
 
 
 def draw_motion(
@@ -80,17 +74,20 @@ def draw_motion(
     free = np.isinf(bounds).max(axis=1)
     active = rng.permutation(model.n_expression)[:6]
     strength = np.where(free[active], rng.uniform(-0.9, 0.9, len(active)), rng.uniform(0.15, 0.55, len(active)))
-    poses = []
-    for t in range(timesteps):
-        yaw, pitch, roll, *shift = swing * np.sin(phase + speed * t)
-        rotation = Rotation.from_euler("yxz", [yaw, pitch, roll], degrees=True).as_matrix()
-        expression = np.zeros(model.n_expression)
-        wave = 0.5 - 0.5 * np.cos(0.9 * t + np.arange(len(active)))
-        expression[active] = strength * (wave if t else 0.0 * wave)  # the first timestep is neutral
-        expression = np.clip(expression, bounds[:, 0], bounds[:, 1])
-        translation = np.array(shift) - scale * rotation @ centre
-        poses.append(HeadPose(expression.astype(np.float32), rotation, translation))
-    return poses
+    seconds = np.arange(timesteps)
+    expression = np.zeros((timesteps, model.n_expression))
+    wave = 0.5 - 0.5 * np.cos(0.9 * seconds[:, None] + np.arange(len(active)))
+    expression[1:, active] = (strength * wave)[1:]  # the first timestep is neutral
+    return _poses(swing * np.sin(phase + speed * seconds[:, None]), np.clip(expression, *bounds.T), scale, centre)
+
+
+def _poses(swing: NDArray, expression: NDArray, scale: float, centre: NDArray) -> list[HeadPose]:
+    """Of angles and shifts (T, 6), degrees of yaw, pitch, roll and centimetres, and expressions (T, K)."""
+    rotations = Rotation.from_euler("yxz", swing[:, :3], degrees=True).as_matrix()
+    return [
+        HeadPose(weights.astype(np.float32), rotation, shift - scale * rotation @ centre)
+        for weights, rotation, shift in zip(expression, rotations, swing[:, 3:], strict=True)
+    ]
 
 
 def _sequence(
@@ -98,7 +95,7 @@ def _sequence(
 ) -> list[HeadPose]:
     """A head that talks or turns, frame by frame."""
     rng = np.random.default_rng([seed, 14])
-    seconds = np.arange(timesteps) / FRAMES_A_SECOND
+    seconds = np.arange(timesteps) / 30.0
     phase = rng.uniform(0, 2 * np.pi, (2, 6))
     slow = np.sin(phase[0] + 2 * np.pi * np.outer(seconds, rng.uniform(0.15, 0.4, 6)))
     swing = slow * (4.0, 2.5, 1.5, 0.3, 0.3, 0.2)
@@ -114,21 +111,16 @@ def _sequence(
         free = np.isinf(bounds).max(axis=1)[talking]
         strength = np.where(free, rng.choice([-1.0, 1.0], len(talking)) * 0.9, rng.uniform(0.2, 0.5, len(talking)))
         expression[:, talking] = strength * wave * breath[:, None]
-        expression = np.clip(expression, bounds[:, 0], bounds[:, 1])
-    poses = []
-    for (yaw, pitch, roll, *shift), weights in zip(swing, expression, strict=True):
-        rotation = Rotation.from_euler("yxz", [yaw, pitch, roll], degrees=True).as_matrix()
-        translation = np.array(shift) - scale * rotation @ centre
-        poses.append(HeadPose(weights.astype(np.float32), rotation, translation))
-    return poses
+        expression = np.clip(expression, *bounds.T)
+    return _poses(swing, expression, scale, centre)
 
 
 def talking_modes(model: MorphableModel) -> NDArray[np.int64]:
-    """The expressions that move the mouth's landmarks most, relative to the brows' and eyes'."""
+    """The six expressions that move the mouth's landmarks most, relative to the brows' and eyes'."""
     moved = np.linalg.norm(model.expression[model.landmarks].astype(np.float64), axis=1)  # (68, Ke)
     mouth, rest = moved[48:68].mean(axis=0), moved[17:48].mean(axis=0)
     score = mouth**2 / (mouth + 3.0 * rest + 1e-12)
-    return np.argsort(-score, kind="stable")[: min(TALKING_MODES, model.n_expression)]
+    return np.argsort(-score, kind="stable")[: min(6, model.n_expression)]
 
 
 def wrap_uv(uv: NDArray, faces_uv: NDArray) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
@@ -136,24 +128,6 @@ def wrap_uv(uv: NDArray, faces_uv: NDArray) -> tuple[NDArray[np.float32], NDArra
     corners = uv[faces_uv]
     corners = corners - np.floor(corners.mean(axis=1, keepdims=True))
     return corners.reshape(-1, 2).astype(np.float32), np.arange(corners.size // 2, dtype=np.int32).reshape(-1, 3)
-
-
-def own_eyeballs(model: MorphableModel) -> list[NDArray[np.bool_]]:
-    """(F,) masks of the model's own eyeballs: separate pieces of its mesh beside the eye landmarks."""
-    first = np.concatenate([model.faces[:, 0], model.faces[:, 1]])
-    second = np.concatenate([model.faces[:, 1], model.faces[:, 2]])
-    graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(model.n_vertices,) * 2)
-    labels = connected_components(graph, directed=False)[1]
-    skin = np.bincount(labels).argmax()
-    found = []
-    for label in np.unique(labels[model.faces]):
-        piece = model.mean[labels == label].mean(axis=0)
-        for eye in (range(36, 42), range(42, 48)):
-            corners = model.mean[model.landmarks[list(eye)]]
-            width = np.linalg.norm(corners[0] - corners[3])
-            if label != skin and np.linalg.norm(piece - corners.mean(axis=0)) < width:
-                found.append(labels[model.faces[:, 0]] == label)
-    return found
 
 
 def split_eyeball(model: MorphableModel, chosen: NDArray[np.bool_]) -> SplitMesh:
@@ -168,29 +142,11 @@ def split_eyeball(model: MorphableModel, chosen: NDArray[np.bool_]) -> SplitMesh
     return SplitMesh(source.astype(np.int64), uv.astype(np.float32), faces.reshape(-1, 3).astype(np.int32))
 
 
-def eye_openings(vertices: NDArray, faces: NDArray, landmarks: NDArray) -> list[NDArray[np.int64]]:
-    """Vertices around each eye's hole in the mesh; empty when the model's eyes are closed surfaces."""
-    unique, count = edges(faces)
-    border = unique[count == 1]
-    if not len(border):
-        return []
-    graph = coo_matrix((np.ones(len(border)), (border[:, 0], border[:, 1])), shape=(len(vertices),) * 2)
-    labels = connected_components(graph, directed=False)[1]
-    loops = [np.flatnonzero(labels == label) for label in np.unique(labels[border[:, 0]])]
-    found = []
-    for eye in (range(36, 42), range(42, 48)):
-        corners = vertices[landmarks[list(eye)]]
-        width = np.linalg.norm(corners[0] - corners[3])
-        near = [loop for loop in loops if np.linalg.norm(vertices[loop].mean(0) - corners.mean(0)) < 0.5 * width]
-        found.extend(near[:1] if near else [])
-    return found
-
-
 def eye_centre(opening_mm: NDArray) -> NDArray[np.float64]:
     """Centre of an eyeball behind an opening (N, 3), millimetres: as far forward as the lids allow."""
     middle = opening_mm.mean(axis=0)
     across = np.linalg.norm(opening_mm[:, :2] - middle[:2], axis=1)
-    depth = opening_mm[:, 2] - np.sqrt(np.maximum(EYE_RADIUS**2 - across**2, 0.0))
+    depth = opening_mm[:, 2] - np.sqrt(np.maximum(RADIUS_MM**2 - across**2, 0.0))
     return np.array([middle[0], middle[1], depth.min()])
 
 

@@ -50,9 +50,6 @@ def _softbox(
     return np.where(depth > 0, edge, 0.0)
 
 
-_SIDE = 48
-
-
 def smooth_noise(points: NDArray, wavelength: float, rng: np.random.Generator, octaves: int = 1) -> NDArray[np.float32]:
     """Noise with mean 0 and standard deviation about 1 at points (N, 3).
 
@@ -66,7 +63,7 @@ def smooth_noise(points: NDArray, wavelength: float, rng: np.random.Generator, o
     """
     total = np.zeros(len(points), dtype=np.float32)
     for octave in range(octaves):
-        grid = rng.standard_normal((_SIDE,) * 3).astype(np.float32)
+        grid = rng.standard_normal((48,) * 3).astype(np.float32)
         at = np.asarray(points, dtype=np.float32).T * np.float32(2.0**octave * 2.0 / wavelength)
         total += map_coordinates(grid, at, order=1, mode="grid-wrap") * np.float32(1.8 * 0.5**octave)
     return total

@@ -10,7 +10,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,25 +21,14 @@ from mifit.capture.transforms import Shot, View, write_transforms
 from mifit.core.arrays import write_ply
 from mifit.core.camera import Camera
 from mifit.core.files import replacing, write_text
-from mifit.core.image import read_image, write_image
+from mifit.core.image import linear_to_srgb, read_image, write_image
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
 from mifit.render.pathtrace import Material, PathTracer, Surface
+from mifit.synth.compose import expose, exposure_of
 
 MAPS = ("albedo", "specular", "roughness", "displacement")
-MAP_SIZE = 1024
-GLOSS = (0.15, 0.85)
-"""Weight of the glossy lobe where a specular map is black and white."""
-ROUGHNESS = (0.48, 0.30)
-"""Roughness where a specular map is black and white and no roughness map is given."""
-RELIEF = 0.05
-"""Centimetres between black and white of a displacement map."""
-SWING = np.array([12.0, 6.0, 3.0, 0.8, 0.5, 0.5])
-"""Degrees of yaw, pitch and roll, centimetres of shift."""
-NOSE_DEPTH = 9.0
-"""Centimetres from the point that the head turns about to the tip of its nose."""
-ENVIRONMENT_ROWS = 512
 
 
 @dataclass(frozen=True)
@@ -107,7 +95,7 @@ class ScannedHead:
             raise InputError(
                 f"{path}: the head is {height:.3g} cm high at {unit_mm:g} mm per unit, expected 10 to 100; set the unit"
             )
-        vertices -= (middle, nose[1], nose[2] - NOSE_DEPTH)
+        vertices -= (middle, nose[1], nose[2] - 9.0)  # the point that the head turns about lies so far behind
         uv = np.asarray(uv, np.float32)
         if flip_v:
             uv = uv * np.array((1, -1), np.float32) + np.array((0, 1), np.float32)
@@ -134,35 +122,28 @@ def _read_maps(files: Mapping[str, str | Path]) -> dict[str, NDArray[np.float32]
     for name, path in files.items():
         image = read_image(path)
         if name != "albedo":  # no colours: the codes themselves are the values
-            image = _codes(image) if Path(path).suffix.lower() not in (".exr", ".hdr") else image
+            image = (
+                linear_to_srgb(np.clip(image, 0.0, 1.0)) if Path(path).suffix.lower() not in (".exr", ".hdr") else image
+            )
             image = image.mean(axis=-1)
-        size = min(MAP_SIZE, min(image.shape[:2]))
+        size = min(1024, min(image.shape[:2]))
         maps[name] = _resized(image, size)
     size = len(maps["albedo"])
-    maps = {
-        k: np.asarray(cv2.resize(v, (size, size), interpolation=cv2.INTER_AREA), np.float32) if len(v) != size else v
-        for k, v in maps.items()
-    }
+    maps = {name: _resized(image, size) for name, image in maps.items()}
     gloss = maps.get("specular", np.full((size, size), 0.4, np.float32))
-    if "roughness" not in maps:
-        maps["roughness"] = ROUGHNESS[0] + (ROUGHNESS[1] - ROUGHNESS[0]) * gloss
-    maps["specular"] = GLOSS[0] + (GLOSS[1] - GLOSS[0]) * gloss
+    # from black to white: roughness where no map of it is given, weight of the glossy lobe
+    maps.setdefault("roughness", 0.48 - 0.18 * gloss)
+    maps["specular"] = 0.15 + 0.7 * gloss
     relief = maps.get("displacement", np.zeros((size, size), np.float32))
-    maps["displacement"] = np.float32(RELIEF) * relief
+    maps["displacement"] = np.float32(0.05) * relief  # centimetres from black to white
     maps["albedo"] = np.clip(maps["albedo"], 0.005, 0.95)
     return {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in maps.items()}
 
 
 def _resized(image: NDArray, size: int) -> NDArray[np.float32]:
-    if image.shape[:2] == (size, size):
-        return np.asarray(image, dtype=np.float32)
-    return cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA).astype(np.float32)
-
-
-def _codes(linear: NDArray) -> NDArray[np.float32]:
-    """The sRGB codes 0..1 of decoded values."""
-    x = np.clip(linear, 0.0, 1.0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055).astype(np.float32)
+    if image.shape[:2] != (size, size):
+        image = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
+    return np.asarray(image, dtype=np.float32)
 
 
 def rigid_motion(timesteps: int, seed: int) -> list[tuple[NDArray, NDArray]]:
@@ -171,7 +152,8 @@ def rigid_motion(timesteps: int, seed: int) -> list[tuple[NDArray, NDArray]]:
     speed, phase = rng.uniform(0.6, 1.2, 6), rng.uniform(-0.15, 0.15, 6)
     found = []
     for t in range(timesteps):
-        yaw, pitch, roll, *shift = SWING * np.sin(phase + speed * t)
+        # degrees, centimetres
+        yaw, pitch, roll, *shift = np.array([12.0, 6.0, 3.0, 0.8, 0.5, 0.5]) * np.sin(phase + speed * t)
         rotation = Rotation.from_euler("yxz", [yaw, pitch, roll], degrees=True).as_matrix()
         found.append((rotation, np.array(shift)))
     return found
@@ -215,8 +197,6 @@ def synthesize_scan(
     Path
         ``out``; ``transforms.json`` is written last.
     """
-    from mifit.synth.compose import expose
-
     out, relit = Path(out), dict(relit or {})
     total = timesteps + len(relit)
     maps = head.maps
@@ -235,7 +215,7 @@ def synthesize_scan(
         placed = surface(pose)
         images = tracer.render([placed], cameras, spp, seed=seed * 100_003 + t)
         if not t:
-            exposure = _exposure(images[0])
+            exposure = exposure_of(images[0])
         for c, (camera, image) in enumerate(zip(cameras, images, strict=True)):
             shot = Shot(camera.name, t, out / "images" / camera.name / f"{t:04d}.png")
             write_image(shot.image, expose(image[..., :3] * exposure, np.random.default_rng([seed, t, c, 22])))
@@ -251,12 +231,12 @@ def synthesize_scan(
         write_ply(out / "truth" / f"{t:04d}.ply", placed.vertices, head.faces, placed.normals, head.uv, grey)
         progress("Rendering", t + 1, total)
     with replacing(out / "truth" / "maps.npz") as temporary:
-        halves: dict[str, Any] = {name: value.astype(np.float16) for name, value in maps.items()}
-        np.savez_compressed(temporary, **halves)
+        halves = {name: value.astype(np.float16) for name, value in maps.items()}
+        np.savez_compressed(temporary, **halves)  # type: ignore[arg-type]
     for i, (name, light) in enumerate(relit.items()):
         light = _reduced(light)
         image = PathTracer({"head": material}, light).render([surface(poses[0])], cameras[-1:], spp, seed=seed + i)[0]
-        relit_exposure[name] = _exposure(image)
+        relit_exposure[name] = exposure_of(image)
         write_image(out / "truth" / f"relit_{name}.exr", image[..., :3])
         write_image(out / "truth" / f"environment_{name}.exr", light)
         progress("Rendering", timesteps + i + 1, total)
@@ -266,18 +246,9 @@ def synthesize_scan(
     return out
 
 
-def _exposure(image: NDArray) -> float:
-    """Factor that puts the brightest skin, highlights aside, near the upper end of the sensor's range."""
-    seen = image[image[..., 3] > 0.9]
-    level = float(np.percentile(seen[:, :3].max(axis=1), 97)) if len(seen) else 0.0
-    if not level > 0:
-        raise InputError("env: the head is black under this environment, expected some radiance above zero")
-    return 0.7 / level
-
-
 def _reduced(environment: NDArray) -> NDArray[np.float32]:
     height, width = environment.shape[:2]
-    if height <= ENVIRONMENT_ROWS:
+    if height <= 512:
         return environment.astype(np.float32)
-    size = (round(width * ENVIRONMENT_ROWS / height), ENVIRONMENT_ROWS)
+    size = (round(width * 512 / height), 512)
     return cv2.resize(environment, size, interpolation=cv2.INTER_AREA).astype(np.float32)

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from mifit.core.mesh import interpolate, normalize
 from mifit.core.uv import TexelMap
+from mifit.morphable.pigment import polyline_distance
 from mifit.synth.procedural import smooth_noise
 
 FAIR = np.array([0.58, 0.385, 0.30])
@@ -110,11 +111,7 @@ class Anatomy:
 
     def line_distance(self, p: NDArray, indices: list[int]) -> NDArray[np.float32]:
         """Distance in millimetres to the polyline through some landmarks."""
-        best = np.full(len(p), np.inf)
-        for a, b in zip(self.landmarks[indices[:-1]], self.landmarks[indices[1:]], strict=True):
-            t = np.clip((p - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-12), 0.0, 1.0)
-            best = np.minimum(best, np.linalg.norm(p - a - t[:, None] * (b - a), axis=1))
-        return best.astype(np.float32)
+        return polyline_distance(p, self.landmarks[indices]).astype(np.float32)
 
 
 def paint(

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mifit.capture import Capture, detect_landmarks
 from mifit.capture.detectors import open_detector
-from mifit.capture.face_mesh import CLOSED, EYE_CORNERS, LIDS, Face, FaceMesh, _Square, landmark_map
+from mifit.capture.face_mesh import EYE_CORNERS, LIDS, Face, FaceMesh, _Square, landmark_map
 from mifit.capture.face_networks import FILES, install_networks, missing, networks_folder
 from mifit.capture.outliers import epipolar_outliers, fundamental_matrix, temporal_outliers
 from mifit.core.image import load_image, to_8_bit
@@ -108,11 +108,9 @@ def test_a_capture_without_any_face_is_refused(folder: Path) -> None:
     assert (folder / "transforms.json").read_bytes() == before
 
 
-def test_detectors_that_cannot_start_say_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match=r"found 'magic', expected one of mediapipe, face-alignment, lbf:FOLDER"):
+def test_detectors_that_cannot_start_say_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match=r"found 'magic', expected one of mediapipe, face-alignment"):
         open_detector("magic")
-    with pytest.raises(InputError, match=r"found 0 lbfmodel.yaml and 0 face finders"):
-        open_detector(f"lbf:{tmp_path}")
     monkeypatch.setitem(sys.modules, "face_alignment", None)
     with pytest.raises(InputError, match=r"face-alignment: can't be imported .* pip install face-alignment"):
         open_detector("face-alignment")
@@ -250,11 +248,11 @@ def eyes_opened(by: float) -> Face:
 def test_landmarks_of_closed_lids_close() -> None:
     """The table is fitted on open eyes and would leave a gap."""
     pairs = [pair for eye in LIDS for pair in eye]
-    closed, opened = eyes_opened(0.5 * CLOSED), eyes_opened(2.0 * CLOSED)
+    closed, opened = eyes_opened(0.5 * 0.12), eyes_opened(2.0 * 0.12)
     assert np.allclose(opened.landmarks, landmark_map() @ opened.points[:, :2])
     marks, table = closed.landmarks, landmark_map() @ closed.points[:, :2]
     for upper, lower, _, _ in pairs:
-        assert np.allclose(marks[lower] - marks[upper], (0.0, 50.0 * CLOSED))
+        assert np.allclose(marks[lower] - marks[upper], (0.0, 50.0 * 0.12))
         assert np.allclose(marks[upper] + marks[lower], table[upper] + table[lower])
     others = np.setdiff1d(np.arange(68), [i for pair in pairs for i in pair[:2]])
     assert np.array_equal(marks[others], table[others])

@@ -111,8 +111,6 @@ class ShadingModel(ABC):
         """
         return lambda n, toward: self.shade(n, toward, lobe, coefficients, shadowed)
 
-    def light(
-        self, n: Any, v: Any, lobe: PreparedLobe, directions: Sequence[Any], visible: Any
-    ) -> tuple[Any, Any]:
+    def light(self, n: Any, v: Any, lobe: PreparedLobe, directions: Sequence[Any], visible: Any) -> tuple[Any, Any]:
         """Diffuse and specular radiance per unit of a compact light's colour, see ``kernels.light_transfer``."""
         return light_transfer(n, v, lobe, directions, visible)

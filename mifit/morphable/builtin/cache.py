@@ -16,9 +16,6 @@ from mifit.morphable.builtin.head import make_head
 from mifit.morphable.formats.own import load_own, save_model
 from mifit.morphable.model import MorphableModel
 
-KEPT_SECONDS = 30 * 86400.0
-"""Models of other versions of mifit go when they have not been used for as long."""
-
 
 @cache
 def builtin_model(coarse: bool = False) -> MorphableModel:
@@ -42,7 +39,7 @@ def builtin_model(coarse: bool = False) -> MorphableModel:
     model = replace(make_head(coarse), fingerprint=path.stem)
     try:
         for other in path.parent.glob(f"{path.name.rsplit('-', 1)[0]}-*.npz"):
-            if time.time() - other.stat().st_mtime > KEPT_SECONDS:
+            if time.time() - other.stat().st_mtime > 30 * 86400:  # of other versions, unused for a month
                 other.unlink(missing_ok=True)
         save_model(model, path)
     except (OSError, InputError):

@@ -10,11 +10,8 @@ from mifit.morphable.builtin.identity import identity_modes
 from mifit.morphable.builtin.landmarks import landmark_vertices
 from mifit.morphable.builtin.template import EYEBALL, POUCH, SKIN, Template, make_template
 from mifit.morphable.model import MorphableModel
+from mifit.morphable.openings import IRIS_ALBEDO, MOUTH_ALBEDO, PUPIL_ALBEDO, SCLERA_ALBEDO
 from mifit.morphable.pigment import skin_model
-
-N_IDENTITY, N_ALBEDO = 100, 100
-_PLACE = np.array([0.0, 34.0, 10.0])  # object-space position of the template's origin in mm
-_SCLERA, _IRIS, _PUPIL, _POUCH = (0.62, 0.58, 0.54), (0.09, 0.055, 0.03), (0.01, 0.01, 0.01), (0.12, 0.03, 0.025)
 
 
 def make_head(coarse: bool = False) -> MorphableModel:
@@ -22,17 +19,17 @@ def make_head(coarse: bool = False) -> MorphableModel:
     t = make_template(2 if coarse else 1)
     landmarks = landmark_vertices(t)
     mask = template_face_mask(t)
-    identity = identity_modes(t, N_IDENTITY)
+    identity = identity_modes(t, 100)
     expression, names, bounds = expression_modes(t)
-    mean_albedo, albedo_modes = skin_model(t.vertices, t.faces[mask], landmarks, 1.0, N_ALBEDO, t.part == SKIN)
+    mean_albedo, albedo_modes = skin_model(t.vertices, t.faces[mask], landmarks, 1.0, 100, t.part == SKIN)
     ball = t.part == EYEBALL
-    mean_albedo[ball] = _SCLERA
-    mean_albedo[ball & (t.eye_angle < np.radians(28.5))] = _IRIS
-    mean_albedo[ball & (t.eye_angle < np.radians(10.5))] = _PUPIL
-    mean_albedo[t.part == POUCH] = _POUCH
+    mean_albedo[ball] = SCLERA_ALBEDO
+    mean_albedo[ball & (t.eye_angle < np.radians(28.5))] = IRIS_ALBEDO
+    mean_albedo[ball & (t.eye_angle < np.radians(10.5))] = PUPIL_ALBEDO
+    mean_albedo[t.part == POUCH] = MOUTH_ALBEDO
     return MorphableModel(
         name="builtin:coarse" if coarse else "builtin",
-        mean=0.1 * (t.vertices + _PLACE),
+        mean=0.1 * (t.vertices + np.array([0.0, 34.0, 10.0])),
         faces=t.faces,
         identity=np.float32(0.1) * identity,
         expression=np.float32(0.1) * expression,

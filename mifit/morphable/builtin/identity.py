@@ -12,8 +12,6 @@ from mifit.morphable.gaussian_process import compress, field_modes
 # correlation length in mm, inducing points, deviation in mm along x, y, z, of both parities
 _SYMMETRIC = ((75.0, 24, (2.8, 3.0, 3.6)), (34.0, 70, (1.5, 1.9, 2.2)), (15.0, 190, (0.6, 0.8, 1.1)))
 _ASYMMETRIC = ((55.0, 24, (0.7, 0.6, 0.8)),)
-_STRETCH = (0.03, 0.03, 0.03)
-"""Deviation of the whole head's relative width, height and depth."""
 
 
 def deformation_modes(
@@ -22,7 +20,7 @@ def deformation_modes(
     count: int,
     symmetric: tuple = _SYMMETRIC,
     asymmetric: tuple = _ASYMMETRIC,
-    stretch: tuple[float, float, float] = _STRETCH,
+    stretch: tuple[float, float, float] = (0.03, 0.03, 0.03),
 ) -> NDArray[np.float32]:
     """Modes (V, 3, count) in mm of smooth random deformations of points (V, 3) in mm.
 

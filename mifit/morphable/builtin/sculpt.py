@@ -38,7 +38,6 @@ _SLICES = np.array(
         [-172, 43, 55, -168, -8, -170, -64, 2.0, 0],  # neck
     ]
 )
-EYE_SLICE, MOUTH_SLICE = 6, 9
 
 # Columns: angle about the vertical axis in degrees, and grid lines to the next one.
 _COLUMNS = np.array([[0, 15], [13, 11], [22, 20], [42, 9], [60, 8], [82, 19], [112, 6], [180, 0]])
@@ -48,7 +47,6 @@ EYE_RADIUS = 12.2
 _LID = 1.9  # thickness
 CANTHI = (15.6, 46.4)
 MOUTH_HALF = 25.5
-_ROLL_ROWS = 2
 
 ROWS = int(_SLICES[:, 8].sum()) + 1
 
@@ -75,7 +73,7 @@ def grid_lines() -> tuple[NDArray, NDArray, int, int]:
     rows = _spread(_KNOTS, _SLICES[:, 8])
     columns = np.radians(_spread(_COLUMNS[:, 0], _COLUMNS[:, 1]))
     count = np.concatenate([[0], np.cumsum(_SLICES[:-1, 8])]).astype(int)
-    return rows, columns, int(count[EYE_SLICE]), int(count[MOUTH_SLICE])
+    return rows, columns, int(count[6]), int(count[9])
 
 
 def loft(angle: NDArray, position: NDArray) -> NDArray:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -105,11 +104,9 @@ class Reader:
         """Whether a dataset or group is present."""
         return key in self._file
 
-    def dataset(self, key: str, optional: bool = False) -> Any:
-        """The dataset itself, unread; None when it is optional and missing."""
+    def dataset(self, key: str) -> h5py.Dataset:
+        """The dataset itself, unread."""
         node = self._file.get(key)
-        if node is None and optional:
-            return None
         if not isinstance(node, h5py.Dataset):
             found = ", ".join(list(self._file)[:8])
             raise InputError(f"{self._path}: lacks dataset {key}; top level has {found}")

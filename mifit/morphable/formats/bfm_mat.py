@@ -160,9 +160,7 @@ def load_deep3d(path: Path) -> MorphableModel:
     check_modes(path, data["texBase"], "texBase", n3)
     mean = vector(path, data["meanshape"], "meanshape", n3).reshape(-1, 3)
     faces = oriented_outwards(mean, triangles(path, data["tri"], "tri", n3 // 3))
-    keypoints = data["keypoints"].ravel().astype(np.int64) - 1
-    if keypoints.size != 68 or keypoints.min() < 0 or keypoints.max() >= n3 // 3:
-        raise InputError(f"{path}: keypoints has shape {data['keypoints'].shape}, expected 68 1-based vertices")
+    keypoints = _keypoints(path, data["keypoints"], n3 // 3)
     mask = find_face_mask(mean, faces, keypoints)
     if "skinmask" in data:
         skin = vector(path, data["skinmask"], "skinmask", n3 // 3) > 0.5

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from mifit.morphable.formats.pickles import plain_array, read_pickle
 from mifit.morphable.model import MorphableModel
 
 KEYS = ("v_template", "shapedirs", "f")
-_N_IDENTITY = 300
 _TEXTURE, _ALBEDO = "FLAME_texture.npz", "FLAME_albedo_from_BFM.npz"
 
 
@@ -30,7 +29,7 @@ def load_flame_npz(path: Path) -> MorphableModel:
     return _build(path, dict(read_npz(path, KEYS)))
 
 
-def _build(path: Path, data: dict[str, Any]) -> MorphableModel:
+def _build(path: Path, data: Mapping[str, object]) -> MorphableModel:
     missing = [k for k in KEYS if k not in data]
     if missing:
         raise InputError(f"{path}: lacks {', '.join(missing)}; found {', '.join(sorted(data)[:12])}")
@@ -42,7 +41,7 @@ def _build(path: Path, data: dict[str, Any]) -> MorphableModel:
     if faces.ndim != 2 or faces.shape[1] != 3:
         raise InputError(f"{path}: f has shape {faces.shape}, expected (triangles, 3)")
     # 300 identity and then 100 expression modes; shorter files split in the same ratio
-    split = _N_IDENTITY if directions.shape[2] > _N_IDENTITY else directions.shape[2] * 3 // 4
+    split = 300 if directions.shape[2] > 300 else directions.shape[2] * 3 // 4
     faces = faces.astype(np.int64)
     uv, albedo = _texture(path.parent, mean.shape[0], faces)
     return complete(

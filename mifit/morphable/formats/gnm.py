@@ -26,7 +26,6 @@ KEYS = (
     "template_vertex_positions", "vertex_identity_basis", "expression_basis", "triangles", "triangle_uvs",
     "vertex_groups", "vertex_group_names",
 )  # fmt: skip
-UNIT_MM = 1000.0
 CLEAR = ("eye_exteriors", "eyeball_exterior")
 """Groups of the corneas, which are clear: the eyes' insides are what images show."""
 ALBEDO = {
@@ -35,8 +34,6 @@ ALBEDO = {
     "gums": (0.4, 0.14, 0.12), "teeth": (0.6, 0.56, 0.48),
 }  # fmt: skip
 """Linear albedo of groups that aren't skin, by the names of both versions; later ones count."""
-MOST_IDENTITY, MOST_EXPRESSION = 150, 100
-"""Modes that are kept: those that move the face most. The model has hundreds, of teeth and tongue among them."""
 STRIP = 0.12
 """Height of the strip at the bottom of the maps that holds all pieces but the skin."""
 
@@ -61,13 +58,13 @@ def load_gnm(path: Path) -> MorphableModel:
     skin = piece == np.bincount(piece).argmax()
     identity, expression = (
         _modes(path, data[key], key, used, skin, most)
-        for key, most in (("vertex_identity_basis", MOST_IDENTITY), ("expression_basis", MOST_EXPRESSION))
+        for key, most in (("vertex_identity_basis", 150), ("expression_basis", 100))
     )
-    landmarks = _landmarks(mean * UNIT_MM, faces[skin[faces[:, 0]]])
+    landmarks = _landmarks(mean * 1000.0, faces[skin[faces[:, 0]]])
     face_mask = find_face_mask(mean, faces, landmarks)
     if not face_mask.any():
         raise InputError(f"{path}: no face lies in the face area that the landmarks span; expected a face mesh")
-    albedo, albedo_modes = skin_model(mean, faces[face_mask], landmarks, UNIT_MM, N_ALBEDO)
+    albedo, albedo_modes = skin_model(mean, faces[face_mask], landmarks, 1000.0, N_ALBEDO)
     for name, colour in ALBEDO.items():
         if name in groups:
             albedo[groups[name][used]], albedo_modes[groups[name][used]] = colour, 0.0
@@ -78,7 +75,7 @@ def load_gnm(path: Path) -> MorphableModel:
         faces,
         identity,
         expression,
-        UNIT_MM,
+        1000.0,
         albedo=(albedo, albedo_modes),
         uv=_atlas(corners[shown], piece[faces[:, 0]]),
         landmarks=landmarks,
@@ -95,7 +92,10 @@ def _groups(path: Path, names: NDArray, weights: NDArray, count: int) -> dict[st
 
 
 def _modes(path: Path, basis: NDArray, key: str, used: NDArray, skin: NDArray, most: int) -> NDArray[np.float32]:
-    """(V', 3, K) of the vertices that are used, the modes that move the skin most, in their order."""
+    """(V', 3, K) of the vertices that are used, the modes that move the skin most, in their order.
+
+    The model has hundreds, of teeth and tongue among them.
+    """
     if basis.ndim != 3 or basis.shape[2] != 3 or basis.shape[1] <= used.max():
         raise InputError(f"{path}: {key} has shape {basis.shape}, expected (modes, vertices, 3)")
     basis = single(basis[:, used])

@@ -12,16 +12,15 @@ from mifit.core.arrays import read_npz
 from mifit.core.files import read_bytes, read_text
 from mifit.core.limits import MAX_SETTINGS_BYTES, MAX_TEXT_MODEL_BYTES
 from mifit.errors import InputError
-from mifit.morphable.assemble import N_ALBEDO, check_mesh, fingerprint
+from mifit.morphable.assemble import check_mesh, complete
 from mifit.morphable.model import MorphableModel
-from mifit.morphable.pigment import skin_model
-from mifit.morphable.topology import mirror_map, opening_faces
+from mifit.morphable.topology import opening_faces
 
 EXPRESSION_SIGMA = 0.3
 """One coefficient unit of an expression mode is this blend-shape weight; weights lie in 0..1."""
 
-_SKIN_VERTICES, _FACE_VERTICES = 11248, 9409
-"""Vertices of face, head and neck skin, and of the face alone, come first in the original files."""
+_SKIN_VERTICES = 11248
+"""Vertices of face, head and neck skin come first in the original files, of them 9409 of the face."""
 
 _KEYS = ("mean", "faces", "uv", "faces_uv", "identity", "expression", "expression_names", "landmarks_ibug68")
 
@@ -42,15 +41,12 @@ def load_ict_npz(path: Path) -> MorphableModel:
             raise InputError(
                 f"{path}: {key} has shape {data[key].shape}, expected (modes, V, 3) with V = {len(data['mean'])}"
             )
-    return assemble_ict(
-        "ict_facekit",
+    return _assemble(
         data["mean"],
         data["faces"],
-        np.moveaxis(data["identity"], 0, 2),
-        np.moveaxis(data["expression"], 0, 2),
+        (np.moveaxis(data["identity"], 0, 2), np.moveaxis(data["expression"], 0, 2)),
         tuple(str(n) for n in data["expression_names"]),
-        data["uv"],
-        data["faces_uv"],
+        (data["uv"], data["faces_uv"]),
         data["landmarks_ibug68"],
         np.arange(len(data["faces"])) < int(data["face_area_faces"]),
     )
@@ -91,17 +87,14 @@ def load_ict_folder(path: Path) -> MorphableModel:
         if vertices.shape != mean.shape:
             raise InputError(f"{file}: {len(vertices)} vertices, expected {len(mean)} as in the neutral mesh")
         modes[:, :, k] = (vertices - mean)[:_SKIN_VERTICES]
-    return assemble_ict(
-        "ict_facekit",
+    return _assemble(
         mean[:_SKIN_VERTICES],
         faces,
-        modes[:, :, : len(identities)],
-        modes[:, :, len(identities) :],
+        (modes[:, :, : len(identities)], modes[:, :, len(identities) :]),
         names,
-        uv[kept],
-        faces_uv,
+        (uv[kept], faces_uv),
         landmarks,
-        np.asarray((faces < _FACE_VERTICES).all(1) & (uv[kept][faces_uv][..., 0] <= 1.0).all(1)),
+        np.asarray((faces < 9409).all(1) & (uv[kept][faces_uv][..., 0] <= 1.0).all(1)),
     )
 
 
@@ -145,42 +138,31 @@ def _read_obj(path: Path) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     return vertices, uv, faces, faces_uv
 
 
-def assemble_ict(
-    name: str,
+def _assemble(
     mean: NDArray,
     faces: NDArray,
-    identity: NDArray,
-    expression: NDArray,
-    expression_names: tuple[str, ...],
-    uv: NDArray,
-    faces_uv: NDArray,
+    modes: tuple[NDArray, NDArray],
+    names: tuple[str, ...],
+    uv: tuple[NDArray, NDArray],
     landmarks: NDArray,
     face_area: NDArray[np.bool_],
 ) -> MorphableModel:
-    """Build a model from ICT-FaceKit's arrays (modes last), with the pigment model's albedo.
+    """A model of identity and expression modes (last), with the pigment model's albedo.
 
-    From ``face_area`` (F,) the faces inside the lids and behind the lips are left out.
-    Texture coordinates with u > 1 belong to the back of the head and the neck, outside the face area.
+    From ``face_area`` (F,) the faces inside the lids and behind the lips are left out. Texture coordinates with u > 1
+    belong to the back of the head and the neck, outside the face area.
     """
-    check_mesh(name, mean, faces, landmarks)
-    face_mask = face_area & ~opening_faces(mean, faces, landmarks)
-    mean_albedo, albedo_modes = skin_model(mean, faces[face_mask], landmarks, 10.0, N_ALBEDO)
-    bound = 1.0 / EXPRESSION_SIGMA
-    return MorphableModel(
-        name=name,
-        mean=mean,
-        faces=faces,
-        identity=identity,
-        expression=np.float32(EXPRESSION_SIGMA) * expression,
-        mean_albedo=mean_albedo,
-        albedo_modes=albedo_modes,
+    check_mesh("ict_facekit", mean, faces, landmarks)
+    return complete(
+        "ict_facekit",
+        mean,
+        faces,
+        modes[0],
+        np.float32(EXPRESSION_SIGMA) * modes[1],
+        10.0,
         uv=uv,
-        faces_uv=faces_uv,
         landmarks=landmarks,
-        face_mask=face_mask,
-        symmetry=mirror_map(mean, 0.01),
-        unit_mm=10.0,
-        expression_names=expression_names,
-        expression_bounds=np.tile(np.array([0.0, bound], dtype=np.float32), (len(expression_names), 1)),
-        fingerprint=fingerprint(mean, faces, identity, expression, landmarks, uv),
+        face_mask=face_area & ~opening_faces(mean, faces, landmarks),
+        expression_names=names,
+        expression_bounds=np.tile(np.array([0.0, 1.0 / EXPRESSION_SIGMA], dtype=np.float32), (len(names), 1)),
     )

@@ -21,7 +21,6 @@ from mifit.errors import InputError
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
-_COMPRESSED, _MATRIX = 15, 14
 
 
 def is_mat5(path: Path) -> bool:
@@ -76,7 +75,7 @@ def _matrices(
             if length > size - f.tell():
                 raise InputError(f"{path}: an element claims {length} bytes, {size - f.tell()} remain; truncated?")
             start = f.tell()
-            if kind == _COMPRESSED:
+            if kind == 15:  # compressed
                 raw = f.read(length)
                 body = _inflate(path, raw, 4096)
                 header = _header(path, body[8:]) if len(body) >= 8 else None
@@ -88,7 +87,7 @@ def _matrices(
                     yield header[0], _array(path, _inflate(path, raw, need)[8:], header)
                 elif header:
                     yield header[0], None
-            elif kind == _MATRIX:
+            elif kind == 14:  # a matrix
                 body = f.read(min(length, 4096))
                 header = _header(path, body)
                 if header and not names_only and header[0] in wanted:

@@ -37,9 +37,9 @@ class Instance:
     """Stands in for an object that isn't an array: its class's name and its state."""
 
     def __init__(self, kind: Name) -> None:
-        self.kind, self.state = kind, None
+        self.kind, self.state = kind, object()
 
-    def build(self, state: Any) -> None:
+    def build(self, state: object) -> None:
         """Take the state as it is."""
         self.state = state
 
@@ -47,17 +47,17 @@ class Instance:
 class Dtype:
     """A type of plain numbers, its byte order set by its state as NumPy pickles it."""
 
-    def __init__(self, text: Any) -> None:
+    def __init__(self, text: object) -> None:
         if not isinstance(text, str) or not re.fullmatch(r"[<>|=]?[biuf][1248]", text):
             raise InputError(f"an array has type {_short(text)}, expected plain numbers")
         self.dtype = np.dtype(text)
 
-    def build(self, state: Any) -> None:
+    def build(self, state: object) -> None:
         """State: (version, byte order, subarray, names, fields, size, alignment, flags[, metadata])."""
-        order = state[1] if isinstance(state, tuple) and len(state) >= 5 else None
-        if type(order) is not str or order not in "<>|=" or any(part is not None for part in state[2:5]):
+        known = isinstance(state, tuple) and len(state) >= 5 and state[2:5] == (None, None, None)
+        if not isinstance(state, tuple) or not known or state[1] not in ("<", ">", "|", "="):
             raise InputError("an array's type has fields or no byte order, expected plain numbers")
-        self.dtype = self.dtype.newbyteorder(order)  # type: ignore[arg-type]
+        self.dtype = self.dtype.newbyteorder(state[1])
 
 
 class Array:
@@ -66,14 +66,14 @@ class Array:
     def __init__(self) -> None:
         self.value: np.ndarray | None = None
 
-    def build(self, state: Any) -> None:
+    def build(self, state: object) -> None:
         """State: (version, shape, dtype, whether Fortran order, bytes)."""
         if not isinstance(state, tuple) or len(state) not in (4, 5):
             raise InputError(f"an array has a state of type {type(state).__name__}, expected 5 values")
         shape, dtype, fortran, data = state[-4:]
         self.fill(data, dtype, shape, "F" if fortran else "C")
 
-    def fill(self, data: Any, dtype: Any, shape: Any, order: Any) -> None:
+    def fill(self, data: object, dtype: object, shape: object, order: object) -> None:
         """Set the values from bytes; every size is checked against them."""
         if isinstance(data, str):
             data = data.encode("latin1")
@@ -86,34 +86,35 @@ class Array:
         self.value = np.frombuffer(data, dtype.dtype).reshape(shape, order=order)
 
 
-def _reconstruct(kind: Any, shape: Any, code: Any) -> Array:
+def _reconstruct(kind: object, shape: object, code: object) -> Array:
     if type(kind) is not Name or kind not in _ARRAY_TYPES or shape != (0,):
         raise InputError(f"an array is built with shape {_short(shape)}, expected (0,)")
     return Array()
 
 
-def _frombuffer(data: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) -> Array:
+def _frombuffer(data: object, dtype: object, shape: object, order: object, axes: object = None) -> Array:
     made = Array()
     made.fill(data, dtype, shape, "C" if order == "K" else order)
     if axes is not None:
-        if not isinstance(axes, tuple) or any(type(n) is not int for n in axes) or sorted(axes) != [*range(len(shape))]:
-            raise InputError(f"an array has its axes in the order {_short(axes)}, expected each once")
         assert made.value is not None
+        every = list(range(made.value.ndim))
+        if not isinstance(axes, tuple) or any(type(n) is not int for n in axes) or sorted(axes) != every:
+            raise InputError(f"an array has its axes in the order {_short(axes)}, expected each once")
         made.value = made.value.transpose(axes)
     return made
 
 
-def _dtype(code: Any, *_: Any) -> Dtype:
+def _dtype(code: object, *_: object) -> Dtype:
     return Dtype(code.decode("latin1") if isinstance(code, bytes) else code)
 
 
-def _scalar(dtype: Any, data: Any) -> Array:
+def _scalar(dtype: object, data: object) -> Array:
     made = Array()
     made.fill(data, dtype, (), "C")
     return made
 
 
-def _encode(text: Any, encoding: Any = "latin1") -> bytes:
+def _encode(text: object, encoding: object = "latin1") -> bytes:
     if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
         raise InputError(f"text in encoding {_short(encoding)}, expected latin1")
     return text.encode("latin1")
@@ -123,7 +124,7 @@ def _empty() -> bytes:
     return b""
 
 
-def _object(kind: Any, *_: Any) -> Instance:
+def _object(kind: object, *_: object) -> Instance:
     if type(kind) is not Name or kind not in _INSTANCES:
         raise InputError(f"an object of type {_short(kind)} is built, expected an array")
     return Instance(kind)
@@ -153,7 +154,7 @@ _ADMITTED = {*_RECIPES, *_ARRAY_TYPES, *_INSTANCES, Name("__builtin__", "object"
 """Names that a pickle may mention; only the recipes have a meaning, and it is given here."""
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     """A value for a message; containers by their type, as they may hold themselves a million times."""
     if isinstance(value, Name):
         return f"{value.module}.{value.name}"[:80]
@@ -181,7 +182,7 @@ def is_pickle(path: Path) -> bool:
         return (head[:1] == b"\x80" or head[:2] == b"(d") and f.read(1) == b"."
 
 
-def read_pickle(path: Path) -> dict[str, Any]:
+def read_pickle(path: Path) -> dict[str, object]:
     """Read a pickled dictionary of arrays; what isn't an array comes as `Instance`.
 
     Raises
@@ -197,7 +198,7 @@ def read_pickle(path: Path) -> dict[str, Any]:
                 raise InputError(f"found more than {MAX_STEPS} instructions, expected a dictionary of arrays")
             if op.name in _REFUSED or op.proto > 5:
                 raise InputError(f"uses {op.name}, which is refused; expected arrays only")
-            if "PUT" in op.name and argument > 2**32:  # larger ones could be chosen to collide
+            if "PUT" in op.name and (argument or 0) > 2**32:  # larger ones could be chosen to collide
                 raise InputError(f"memo index {_short(argument)}, expected at most {2**32}")
         out = _Unpickler(io.BytesIO(data), encoding="latin1").load()
     except InputError as error:
@@ -209,7 +210,7 @@ def read_pickle(path: Path) -> dict[str, Any]:
     return out
 
 
-def plain_array(value: Any, where: str) -> np.ndarray:
+def plain_array(value: object, where: str) -> np.ndarray:
     """Array of a pickled value, out of chumpy if need be; raises InputError for anything else."""
     if isinstance(value, Instance) and isinstance(value.state, dict):  # chumpy keeps the array in its attribute x
         value = value.state.get("x")
@@ -224,7 +225,8 @@ def plain_array(value: Any, where: str) -> np.ndarray:
 class _Unpickler(pickle._Unpickler):  # type: ignore[name-defined, misc]
     """Python's machine; a name is a `Name`, which can't be called."""
 
-    stack: list[Any]
+    stack: list[object]
+    pop_mark: Callable[[], list[object]]
     dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)  # type: ignore[attr-defined]
 
     def find_class(self, module: str, name: str) -> Name:
@@ -261,7 +263,7 @@ class _Unpickler(pickle._Unpickler):  # type: ignore[name-defined, misc]
         self.stack.append({})
         self._set(items)
 
-    def _set(self, values: list[Any]) -> None:
+    def _set(self, values: list[object]) -> None:
         target = self.stack[-1]
         if type(target) is not dict or len(values) % 2:
             raise ValueError("items without a dictionary")

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from mifit.core.mesh import edges, face_cross, vertex_normals
 from mifit.core.mesh_solve import cotangent_laplacian
-from mifit.morphable.openings import closed_borders
+from mifit.morphable.topology import closed_borders
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
