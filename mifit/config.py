@@ -255,9 +255,6 @@ class ReflectanceConfig:
         "part from the albedo what varies more than skin does: relief and shadows that the mesh doesn't have, which "
         "another light doesn't show; with robust alone",
     )
-    symmetric_fill: bool = flag(
-        False, "fill what no image shows from the opposite half of the face, where that was seen"
-    )
     max_iterations: int = number(30, "Gauss-Newton iterations of the lighting", least=1, most=10_000)
 
 

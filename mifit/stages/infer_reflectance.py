@@ -13,15 +13,16 @@ from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report, hidden
 from mifit.core.mesh import interpolate
 from mifit.core.process import one_blas_thread
+from mifit.core.sh import LUMINANCE
 from mifit.errors import ConvergenceError
 from mifit.optim import Outcome
 from mifit.progress import Progress, silent
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.als import find_forward, fit_als
-from mifit.stages.reflectance.fill import blend_unseen, mirrored_coordinates
+from mifit.stages.reflectance.fill import blend_unseen
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.paper_energy import energies, fit_paper
-from mifit.stages.reflectance.relief import part_relief
+from mifit.stages.reflectance.relief import SYMMETRIC_SPREAD, part_relief
 from mifit.stages.segment import segment
 
 if TYPE_CHECKING:
@@ -50,8 +51,8 @@ def infer_reflectance(
     All timesteps of the geometry and all named cameras enter; albedo and lighting are shared by them. The product
     of albedo and lighting is all that images show, so the scale between the two is fixed by a convention: the mean
     diffuse albedo over the seen texels and channels is stage 1's, which has the level of the morphable model's mean
-    face. Texels that no image shows are filled from the model's albedo, shifted smoothly to agree with their
-    surroundings.
+    face. Texels that no image shows or no light reaches are filled from the mean face's albedo, in proportion to their
+    surroundings, and have confidence 0.
 
     Parameters
     ----------
@@ -81,7 +82,6 @@ def infer_reflectance(
     started = time.perf_counter()
     config = config or ReflectanceConfig()
     surface = Surface(capture, model, geometry, cameras, config.texture_size, config.robust, whole=config.robust)
-    mirrored = mirrored_coordinates(model, surface.texels) if config.symmetric_fill else None
     albedo = interpolate(geometry.vertex_albedo, model.faces, surface.texels.face, surface.texels.weights)
     albedo = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float32)
     progress("Reflectance lighting", 0, 2)
@@ -99,7 +99,7 @@ def infer_reflectance(
     if not (np.isfinite(solved.maps).all() and np.isfinite(illumination.unknowns).all()):
         raise ConvergenceError("stage 2 (reflectance): the maps or the lighting are not finite; see the images' range")
     quality = surface.quality()
-    filled = blend_unseen(model, surface.texels, albedo, solved.maps, quality, solved.observability, mirrored)
+    filled = shown = blend_unseen(model, surface.texels, solved.maps, quality, solved.observability)
     if fitted.outcome is Outcome.MAX_ITERATIONS:
         text = "the lighting had not converged when the iterations ran out; raise max_iterations"
         warnings = (*warnings, Diagnostic("not-converged", text, "note"))
@@ -124,13 +124,18 @@ def infer_reflectance(
         terms = energies(surface, forward, *light, solved.maps, albedo, config)
         details["objective"] = {**terms, "total": sum(terms.values())}
     diffuse, relief = filled.diffuse, None
-    if config.robust and config.relief:
-        parted = part_relief(model, surface.texels, diffuse, filled.confidence)
-        diffuse, relief = parted.skin, parted.relief
+    if first is not None and config.relief:
+        # What no light reached is as dark as it was seen under the capture's own light, and skin under any other. Where
+        # the lighting's error changes an albedo by as much as skin varies, skin is the better guess.
+        quality = surface.quality(first.unexplained / SYMMETRIC_SPREAD)
+        filled = blend_unseen(model, surface.texels, solved.maps, quality, solved.observability)
+        parted = part_relief(model, surface.texels, filled.diffuse, filled.confidence)
+        shade = (shown.diffuse @ LUMINANCE) / np.maximum(filled.diffuse @ LUMINANCE, 1e-3)
+        diffuse, relief = parted.skin, parted.relief * np.where(surface.texels.mask, np.clip(shade, 0.0, 1.0), 1.0)
         details["spread"] = {"symmetric": parted.symmetric, "sided": parted.sided}
     return ReflectanceEstimate(
         diffuse=diffuse,
-        relief=relief,
+        relief=None if relief is None else relief.astype(np.float32),
         specular=filled.specular,
         confidence=filled.confidence,
         specular_confidence=filled.specular_confidence,

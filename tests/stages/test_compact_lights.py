@@ -20,7 +20,6 @@ from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.lighting_equations import bounded_step
 from tests.shaded import appearance, light_columns, shade_points
 
 CONFIG = ReflectanceConfig(texture_size=SIZE, bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
@@ -213,15 +212,3 @@ def test_single_directions_are_columns_of_point_lights(walled):
     expected = forward.with_lights(lights).transfers(seen, np.zeros((16 + len(lights), 3)))
     for found, known in zip(forward.columns(seen, towards), expected, strict=True):
         np.testing.assert_allclose(found, known[..., 16:], atol=1e-5)
-
-
-def test_a_bounded_step_is_the_constrained_minimum():
-    rng = np.random.default_rng(0)
-    rows, target = rng.normal(size=(90, 60)), rng.normal(size=90)
-    system, right = rows.T @ rows + np.eye(60), rows.T @ target
-    lowest = np.where(np.arange(60) < 20, -np.inf, rng.normal(size=60) - 0.2)
-    step = bounded_step(system, right, lowest, 0.3)
-    slope = system @ step - right + 0.3 * np.isfinite(lowest)
-    held = step <= lowest + 1e-9
-    assert 5 < held.sum() < 35 and (step >= lowest - 1e-9).all()
-    assert np.abs(slope[~held]).max() < 1e-6 and slope[held].min() > -1e-6

@@ -7,9 +7,8 @@ import pytest
 
 from mifit.core.mesh import interpolate
 from mifit.core.uv import rasterize_uv
-from mifit.errors import InputError
 from mifit.morphable import MorphableModel
-from mifit.stages.reflectance.fill import blend_unseen, mirrored_coordinates
+from mifit.stages.reflectance.fill import blend_unseen
 
 
 @pytest.fixture(scope="module")
@@ -27,11 +26,10 @@ def half_seen():
 
 def test_the_unseen_side_takes_what_the_other_shows(half_seen):
     model, texels, truth, found, seen = half_seen
-    albedo = np.full((len(truth), 3), 0.4, np.float32)
     errors = []
-    for mirrored in (None, mirrored_coordinates(model, texels)):
+    for given in (replace(model, symmetry=None), model):
         told = np.ones(len(truth), np.float32)
-        blend = blend_unseen(model, texels, albedo, texels.to_map(found), seen.astype(float), told, mirrored)
+        blend = blend_unseen(given, texels, texels.to_map(found), seen.astype(float), told)
         filled = np.concatenate([texels.from_map(blend.diffuse), texels.from_map(blend.specular)[:, None]], axis=1)
         errors.append(np.sqrt(np.mean((filled - truth)[~seen] ** 2)))
         np.testing.assert_allclose(filled[seen], truth[seen], atol=0.03)
@@ -44,14 +42,20 @@ def test_what_was_seen_but_told_nothing_of_its_gloss_says_so(half_seen):
     """The maps stay as they were found; the specular one's confidence is its own."""
     model, texels, truth, _, seen = half_seen
     told = np.where(np.arange(len(truth)) % 3 == 0, 0.0, 0.8).astype(np.float32)
-    albedo = np.full((len(truth), 3), 0.4, np.float32)
-    blend = blend_unseen(model, texels, albedo, texels.to_map(truth), seen.astype(float), told)
+    blend = blend_unseen(replace(model, symmetry=None), texels, texels.to_map(truth), seen.astype(float), told)
     np.testing.assert_array_equal(texels.from_map(blend.specular_confidence), seen * told)
     np.testing.assert_array_equal(texels.from_map(blend.confidence), seen)
     np.testing.assert_allclose(texels.from_map(blend.specular)[seen], truth[seen, 3], atol=0.03)
 
 
-def test_a_model_without_symmetry_is_refused(half_seen):
-    model, texels, *_ = half_seen
-    with pytest.raises(InputError, match=r"symmetric_fill: model .* has no symmetry"):
-        mirrored_coordinates(replace(model, symmetry=None), texels)
+def test_far_from_all_that_was_seen_skin_has_its_typical_colour(half_seen):
+    """However dark the border of what was seen is."""
+    model, texels, truth, _, seen = half_seen
+    x = interpolate(model.mean.astype(float) * model.unit_mm, model.faces, texels.face, texels.weights)[:, 0]
+    border = seen & (x < 6.0)
+    found = np.where(border[:, None], 0.05, truth).astype(np.float32)
+    confidence = np.where(border, 0.1, seen.astype(float))
+    told = np.ones(len(truth), np.float32)
+    blend = blend_unseen(replace(model, symmetry=None), texels, texels.to_map(found), confidence, told)
+    far = texels.from_map(blend.diffuse)[x < -40.0]
+    assert np.median(far) > 0.6 * np.median(truth[:, :3]) and (texels.from_map(blend.confidence)[x < 0] == 0).all()

@@ -275,9 +275,9 @@ def test_weights_ignore_the_map_size(dome):
 
 def test_few_images_leave_the_specular_albedo_to_what_skin_has():
     found = np.full(9, 0.2)
-    assert expected_specular(found, np.ones((9, 2), bool)) == SPECULAR_LIMIT
-    assert expected_specular(found, np.ones((9, 8), bool)) == pytest.approx(0.2)
-    assert expected_specular(found / 20, np.ones((9, 2), bool)) == pytest.approx(0.01)
+    assert expected_specular(found, np.full(9, 2)) == SPECULAR_LIMIT
+    assert expected_specular(found, np.full(9, 8)) == pytest.approx(0.2)
+    assert expected_specular(found / 20, np.full(9, 2)) == pytest.approx(0.01)
 
 
 def test_noise_decides_how_far_the_specular_albedo_is_told_by_the_images():

@@ -210,8 +210,7 @@ def recover(scene, shading, bands, exponent, fresnel, monkeypatch):
     light = fit_lighting(seen, forward, albedo, True, 100, priors=WEAK)
     shade, glint = forward.shade(seen, light.light)
     weight = seen.measured[..., None] * np.ones(3, np.float32)
-    colour = seen.colour - np.float32(light.ambient)
-    systems = TexelSystems.accumulate(colour, weight, shade, glint, surface.pairs, 0.1)
+    systems = TexelSystems.accumulate(seen.colour, weight, shade, glint, surface.pairs, 0.1)
     prior = np.full((FINE, FINE, 4), 0.3, np.float32)
     where = surface.texels.index[seen.texel]
     maps = solve_maps(systems, where, prior, Smoothness(0.0, 0.0), prior_weight=1e-7, iterations=1000, tolerance=1e-7)

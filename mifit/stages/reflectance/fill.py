@@ -1,4 +1,4 @@
-"""What to show where no image looked: the morphable model's albedo, shifted to meet its surroundings."""
+"""What to show where no image looked or no light came: the mean face in proportion to the skin that was seen."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 from mifit.core.mesh import interpolate
 from mifit.core.mesh_solve import membrane
 from mifit.core.uv import TexelMap, sample_map
-from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.stages.geometry.points import corner_matrix
 
 BLEND = 0.05
 """Confidence at which a texel's own estimate counts as much as its surroundings'."""
+TYPICAL = 3e-3
+"""Weight of the typical value of skin beside that of a texel of confidence 1: it decides far from what was seen."""
+DARKEST = 1e-3
+"""Albedo below which ratios mean nothing."""
 STIFFNESS = 0.02
 """Of the membrane, beside texels of confidence 1."""
 
@@ -37,68 +40,54 @@ class Filled:
     specular_confidence: NDArray[np.float32]
 
 
-def blend_unseen(
-    model: MorphableModel,
-    texels: TexelMap,
-    albedo: NDArray,
-    maps: NDArray,
-    quality: NDArray,
-    told: NDArray,
-    mirrored: NDArray | None = None,
-) -> Filled:
-    """Replace texels that were hardly seen by the model's albedo plus an offset that continues the seen ones.
+def blend_unseen(model: MorphableModel, texels: TexelMap, maps: NDArray, confidence: NDArray, told: NDArray) -> Filled:
+    """Replace texels that were hardly seen by the mean face's albedo times a factor that continues the seen ones.
 
-    The offset is a membrane over the mesh (`core.mesh_solve`), so that it crosses the atlas's seams.
+    The factor's logarithm, like the specular albedo itself, is first taken from the opposite half of the face, where
+    that was seen. Elsewhere it is a membrane over the mesh (`core.mesh_solve`), so that it crosses the atlas's seams.
 
     Parameters
     ----------
     model : MorphableModel
     texels : TexelMap
-    albedo : (N, 3)
-        Diffuse albedo of the fitted model.
     maps : (S, S, 4)
         Diffuse and specular albedo from the images.
-    quality : (N,)
+    confidence : (N,)
         How often and how well each texel was seen, 0..1.
     told : (N,)
         Share of what images tell of the specular albedo, 0..1: a texel that was well seen may tell nothing of it, in
         deep shade or where no lobe points at a light.
-    mirrored : (N, 2), optional
-        Texture coordinates of the point opposite to each texel: a texel that was hardly seen first takes the offset
-        found there.
     """
-    confidence, of_specular = (texels.to_map(np.asarray(x, np.float32)) for x in (quality, quality * told))
-    expected = texels.to_map(albedo.astype(np.float32))
-    offset, known = maps.copy(), confidence
-    offset[..., :3] -= expected
-    if mirrored is not None:
-        there = texels.to_map(sample_map(confidence, mirrored))
-        opposite = texels.to_map(sample_map(offset * confidence[..., None], mirrored))
-        opposite /= np.maximum(there, 1e-12)[..., None]
-        known = confidence + there * (1.0 - np.clip(confidence / BLEND, 0.0, 1.0))
-        own = (confidence / np.maximum(known, 1e-12))[..., None]
-        offset = own * offset + (1.0 - own) * opposite
+    expected = np.maximum(interpolate(model.mean_albedo, model.faces, texels.face, texels.weights), DARKEST)
+    found = texels.from_map(maps).astype(np.float64)
+    found[:, :3] = np.log(np.maximum(found[:, :3], DARKEST) / expected)
+    known = np.asarray(confidence, dtype=np.float64)
+    if model.symmetry is not None:
+        opposite = mirrored_coordinates(model, texels)
+        there = sample_map(texels.to_map(known.astype(np.float32)), opposite)
+        values = sample_map(texels.to_map((found * known[:, None]).astype(np.float32)), opposite)
+        taken = there * (1.0 - np.clip(known / BLEND, 0.0, 1.0))
+        total = np.maximum(known + taken, 1e-12)[:, None]
+        found = (known[:, None] * found + (taken / np.maximum(there, 1e-12))[:, None] * values) / total
+        known = known + taken
+    certain = known > 0.5 * known.max(initial=0.0)
+    typical = np.median(found[certain], axis=0) if certain.any() else np.zeros(4)
     where = corner_matrix(model.faces, texels.face, texels.weights, model.n_vertices)
-    sheet = membrane(model.mean, model.faces, where, texels.from_map(offset), texels.from_map(known), STIFFNESS)
-    smooth = texels.to_map((where @ sheet).astype(np.float32))
-    share = (known / (known + BLEND))[..., None]
-    blended = share * offset + (1.0 - share) * smooth
-    blended[..., :3] += expected
-    blended = np.clip(blended, 0.0, 1.0).astype(np.float32)
-    blended[~texels.mask] = 0.0
-    return Filled(blended[..., :3], blended[..., 3], confidence, of_specular)
+    sheet = (known[:, None] * found + TYPICAL * typical) / (known + TYPICAL)[:, None]
+    smooth = where @ membrane(model.mean, model.faces, where, sheet, known + TYPICAL, STIFFNESS)
+    share = (known / (known + BLEND))[:, None]
+    blended = share * found + (1.0 - share) * smooth
+    blended[:, :3] = expected * np.exp(blended[:, :3])
+    image = texels.to_map(np.clip(blended, 0.0, 1.0).astype(np.float32))
+    trusted, glossy = (texels.to_map(np.asarray(x, np.float32)) for x in (confidence, confidence * told))
+    return Filled(image[..., :3], image[..., 3], trusted, glossy)
 
 
 def mirrored_coordinates(model: MorphableModel, texels: TexelMap) -> NDArray[np.float64]:
     """(N, 2) texture coordinates of the point opposite to each texel on the other half of the face.
 
-    Raises
-    ------
-    InputError
-        The model doesn't say which vertices are opposite to one another.
+    The model has to say which vertices are opposite to one another.
     """
-    if model.symmetry is None:
-        raise InputError(f"reflectance.symmetric_fill: model {model.name!r} has no symmetry; leave it false")
     inside = model.face_mask
     of_vertex = np.zeros((len(model.mean), 2))
     of_vertex[model.faces[inside].ravel()] = model.uv[model.faces_uv[inside].ravel()]
