@@ -13,6 +13,7 @@ from mifit.errors import InputError
 from mifit.optim import Outcome
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.observations import Surface
+from mifit.stages.reflectance.als import with_skin_chroma
 from mifit.stages.reflectance.lighting_equations import SPECULAR_LIMIT, expected_specular, specular_pull
 from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, laplacian, solve_maps
 
@@ -292,3 +293,17 @@ def test_noise_decides_how_far_the_specular_albedo_is_told_by_the_images():
     ]
     np.testing.assert_allclose([v[..., 3].mean() for v in values], [0.1, 0.055, 0.01], atol=2e-3)
     np.testing.assert_allclose([v[..., :3].mean() for v in values], 0.4, atol=2e-3)
+
+
+def test_colour_parts_what_views_leave_open():
+    """Light that is alike in all images: skin's chroma alone tells where there is more gloss."""
+    rng = np.random.default_rng(0)
+    skin = np.array([0.5, 0.3, 0.2]) * rng.uniform(0.5, 1.5, (50, 1))
+    gloss, light = rng.uniform(0.0, 0.2, 50), np.ones((50, 4, 3), np.float32)
+    colour = ((skin + gloss[:, None])[:, None] * light).astype(np.float32)
+    systems = TexelSystems.accumulate(colour, light, light, light, np.zeros((0, 2), np.int64), 0.0)
+    expected, likely, found = np.tile([0.5, 0.3, 0.2], (50, 1)), np.full(50, 0.1), None
+    without = systems.solve(expected, likely, 1e-9, 1e-6)[1]
+    for _ in range(3):
+        found, specular = with_skin_chroma(systems, expected, found, 0.02).solve(expected, likely, 1e-9, 1e-6)
+    assert np.corrcoef(specular, gloss)[0, 1] > 0.9 > np.corrcoef(without, gloss)[0, 1] + 0.2
