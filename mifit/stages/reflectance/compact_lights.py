@@ -41,7 +41,7 @@ OBSERVATIONS = 8000
 LIGHTS = 3
 """Compact lights at the most: a face shows a few lamps apart, and what more there are is smooth light to it."""
 EXPONENT = 40.0
-"""Exponent of the lobe beforehand, in the middle of `EXPONENTS`: as wide as a Beckmann roughness of 0.2."""
+"""Exponent of the lobe beforehand: as wide as a Beckmann roughness of 0.2."""
 EXPONENTS = 10.0, 80.0
 """Exponents between which the lobe is looked for: Beckmann roughness 0.4 to 0.15."""
 ITERATIONS = 8
