@@ -29,7 +29,8 @@ from mifit.core.files import write_text
 from mifit.core.image import load_image, to_8_bit
 from mifit.morphable import MorphableModel
 from mifit.morphable.describe import save_png, sketch
-from mifit.morphable.register import distance_to_surface, register
+from mifit.morphable.register import register
+from mifit.output.truth import nearest_points
 from mifit.synth import synthesize
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
@@ -69,13 +70,13 @@ def distances(model: MorphableModel, ict: MorphableModel, seed: int) -> dict[str
     start = time.perf_counter()
     fit = register(model, head, ict.faces, ict.landmarks)
     seconds = time.perf_counter() - start
-    there = distance_to_surface(fit.vertices[np.unique(model.faces[model.face_mask])], head, ict.faces)
+    there = nearest_points(fit.vertices[np.unique(model.faces[model.face_mask])], head, ict.faces)[0]
     # Back: the head's face between its contour landmarks, forehead included, without ears and neck.
     p = head[ict.landmarks]
     brow, chin = p[17:27, 1].max(), p[8, 1]
     inside = (head[:, 1] > chin) & (head[:, 1] < brow + 35) & (head[:, 2] > p[[0, 16], 2].mean())
     region = np.intersect1d(np.unique(ict.faces[ict.face_mask]), np.flatnonzero(inside))
-    back = distance_to_surface(head[region], fit.vertices, model.faces[model.face_mask])
+    back = nearest_points(head[region], fit.vertices, model.faces[model.face_mask])[0]
     return {
         "model_to_head_mean_mm": float(there.mean()),
         "head_to_model_mean_mm": float(back.mean()),

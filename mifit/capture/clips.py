@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import correlate
 
-from mifit.capture.sources import Source, Video
+from mifit.capture.sources import Source, Video, opened_video
 from mifit.core.process import decoding
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
@@ -133,8 +133,7 @@ def _motion(video: Video) -> NDArray[np.float64]:
 
 
 def _small_frames(video: Video) -> Iterator[NDArray[np.float32]]:
-    reader = cv2.VideoCapture(str(video.path))
-    try:
+    with opened_video(video.path) as reader:
         while True:
             with decoding():
                 there, frame = reader.read()
@@ -143,8 +142,6 @@ def _small_frames(video: Video) -> Iterator[NDArray[np.float32]]:
             grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
             height = max(round(160 * grey.shape[0] / grey.shape[1]), 1)
             yield cv2.resize(grey, (160, height), interpolation=cv2.INTER_AREA).astype(np.float32)
-    finally:
-        reader.release()
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ class Video:
     def open(cls, path: Path, name: str) -> Video:
         """Read a video's header; InputError when it isn't one."""
         check_file(path, MAX_VIDEO_BYTES, "video file")
-        with _reader(path) as reader:
+        with opened_video(path) as reader:
             size = (int(reader.get(cv2.CAP_PROP_FRAME_WIDTH)), int(reader.get(cv2.CAP_PROP_FRAME_HEIGHT)))
             length, rate = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)), float(reader.get(cv2.CAP_PROP_FPS))
         if not 1 <= length <= MAX_VIDEO_FRAMES or min(size) < 1 or size[0] * size[1] > MAX_PIXELS or not rate > 0:
@@ -108,7 +108,7 @@ class Video:
     def files(self, numbers: Sequence[int]) -> Iterator[tuple[str, bytes]]:
         """Decode in order; frames between the wanted ones are passed over without conversion."""
         wanted = set(numbers)
-        with _reader(self.path) as reader:
+        with opened_video(self.path) as reader:
             for i in range(max(wanted, default=-1) + 1):
                 with decoding():
                     there = reader.grab()
@@ -125,7 +125,8 @@ class Video:
 
 
 @contextlib.contextmanager
-def _reader(path: Path) -> Iterator[cv2.VideoCapture]:
+def opened_video(path: Path) -> Iterator[cv2.VideoCapture]:
+    """A video's reader, closed in the end; InputError for what is no video."""
     with decoding():
         reader = cv2.VideoCapture(str(path))
     try:

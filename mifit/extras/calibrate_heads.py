@@ -288,9 +288,8 @@ def write_cameras(path: str | Path, capture: Capture, cameras: Sequence[Camera])
     by_name = {camera.name: camera for camera in cameras}
     changes: dict[tuple[str, int], dict[str, object]] = {}
     for key in (shot for shot in capture.shots if shot[0] in by_name):
-        camera = by_name[key[0]]
-        inverse = np.linalg.inv(camera.world_to_camera) @ OPENGL_FROM_OPENCV
-        numbers = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-        changes[key] = {k: float(v) for k, v in numbers.items()} | {"transform_matrix": inverse.tolist()}
+        c = by_name[key[0]]
+        numbers = {"fl_x": float(c.fx), "fl_y": float(c.fy), "cx": float(c.cx), "cy": float(c.cy)}
+        changes[key] = numbers | {"transform_matrix": c.camera_to_world_opengl.tolist()}
     file = Path(path) if Path(path).is_file() else Path(path) / "transforms.json"
     update_frames(file, changes)

@@ -162,7 +162,7 @@ def _binary_images(path: Path) -> Iterator[_ImageEntry]:
             while not name.endswith(b"\0"):
                 character = stream.read(1)
                 if not character or len(name) > 4096:
-                    raise InputError(f"{where}: found no end of its name, expected at most {4096} bytes")
+                    raise InputError(f"{where}: found no end of its name, expected at most 4096 bytes")
                 name += character
             try:
                 text = name[:-1].decode("utf-8")

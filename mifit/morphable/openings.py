@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 import scipy.sparse as sp
@@ -85,12 +84,6 @@ def eyeballs(model: MorphableModel) -> list[NDArray[np.int64]]:
         small = high[:, 0] - low[:, 0] < 2.5 * reach
         found += [np.flatnonzero(piece == k) for k in np.flatnonzero(balls & near & small)]
     return found
-
-
-@lru_cache(maxsize=4)
-def eyeball_faces(model: MorphableModel) -> NDArray[np.bool_]:
-    """(F,) faces of the model's eyeballs."""
-    return np.isin(model.faces[:, 0], np.concatenate([np.zeros(0, np.int64), *eyeballs(model)]))
 
 
 def lacks_eyes(model: MorphableModel) -> bool:

@@ -124,13 +124,3 @@ def nose_tip(vertices: NDArray) -> NDArray:
     middle = np.abs(vertices[:, 0] - np.median(vertices[:, 0])) < 0.1 * np.ptp(vertices[:, 0])
     candidates = vertices[middle]
     return candidates[candidates[:, 2].argmax()]
-
-
-def distance_to_surface(points: NDArray, vertices: NDArray, faces: NDArray, candidates: int = 16) -> NDArray:
-    """Distance of points (N, 3) from a surface: to the nearest of the triangles whose centres are closest."""
-    from trimesh.triangles import closest_point
-
-    corners = vertices[faces]
-    _, near = cKDTree(corners.mean(1)).query(points, k=min(candidates, len(faces)))
-    feet = [closest_point(corners[k], points) for k in near.reshape(len(points), -1).T]
-    return np.linalg.norm(np.stack(feet) - points, axis=-1).min(0)

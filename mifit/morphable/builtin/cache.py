@@ -53,7 +53,7 @@ def _source_digest() -> str:
     files = sorted(
         [
             *here.glob("*.py"),
-            *(here.parent / f for f in ("gaussian_process.py", "pigment.py", "topology.py")),
+            *(here.parent / f for f in ("gaussian_process.py", "openings.py", "pigment.py", "topology.py")),
             here.parents[1] / "core" / "mesh.py",
         ]
     )

@@ -73,7 +73,7 @@ def grid_lines() -> tuple[NDArray, NDArray, int, int]:
     rows = _spread(_KNOTS, _SLICES[:, 8])
     columns = np.radians(_spread(_COLUMNS[:, 0], _COLUMNS[:, 1]))
     count = np.concatenate([[0], np.cumsum(_SLICES[:-1, 8])]).astype(int)
-    return rows, columns, int(count[6]), int(count[9])
+    return rows, columns, int(count[6]), int(count[9])  # the slices of eye and mouth
 
 
 def loft(angle: NDArray, position: NDArray) -> NDArray:
