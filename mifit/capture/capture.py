@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mifit.capture.landmark_files import COUNT, Landmarks, read_landmarks
 from mifit.capture.lens import Undistortion, undistort_points
-from mifit.capture.transforms import UNITS_MM, Shot, Transforms, View, read_transforms, write_transforms
+from mifit.capture.transforms import UNITS_MM, Shot, Transforms, View, read_transforms
 from mifit.core.camera import Camera
 from mifit.core.files import file_digest, note_read
 from mifit.core.image import load_image
@@ -264,10 +264,6 @@ class Capture:
     def with_fitted(self, cameras: Sequence[Camera]) -> Capture:
         """The capture as a fit with these cameras saw it: its own calibration, or else the estimated cameras."""
         return self if self.calibrated or not cameras else self.with_estimate(cameras)
-
-    def save(self) -> None:
-        """Write ``transforms.json`` anew (whole or not at all); images and landmarks stay as they are."""
-        write_transforms(self.path / "transforms.json", self.views.values(), self.shots.values(), self.units)
 
     def _view(self, name: str) -> View:
         if name not in self.views:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from mifit.capture.capture import Capture
 from mifit.capture.detectors import Detector, open_detector
-from mifit.capture.face_mesh import FaceMesh
 from mifit.capture.landmark_files import COUNT, Landmarks, write_landmarks
 from mifit.capture.lens import undistort_points
 from mifit.capture.outliers import epipolar_outliers, temporal_outliers
@@ -54,7 +53,7 @@ def detect_landmarks(path: str | Path, detector: str | Detector | None = None, p
     capture = Capture.load(path)
     opened = open_detector(detector) if detector is None or isinstance(detector, str) else detector
     name, scatter = opened.name, opened.scatter
-    points, more = _run(capture, opened, progress)
+    points = _run(capture, opened, progress)
     without = [capture.shots[key].image for key, found in points.items() if not np.isfinite(found).all()]
     if len(without) == len(points):
         raise InputError(f"{capture.path}: detector {name} finds no face in any of {len(points)} images")
@@ -69,7 +68,7 @@ def detect_landmarks(path: str | Path, detector: str | Detector | None = None, p
         check_no_links(capture.path, capture.path / place)
     kept = _keep_landmarks(capture.path)
     for key, landmarks in found.items():
-        write_landmarks(capture.path / names[key], landmarks, more.get(key))
+        write_landmarks(capture.path / names[key], landmarks)
     file = Path(path) if Path(path).is_file() else capture.path / "transforms.json"
     update_frames(file, {key: {"landmark_path": names.get(key)} for key in capture.shots})
     marked = sum(int(hidden[key].sum()) for key in found)
@@ -96,24 +95,15 @@ def _keep_landmarks(folder: Path) -> Path | None:
     return kept
 
 
-def _run(
-    capture: Capture, detector: Detector, progress: Progress
-) -> tuple[dict[tuple[str, int], NDArray[np.float64]], dict[tuple[str, int], dict[str, list]]]:
-    """Landmarks per image in coordinates of the stored images (NaN where no face is found), and what else is known."""
-    points, more = {}, {}
+def _run(capture: Capture, detector: Detector, progress: Progress) -> dict[tuple[str, int], NDArray[np.float64]]:
+    """Landmarks per image in coordinates of the stored images; NaN where no face is found."""
+    points = {}
     for i, (key, shot) in enumerate(capture.shots.items()):
         progress("Finding landmarks", i, len(capture.shots))
-        image = to_8_bit(load_image(shot.image).pixels)
-        if isinstance(detector, FaceMesh):
-            face = detector.face(image)
-            found = None if face is None else face.landmarks
-            if face is not None:
-                more[key] = {"iris": face.iris.round(2).tolist(), "head_rotation": face.rotation.round(4).tolist()}
-        else:
-            found = detector.detect(image)
+        found = detector.detect(to_8_bit(load_image(shot.image).pixels))
         points[key] = np.full((COUNT, 2), np.nan) if found is None else found
     progress("Finding landmarks", len(points), len(points))
-    return points, more
+    return points
 
 
 def _outliers(

@@ -39,8 +39,6 @@ EYE_CONTOURS = (
 """Mesh points on the rim of each eye, as the iris network lists them."""
 LIDS = (((37, 41, 160, 144), (38, 40, 158, 153)), ((43, 47, 385, 380), (44, 46, 387, 373)))
 """Of each eye, two landmarks on the upper lid with those below them, and the mesh points of the rim at both."""
-SIDES, TOP_CHIN = (234, 454), (10, 152)
-"""Mesh points at the ears, and at the hairline and chin."""
 
 
 @cache
@@ -108,23 +106,6 @@ class Face:
                     middle = 0.5 * (marks[upper] + marks[lower])
                     marks[upper], marks[lower] = middle + 0.5 * gap, middle - 0.5 * gap
         return np.asarray(marks)
-
-    @property
-    def iris(self) -> NDArray[np.float64]:
-        """(2, 3) centre and radius of the iris of the person's right and left eye, pixels."""
-        rims = self.points[POINTS:, :2].reshape(2, IRIS, 2)
-        radius = np.linalg.norm(rims[:, 1:] - rims[:, :1], axis=2).mean(axis=1)
-        return np.column_stack([rims[:, 0], radius])
-
-    @property
-    def rotation(self) -> NDArray[np.float64]:
-        """(3, 3) head to camera axes: columns are the head's left, up and front in x right, y down, z away."""
-        left = self.points[SIDES[1]] - self.points[SIDES[0]]
-        up = self.points[TOP_CHIN[0]] - self.points[TOP_CHIN[1]]
-        left /= np.linalg.norm(left)
-        up -= left * (up @ left)
-        up /= np.linalg.norm(up)
-        return np.column_stack([left, up, np.cross(left, up)])
 
 
 @dataclass(frozen=True)
@@ -208,20 +189,9 @@ class FaceMesh:
         face = self.face(image)
         return None if face is None else face.landmarks
 
-    def face(self, image: NDArray[np.uint8], near: NDArray | None = None) -> Face | None:
-        """The largest face of an RGB image (H, W, 3), or None.
-
-        Parameters
-        ----------
-        near : (N, 2), optional
-            Points about which a face is expected, in pixels: looked at before the image is searched.
-        """
+    def face(self, image: NDArray[np.uint8]) -> Face | None:
+        """The largest face of an RGB image (H, W, 3), or None."""
         image = np.ascontiguousarray(image)
-        if near is not None:
-            level = np.array([1.0, 0.0])
-            found = self._settle(image, _Square.about(near, 0 * level, level, MARGIN))
-            if found is not None:
-                return found
         for windows in _windows(image):
             boxes = [(w, box) for w in windows for box in self._boxes(image, w)]
             faces = [(box.score, face) for w, box in boxes if (face := self._upright(image, w, box)) is not None]

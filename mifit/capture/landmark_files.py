@@ -8,7 +8,6 @@ MATLAB tools, at (1, 1)); the caller names the origin where it matters.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
@@ -102,15 +101,14 @@ def _check_spread(path: Path, points: NDArray[np.float64]) -> None:
         )
 
 
-def write_landmarks(path: str | Path, landmarks: Landmarks, more: Mapping[str, object] | None = None) -> None:
-    """Write the JSON form, whole or not at all; ``more`` is what else a detector found, JSON values by name."""
+def write_landmarks(path: str | Path, landmarks: Landmarks) -> None:
+    """Write the JSON form, whole or not at all."""
     text = json.dumps(
         {
             "convention": "ibug68",
             "points": np.round(landmarks.points, 3).tolist(),
             "visible": [bool(v) for v in landmarks.visible],
             "deviation": round(float(landmarks.deviation), 2),
-            **(more or {}),
         }
     )
     write_text(path, text + "\n")
