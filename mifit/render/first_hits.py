@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mifit.render.gbuffer import MESH_BUFFERS
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 TILES = 64
 """Tiles along the maps' sides, in whose order the points of a view are shaded: a tile's gradients stay in the cache."""
@@ -14,7 +17,7 @@ KEPT_BYTES, RAY_BYTES = 2**30, 260
 """Of first hits at most, and of one of them with its ray and its point: a dozen views of 680 x 480."""
 
 
-def _buffers_of(mesh: Any) -> list[Any]:
+def _buffers_of(mesh: mi.Mesh) -> list[Any]:
     """What a point on a mesh is made of: positions, faces, normals and UVs, as far as there are any."""
     import mitsuba as mi
 
@@ -37,7 +40,7 @@ def recording() -> bool:
     return bool(dr.flag(dr.JitFlag.SymbolicScope) or dr.flag(dr.JitFlag.FreezingScope))
 
 
-def _by_tile(uv: Any) -> Any:
+def _by_tile(uv: mi.Point2f) -> Any:
     """The order of points in which those that share a tile of texels follow one another."""
     import mitsuba as mi
 
@@ -55,10 +58,10 @@ class FirstHits:
     """
 
     def __init__(self) -> None:
-        self.sensor: Any = None
+        self.sensor: mi.Sensor = None
         self.kept: dict[tuple[int, int], dict[str, Any]] = {}
 
-    def find(self, scene: Any, ray: Any, active: Any) -> tuple[Any, Any]:
+    def find(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> tuple[Any, Any]:
         """The points that a sensor's rays meet, and the numbers of their rays; None where each ray has an entry."""
         import drjit as dr
         import mitsuba as mi
@@ -75,7 +78,7 @@ class FirstHits:
             kept = self.kept.get(name)
             if kept is None or kept["moved"] != moved or not _same_rays(kept["ray"], still):
                 hits = scene.ray_intersect_preliminary(still, coherent=True)
-                index: Any = dr.compress(hits.is_valid())
+                index: mi.UInt32 = dr.compress(hits.is_valid())
                 if dr.width(index) > 0:
                     met = dr.gather(type(hits), hits, index)
                     met = met.compute_surface_interaction(dr.gather(mi.Ray3f, still, index))
@@ -98,7 +101,7 @@ class FirstHits:
             return index, kept["hits"].compute_surface_interaction(dr.gather(mi.Ray3f, mi.Ray3f(ray), index))
         return index, mi.SurfaceInteraction3f(kept["si"])
 
-    def hit(self, index: Any, si: Any, ray: Any) -> Any:
+    def hit(self, index: mi.UInt32, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> Any:
         """Which rays meet something, given what `find` found."""
         import drjit as dr
         import mitsuba as mi
@@ -110,7 +113,7 @@ class FirstHits:
         return met
 
 
-def _same_rays(one: Any, other: Any) -> bool:
+def _same_rays(one: mi.Ray3f, other: mi.Ray3f) -> bool:
     """Are two sets of rays equal, each ray and number of them?"""
     import drjit as dr
     import mitsuba as mi

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.errors import InputError
 from mifit.render.plugins import register_plugins
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 
 def load_scene(source: str | Path | Mapping[str, Any], **parameters: Any) -> Any:
@@ -51,7 +54,7 @@ def load_scene(source: str | Path | Mapping[str, Any], **parameters: Any) -> Any
     return scene
 
 
-def fit_environment(scene: Any) -> None:
+def fit_environment(scene: mi.Scene) -> None:
     """Give each ``shenv`` a radius about the origin that holds the scene and its sensors."""
     import mitsuba as mi
 

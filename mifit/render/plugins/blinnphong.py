@@ -94,7 +94,7 @@ def make() -> type:
         def parameters_changed(self, keys: list[str]) -> None:
             self._set_flags()
 
-        def parameters(self, si: mi.SurfaceInteraction3f, active: Any = True) -> tuple[Any, Any, Any, Any, Any]:
+        def parameters(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> tuple[Any, Any, Any, Any, Any]:
             """Both albedos, exponent, Fresnel factor (or None) and corrected local normal at a surface point."""
             diffuse = self.diffuse.eval(si, active)
             specular = self.specular.eval(si, active)
@@ -109,18 +109,20 @@ def make() -> type:
             n = mi.Normal3f(dr.normalize(mi.Vector3f(slopes.x, slopes.y, 1.0)))
             return diffuse, specular, exponent, fresnel, n
 
-        def at_angle(self, diffuse: Any, specular: Any, fresnel: Any, cosine: Any) -> Any:
+        def at_angle(self, diffuse: mi.Color3f, specular: mi.Float, fresnel: mi.Float, cosine: mi.Float) -> Any:
             """Specular albedo with its Fresnel factor at a cosine, stopped where it would gain energy."""
             if fresnel is None:
                 return specular
             value = specular * fresnel_factor(cosine, fresnel)
             return dr.minimum(value, dr.maximum(1.0 - diffuse, 0.0)) if self.normalized else value
 
-        def _half(self, wi: Any, wo: Any) -> Any:
+        def _half(self, wi: mi.Vector3f, wo: mi.Vector3f) -> Any:
             h = wi + wo
             return h * dr.rsqrt(dr.maximum(dr.squared_norm(h), 1e-12))
 
-        def _lobe(self, wi: Any, wo: Any, n: Any, exponent: Any, fresnel: Any) -> tuple[Any, Any]:
+        def _lobe(
+            self, wi: mi.Vector3f, wo: mi.Vector3f, n: mi.Vector3f, exponent: mi.Float, fresnel: mi.Float
+        ) -> tuple[Any, Any]:
             """The lobe without albedo and N(m), and the density of wo when it is sampled."""
             if fresnel is not None:
                 return carried_lobe(wi, wo, n, exponent)
@@ -131,7 +133,7 @@ def make() -> type:
             density = (exponent + 1.0) * dr.inv_two_pi * power / dr.maximum(4.0 * wi_h, 1e-8)
             return power, dr.select(wi_h > 0.0, density, 0.0)
 
-        def _specular_probability(self, ctx: Any, wi: Any, parameters: Any) -> Any:
+        def _specular_probability(self, ctx: mi.BSDFContext, wi: mi.Vector3f, parameters: Any) -> Any:
             """Probability of sampling the lobe: the share of its albedo; none where the normal faces away."""
             has_specular = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
             has_diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1)
@@ -145,14 +147,16 @@ def make() -> type:
             facing = (cosine > 0.0) & (mi.Frame3f.cos_theta(wi) > 0.0)
             return dr.select(facing, dr.select(s + d > 0.0, s / dr.maximum(s + d, 1e-12), 0.5), 0.0)
 
-        def _reflects(self, si: Any, wo: Any, n: Any) -> tuple[Any, Any, Any]:
+        def _reflects(self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, n: mi.Vector3f) -> tuple[Any, Any, Any]:
             """Where the base reflects, where the lobe does as well, and the corrected cosine of wo."""
             cosine, facing = dr.dot(wo, n), mi.Frame3f.cos_theta(si.wi) > 0.0
             front = facing | (dr.dot(si.n, si.to_world(si.wi)) > 0.0)
             above = front & (mi.Frame3f.cos_theta(wo) > 0.0) & (cosine > 0.0)
             return above, above & facing & (dr.dot(si.wi, n) > 0.0), cosine
 
-        def _value(self, ctx: Any, si: Any, wo: Any, parameters: Any, active: Any) -> Any:
+        def _value(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, parameters: Any, active: mi.Bool
+        ) -> Any:
             diffuse, specular, exponent, fresnel, n = parameters
             wi = si.wi
             reflects, shines, cosine = self._reflects(si, wo, n)
@@ -166,27 +170,40 @@ def make() -> type:
                 value += diffuse * dr.inv_pi
             return dr.select(active & reflects, value * cosine, 0.0)
 
-        def _density(self, ctx: Any, si: Any, wo: Any, parameters: Any, active: Any) -> Any:
+        def _density(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, parameters: Any, active: mi.Bool
+        ) -> Any:
             _, _, exponent, fresnel, n = parameters
             reflects, shines, cosine = self._reflects(si, wo, n)
             p = self._specular_probability(ctx, si.wi, parameters)
             lobe = dr.select(shines, self._lobe(si.wi, wo, n, exponent, fresnel)[1], 0.0)
             return dr.select(active & reflects, dr.lerp(cosine * dr.inv_pi, lobe, p), 0.0)
 
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        def eval(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> Any:
             return self._value(ctx, si, wo, self.parameters(si, active), active)
 
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True) -> Any:
             return self._density(ctx, si, wo, self.parameters(si, active), active)
 
-        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+        def eval_pdf(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> tuple[Any, Any]:
             parameters = self.parameters(si, active)
             return (
                 self._value(ctx, si, wo, parameters, active),
                 self._density(ctx, si, wo, parameters, active),
             )
 
-        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+        def sample(
+            self,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            sample1: mi.Float,
+            sample2: mi.Point2f,
+            active: mi.Bool = True,
+        ) -> tuple[Any, Any]:
             parameters = self.parameters(si, active)
             _, _, exponent, fresnel, n = dr.detach(parameters)
             p = self._specular_probability(ctx, si.wi, parameters)
@@ -221,7 +238,7 @@ def make() -> type:
             valid = active & (bs.pdf > 0.0)
             return bs, dr.select(valid, value / dr.select(valid, bs.pdf, 1.0), 0.0)
 
-        def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
+        def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> Any:
             return self.parameters(si, active)[0]
 
         def to_string(self) -> str:

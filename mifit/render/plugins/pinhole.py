@@ -54,7 +54,7 @@ def make() -> type:
                     callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
         def sample_ray(
-            self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+            self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
         ) -> tuple[Any, Any]:
             film = self.film()
             pixel = sample2 * mi.Vector2f(film.crop_size()) + mi.Vector2f(film.crop_offset())
@@ -66,7 +66,7 @@ def make() -> type:
             return ray, mi.Color3f(1.0)
 
         def sample_ray_differential(
-            self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+            self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
         ) -> tuple[Any, Any]:
             ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
             differential = mi.RayDifferential3f(ray)

@@ -34,7 +34,7 @@ def make() -> type:
         def put(self, name: str, value: Any, flags: Any) -> None:
             self.found.append(value)
 
-    def at(values: Any, index: Any) -> Any:
+    def at(values: Any, index: mi.UInt32) -> Any:
         """The entries of an array, whose only one may be that of all."""
         return values if dr.width(values) == 1 else dr.gather(type(values), values, index)
 
@@ -87,7 +87,7 @@ def make() -> type:
             if dr.is_jit_v(mi.Float):
                 callback.put("ambient", self.ambient, mi.ParamFlags.Differentiable)
 
-        def sample_rays(self, scene: Any, sensor: Any, sampler: Any) -> tuple[Any, Any, Any]:
+        def sample_rays(self, scene: mi.Scene, sensor: mi.Sensor, sampler: mi.Sampler) -> tuple[Any, Any, Any]:
             """Rays on a fixed pattern inside each pixel, the same for every pixel and seed."""
             film = sensor.film()
             size = film.crop_size()
@@ -110,9 +110,9 @@ def make() -> type:
 
         def render(
             self,
-            scene: Any,
-            sensor: Any = 0,
-            seed: Any = 0,
+            scene: mi.Scene,
+            sensor: mi.Sensor = 0,
+            seed: mi.UInt32 = 0,
             spp: int = 0,
             develop: bool = True,
             evaluate: bool = True,
@@ -152,7 +152,13 @@ def make() -> type:
                 return mi.TensorXf(pixels, (height, width, channels))
 
         def render_backward(
-            self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
+            self,
+            scene: mi.Scene,
+            params: mi.SceneParameters,
+            grad_in: mi.TensorXf,
+            sensor: mi.Sensor = 0,
+            seed: mi.UInt32 = 0,
+            spp: int = 0,
         ) -> None:
             """Gradients of all parameters, given those of the image.
 
@@ -169,7 +175,7 @@ def make() -> type:
                 ray, weight, _ = self.sample_rays(scene, sensor, sampler)
                 share = dr.opaque(mi.Float, 1.0 / spp)
 
-                def given(samples: Any) -> Any:
+                def given(samples: mi.UInt32) -> Any:
                     """Gradients of samples."""
                     first = samples // dr.opaque(mi.UInt32, spp) * grad_in.shape[2]
                     entries = (dr.gather(mi.Float, grad_in.array, first + k) for k in range(3))
@@ -190,24 +196,24 @@ def make() -> type:
                 dr.eval()
 
         def sample(
-            self, mode: Any, scene: Any, sampler: Any, ray: Any, active: Any = True, **_: Any
+            self, mode: Any, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool = True, **_: Any
         ) -> tuple[Any, Any, list[Any], Any]:
             """Radiance along primary rays; plain automatic differentiation in every mode."""
             index, value, behind, hit = self._seen(scene, ray, active)
             return self._everywhere(index, value, behind, hit), hit | (not self.hide), [], None
 
-        def _is_plain(self, film: Any) -> bool:
+        def _is_plain(self, film: mi.Film) -> bool:
             """Is a pixel the mean of its own samples' radiance?"""
             special = dr.all(mi.has_flag(film.flags(), mi.FilmFlags.Special))
             return not special and film.rfilter().is_box_filter()
 
-        def _seen(self, scene: Any, ray: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+        def _seen(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> tuple[Any, Any, Any, Any]:
             """Numbers of the rays that meet something (None: one entry per ray), radiance there, behind, and which."""
             index, si = self._hits.find(scene, ray, active)
             behind = None if self.hide else self._emitters(scene)[0].radiance(ray.d)
             return index, self._shade(scene, si), behind, self._hits.hit(index, si, ray)
 
-        def _everywhere(self, index: Any, value: Any, behind: Any, hit: Any) -> Any:
+        def _everywhere(self, index: mi.UInt32, value: Any, behind: mi.Color3f, hit: mi.Bool) -> Any:
             """Radiance along every ray, of what `_seen` found."""
             if index is not None:
                 radiance = dr.zeros(mi.Color3f, dr.width(hit))
@@ -215,7 +221,7 @@ def make() -> type:
                 value = radiance
             return value if behind is None else dr.select(hit, value, behind)
 
-        def _shade(self, scene: Any, si: Any) -> Any:
+        def _shade(self, scene: mi.Scene, si: mi.SurfaceInteraction3f) -> Any:
             """Radiance that leaves points of surfaces towards the camera; nothing where there is none."""
             emitter, compact = self._emitters(scene)
             flat = emitter.project()
@@ -249,7 +255,7 @@ def make() -> type:
                 radiance += self._direct(scene, light, si, hit)
             return radiance
 
-        def _lobe(self, exponent: Any, order: int, normalized: bool, fresnel: Any) -> kernels.PreparedLobe:
+        def _lobe(self, exponent: mi.Float, order: int, normalized: bool, fresnel: mi.Float) -> kernels.PreparedLobe:
             """The lobe of an exponent, prepared once where all points share it and nothing differentiates by it."""
             if dr.width(exponent) != 1 or dr.grad_enabled(exponent) or recording():
                 return kernels.prepare_exponent(exponent, order, normalized, fresnel)
@@ -257,7 +263,7 @@ def make() -> type:
             lobe = self._lobes.get(key, lambda: kernels.prepare_exponent(exponent, order, normalized))
             return replace(lobe, fresnel=fresnel)
 
-        def _emitters(self, scene: Any) -> tuple[Any, list[Any]]:
+        def _emitters(self, scene: mi.Scene) -> tuple[Any, list[Any]]:
             """The scene's `shenv`, of which there is one, and its other emitters, none of them an environment."""
             emitters = scene.emitters()
             smooth = [e for e in emitters if type(e).__name__ == "SHEnvironment"]
@@ -269,7 +275,7 @@ def make() -> type:
                 )
             return smooth[0], others
 
-        def _direct(self, scene: Any, light: Any, si: Any, active: Any) -> Any:
+        def _direct(self, scene: mi.Scene, light: mi.Emitter, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Any:
             """What the points reflect of a compact light that they see, averaged over a fixed pattern on it."""
             context, bsdf = mi.BSDFContext(), si.bsdf()
             count = 1 if mi.has_flag(light.flags(), mi.EmitterFlags.Delta) else 16
@@ -282,7 +288,7 @@ def make() -> type:
                 total += dr.select(lit, bsdf.eval(context, si, si.to_local(ds.d), lit) * weight, 0.0)
             return total / count
 
-        def _bsdfs(self, scene: Any) -> list[tuple[Any, Any, bool]]:
+        def _bsdfs(self, scene: mi.Scene) -> list[tuple[Any, Any, bool]]:
             """The scene's `blinnphong` objects, the pointers that surfaces carry, and whether they are two-sided."""
             result: dict[int, tuple[Any, Any, bool]] = {}
             for shape in scene.shapes():
@@ -300,7 +306,7 @@ def make() -> type:
                 result[id(outer)] = (bsdf, mi.BSDFPtr(outer), two_sided)
             return list(result.values())
 
-        def _transfer(self, scene: Any, si: Any, active: Any, order: int) -> list[Any]:
+        def _transfer(self, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: mi.Bool, order: int) -> list[Any]:
             """Traced transfer vectors at the hits, interpolated between vertices."""
             size = order * order
             values = [mi.Float(0.0) for _ in range(size)]
@@ -315,7 +321,9 @@ def make() -> type:
                     values[k] += at[0] + b1 * (at[1] - at[0]) + b2 * (at[2] - at[0])
             return values
 
-        def _barycentric(self, shape: Any, si: Any, corners: Any, active: Any) -> tuple[Any, Any]:
+        def _barycentric(
+            self, shape: mi.Shape, si: mi.SurfaceInteraction3f, corners: mi.Vector3u, active: mi.Bool
+        ) -> tuple[Any, Any]:
             with dr.suspend_grad():
                 p0, p1, p2 = (shape.vertex_position(corner, active) for corner in corners)
                 e1, e2, q = p1 - p0, p2 - p0, si.p - p0
@@ -324,7 +332,7 @@ def make() -> type:
                 area = dr.maximum(a * c - b * b, 1e-30)
                 return (c * d - b * e) / area, (a * e - b * d) / area
 
-        def _tables(self, shapes: Any, order: int) -> list[Any]:
+        def _tables(self, shapes: list[mi.Shape], order: int) -> list[Any]:
             """Transfer vectors per vertex of every shape; traced again only when positions changed."""
             if any(not shape.is_mesh() for shape in shapes):
                 raise InputError("shdirect: model 'shadowed': found a shape that isn't a mesh, expected meshes only")

@@ -140,7 +140,7 @@ def make() -> type:
             if not keys or "coefficients" in keys:
                 self._rebuild()
 
-        def radiance(self, direction: Any) -> Any:
+        def radiance(self, direction: mi.Vector3f) -> Any:
             """Clamped radiance from world directions."""
             local = self._to_local(direction)
             flat = self.coefficients.array
@@ -149,7 +149,7 @@ def make() -> type:
                 total += y * mi.Color3f(*(_entry(flat, 3 * k + c) for c in range(3)))
             return mi.Color3f(dr.maximum(total * self.scale, 0.0))
 
-        def _to_local(self, direction: Any) -> Any:
+        def _to_local(self, direction: mi.Vector3f) -> Any:
             return self.to_world.inverse() @ mi.Vector3f(direction)
 
         def project(self) -> Any:
@@ -179,7 +179,7 @@ def make() -> type:
                 dr.scatter(flat, sums[c], 3 * dr.arange(mi.UInt32, order * order) + c)
             return flat
 
-        def _sample(self, sample: Any, active: Any) -> tuple[Any, Any]:
+        def _sample(self, sample: mi.Point2f, active: mi.Bool) -> tuple[Any, Any]:
             """A world direction and its density."""
             index, x = self._table.sample_reuse(sample.x, active)
             z = -1.0 + (2.0 / ROWS) * (mi.Float(index // COLUMNS) + x)
@@ -190,7 +190,7 @@ def make() -> type:
             # Looked up again, so that rounding at a cell's edge can't make it differ from pdf_direction.
             return d, self._density(d, active)
 
-        def _density(self, direction: Any, active: Any) -> Any:
+        def _density(self, direction: mi.Vector3f, active: mi.Bool) -> Any:
             d = self._to_local(direction)
             row = dr.clip(mi.Int32(dr.floor((d.z + 1.0) * (0.5 * ROWS))), 0, ROWS - 1)
             turn = dr.atan2(d.y, d.x) * (0.5 / np.pi)
@@ -198,10 +198,10 @@ def make() -> type:
             pmf = self._table.eval_pmf_normalized(mi.UInt32(row * COLUMNS + column), active)
             return dr.select(active, pmf * (ROWS * COLUMNS / (4.0 * np.pi)), 0.0)
 
-        def eval(self, si: Any, active: Any = True) -> Any:
+        def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> Any:
             return dr.select(active, self.radiance(-si.wi), 0.0)
 
-        def sample_direction(self, it: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
+        def sample_direction(self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True) -> tuple[Any, Any]:
             d, pdf = self._sample(sample, active)
             reach = 2.0 * dr.maximum(self.radius, dr.norm(mi.Vector3f(it.p)))
             ds = mi.DirectionSample3f()
@@ -216,14 +216,14 @@ def make() -> type:
             ds.dist = reach
             return ds, dr.select(active, self.radiance(d) / pdf, 0.0)
 
-        def pdf_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+        def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> Any:
             return self._density(ds.d, active)
 
-        def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+        def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> Any:
             return dr.select(active, self.radiance(ds.d), 0.0)
 
         def sample_ray(
-            self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+            self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
         ) -> tuple[Any, Any]:
             d, pdf = self._sample(sample3, active)
             disk = mi.warp.square_to_uniform_disk_concentric(sample2)
@@ -241,7 +241,7 @@ def make() -> type:
                 f"  rotation = {self._rotation.tolist()}\n]"
             )
 
-    def _entry(flat: Any, index: int) -> Any:
+    def _entry(flat: mi.Float, index: int) -> Any:
         if not dr.is_jit_v(mi.Float):
             return flat[index]
         # All points add to these few gradients: in copies per thread, or they would wait for one another.
