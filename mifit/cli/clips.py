@@ -41,7 +41,7 @@ def capture_of(arguments: Namespace) -> Path:
         return paths[0]
     from mifit.capture.detectors import available
     from mifit.capture.face_networks import missing
-    from mifit.result.ownership import claim, clear, files_in, remember
+    from mifit.result.ownership import add_folder, clear
 
     if not any(available().values()):
         raise InputError(missing())
@@ -57,14 +57,12 @@ def capture_of(arguments: Namespace) -> Path:
         if not arguments.force:
             raise InputError(f"{folder}: holds a capture of something else; --force replaces it, or name another --out")
         clear(folder)
-    claim(out, arguments.force)
-    made = out / ".mifit" / "capture"
-    shutil.rmtree(made, ignore_errors=True)  # of a run that was killed
-    _make(arguments, paths, made)
-    write_text(made / ORIGIN, json.dumps(origin, indent=1) + "\n")
-    claim(made, force=True)
-    remember(made, files_in(made))
-    made.rename(folder)
+
+    def make(made: Path) -> None:
+        _make(arguments, paths, made)
+        write_text(made / ORIGIN, json.dumps(origin, indent=1) + "\n")
+
+    add_folder(out, folder.name, make, arguments.force)
     say(arguments, f"Capture: {folder}")
     return folder
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,23 +32,15 @@ def demo(arguments: Namespace) -> None:
     capture = out / "capture"
     progress = console_progress(arguments.quiet)
     use_variant(arguments)
-    from mifit.result.ownership import MARK, check_ours, claim, clear, remember
+    from mifit.result.ownership import MARK, add_folder, check_ours, clear
     from mifit.synth import synthesize
 
     check_ours(out)
     if (out / "result.json").exists() and not (capture / MARK).is_dir():
         raise InputError(f"--out {out}: holds a result that isn't the demo's; name another folder")
     clear(capture)
-    claim(out)
     say(arguments, "Rendering a capture: two cameras to fit, a third to judge by")
-    made = out / MARK / "capture"
-    shutil.rmtree(made, ignore_errors=True)  # of a demo that was killed
-    synthesize(made, seed=arguments.seed, progress=progress, **DEMO)
-    claim(made, force=True)
-    remember(
-        made, [p.relative_to(made).as_posix() for p in made.rglob("*") if p.is_file() and MARK not in p.parts[-2:]]
-    )
-    made.rename(capture)
+    add_folder(out, capture.name, lambda made: synthesize(made, seed=arguments.seed, progress=progress, **DEMO))
     _fit_and_judge(arguments, capture, progress)
     print(f"Report: {out / 'report.html'}")
 
@@ -62,7 +53,6 @@ def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> No
 
     out: Path = arguments.out
     capture = mifit.Capture.load(folder)
-    cameras = ("left", "right")
     first: list[Path] = []
 
     def show(result: Reconstruction) -> None:
@@ -70,30 +60,13 @@ def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> No
             first.append(_first_picture(out, result, capture))
             say(arguments, f"First picture, of the model before light and skin are found: {first[0]}")
 
-    result = fit_into(
-        out,
-        capture,
-        mifit.MorphableModel.load(DEMO["model"]),
-        cameras=cameras,
-        config=FitConfig(reflectance=ReflectanceConfig(texture_size=256)),
-        seed=arguments.seed,
-        progress=progress,
-        force=True,
-        watch=show,
-    )
+    model, config = mifit.MorphableModel.load(DEMO["model"]), FitConfig(reflectance=ReflectanceConfig(texture_size=256))
+    options: dict[str, Any] = {"seed": arguments.seed, "progress": progress, "force": True, "watch": show}
+    result = fit_into(out, capture, model, ("left", "right"), config=config, **options)
     remember(out, [path.name for path in first])  # after the fit, which clears away what a result before it left
-    judged = {
-        "camera": "third",
-        "timesteps": None,
-        "region": "face",
-        "baseline": True,
-        "passes": False,
-        "fitted": False,
-    }
-    given = Namespace(
-        quiet=arguments.quiet, strict=False, result=out, capture=folder, json=out / "third.json", **judged
-    )
-    judge(given, result, capture)
+    judged: dict[str, Any] = {"timesteps": None, "passes": False, "fitted": False, "strict": False, "baseline": True}
+    judged |= {"camera": "third", "region": "face", "capture": folder, "json": out / "third.json"}
+    judge(Namespace(quiet=arguments.quiet, result=out, **judged), result, capture)
 
 
 def _first_picture(out: Path, result: Reconstruction, capture: Capture) -> Path:

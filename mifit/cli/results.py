@@ -63,16 +63,11 @@ def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> int
         asked = {key: value for key, value in found.items() if key != "baseline" or arguments.baseline}
         write_text(arguments.json, json.dumps(asked, indent=2) + "\n")
     print(f"camera {found['camera']}, timesteps {found['timesteps']}, {found['region_pixels']} pixels")
+    placed = {f"timestep {t} was not fitted: the head was placed by its": p for t, p in found.get("posed", {}).items()}
     if "resected" in found:
-        print(
-            f"camera {found['camera']} is not calibrated: placed from its landmarks against the fitted head, "
-            f"{found['resected']['landmark_pixels']:.1f} pixels beside them"
-        )
-    for timestep, placed in found.get("posed", {}).items():
-        print(
-            f"timestep {timestep} was not fitted: the head was placed by its landmarks, "
-            f"{placed['landmark_pixels']:.1f} pixels beside them"
-        )
+        placed[f"camera {found['camera']} is not calibrated: placed against the fitted head by its"] = found["resected"]
+    for what, figures in placed.items():
+        print(f"{what} landmarks, {figures['landmark_pixels']:.1f} pixels beside them")
     _print_measures(found["methods"])
     if arguments.baseline:
         print(f"image-based rendering on the same mesh, {found['baseline']['region_pixels']} pixels that it can fill")
@@ -106,13 +101,10 @@ def score(arguments: Namespace) -> None:
 
     found = scored(capture, arguments.images, arguments.cameras, model, console_progress(arguments.quiet))
     for name in found["ignored"]:
-        print(
-            f"mifit: warning: {arguments.images / name}: its name says nothing that is scored; left out",
-            file=sys.stderr,
-        )
+        text = f"{arguments.images / name}: its name says nothing that is scored; left out"
+        print(f"mifit: warning: {text}", file=sys.stderr)
     if arguments.json:
-        asked = {key: value for key, value in found.items() if key != "baseline" or arguments.baseline}
-        write_text(arguments.json, json.dumps(asked, indent=2) + "\n")
+        write_text(arguments.json, json.dumps(found, indent=2) + "\n")
     print(summary(found))
 
 

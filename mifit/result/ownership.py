@@ -14,7 +14,7 @@ import json
 import os
 import shutil
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
@@ -185,6 +185,17 @@ def clear(folder: Path) -> None:
             f"{folder}: found {foreign[0]}, which mifit did not write as it is; move the folder away, or name another"
         )
     shutil.rmtree(folder)
+
+
+def add_folder(folder: Path, name: str, make: Callable[[Path], None], force: bool = False) -> Path:
+    """A folder within a claimed one, all of whose files ``make`` writes; it takes its name when all are there."""
+    claim(folder, force)
+    made = folder / MARK / name
+    shutil.rmtree(made, ignore_errors=True)  # of a process that was killed
+    make(made)
+    claim(made, force=True)
+    remember(made, files_in(made))
+    return made.rename(folder / name)
 
 
 @contextmanager
