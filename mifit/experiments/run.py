@@ -14,7 +14,8 @@ import os
 import platform
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -103,33 +104,31 @@ def _execute_all(
         for part in (run.experiment.fit, run.experiment.relight):
             if part and part.synth:
                 _synthetic_capture(part.synth, folder, variant)
-    if dask is not None:
-        yield from _execute_on_dask(arguments, dask)
+    with _executor(min(jobs, len(runs)), dask) as executor:
+        futures: dict[Future, Run] = {executor.submit(execute, *a): a[0] for a in arguments}
+        for future in as_completed(futures):
+            yield futures[future], future.exception()
+
+
+@contextmanager
+def _executor(jobs: int, dask: str | None) -> Iterator[Executor]:
+    """What runs go through: processes of this machine, or the workers of a Dask scheduler."""
+    if dask is None:
+        # A process per run, never a forked one: Mitsuba's threads don't survive a fork, and its memory goes with it.
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(jobs, mp_context=context, max_tasks_per_child=1) as pool:
+            yield pool
         return
-    # A process per run, never a forked one: Mitsuba's threads don't survive a fork, and its memory goes with it.
-    context = multiprocessing.get_context("spawn")
-    workers = min(jobs, len(runs))
-    with ProcessPoolExecutor(workers, mp_context=context, max_tasks_per_child=1) as pool:
-        waiting: dict[Future, Run] = {pool.submit(execute, *a): a[0] for a in arguments}
-        while waiting:
-            ended, _ = wait(waiting, return_when=FIRST_COMPLETED)
-            for future in ended:
-                yield waiting.pop(future), future.exception()
-
-
-def _execute_on_dask(arguments: Sequence[tuple], address: str) -> Iterator[tuple[Run, BaseException | None]]:
     try:
-        from distributed import Client, as_completed
+        from distributed import Client
+
+        client = Client(dask, timeout=20)
     except ModuleNotFoundError:
         raise InputError('--dask needs Dask: install it with pip install "mifit[cluster]"') from None
-    try:
-        client = Client(address, timeout=20)
     except (OSError, ValueError) as error:
-        raise InputError(f"--dask {address}: no Dask scheduler answers there ({error})") from None
-    with client:
-        futures = {client.submit(execute, *a, pure=False, key=f"mifit-{a[0].digest}"): a[0] for a in arguments}
-        for future in as_completed(list(futures)):
-            yield futures[future], future.exception()
+        raise InputError(f"--dask {dask}: no Dask scheduler answers there ({error})") from None
+    with client, client.get_executor(pure=False) as executor:
+        yield executor
 
 
 def _synthetic_capture(synth: SynthRun, folder: Path, variant: str) -> Path:
