@@ -27,8 +27,6 @@ class Camera:
 
     Parameters
     ----------
-    name : str
-        Camera identifier, e.g. ``"left"``.
     width, height : int
         Image size in pixels.
     fx, fy, cx, cy : float
@@ -73,24 +71,11 @@ class Camera:
         fov: float = 20.0,
         name: str = "view",
     ) -> Camera:
-        """A camera at a place that looks at a point, with square pixels and the principal point in the middle.
+        """A camera at ``eye`` that looks at ``target`` (3,), with square pixels and the principal point in the middle.
 
-        Parameters
-        ----------
-        eye, target : (3,)
-            World space.
-        up : (3,)
-            World direction that is up in the image; not along the view.
-        width, height : int
-            Pixels.
-        fov : float
-            Horizontal field of view in degrees, above 0 and below 180.
-        name : str
-
-        Raises
-        ------
-        InputError
-            A field of view out of range, or no view: eye at the target, or ``up`` along the view.
+        ``up`` is the world direction that is up in the image; ``fov`` the horizontal field of view in degrees, above 0
+        and below 180. InputError for a field of view out of range, or no view: eye at the target, or ``up`` along the
+        view.
         """
         if not 0.0 < fov < 180.0:
             raise InputError(f"fov: found {fov}, expected degrees above 0 and below 180")
@@ -126,17 +111,10 @@ class Camera:
             Degrees upwards, after the yaw.
         target : (3,)
             World point to move about.
-        up : (3,)
-            World direction of the axis.
         distance : float, optional
-            From the target, the capture's units; default: as it is.
+            From the target, the capture's units, above 0; default: as it is.
         name : str, optional
             Default: this camera's name with the angles.
-
-        Raises
-        ------
-        InputError
-            A distance that isn't positive.
         """
         if distance is not None and not distance > 0:
             raise InputError(f"distance: found {distance}, expected a number above 0")
@@ -182,8 +160,8 @@ class Camera:
     def with_square_pixels(self) -> Camera:
         """This view with rows as high as columns are wide, for programs that know square pixels only.
 
-        Centre, axes and fx stay, fy becomes fx, and the number of rows grows or shrinks with it, rounded up: shrunk or
-        stretched to the old height the image is this camera's, up to the last row's fraction.
+        Centre, axes and fx stay, fy becomes fx, and the number of rows changes with it, rounded up: scaled to the old
+        height the image is this camera's, up to the last row's fraction.
         """
         if self.fx == self.fy:
             return self

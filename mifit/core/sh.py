@@ -38,14 +38,10 @@ def basis(directions: ArrayLike, order: int) -> Array:
 
 
 def basis_gradient(directions: ArrayLike, order: int) -> tuple[Array, Array]:
-    """Evaluate the basis and its gradient at unit directions.
+    """The basis (..., B*B) and its gradient (..., B*B, 3) at unit directions.
 
-    Returns
-    -------
-    values : (..., B*B)
-    gradient : (..., B*B, 3)
-        Derivatives by x, y, z of the polynomials that ``drjit.sh_eval`` computes. Only the part along the sphere has
-        a meaning; project it where the direction is a normalised vector.
+    Derivatives are those by x, y, z of the polynomials that ``drjit.sh_eval`` computes. Only the part along the sphere
+    has a meaning; project it where the direction is a normalised vector.
     """
     values, gradient = _evaluate(directions, order, gradient=True)
     assert gradient is not None
@@ -193,15 +189,7 @@ def project_latlong(image: ArrayLike, order: int) -> Array:
 class SHLighting:
     """Distant lighting as real spherical harmonics of radiance, world axes (conventions at the top of this module).
 
-    Parameters
-    ----------
-    coefficients : (B*B, 3) float64
-        Linear Rec. 709 radiance.
-
-    Raises
-    ------
-    InputError
-        Another shape, or values that are not finite.
+    ``coefficients`` (B*B, 3) are linear Rec. 709; InputError for another shape, or values that are not finite.
     """
 
     coefficients: Array
@@ -220,10 +208,7 @@ class SHLighting:
     def from_envmap(cls, source: str | Path | ArrayLike, order: int = 3) -> SHLighting:
         """Project a lat-long environment map, a file (.hdr, .exr) or an array (H, W, 3) of linear radiance.
 
-        Raises
-        ------
-        InputError
-            A file that can't be read, a wrong shape, or pixels that are not finite.
+        InputError for a file that can't be read, a wrong shape, or pixels that are not finite.
         """
         if isinstance(source, (str, Path)):
             from mifit.core.image import read_environment

@@ -44,22 +44,17 @@ def export(
 
     Parameters
     ----------
-    result : Reconstruction
     format : {"glb", "obj", "ply", "mitsuba"}
-        ``glb``: binary glTF (`write_glb`). ``obj``: mesh in world space, ``.mtl`` and maps beside it. ``ply``: mesh
-        in world space with UVs, normals and vertex colours. ``mitsuba``: a scene with mifit's plugins and, as
+        ``glb``: binary glTF (`write_glb`). ``obj``: mesh in world space, ``.mtl`` and maps beside it. ``ply``: mesh in
+        world space with UVs, normals and vertex colours. ``mitsuba``: a scene with mifit's plugins and, as
         ``NAME_stock.xml``, one for plain Mitsuba, with their files in ``NAME_files``.
     path : path
         File to write; its suffix must be the format's.
-    timestep : int, optional
-        Default: the first that was fitted.
     mesh : {"fitted", "refined"}
         ``refined`` has the refined normals as shape; its displacement from the fitted mesh, in the result's units
         along that mesh's normals, is written as ``NAME_displacement.exr``.
     animate : bool
-        ``glb`` plays all timesteps; maps, and a refined mesh's shape, stay those of ``timestep``.
-    fps : float
-        Timesteps per second of that animation.
+        ``glb`` plays all timesteps, ``fps`` a second; maps, and a refined mesh's shape, stay those of ``timestep``.
     units : {"m", "cm", "mm"}, optional
         Of ``obj`` and ``ply``; default: the result's. ``glb`` is in metres, as glTF has it.
 

@@ -128,13 +128,9 @@ class Reconstruction:
     def save(self, folder: str | Path, force: bool = False) -> None:
         """Write the result folder (docs/formats.md), or replace the result that is in it.
 
-        A save that fails leaves the older result as it was. Files that mifit did not write, or that were changed since,
-        are never deleted.
-
-        Raises
-        ------
-        InputError
-            The folder holds other files and no result, and ``force`` isn't given.
+        A save that fails leaves the older result as it was. Files that mifit did not write, or that were changed
+        since, are never deleted. InputError where the folder holds other files and no result, and ``force`` isn't
+        given.
         """
         from mifit.output.scene import write_scene
         from mifit.result.writing import save
@@ -143,18 +139,10 @@ class Reconstruction:
 
     @classmethod
     def load(cls, folder: str | Path, model: MorphableModel | None = None) -> Reconstruction:
-        """Read a result folder.
+        """Read a result folder; ``model`` is the one that was fitted, where its file is no longer where
+        ``result.json`` says.
 
-        Parameters
-        ----------
-        folder : path
-        model : MorphableModel, optional
-            The model that was fitted, when its file is no longer where ``result.json`` says.
-
-        Raises
-        ------
-        InputError
-            The folder is no result, damaged, of another format version, or the model is another one.
+        InputError where the folder is no result, damaged, of another format version, or the model is another one.
         """
         from mifit.result.reading import load
 
@@ -169,28 +157,21 @@ class Reconstruction:
         samples: int | None = None,
         seed: int = 0,
     ) -> NDArray[np.float32]:
-        """Render one view.
+        """One view, (H, W, 4) float32: linear colour, not premultiplied, 0 where the model covers nothing, and its
+        coverage.
 
         Parameters
         ----------
         camera : Camera
             Undistorted camera in the capture's world space.
-        timestep : int
         method : {"full", "diffuse", "pca"}
-            ``pca`` is the stage-1 model (vertex albedo under its shading coefficients and ambient term),
-            ``diffuse`` the final geometry, normals and diffuse albedo without specular, ``full`` everything.
+            ``pca`` is the stage-1 model (vertex albedo under its shading coefficients and ambient term), ``diffuse``
+            the final geometry, normals and diffuse albedo without specular, ``full`` everything.
         integrator : {"local", "path"}
-            ``local`` shades the visible surface as the fit did; ``path`` traces paths through a Mitsuba scene
-            with shadows and interreflection.
+            ``local`` shades the visible surface as the fit did; ``path`` traces paths through a Mitsuba scene with
+            shadows and interreflection, by ``seed``.
         samples : int, optional
             ``local``: samples along one side of a pixel (default 2); ``path``: samples per pixel (default 64).
-        seed : int
-            For ``path``.
-
-        Returns
-        -------
-        (H, W, 4) float32
-            Linear colour (not premultiplied; 0 where the model covers nothing) and the model's coverage.
 
         Raises
         ------
@@ -210,19 +191,15 @@ class Reconstruction:
         samples: int = 16,
         skin: Skin | None = None,
     ) -> Any:
-        """A loaded Mitsuba scene of one timestep, to render and to differentiate.
+        """A loaded ``mi.Scene`` of one timestep (the first by default), to render and to differentiate.
 
         Parameters
         ----------
         integrator : str or dict
             A plugin: ``"path"``, ``"prb"``, ``"direct"`` or another of Mitsuba's, or ``"shdirect"``, which gets the
             fit's shading model and ambient term; or a dictionary as ``mi.load_dict`` takes it.
-        timestep : int, optional
-            Default: the first that was fitted.
         cameras : sequence of Camera, optional
             Default: the fitted cameras.
-        method : {"full", "diffuse", "pca"}
-            As in `render`.
         samples : int
             Samples per pixel where ``mi.render`` is given none.
         skin : callable, optional
@@ -230,20 +207,14 @@ class Reconstruction:
             ``specular`` (S, S), ``slopes`` (S, S, 3; normals as `blinnphong` corrects them) and ``normal`` (S, S, 3;
             the same for Mitsuba's ``normalmap``), and returns the BSDF as ``mi.load_dict`` takes it.
 
-        Returns
-        -------
-        mi.Scene
-            With ids that don't change: the BSDF ``skin``, the emitters ``light`` (``shenv``, or an ``envmap`` after
-            `relight` with an image) and ``light_1`` ... (compact lights), the shapes ``face`` and ``rest``, and sensors
-            ``camera_NAME``. So ``mi.traverse(scene)`` has ``skin.diffuse_reflectance.data`` (S, S, 3),
-            ``skin.specular_reflectance.data`` (S, S, 1), ``skin.normal_correction.data``, ``skin.exponent.value`` and
-            ``light.coefficients`` (B*B, 3). Lengths are in the result's units, colours linear, row 0 of textures at
-            v = 1 as in the maps.
-
-        Raises
-        ------
-        InputError
-            A timestep that was not fitted, a camera with lens distortion, or an integrator that can't be made.
+        Notes
+        -----
+        Ids don't change: the BSDF ``skin``, the emitters ``light`` (``shenv``, or an ``envmap`` after `relight` with
+        an image) and ``light_1`` ... (compact lights), the shapes ``face`` and ``rest``, and sensors ``camera_NAME``.
+        So ``mi.traverse(scene)`` has ``skin.diffuse_reflectance.data`` (S, S, 3), ``skin.specular_reflectance.data``
+        (S, S, 1), ``skin.normal_correction.data``, ``skin.exponent.value`` and ``light.coefficients`` (B*B, 3).
+        Lengths are in the result's units, colours linear, row 0 of textures at v = 1 as in the maps. InputError for a
+        timestep that was not fitted, a camera with lens distortion, or an integrator that can't be made.
         """
         from mifit.output.scene import load_result_scene
 
@@ -257,21 +228,9 @@ class Reconstruction:
     ) -> Camera:
         """A camera that looks at the face, with image size and focal length of the fitted cameras.
 
-        Parameters
-        ----------
-        yaw : float
-            Degrees about the vertical; 0 is straight from the front, positive ones see the head's left side.
-        pitch : float
-            Degrees upwards.
-        distance : float, optional
-            From the middle of the face, the result's units; default: that of the fitted cameras.
-        timestep : int, optional
-            Default: the first that was fitted.
-
-        Raises
-        ------
-        InputError
-            A result without cameras, or a distance that isn't positive.
+        ``yaw`` is in degrees about the vertical, 0 straight from the front, positive to see the head's left side;
+        ``pitch`` in degrees upwards; ``distance`` from the middle of the face in the result's units, by default that
+        of the fitted cameras. InputError for a result without cameras, or a distance that isn't positive.
         """
         from mifit.output.views import orbit_camera
 
@@ -292,28 +251,21 @@ class Reconstruction:
         exposure: Exposure = 1.0,
         rotations: Sequence[float | NDArray] | None = None,
     ) -> Reconstruction | list[Reconstruction]:
-        """Put the face under another light.
+        """The same face under another light.
 
         Parameters
         ----------
         lighting : path, (H, W, 3) array, SHLighting or Illumination
             A path or an array is a lat-long environment of linear radiance (``.hdr``, ``.exr``) in the axes of
-            Mitsuba's ``envmap``: +y up, the middle column towards +z. `SHLighting` replaces all light by its harmonics,
-            `Illumination` all of it, ambient term included.
+            Mitsuba's ``envmap``: +y up, the middle column towards +z. `SHLighting` replaces all light by its
+            harmonics, `Illumination` all of it, ambient term included; else that grows with the mean radiance.
         rotate : float or (3, 3)
             Turns the light about the vertical (+y) by degrees, or by a rotation R: what came from d comes from R d.
         exposure : float or "auto"
-            Factor on the radiance; by default the lighting is taken as it is. A capture doesn't tell how its exposure
-            relates to that of an environment file: ``"auto"`` keeps the mean luminance of the recovered lighting.
+            Factor on the radiance. A capture doesn't tell how its exposure relates to that of an environment file:
+            ``"auto"`` keeps the mean luminance of the recovered lighting.
         rotations : sequence, optional
-            Several values of ``rotate``, for which the environment is read and projected once.
-
-        Returns
-        -------
-        Reconstruction, or a list of one for each of ``rotations``
-            The same face; its `render` uses all of the environment, without tracing paths (``local``,
-            `appearance.environment`) or with (``path``).
-            The ambient term grows with the mean radiance, but for `Illumination`, which has its own.
+            Several values of ``rotate``, for which the environment is read and projected once; a list is returned.
 
         Raises
         ------
@@ -326,17 +278,10 @@ class Reconstruction:
         return lit[0] if rotations is None else lit
 
     def with_albedo(self, diffuse: ArrayLike) -> Reconstruction:
-        """The same face with another diffuse albedo.
+        """The same face with another diffuse albedo (S, S, 3), linear reflectance 0..1, row 0 at v = 1, of the old
+        one's size.
 
-        Parameters
-        ----------
-        diffuse : (S, S, 3)
-            Linear reflectance 0..1, row 0 at v = 1, of the size of ``reflectance.diffuse``.
-
-        Raises
-        ------
-        InputError
-            Another shape, values outside 0..1, or a result without reflectance.
+        InputError for another shape, values outside 0..1, or a result without reflectance.
         """
         return self._with_map("diffuse", diffuse)
 
@@ -362,11 +307,7 @@ class Reconstruction:
         """The same face in another light, taken as it is; see `relight` for environment maps.
 
         What the capture's own light left unexplained (``reflectance.relief``, ``residual``) is gone with it.
-
-        Raises
-        ------
-        InputError
-            A result without reflectance.
+        InputError for a result without reflectance.
         """
         if self.reflectance is None:
             raise InputError("illumination: this result has no reflectance; fit with --until reflectance")
@@ -473,13 +414,7 @@ class Reconstruction:
         return self.mesh.displacement[self.mesh.timesteps.index(timestep)]
 
     def with_refined_mesh(self) -> Reconstruction:
-        """This face on its refined mesh: `mesh` becomes model and geometry, for export or for rendering.
-
-        Raises
-        ------
-        InputError
-            The result has no refined mesh.
-        """
+        """This face on its refined mesh, which becomes model and geometry, for export or for rendering; InputError without one."""
         if self.mesh is None:
             raise InputError("this result has no refined mesh; fit with --until normals, which makes it")
         matrix = split_faces(self.model, self.mesh.subdivisions).matrix
