@@ -18,8 +18,10 @@ from scipy import linalg
 class System(Protocol):
     """What `minimize` needs to know of a linearisation."""
 
-    gradient: NDArray[np.float64]
-    """(n,) g = J^T r, half the gradient of the energy."""
+    @property
+    def gradient(self) -> NDArray[np.float64]:
+        """(n,) g = J^T r, half the gradient of the energy."""
+        ...
 
     def product(self, step: NDArray) -> NDArray[np.float64]:
         """H times a vector."""

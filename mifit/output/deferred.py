@@ -103,7 +103,7 @@ def shade_methods(
         if result.environment is not None and appearance.lobe.fresnel is not None:
             turn = result.environment_rotation
             light = EnvironmentLight(result.environment, np.eye(3) if turn is None else turn)
-            albedo, lobe, view = _vertex_albedo(result), appearance.lobe, surface.view
+            albedo, lobe, view = vertex_materials(result)[:, :3], appearance.lobe, surface.view
             shaded = light.shade(mesh.scene, points, material.normal, view, lobe, albedo, surface.group)
         else:
             occlusion = appearance.trace(mesh, points)
@@ -125,17 +125,6 @@ def _with_residual(
         return colour
     inside = mapped_faces(result)[surface.face, None]
     return np.where(inside, np.maximum(colour + _look_up(result.model, surface, residual), 0), colour)
-
-
-def _vertex_albedo(result: Reconstruction) -> NDArray[np.float32]:
-    """(V, 3) diffuse albedo at the vertices: the map's in the face area, the fitted model's elsewhere."""
-    model, reflectance = result.model, result.reflectance
-    assert reflectance is not None
-    albedo = np.clip(result.geometry.vertex_albedo, 0.0, 1.0).astype(np.float32)
-    inside = model.face_mask
-    uv = model.uv[model.faces_uv[inside].ravel()]
-    albedo[model.faces[inside].ravel()] = sample_map(reflectance.lit_diffuse, uv)
-    return albedo
 
 
 def _look_up(model: MorphableModel, surface: VisibleSurface, image: NDArray) -> NDArray:

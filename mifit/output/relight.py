@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mifit.appearance.illumination import Illumination
 from mifit.core.files import file_name, write_text
@@ -87,10 +88,8 @@ def _level(lighting: SHLighting) -> float:
 
 def _environment(source: str | Path | NDArray) -> NDArray[np.float32]:
     """A lat-long image of linear radiance, checked, of at most 512 rows: finer light makes no difference on skin."""
-    if isinstance(source, (str, Path)):
-        image = read_environment(source)
-    else:
-        image = check_environment("environment", np.asarray(source, np.float32))
+    named = isinstance(source, (str, Path))
+    image = read_environment(source) if named else check_environment("environment", np.asarray(source, np.float32))
     if image.shape[0] > 512:
         width = round(image.shape[1] * 512 / image.shape[0])
         image = np.asarray(cv2.resize(image, (width, 512), interpolation=cv2.INTER_AREA), np.float32)
@@ -102,8 +101,7 @@ def _rotation(value: float | NDArray) -> NDArray[np.float64]:
     if np.ndim(value) == 0:
         if not np.isfinite(value):
             raise InputError(f"rotation: found {value}, expected a finite angle in degrees")
-        angle = np.radians(float(value))
-        return np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        return Rotation.from_euler("y", float(value), degrees=True).as_matrix()
     turn = np.asarray(value, dtype=np.float64)
     if turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
         raise InputError(f"rotation: found {turn.tolist()}, expected degrees about +y or a rotation matrix (3, 3)")
@@ -226,8 +224,6 @@ def evaluate_relit(
     camera: str,
     rotate: float = 0.0,
     integrator: Literal["local", "path"] = "local",
-    samples: int = 64,
-    seed: int = 0,
 ) -> dict[str, Any]:
     """Errors of a relit result against photographs of the same head, in the same poses, under that environment.
 
@@ -257,7 +253,7 @@ def evaluate_relit(
             frame = capture.frame(name, t)
             vertices = lit.geometry.vertices[lit.index(t)]
             area = face_area(vertices, lit.model.faces, lit.model.face_mask, view) & frame.valid
-            shown = render_view(lit, view, t, method, integrator, samples if integrator == "path" else None, seed)
+            shown = render_view(lit, view, t, method, integrator)
             photographs.append(frame.image[area])
             renders.append(shown[area][:, :3])
         return np.concatenate(photographs), np.concatenate(renders)

@@ -414,7 +414,7 @@ class Reconstruction:
         return self.mesh.displacement[self.mesh.timesteps.index(timestep)]
 
     def with_refined_mesh(self) -> Reconstruction:
-        """This face on its refined mesh, which becomes model and geometry, for export or rendering; InputError without."""
+        """This face on its refined mesh, which becomes model and geometry, to export or render; InputError without."""
         if self.mesh is None:
             raise InputError("this result has no refined mesh; fit with --until normals, which makes it")
         matrix = split_faces(self.model, self.mesh.subdivisions).matrix
