@@ -88,8 +88,10 @@ def _level(lighting: SHLighting) -> float:
 
 def _environment(source: str | Path | NDArray) -> NDArray[np.float32]:
     """A lat-long image of linear radiance, checked, of at most 512 rows: finer light makes no difference on skin."""
-    named = isinstance(source, (str, Path))
-    image = read_environment(source) if named else check_environment("environment", np.asarray(source, np.float32))
+    if isinstance(source, (str, Path)):
+        image = read_environment(source)
+    else:
+        image = check_environment("environment", np.asarray(source, np.float32))
     if image.shape[0] > 512:
         width = round(image.shape[1] * 512 / image.shape[0])
         image = np.asarray(cv2.resize(image, (width, 512), interpolation=cv2.INTER_AREA), np.float32)

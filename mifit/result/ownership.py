@@ -187,7 +187,7 @@ def clear(folder: Path) -> None:
     shutil.rmtree(folder)
 
 
-def add_folder(folder: Path, name: str, make: Callable[[Path], None], force: bool = False) -> Path:
+def add_folder(folder: Path, name: str, make: Callable[[Path], object], force: bool = False) -> Path:
     """A folder within a claimed one, all of whose files ``make`` writes; it takes its name when all are there."""
     claim(folder, force)
     made = folder / MARK / name

@@ -301,7 +301,8 @@ class Reconstruction:
                 f"{name}: found shape {array.shape} with values {np.min(array):g} to {np.max(array):g}, "
                 f"expected {before.shape} with reflectances 0 to 1"
             )
-        return replace(self, reflectance=replace(self.reflectance, **{name: array}), residual=None)
+        change: dict[str, Any] = {name: array}
+        return replace(self, reflectance=replace(self.reflectance, **change), residual=None)
 
     def with_illumination(self, illumination: Illumination) -> Reconstruction:
         """The same face in another light, taken as it is; see `relight` for environment maps.
