@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from argparse import Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mifit.cli.arguments import say, tell, use_variant
 from mifit.cli.clips import capture_of
 from mifit.cli.console import console_progress
 from mifit.cli.results import judge
 from mifit.config import PRESETS, FitConfig, NormalsConfig, ReflectanceConfig, from_mapping
-from mifit.core.files import check_file
+from mifit.core.files import Document, check_file
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mifit.result import Reconstruction
 
 
-DEMO: dict[str, Any] = {"model": "builtin:coarse", "width": 340, "height": 240, "spp": 32, "timesteps": 3}
+DEMO: Document = {"model": "builtin:coarse", "width": 340, "height": 240, "spp": 32, "timesteps": 3}
 """Size of the capture that ``mifit demo`` makes: small enough for seconds, large enough to show a face."""
 
 
@@ -61,10 +61,10 @@ def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> No
             say(arguments, f"First picture, of the model before light and skin are found: {first[0]}")
 
     model, config = mifit.MorphableModel.load(DEMO["model"]), FitConfig(reflectance=ReflectanceConfig(texture_size=256))
-    options: dict[str, Any] = {"seed": arguments.seed, "progress": progress, "force": True, "watch": show}
+    options: Document = {"seed": arguments.seed, "progress": progress, "force": True, "watch": show}
     result = fit_into(out, capture, model, ("left", "right"), config=config, **options)
     remember(out, [path.name for path in first])  # after the fit, which clears away what a result before it left
-    judged: dict[str, Any] = {"timesteps": None, "passes": False, "fitted": False, "strict": False, "baseline": True}
+    judged: Document = {"timesteps": None, "passes": False, "fitted": False, "strict": False, "baseline": True}
     judged |= {"camera": "third", "region": "face", "capture": folder, "json": out / "third.json"}
     judge(Namespace(quiet=arguments.quiet, result=out, **judged), result, capture)
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from argparse import Namespace
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mifit.cli.arguments import tell, use_variant, writes
 from mifit.cli.console import console_progress
 from mifit.core.diagnostics import Diagnostic
+from mifit.core.files import Document
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -51,7 +52,7 @@ def _examine(arguments: Namespace) -> int:
     timesteps = choose_timesteps(capture, arguments.timesteps)
     found = check_capture(capture, model, cameras, timesteps)
     faults = [one for one in found if one.severity == "fault"]
-    figures: dict[str, Any] = {"cameras": {}}
+    figures: Document = {"cameras": {}}
     if capture.calibrated:
         figures["cameras"] = landmark_offsets(capture, model, cameras, timesteps)
         if not faults and not arguments.quick and len(cameras) > 1:
@@ -77,7 +78,7 @@ def _dense(
     cameras: Sequence[str],
     timesteps: Sequence[int],
     found: list[Diagnostic],
-) -> dict[str, Any]:
+) -> Document:
     """What dense matches between the views of a fitted face say of the calibration; findings are added to ``found``."""
     import mifit
     from mifit.extras.refine_cameras import refine_cameras
@@ -111,7 +112,7 @@ def model(arguments: Namespace) -> None:
             describe.save_preview(loaded, arguments.preview)
             print(f"Preview: {arguments.preview}")
     else:
-        options: dict[str, Any] = {"kind": arguments.kind} if arguments.kind else {}
+        options: Document = {"kind": arguments.kind} if arguments.kind else {}
         loaded = mifit.MorphableModel.load(arguments.source, **options)
         (with_eyes(loaded) if arguments.eyes else loaded).save(arguments.out)
         print(f"Model: {arguments.out}")

@@ -15,11 +15,13 @@ import unicodedata
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from mifit.core.limits import MAX_NAME_BYTES
 from mifit.errors import InputError
 
+Document = dict[str, Any]
+"""A JSON object."""
 FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
 """Error numbers that say that there is no room for what is written."""
 

@@ -30,7 +30,7 @@ from mifit.config import (
     several,
     text,
 )
-from mifit.core.files import check_file, file_digest, file_name
+from mifit.core.files import Document, check_file, file_digest, file_name
 from mifit.core.limits import MAX_IMAGE_BYTES, MAX_RUNS, MAX_SAMPLES, MAX_SEED, MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 
@@ -139,7 +139,7 @@ class Run:
     """
 
     experiment: Experiment
-    swept: dict[str, Any]
+    swept: Document
     digest: str
 
     @property
@@ -226,7 +226,7 @@ def _assign(table: dict, key: str, value: Any, where: str) -> None:
         table.pop(other, None)
 
 
-def _points(sweep: Any, where: str) -> Iterator[dict[str, Any]]:
+def _points(sweep: Any, where: str) -> Iterator[Document]:
     """The points of a sweep: the product of ``grid``'s lists, or the tables of ``list``; one point without a sweep."""
     if not isinstance(sweep, dict) or set(sweep) - {"grid", "list"} or len(sweep) > 1:
         raise InputError(f"{where}: sweep: found {sweep!r}, expected one table 'grid' or one list 'list'")
@@ -306,7 +306,7 @@ def _resolved(e: Experiment, folder: Path, where: str) -> Experiment:
 
 def _absolute(settings: Any, folder: Path) -> Any:
     """Settings whose paths are absolute, in their parts too."""
-    changed: dict[str, Any] = {}
+    changed: Document = {}
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
         if isinstance(value, (FitRun, SynthRun, RelightRun, RenderRun)):

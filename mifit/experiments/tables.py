@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from mifit.core.files import replacing
+from mifit.core.files import Document, replacing
 
 SUBJECTS = ("fit.capture", "fit.synth.seed")
 """Swept keys whose values are subjects: figures are averaged over them."""
@@ -24,18 +23,18 @@ class Group:
     of its 95 % confidence interval, None for a single subject.
     """
 
-    settings: dict[str, Any]
+    settings: Document
     subjects: int
     metrics: dict[str, tuple[float, float | None]]
 
 
-def over_subjects(rows: Sequence[dict[str, Any]]) -> list[Group]:
+def over_subjects(rows: Sequence[Document]) -> list[Group]:
     """Means and Student's t intervals over the subjects of every setting, in the order of the runs.
 
     ``rows`` are runs with ``swept`` and ``metrics``. Empty where no run names a subject; a metric that a subject lacks
     is left out.
     """
-    found: dict[str, list[dict[str, Any]]] = {}
+    found: dict[str, list[Document]] = {}
     for row in rows:
         if set(row["swept"]) & set(SUBJECTS):
             found.setdefault(str(_settings(row)), []).append(row)
@@ -47,7 +46,7 @@ def over_subjects(rows: Sequence[dict[str, Any]]) -> list[Group]:
     return groups
 
 
-def _settings(row: dict[str, Any]) -> dict[str, Any]:
+def _settings(row: Document) -> Document:
     return {key: value for key, value in row["swept"].items() if key not in SUBJECTS}
 
 
@@ -57,7 +56,7 @@ def interval(values: Sequence[float]) -> tuple[float, float | None]:
     return float(np.mean(values)), half
 
 
-def runs_table(rows: Sequence[dict[str, Any]]) -> list[str]:
+def runs_table(rows: Sequence[Document]) -> list[str]:
     """Lines of a Markdown table: a row for each run, its swept values and its metrics."""
     cells = [{k: f"{v:.4g}" for k, v in row["metrics"].items()} for row in rows]
     swept = [{k: str(v) for k, v in row["swept"].items()} for row in rows]
@@ -88,7 +87,7 @@ def _markdown(left: Sequence[dict[str, str]], right: Sequence[dict[str, str]]) -
     return [f"| {line} |" for line in lines]
 
 
-def draw(folder: Path, rows: Sequence[dict[str, Any]], groups: Sequence[Group]) -> None:
+def draw(folder: Path, rows: Sequence[Document], groups: Sequence[Group]) -> None:
     """Write a plot of every metric over the first swept setting, ``METRIC.svg``; a line for each of the other settings.
 
     Intervals are drawn where there are subjects. Nothing is written without matplotlib (extra ``bench``), or with fewer

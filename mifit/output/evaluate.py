@@ -110,7 +110,8 @@ def evaluate(
         capture = capture.with_estimate([*result.cameras, placed[0]])
     separated = separation_of(result, capture, camera) if passes else None
     per_timestep, posed = [], {}
-    whole, seen = defaultdict(Errors), defaultdict(Errors)
+    whole: dict[str, Errors] = defaultdict(Errors)
+    seen: dict[str, Errors] = defaultdict(Errors)
     progress("Evaluating", 0, len(steps))
     for done, timestep in enumerate(steps):
         found = compare(result, capture, camera, timestep, region, baseline=baseline)

@@ -8,14 +8,14 @@ import re
 import struct
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import mifit
-from mifit.core.files import replacing
+from mifit.core.files import Document, replacing
 from mifit.core.image import encode_png, to_8_bit
 from mifit.core.mesh import SplitMesh, part_of, split_at_seams, tangent_space_map, tangents, vertex_normals
 from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
@@ -36,8 +36,8 @@ class _Buffer:
 
     def __init__(self) -> None:
         self.data = bytearray()
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
+        self.views: list[Document] = []
+        self.accessors: list[Document] = []
 
     def view(self, data: bytes, target: int | None = None) -> int:
         self.data += b"\0" * (-len(self.data) % 4)
@@ -51,7 +51,7 @@ class _Buffer:
     def accessor(self, values: NDArray, kind: str, target: int | None = 34962, bounds: bool = False) -> int:
         """Append an array (N,) or (N, C); returns the accessor's index."""
         array = np.ascontiguousarray(values, dtype=kind)
-        entry: dict[str, Any] = {
+        entry: Document = {
             "bufferView": self.view(array.tobytes(), target),
             "componentType": _KINDS[array.dtype],
             "count": len(array),
@@ -131,7 +131,7 @@ def write_glb(
             primitives.append(_primitive(out, part, base, normals, targets, material, albedo))
     images, textures, skin = _skin(out, result, timestep, mesh, posed, normals)
     subject = Path(path).stem
-    head: dict[str, Any] = {"name": subject, "mesh": 0}
+    head: Document = {"name": subject, "mesh": 0}
     animations = []
     if animate:
         # A node that is animated may have no matrix.
@@ -145,8 +145,8 @@ def write_glb(
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation, geometry.translation[i] * metre
         head["matrix"] = pose.T.ravel().tolist()
-    nodes: list[dict[str, Any]] = [head]
-    cameras: list[dict[str, Any]] = []
+    nodes: list[Document] = [head]
+    cameras: list[Document] = []
     for camera in result.cameras:
         nodes.append(_camera_node(camera, len(cameras), metre))
         cameras.append(_camera(camera))
@@ -154,7 +154,7 @@ def write_glb(
         skin,
         {"name": "rest", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}},
     ]
-    document: dict[str, Any] = {
+    document: Document = {
         "asset": {"version": "2.0", "generator": f"mifit {mifit.__version__}"},
         "extensionsUsed": sorted({name for material in materials for name in material.get("extensions", {})}),
         "scene": 0,
@@ -197,7 +197,7 @@ def _primitive(
     targets: NDArray,
     material: int,
     albedo: NDArray,
-) -> dict[str, Any]:
+) -> Document:
     """One primitive: with texture coordinates and tangents, or of the material without maps with vertex colours."""
     n = normals[part.origin]
     attributes = {
@@ -210,7 +210,7 @@ def _primitive(
         attributes["TEXCOORD_0"] = out.accessor(part.uv * (1, -1) + (0, 1), "<f4")
     else:
         attributes["COLOR_0"] = out.accessor(albedo[part.origin], "<f4")
-    primitive: dict[str, Any] = {
+    primitive: Document = {
         "attributes": attributes,
         "indices": out.accessor(part.faces.ravel(), "<u2" if len(part.origin) <= 2**16 else "<u4", target=34963),
         "material": material,
@@ -222,7 +222,7 @@ def _primitive(
 
 def _skin(
     out: _Buffer, result: Reconstruction, timestep: int, mesh: SplitMesh, vertices: NDArray, normals: NDArray
-) -> tuple[list[dict], list[dict], dict[str, Any]]:
+) -> tuple[list[dict], list[dict], Document]:
     """Images, textures and material of the face area."""
     maps = surface_maps(result, timestep, skin=True)
     bent = tangent_space_map(maps.normal, vertices[mesh.origin], normals[mesh.origin], mesh, mapped_faces(result))
@@ -266,7 +266,7 @@ def _skin(
 
 def _animation(
     out: _Buffer, geometry: GeometryEstimate, rows: Sequence[int], seconds: NDArray, metre: float, full: NDArray
-) -> dict[str, Any]:
+) -> Document:
     """Pose and expression of node 0 over time, linear between timesteps."""
     times = out.accessor(seconds, "<f4", target=None, bounds=True)
     values = {
@@ -292,7 +292,7 @@ def _quaternions(rotations: NDArray) -> NDArray[np.float64]:
     return q * np.concatenate([[1.0], np.cumprod(turn)])[:, None]
 
 
-def _camera(camera: Camera) -> dict[str, Any]:
+def _camera(camera: Camera) -> Document:
     return {
         "name": camera.name,
         "type": "perspective",
@@ -304,13 +304,13 @@ def _camera(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _camera_node(camera: Camera, index: int, metre: float) -> dict[str, Any]:
+def _camera_node(camera: Camera, index: int, metre: float) -> Document:
     pose = camera.camera_to_world_opengl.copy()
     pose[:3, 3] *= metre
     return {"name": camera.name, "camera": index, "matrix": pose.T.ravel().tolist()}
 
 
-def _write(path: Path, document: dict[str, Any], binary: bytes) -> None:
+def _write(path: Path, document: Document, binary: bytes) -> None:
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     binary += b"\0" * (-len(binary) % 4)

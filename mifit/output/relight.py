@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mifit.appearance.illumination import Illumination
-from mifit.core.files import file_name, write_text
+from mifit.core.files import Document, file_name, write_text
 from mifit.core.image import check_environment, read_environment, to_8_bit, write_image
 from mifit.core.metrics import psnr, rmse
 from mifit.core.sh import LUMINANCE, SHLighting
@@ -124,7 +124,7 @@ def write_relit(  # noqa: PLR0913
     check: bool = False,
     seed: int = 0,
     progress: Progress = silent,
-) -> dict[str, Any]:
+) -> Document:
     """Write views of the first timestep under a measured environment.
 
     ``NAME.png`` (RGBA) is a camera's view, or ``NAME_NNN.png`` where the light is turned several times; ``relight.png``
@@ -195,7 +195,7 @@ def write_relit(  # noqa: PLR0913
             write_image(folder / "relight.png", sheet([first]))
             written.append("relight.png")
     progress("Relighting", total, total)
-    figures: dict[str, Any] = {
+    figures: Document = {
         "environment": Path(environment).name,
         "exposure": used,
         "capture_exposure": capture_exposure,
@@ -226,7 +226,7 @@ def evaluate_relit(
     camera: str,
     rotate: float = 0.0,
     integrator: Literal["local", "path"] = "local",
-) -> dict[str, Any]:
+) -> Document:
     """Errors of a relit result against photographs of the same head, in the same poses, under that environment.
 
     The two captures' exposures are not known to each other, so each method gets one factor on its brightness: the

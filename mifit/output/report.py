@@ -7,13 +7,13 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 import mifit
-from mifit.core.files import write_text
+from mifit.core.files import Document, write_text
 from mifit.core.image import to_8_bit
 from mifit.output.evaluate import Comparison, compare, face_area, held_out, rgba_8_bit
 from mifit.output.figures import (
@@ -54,7 +54,7 @@ def write_report(
     folder: str | Path,
     result: Reconstruction,
     capture: Capture,
-    evaluation: dict[str, Any] | None = None,
+    evaluation: Document | None = None,
     comparisons: Sequence[Comparison] = (),
 ) -> Path:
     """Write ``report.html`` into a folder, whole or not at all; returns the file.
@@ -137,7 +137,7 @@ def _grid(figures: Iterable[str]) -> str:
     return f'<div class="grid">{"".join(figures)}</div>'
 
 
-def _summary(result: Reconstruction, evaluation: dict[str, Any] | None) -> str:
+def _summary(result: Reconstruction, evaluation: Document | None) -> str:
     parts = []
     if evaluation is None:
         parts.append("<p>No held-out view was evaluated; <code>mifit evaluate</code> adds one to this page.</p>")
@@ -192,7 +192,7 @@ def _view3d(result: Reconstruction, timestep: int) -> str:
 
 
 def _comparison(
-    result: Reconstruction, capture: Capture, evaluation: dict[str, Any], comparisons: Sequence[Comparison]
+    result: Reconstruction, capture: Capture, evaluation: Document, comparisons: Sequence[Comparison]
 ) -> str:
     known = {found.timestep: found for found in comparisons}
     parts = [

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mifit.appearance.lobe import Lobe
 from mifit.core.arrays import write_ply
 from mifit.core.camera import Camera
-from mifit.core.files import write_text
+from mifit.core.files import Document, write_text
 from mifit.core.image import write_image
 from mifit.core.mesh import SplitMesh, interpolate, normalize, part_of, split_at_seams, vertex_normals
 from mifit.core.sh import SHLighting
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from mifit.result import Method, Reconstruction
 
 SAMPLES = Parameter("spp", 64)
-Skin = Callable[[Mapping[str, dict[str, Any]]], Mapping[str, Any]]
+Skin = Callable[[Mapping[str, Document]], Mapping[str, Any]]
 """Makes a BSDF's dictionary of those of the maps' textures."""
 
 
@@ -239,7 +239,7 @@ def scene_description(
     files: str,
     integrator: Mapping[str, Any] | None = None,
     samples: int | Parameter = SAMPLES,
-) -> dict[str, Any]:
+) -> Document:
     """The scene of `write_scene` as a plain dictionary (`render.description`), its files in the folder ``files``.
 
     Ids are ours, not the user's: ``skin`` and ``light`` (maps and lighting), ``light_1`` ... (compact lights),
@@ -248,7 +248,7 @@ def scene_description(
     if method == "pca":
         result = replace(result, reflectance=None, normals=None)
     path = {"type": "path", "max_depth": Parameter("max_depth", 5), "hide_emitters": True}
-    scene: dict[str, Any] = {"type": "scene", "integrator": path if integrator is None else dict(integrator)}
+    scene: Document = {"type": "scene", "integrator": path if integrator is None else dict(integrator)}
     for name, camera in zip(sensor_ids(cameras), cameras, strict=True):
         scene[name] = sensor_description(camera.with_square_pixels() if stock else camera, samples)
     scene["skin"] = _skin(result, files, stock)
@@ -282,18 +282,18 @@ def sensor_ids(cameras: Sequence[Camera]) -> list[str]:
     return ids
 
 
-def _texture(file: str, raw: bool = True) -> dict[str, Any]:
+def _texture(file: str, raw: bool = True) -> Document:
     return {"type": "bitmap", "filename": file, "raw": raw, "wrap_mode": "clamp"}
 
 
-def _skin(result: Reconstruction, files: str, stock: bool) -> dict[str, Any]:
+def _skin(result: Reconstruction, files: str, stock: bool) -> Document:
     found = _mapped(result.lobe, files, stock)
     if stock:
         return {"type": "normalmap", "normalmap": _texture(f"{files}/normal.exr"), "nested": found}
     return {**found, "normal_correction": _texture(f"{files}/slopes.exr")}
 
 
-def _mapped(lobe: Lobe, files: str, stock: bool) -> dict[str, Any]:
+def _mapped(lobe: Lobe, files: str, stock: bool) -> Document:
     """The BSDF of the maps with a lobe."""
     strength = _texture(f"{files}/specular.exr")
     if stock:
@@ -308,7 +308,7 @@ def _mapped(lobe: Lobe, files: str, stock: bool) -> dict[str, Any]:
     }
 
 
-def _vertex_albedo(stock: bool) -> dict[str, Any]:
+def _vertex_albedo(stock: bool) -> Document:
     """The BSDF of what has no maps: the fitted model's vertex albedo, without a lobe."""
     colour = {"type": "mesh_attribute", "name": "vertex_color"}
     if stock:
@@ -316,5 +316,5 @@ def _vertex_albedo(stock: bool) -> dict[str, Any]:
     return {"type": "blinnphong", "diffuse_reflectance": colour, "specular_reflectance": 0.0}
 
 
-def _shape(file: str, bsdf: dict[str, Any]) -> dict[str, Any]:
+def _shape(file: str, bsdf: Document) -> Document:
     return {"type": "ply", "filename": file, "flip_tex_coords": True, "bsdf": bsdf}

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.files import Document
 from mifit.core.image import SUFFIXES, read_image, to_8_bit
 from mifit.errors import InputError
 from mifit.output.compare import (
@@ -64,7 +65,7 @@ def score(
     fitted: Sequence[str] | None = None,
     model: MorphableModel | None = None,
     progress: Progress = silent,
-) -> dict[str, Any]:
+) -> Document:
     """Figures of the files of a folder, named as the module says, against a capture's photographs and truth.
 
     Regions are those of the photograph's landmarks: ``face`` (their hull), ``skin`` (without eyes and inner mouth;
@@ -97,7 +98,7 @@ def score(
     for name in cameras:
         capture.camera(name)
     found = _Files.of(folder, capture)
-    out: dict[str, Any] = {"capture": Path(capture.path).name, "fitted": list(cameras)}
+    out: Document = {"capture": Path(capture.path).name, "fitted": list(cameras)}
     jobs = len(found.views) + len(found.relit) + len(found.passes) + len(found.meshes)
     if not jobs:
         example = next((c for c in capture.cameras if c not in cameras), capture.cameras[-1])
@@ -201,7 +202,7 @@ class _Truths:
         return regions
 
 
-def _views(files: dict[tuple[str, int], Path], truth: _Truths) -> dict[str, Any]:
+def _views(files: dict[tuple[str, int], Path], truth: _Truths) -> Document:
     tallies: dict[str, dict[str, Errors]] = {}
     for (camera, timestep), path in files.items():
         frame = truth.capture.frame(camera, timestep)
@@ -264,7 +265,7 @@ def _read(path: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
     return image
 
 
-def summary(found: dict[str, Any]) -> str:
+def summary(found: Document) -> str:
     """The scores as lines of text."""
     lines = []
     for group, regions in found.get("views", {}).items():

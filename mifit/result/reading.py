@@ -27,7 +27,7 @@ from mifit.core.estimate import (
     Report,
     ResidualEstimate,
 )
-from mifit.core.files import read_text
+from mifit.core.files import Document, read_text
 from mifit.core.image import read_image, to_8_bit
 from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_LIGHTS, MAX_NUMBER, MAX_PIXELS
 from mifit.core.mesh import SplitMesh, split_at_seams, split_faces
@@ -92,7 +92,7 @@ def _load(folder: Path, model: MorphableModel | None) -> Reconstruction:
         raise InputError(f"{path}: holds a value of the wrong kind ({error}); fit again") from None
 
 
-def read_document(folder: Path) -> dict[str, Any]:
+def read_document(folder: Path) -> Document:
     """Parse ``result.json`` and check that it is one, of this version; InputError otherwise."""
     path = folder / "result.json"
     if not folder.is_dir():
@@ -117,7 +117,7 @@ def read_document(folder: Path) -> dict[str, Any]:
     return document
 
 
-def _load_model(entry: dict[str, Any], path: Path) -> MorphableModel:
+def _load_model(entry: Document, path: Path) -> MorphableModel:
     if not entry["source"]:
         raise InputError(
             f"{path}: doesn't say which file holds its model {entry['name']!r}; "
@@ -129,7 +129,7 @@ def _load_model(entry: dict[str, Any], path: Path) -> MorphableModel:
         raise InputError(f"{path}: the model it was fitted with can't be read: {error}") from None
 
 
-def _camera(entry: dict[str, Any]) -> Camera:
+def _camera(entry: Document) -> Camera:
     """A camera from the keys of `_camera_document`, all of its numbers finite and its sizes positive."""
     size, focal = (_array([entry[k] for k in keys], (2,), "camera") for keys in (("width", "height"), ("fx", "fy")))
     if not (size.min() >= 1 and size.prod() <= MAX_PIXELS and focal.min() > 0):
@@ -140,7 +140,7 @@ def _camera(entry: dict[str, Any]) -> Camera:
     return Camera(str(entry["name"]), int(size[0]), int(size[1]), fx, fy, cx, cy, pose)
 
 
-def _report(document: dict[str, Any], stage: str) -> Report:
+def _report(document: Document, stage: str) -> Report:
     entry = document["stages"][stage]
     energies = {k: [math.nan if x is None else float(x) for x in v] for k, v in entry["energies"].items()}
     return Report(entry["status"], energies, float(entry["seconds"]), _diagnostics(entry["warnings"]), entry["details"])
@@ -174,7 +174,7 @@ def _rotations(value: Any, count: int) -> NDArray[np.float64]:
     return out
 
 
-def _geometry(folder: Path, document: dict[str, Any], model: MorphableModel) -> GeometryEstimate:
+def _geometry(folder: Path, document: Document, model: MorphableModel) -> GeometryEstimate:
     entry, steps, lighting = document["model"], document["timesteps"], document["lighting"]
     identity = _array(entry["identity"], (model.identity.shape[2],), "identity")
     albedo = _array(entry["albedo"], (model.albedo_modes.shape[2],), "albedo")
@@ -259,7 +259,7 @@ def _read_maps(paths: Sequence[Path], channels: int) -> NDArray[np.float32]:
     return rows.extend(_read_map(path, channels, len(first)) for path in paths[1:])
 
 
-def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate | None:
+def _reflectance(folder: Path, document: Document) -> ReflectanceEstimate | None:
     if "reflectance" not in document["stages"]:
         return None
     lighting = document["lighting"]
@@ -299,7 +299,7 @@ def _reflectance(folder: Path, document: dict[str, Any]) -> ReflectanceEstimate 
     )
 
 
-def _labels(folder: Path, document: dict[str, Any]) -> dict[tuple[str, int], NDArray[np.uint8]]:
+def _labels(folder: Path, document: Document) -> dict[tuple[str, int], NDArray[np.uint8]]:
     """What images show, by camera and timestep: of those that the result keeps it of."""
     found = {}
     for camera in map(_camera, document["capture"]["cameras"]):
@@ -315,7 +315,7 @@ def _labels(folder: Path, document: dict[str, Any]) -> dict[tuple[str, int], NDA
     return found
 
 
-def _normals(folder: Path, document: dict[str, Any]) -> NormalsEstimate | None:
+def _normals(folder: Path, document: Document) -> NormalsEstimate | None:
     if "normals" not in document["stages"]:
         return None
     timesteps = [int(s["timestep"]) for s in document["timesteps"] if s["refined_normals"]]
@@ -324,7 +324,7 @@ def _normals(folder: Path, document: dict[str, Any]) -> NormalsEstimate | None:
     return NormalsEstimate(tuple(timesteps), _read_maps(paths, 3), _report(document, "normals"), tracked)
 
 
-def _residual(folder: Path, document: dict[str, Any], size: int) -> ResidualEstimate | None:
+def _residual(folder: Path, document: Document, size: int) -> ResidualEstimate | None:
     if "residual" not in document["stages"]:
         return None
     timesteps = [int(s["timestep"]) for s in document["timesteps"] if s["residual"]]
@@ -333,9 +333,7 @@ def _residual(folder: Path, document: dict[str, Any], size: int) -> ResidualEsti
     return ResidualEstimate(tuple(timesteps), radiance.all, _report(document, "residual"))
 
 
-def _mesh(
-    folder: Path, document: dict[str, Any], model: MorphableModel, geometry: GeometryEstimate
-) -> MeshEstimate | None:
+def _mesh(folder: Path, document: Document, model: MorphableModel, geometry: GeometryEstimate) -> MeshEstimate | None:
     if "mesh" not in document["stages"]:
         return None
     report = _report(document, "mesh")

@@ -17,7 +17,7 @@ import mifit
 from mifit.core.arrays import write_ply
 from mifit.core.camera import Camera
 from mifit.core.estimate import Report
-from mifit.core.files import file_name, replacing, write_bytes, write_text
+from mifit.core.files import Document, file_name, replacing, write_bytes, write_text
 from mifit.core.image import encode_png, write_image
 from mifit.core.mesh import SplitMesh, split_at_seams, split_faces, tangent_space_map, vertex_normals
 from mifit.core.process import on_all_cores
@@ -127,10 +127,10 @@ def write_data_png(path: Path, values: NDArray) -> None:
         temporary.write_bytes(encode_png(np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)))
 
 
-def _document(result: Reconstruction) -> dict[str, Any]:
+def _document(result: Reconstruction) -> Document:
     """``result.json`` as a dictionary."""
     geometry, reflectance = result.geometry, result.reflectance
-    lighting: dict[str, Any] = {
+    lighting: Document = {
         "order": 3,
         "shading": geometry.shading.tolist(),
         "shading_ambient": float(geometry.ambient),
@@ -196,12 +196,12 @@ def _source(source: str) -> str:
     return str(Path(source).resolve()) if source and not named and Path(source).exists() else source
 
 
-def _camera_document(camera: Camera) -> dict[str, Any]:
+def _camera_document(camera: Camera) -> Document:
     keys = ("name", "width", "height", "fx", "fy", "cx", "cy")
     return {k: getattr(camera, k) for k in keys} | {"world_to_camera": camera.world_to_camera.tolist()}
 
 
-def _report_document(report: Report) -> dict[str, Any]:
+def _report_document(report: Report) -> Document:
     return {
         "status": report.outcome,
         "seconds": report.seconds,
