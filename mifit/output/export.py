@@ -11,10 +11,9 @@ import numpy as np
 from mifit.core.arrays import write_ply
 from mifit.core.files import check_overwriting, write_bytes, write_text
 from mifit.core.image import encode_png, to_8_bit, write_image
-from mifit.core.mesh import part_of, split_at_seams, tangent_space_map, vertex_normals
 from mifit.errors import InputError
 from mifit.output.gltf import write_glb
-from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
+from mifit.output.surface import shape_of, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
     from mifit.result import Reconstruction
@@ -90,11 +89,10 @@ def export(
     elif format == "obj":
         _write_obj(result, path, timestep, factor, units or result.units)
     elif format == "ply":
-        split = split_at_seams(result.model)
-        vertices = result.geometry.vertices[result.index(timestep)]
-        normals = vertex_normals(vertices, result.model.faces)[split.origin]
-        albedo = result.geometry.vertex_albedo[split.origin]
-        write_ply(path, factor * vertices[split.origin], split.faces, normals, split.uv, albedo)
+        shape = shape_of(result, timestep)
+        split, at = shape.mesh, shape.mesh.origin
+        albedo = result.geometry.vertex_albedo[at]
+        write_ply(path, factor * shape.vertices[at], split.faces, shape.normals[at], split.uv, albedo)
     else:
         from mifit.output.scene import write_scene
 
@@ -103,23 +101,16 @@ def export(
 
 def _write_obj(result: Reconstruction, path: Path, timestep: int, factor: float, units: str) -> None:
     """OBJ with ``vt`` and ``vn``; what has maps and the rest are groups with a material each."""
-    model, i = result.model, result.index(timestep)
-    vertices = result.geometry.vertices[i]
-    normals = vertex_normals(vertices, model.faces)
-    mesh, mapped = split_at_seams(model), mapped_faces(result)
-    maps = surface_maps(result, timestep, skin=True)
-    rotation = result.geometry.rotation[i]
-    bent = tangent_space_map(
-        maps.normal, (vertices @ rotation)[mesh.origin], (normals @ rotation)[mesh.origin], mesh, mapped
-    )
-    stem = path.stem
+    model, shape, stem = result.model, shape_of(result, timestep), path.stem
+    mapped, maps = shape.mapped, surface_maps(result, timestep, skin=True)
+    bent = shape_of(result, timestep, world=False).tangent_map(maps.normal)
     write_image(path.with_name(f"{stem}_diffuse.png"), maps.diffuse)
     reflectance = np.clip(result.lobe.factor() * maps.specular / OBJ_SPECULAR, 0.0, 1.0)
     write_image(path.with_name(f"{stem}_specular.png"), reflectance)
     write_bytes(path.with_name(f"{stem}_normal.png"), encode_png(np.round(127.5 * (bent + 1)).astype(np.uint8)))
     write_image(path.with_name(f"{stem}_normal.exr"), 0.5 * (bent + 1))
     albedo = vertex_materials(result, skin=True)[:, :3]
-    rest = part_of(mesh, ~mapped) if not mapped.all() else None
+    rest = shape.parts().get("rest")
     grey = albedo[rest.origin].mean(0) if rest else np.full(3, 0.5)
     colour = " ".join(f"{c:.5f}" for c in np.clip(grey, 0, 1))
     specular = " ".join([f"{OBJ_SPECULAR:g}"] * 3)
@@ -136,10 +127,10 @@ def _write_obj(result: Reconstruction, path: Path, timestep: int, factor: float,
     lines = [f"# written by mifit; units {units}", f"mtllib {stem}.mtl"]
     lines += [
         f"v {x:.7g} {y:.7g} {z:.7g} {r:.4f} {g:.4f} {b:.4f}"
-        for (x, y, z), (r, g, b) in zip((factor * vertices).tolist(), codes.tolist(), strict=True)
+        for (x, y, z), (r, g, b) in zip((factor * shape.vertices).tolist(), codes.tolist(), strict=True)
     ]
     lines += [f"vt {u:.7g} {v:.7g}" for u, v in model.uv.tolist()]
-    lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in normals.tolist()]
+    lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in shape.normals.tolist()]
     for name, selected in (("skin", mapped), ("rest", ~mapped)):
         lines += [f"g {name}", f"usemtl {name}"]
         for f, t in zip((model.faces[selected] + 1).tolist(), (model.faces_uv[selected] + 1).tolist(), strict=True):

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 import mifit
 from mifit.core.files import Document, replacing
 from mifit.core.image import encode_png, to_8_bit
-from mifit.core.mesh import SplitMesh, part_of, split_at_seams, tangent_space_map, tangents, vertex_normals
-from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
+from mifit.core.mesh import SplitMesh, tangents
+from mifit.output.surface import Shape, shape_of, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
     from mifit.core.camera import Camera
@@ -108,8 +108,8 @@ def write_glb(
     i = result.index(timestep)
     metre = result.unit_mm / 1000.0
     rotation, scale = geometry.rotation[i], float(geometry.scale)
-    posed = (geometry.vertices[i] - geometry.translation[i]) @ rotation * metre
-    normals = vertex_normals(posed, model.faces)
+    shape = shape_of(result, timestep, world=False)
+    posed = shape.vertices * metre
     low, high = np.asarray(model.expression_bounds, dtype=np.float64).T
     full = np.where((low == 0) & np.isfinite(high) & (high > 0), high, 1.0)  # coefficient of a weight of 1
     weights = np.asarray(geometry.expression[i], dtype=np.float64) / full
@@ -120,16 +120,12 @@ def write_glb(
     base = posed - targets @ weights if len(weights) else posed
 
     out = _Buffer()
-    mesh = split_at_seams(model)
     albedo = vertex_materials(result, skin=True)[:, :3]
-    primitives = []
-    mapped = mapped_faces(result)
-    parts = {SKIN: mapped, REST: ~mapped}
-    for material, selected in parts.items():
-        if selected.any():
-            part = part_of(mesh, selected)
-            primitives.append(_primitive(out, part, base, normals, targets, material, albedo))
-    images, textures, skin = _skin(out, result, timestep, mesh, posed, normals)
+    kinds = {"face": SKIN, "rest": REST}
+    primitives = [
+        _primitive(out, part, base, shape.normals, targets, kinds[name], albedo) for name, part in shape.parts().items()
+    ]
+    images, textures, skin = _skin(out, result, timestep, shape)
     subject = Path(path).stem
     head: Document = {"name": subject, "mesh": 0}
     animations = []
@@ -221,11 +217,11 @@ def _primitive(
 
 
 def _skin(
-    out: _Buffer, result: Reconstruction, timestep: int, mesh: SplitMesh, vertices: NDArray, normals: NDArray
-) -> tuple[list[dict], list[dict], Document]:
+    out: _Buffer, result: Reconstruction, timestep: int, shape: Shape
+) -> tuple[list[Document], list[Document], Document]:
     """Images, textures and material of the face area."""
     maps = surface_maps(result, timestep, skin=True)
-    bent = tangent_space_map(maps.normal, vertices[mesh.origin], normals[mesh.origin], mesh, mapped_faces(result))
+    bent = shape.tangent_map(maps.normal)
     peak = max(float(maps.specular.max()), 1e-6)
     lobe = result.lobe
     # Plain Blinn-Phong reflects alike at all angles; a fitted Fresnel factor has Schlick's form, as glTF's has.

@@ -20,12 +20,12 @@ from mifit.core.arrays import write_ply
 from mifit.core.camera import Camera
 from mifit.core.files import Document, write_text
 from mifit.core.image import write_image
-from mifit.core.mesh import SplitMesh, interpolate, normalize, part_of, split_at_seams, vertex_normals
+from mifit.core.mesh import interpolate, normalize
 from mifit.core.sh import SHLighting
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.output.deferred import render_local, visible_surface
-from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
+from mifit.output.surface import Shape, mapped_faces, shape_of, surface_maps, vertex_materials
 from mifit.render.description import Parameter, to_mitsuba, to_xml
 from mifit.render.sensor import sensor_description
 from mifit.render.variant import check_active_variant
@@ -125,29 +125,16 @@ def render_path(
 
 
 def _write_files(result: Reconstruction, files: Path, timestep: int, method: Method) -> None:
-    model, geometry = result.model, result.geometry
     if method == "pca":
         result = replace(result, reflectance=None, normals=None)
-    vertices = geometry.vertices[result.index(timestep)]
-    normals = vertex_normals(vertices, model.faces)
-    mesh = split_at_seams(model)
+    shape, albedo = shape_of(result, timestep), vertex_materials(result)[:, :3]
     files.mkdir(parents=True, exist_ok=True)
-    albedo = vertex_materials(result)[:, :3]
-    for name, selected in _parts(result).items():
-        if selected.any():
-            part = part_of(mesh, selected)
-            write_ply(
-                files / f"{name}.ply",
-                vertices[part.origin],
-                part.faces,
-                normals[part.origin],
-                part.uv,
-                albedo[part.origin],
-                viewer_colours=False,
-            )
+    for name, part in shape.parts().items():
+        vertices, normals, colours = (values[part.origin] for values in (shape.vertices, shape.normals, albedo))
+        write_ply(files / f"{name}.ply", vertices, part.faces, normals, part.uv, colours, viewer_colours=False)
     maps = surface_maps(result, timestep)
     specular = maps.specular if method == "full" else np.zeros_like(maps.specular)
-    slopes = _slopes(result, timestep, maps.normal, vertices, normals, mesh)
+    slopes = _slopes(result, timestep, maps.normal, shape)
     bent = normalize(np.concatenate([slopes[..., :2], np.ones_like(slopes[..., :1])], axis=-1))
     write_image(files / "diffuse.exr", np.clip(maps.diffuse, 0, 1))
     write_image(files / "specular.exr", np.clip(specular, 0, 1))
@@ -162,20 +149,7 @@ def _write_files(result: Reconstruction, files: Path, timestep: int, method: Met
     write_image(files / "environment.exr", environment)
 
 
-def _parts(result: Reconstruction) -> dict[str, NDArray[np.bool_]]:
-    """(F,) faces of each shape, by its name: with maps, and without maps."""
-    mapped = mapped_faces(result)
-    return {"face": mapped, "rest": ~mapped}
-
-
-def _slopes(
-    result: Reconstruction,
-    timestep: int,
-    normal_object: NDArray,
-    vertices: NDArray,
-    normals: NDArray,
-    mesh: SplitMesh,
-) -> NDArray[np.float32]:
+def _slopes(result: Reconstruction, timestep: int, normal_object: NDArray, shape: Shape) -> NDArray[np.float32]:
     """(S, S, 3) refined normals as slopes along Mitsuba's shading frame; the third channel is 0.
 
     That frame has s along dp/du of the triangle, made perpendicular to the interpolated normal n, and t = n x s.
@@ -183,9 +157,9 @@ def _slopes(
     model = result.model
     size = normal_object.shape[0]
     rotation = result.geometry.rotation[result.index(timestep)]
-    texels = rasterize_uv(model.uv, model.faces_uv, size, mapped_faces(result))
-    n = normalize(interpolate(normals, model.faces, texels.face, texels.weights))
-    p, t = vertices[model.faces].astype(np.float64), model.uv[model.faces_uv].astype(np.float64)
+    texels = rasterize_uv(model.uv, model.faces_uv, size, shape.mapped)
+    n = normalize(interpolate(shape.normals, model.faces, texels.face, texels.weights))
+    p, t = shape.vertices[model.faces].astype(np.float64), model.uv[model.faces_uv].astype(np.float64)
     d1, d2 = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
     area = d1[:, :1] * d2[:, 1:] - d1[:, 1:] * d2[:, :1]
     along_u = (d2[:, 1:] * (p[:, 1] - p[:, 0]) - d1[:, 1:] * (p[:, 2] - p[:, 0])) * np.sign(area)
@@ -253,7 +227,7 @@ def scene_description(
         scene[name] = sensor_description(camera.with_square_pixels() if stock else camera, samples)
     scene["skin"] = _skin(result, files, stock)
     scene["face"] = _shape(f"{files}/face.ply", {"type": "ref", "id": "skin"})
-    if _parts(result)["rest"].any():
+    if not mapped_faces(result).all():
         scene["rest"] = _shape(f"{files}/rest.ply", _vertex_albedo(stock))
     if stock or result.environment is not None:
         scene["light"] = {"type": "envmap", "filename": f"{files}/environment.exr"}

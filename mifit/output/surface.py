@@ -16,7 +16,15 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.mesh import (
+    SplitMesh,
+    interpolate,
+    normalize,
+    part_of,
+    split_at_seams,
+    tangent_space_map,
+    vertex_normals,
+)
 from mifit.core.mesh_solve import factored_membrane
 from mifit.core.uv import TexelMap, rasterize_uv, sample_map
 
@@ -36,6 +44,39 @@ class SurfaceMaps:
     diffuse: NDArray[np.float32]
     specular: NDArray[np.float32]
     normal: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The mesh of one timestep as files hold it: ``vertices`` and unit ``normals`` (V, 3), and its split at the seams.
+
+    ``mapped`` (F,) are the faces with maps.
+    """
+
+    vertices: NDArray
+    normals: NDArray
+    mesh: SplitMesh
+    mapped: NDArray[np.bool_]
+
+    def parts(self) -> dict[str, SplitMesh]:
+        """The faces with maps, ``face``, and without, ``rest``, as far as there are any."""
+        both = {"face": self.mapped, "rest": ~self.mapped}
+        return {name: part_of(self.mesh, selected) for name, selected in both.items() if selected.any()}
+
+    def tangent_map(self, normals: NDArray) -> NDArray[np.float32]:
+        """A map of normals in this shape's space, in MikkTSpace tangent space (`core.mesh.tangent_space_map`)."""
+        at = self.mesh.origin
+        return tangent_space_map(normals, self.vertices[at], self.normals[at], self.mesh, self.mapped)
+
+
+def shape_of(result: Reconstruction, timestep: int, world: bool = True) -> Shape:
+    """The mesh of a timestep in world space, or as posed in object space, in the result's units."""
+    i, geometry = result.index(timestep), result.geometry
+    vertices = geometry.vertices[i]
+    if not world:
+        vertices = (vertices - geometry.translation[i]) @ geometry.rotation[i]
+    normals = vertex_normals(vertices, result.model.faces)
+    return Shape(vertices, normals, split_at_seams(result.model), mapped_faces(result))
 
 
 def surface_maps(result: Reconstruction, timestep: int, skin: bool = False) -> SurfaceMaps:

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.image import to_8_bit
-from mifit.core.mesh import part_of, split_at_seams, vertex_normals
 from mifit.core.sh import SHLighting, bands, cosine_coefficients
 from mifit.output.figures import jpeg_uri, png_uri
-from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
+from mifit.output.surface import shape_of, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
     from mifit.result import Reconstruction
@@ -25,21 +24,17 @@ def viewer_data(result: Reconstruction, timestep: int) -> str:
     Positions have 16 bits of the bounding sphere, normals 8, texture coordinates 16; the alpha of the vertex
     colour tells whether a face has maps (1) or none (0).
     """
-    model, geometry = result.model, result.geometry
-    i = result.index(timestep)
-    rotation, translation, scale = geometry.rotation[i], geometry.translation[i], geometry.scale
-    vertices = (geometry.vertices[i] - translation) @ rotation / scale
-    mesh = split_at_seams(model)
-    # Parts that share no vertex: with maps, and without.
-    mapped = mapped_faces(result)
-    parts = [part_of(mesh, selected) for selected in (mapped, ~mapped)]
+    model, shape = result.model, shape_of(result, timestep, world=False)
+    vertices, rotation = shape.vertices / result.geometry.scale, result.geometry.rotation[result.index(timestep)]
+    named = shape.parts()
+    parts = list(named.values())  # they share no vertex
     origin = np.concatenate([p.origin for p in parts])
     uv = np.concatenate([p.uv for p in parts])
     starts = np.cumsum([0, *(len(p.origin) for p in parts)])
-    kind = np.repeat([255, 0], np.diff(starts))
+    kind = np.repeat([255 if name == "face" else 0 for name in named], np.diff(starts))
     faces = np.concatenate([p.faces + start for p, start in zip(parts, starts, strict=False)])
     position = vertices[origin]
-    normals = vertex_normals(vertices, model.faces)[origin]
+    normals = shape.normals[origin]
     centre = (position.min(0) + position.max(0)) / 2
     radius = float(np.abs(position - centre).max())
     face_centre = vertices[np.unique(model.faces[model.face_mask])]
