@@ -85,7 +85,7 @@ def load_image(path: str | Path) -> Image:
 
 def decode_image(data: bytes, path: str | Path) -> Image:
     """Decode the content of an image file; ``path`` is for messages. See `load_image`."""
-    decode = {"exr": _decode_exr, "hdr": _decode_hdr, "raster": _decode_raster}[_kind(data, path)]
+    decode = {".exr": _decode_exr, ".hdr": _decode_hdr}.get(image_kind(data, path), _decode_raster)
     try:
         with decoding():
             return decode(data, path)
@@ -95,13 +95,19 @@ def decode_image(data: bytes, path: str | Path) -> Image:
         raise _damaged(path, error) from None
 
 
-def _kind(data: bytes, path: str | Path) -> str:
-    if data[:4] == b"\x76\x2f\x31\x01":
-        return "exr"
-    if data[:2] == b"#?":
-        return "hdr"
-    if data[:8] == b"\x89PNG\r\n\x1a\n" or data[:2] == b"\xff\xd8" or data[:4] in (b"II*\0", b"MM\0*"):
-        return "raster"
+def image_kind(data: bytes, path: str | Path) -> str:
+    """Suffix that belongs to an image file's content: ``.png``, ``.jpg``, ``.tif``, ``.exr`` or ``.hdr``."""
+    starts = {
+        b"\x76\x2f\x31\x01": ".exr",
+        b"#?": ".hdr",
+        b"\x89PNG\r\n\x1a\n": ".png",
+        b"\xff\xd8": ".jpg",
+        b"II*\0": ".tif",
+        b"MM\0*": ".tif",
+    }
+    for start, suffix in starts.items():
+        if data.startswith(start):
+            return suffix
     found = f"a file that starts with {data[:8]!r}" if data else "an empty file"
     raise InputError(f"{path}: found {found}, expected a PNG, JPEG, TIFF, EXR or HDR image")
 
@@ -187,14 +193,6 @@ def _float_image(colour: NDArray, alpha: NDArray | None) -> Image:
     pixels = np.ascontiguousarray(colour, dtype=np.float32)
     coverage = None if alpha is None else np.ascontiguousarray(alpha, dtype=np.float32)
     return Image(pixels, coverage, np.zeros(pixels.shape[:2], dtype=bool), 32)
-
-
-def image_kind(data: bytes, path: str | Path) -> str:
-    """Suffix that belongs to an image file's content: ``.png``, ``.jpg``, ``.tif``, ``.exr`` or ``.hdr``."""
-    kind = _kind(data, path)
-    if kind != "raster":
-        return f".{kind}"
-    return ".png" if data[:1] == b"\x89" else ".jpg" if data[:1] == b"\xff" else ".tif"
 
 
 def _exr_header(data: bytes) -> tuple[tuple[int, int], int]:
