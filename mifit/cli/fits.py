@@ -11,7 +11,7 @@ from mifit.cli.clips import capture_of
 from mifit.cli.console import console_progress
 from mifit.cli.results import judge
 from mifit.config import PRESETS, FitConfig, NormalsConfig, ReflectanceConfig, from_mapping
-from mifit.core.files import Document, check_file
+from mifit.core.files import Document, check_file, write_bytes
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 
@@ -48,7 +48,9 @@ def demo(arguments: Namespace) -> None:
 def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> None:
     """Fit two cameras of the demo's capture, judge by the third; a picture of the first step comes at once."""
     import mifit
+    from mifit.core.image import encode_png
     from mifit.fitting import fit_into
+    from mifit.output.views import beside
     from mifit.result.ownership import remember
 
     out: Path = arguments.out
@@ -57,7 +59,8 @@ def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> No
 
     def show(result: Reconstruction) -> None:
         if not first:
-            first.append(_first_picture(out, result, capture))
+            first.append(out / "first.png")
+            write_bytes(first[0], encode_png(beside(result, capture, result.cameras[0], result.timesteps[0])))
             say(arguments, f"First picture, of the model before light and skin are found: {first[0]}")
 
     model, config = mifit.MorphableModel.load(DEMO["model"]), FitConfig(reflectance=ReflectanceConfig(texture_size=256))
@@ -67,24 +70,6 @@ def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> No
     judged: Document = {"timesteps": None, "passes": False, "fitted": False, "strict": False, "baseline": True}
     judged |= {"camera": "third", "region": "face", "capture": folder, "json": out / "third.json"}
     judge(Namespace(quiet=arguments.quiet, result=out, **judged), result, capture)
-
-
-def _first_picture(out: Path, result: Reconstruction, capture: Capture) -> Path:
-    """Write a photograph of the first camera beside the fit laid over it; returns the file."""
-    import numpy as np
-
-    from mifit.core.files import write_bytes
-    from mifit.core.image import encode_png, to_8_bit
-    from mifit.output.evaluate import rgba_8_bit
-    from mifit.output.figures import overlay
-
-    camera, timestep = result.cameras[0], result.timesteps[0]
-    photograph = to_8_bit(capture.frame(camera.name, timestep).image)
-    linear = result.render(camera, timestep, result.methods[-1])
-    laid_over = overlay(photograph, rgba_8_bit(linear))
-    path = out / "first.png"
-    write_bytes(path, encode_png(np.concatenate([photograph, laid_over], axis=1)))
-    return path
 
 
 def fit(arguments: Namespace) -> int:

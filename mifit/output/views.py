@@ -90,31 +90,18 @@ def write_sequence(
     path: str | Path,
     start: float = 0.0,
     stop: float = 0.0,
-    timesteps: Sequence[int] | None = None,
     methods: Sequence[Method] | None = None,
     fps: float = 12.0,
     progress: Progress = silent,
 ) -> None:
-    """Animate the timesteps of a result, the face moving as it did while a camera turns about it.
+    """Animate the timesteps of a result in order of time, the face moving as it did while a camera turns about it.
 
-    Parameters
-    ----------
-    path : path
-        ``.mp4``, or ``.webp`` for an animated picture.
-    start, stop : float
-        Angles in degrees of the camera at the first and the last frame, as in a turntable around the first frame.
-    timesteps : sequence of int, optional
-        Default: all in order of time.
-    methods : sequence of str, optional
-        Shown side by side; default: the best that the result has.
-
-    Raises
-    ------
-    InputError
-        A timestep or method that the result lacks, another suffix, or no cameras.
+    ``.mp4``, or ``.webp`` for an animated picture. The camera turns between two angles in degrees, as in a turntable
+    around the first frame; ``methods`` are side by side, by default the best that the result has. InputError for a
+    method that the result lacks, another suffix, or no cameras.
     """
     check_moving(path)
-    steps = sorted(result.timesteps) if timesteps is None else timesteps
+    steps = sorted(result.timesteps)
     shown = tuple(result.methods[-1:] if methods is None else methods)
     for method in shown:
         if method not in result.methods:
@@ -151,12 +138,17 @@ def write_overlay(
     def frames() -> Iterable[NDArray[np.uint8]]:
         for k, timestep in enumerate(steps):
             progress(f"overlay {camera}", k, len(steps))
-            photograph = to_8_bit(capture.frame(camera, timestep).image)
-            linear = render_view(result, view, timestep, result.methods[-1], samples=1)
-            yield np.concatenate([photograph, overlay(photograph, rgba_8_bit(linear))], axis=1)
+            yield beside(result, capture, view, timestep)
         progress(f"overlay {camera}", len(steps), len(steps))
 
     write_video(path, frames(), fps)
+
+
+def beside(result: Reconstruction, capture: Capture, camera: Camera, timestep: int) -> NDArray[np.uint8]:
+    """(H, 2 W, 3) a photograph, and beside it the same one under the render."""
+    photograph = to_8_bit(capture.frame(camera.name, timestep).image)
+    linear = render_view(result, camera, timestep, result.methods[-1], samples=1)
+    return np.concatenate([photograph, overlay(photograph, rgba_8_bit(linear))], axis=1)
 
 
 def write_moving_pictures(
