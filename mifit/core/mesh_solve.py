@@ -50,10 +50,6 @@ class MeshUpdater:
         self._fixed_part = matrix[:, ~self.free]
         self._factor = spl.splu(matrix[:, self.free].tocsc()) if self.free.any() else None
 
-    def update(self, vertices: NDArray, normals: NDArray, iterations: int = 4) -> NDArray[np.float64]:
-        """New positions (V, 3) after some iterations, see `settle`."""
-        return self.settle(vertices, normals, iterations, 0.0)[0]
-
     def settle(
         self, vertices: NDArray, normals: NDArray, iterations: int, tolerance: float
     ) -> tuple[NDArray[np.float64], float]:
@@ -186,29 +182,19 @@ def displacement(texels: TexelMap, faces: NDArray, vertices: NDArray, moved: NDA
 
 
 def membrane(
-    vertices: NDArray,
-    faces: NDArray,
-    where: sp.spmatrix,
-    values: NDArray,
-    weight: NDArray,
-    stiffness: float,
-) -> NDArray[np.float64]:
-    """Vertex values (V, C) that fit known ones and otherwise are as flat as possible.
+    vertices: NDArray, faces: NDArray, where: sp.spmatrix, weight: NDArray, stiffness: float
+) -> Callable[[NDArray], NDArray[np.float64]]:
+    """A function that turns known values (N, C) into vertex values (V, C) that fit them and else are as flat as
+    possible.
 
     Minimises ``sum_i weight_i |(where x)_i - values_i|^2 + stiffness * tr(x' L x)`` with the cotangent Laplacian L of
     the mesh: an elastic sheet over the surface, whatever the atlas. ``where`` (N, V) interpolates from vertices to the
-    points where ``values`` (N, C) are known. A piece of the mesh without known values gets 0.
+    points where values are known. A piece of the mesh without known values gets 0. Nearly all of the time goes into
+    what doesn't depend on the values.
     """
-    return factored_membrane(vertices, faces, where, weight, stiffness)(values)
-
-
-def factored_membrane(
-    vertices: NDArray, faces: NDArray, where: sp.spmatrix, weight: NDArray, stiffness: float
-) -> Callable[[NDArray], NDArray[np.float64]]:
-    """`membrane` as a function of the values alone: nearly all of its time goes into what doesn't depend on them."""
     weighted = where.T @ sp.diags(np.asarray(weight, dtype=np.float64))
     flat = cotangent_laplacian(np.asarray(vertices, dtype=np.float64), faces)
-    floor = 1e-8 * float(flat.diagonal().max())
+    floor = 1e-8 * float(flat.diagonal().max())  # decides for pieces of which nothing is known
     system = weighted @ where + stiffness * (flat + floor * sp.identity(len(vertices)))
     factor = splu(sp.csc_matrix(system))
     return lambda values: factor.solve(np.asarray(weighted @ values, dtype=np.float64))

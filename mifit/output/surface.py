@@ -25,7 +25,7 @@ from mifit.core.mesh import (
     tangent_space_map,
     vertex_normals,
 )
-from mifit.core.mesh_solve import factored_membrane
+from mifit.core.mesh_solve import membrane
 from mifit.core.uv import TexelMap, rasterize_uv, sample_map
 
 if TYPE_CHECKING:
@@ -180,4 +180,4 @@ def _continuation(model: MorphableModel, whole: bool) -> tuple[NDArray, NDArray,
     if len(known) == count:
         return known, uv[known], lambda values: values
     where = sp.csr_matrix((np.ones(len(known)), (np.arange(len(known)), known)), (len(known), count))
-    return known, uv[known], factored_membrane(model.mean, model.faces, where, np.ones(len(known)), 1e-3)
+    return known, uv[known], membrane(model.mean, model.faces, where, np.ones(len(known)), 1e-3)

@@ -23,7 +23,7 @@ def test_known_ends_are_joined_by_a_line_and_the_unknown_piece_is_zero() -> None
     known = np.flatnonzero(np.isin(vertices[:, 0], (0, 20)))
     where = sp.csr_matrix((np.ones(4), (np.arange(4), known)), (4, len(vertices)))
     values = np.stack([vertices[known, 0] / 20, 1 - vertices[known, 0] / 20], axis=1)
-    found = membrane(vertices, faces, where, values, np.ones(4), 1e-6)
+    found = membrane(vertices, faces, where, np.ones(4), 1e-6)(values)
     np.testing.assert_allclose(found[:42, 0], vertices[:42, 0] / 20, atol=3e-3)  # right angles' cotangents are raised
     np.testing.assert_allclose(found[:42].sum(axis=1), 1.0, atol=1e-4)
     np.testing.assert_allclose(found[42:], 0.0, atol=1e-9)
@@ -32,5 +32,5 @@ def test_known_ends_are_joined_by_a_line_and_the_unknown_piece_is_zero() -> None
 def test_weights_decide_between_contradictions() -> None:
     vertices, faces = strip(3)
     where = sp.csr_matrix((np.ones(2), ([0, 1], [0, 0])), (2, len(vertices)))
-    found = membrane(vertices, faces, where, np.array([[0.0], [1.0]]), np.array([1.0, 3.0]), 1e-6)
+    found = membrane(vertices, faces, where, np.array([1.0, 3.0]), 1e-6)(np.array([[0.0], [1.0]]))
     np.testing.assert_allclose(found[:6], 0.75, atol=1e-4)

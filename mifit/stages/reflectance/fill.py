@@ -74,7 +74,7 @@ def blend_unseen(model: MorphableModel, texels: TexelMap, maps: NDArray, confide
     typical = np.median(found[certain], axis=0) if certain.any() else np.zeros(4)
     where = corner_matrix(model.faces, texels.face, texels.weights, model.n_vertices)
     sheet = (known[:, None] * found + TYPICAL * typical) / (known + TYPICAL)[:, None]
-    smooth = where @ membrane(model.mean, model.faces, where, sheet, known + TYPICAL, STIFFNESS)
+    smooth = where @ membrane(model.mean, model.faces, where, known + TYPICAL, STIFFNESS)(sheet)
     share = (known / (known + BLEND))[:, None]
     blended = share * found + (1.0 - share) * smooth
     blended[:, :3] = expected * np.exp(blended[:, :3])
