@@ -65,7 +65,7 @@ def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> No
 
     model, config = mifit.MorphableModel.load(DEMO["model"]), FitConfig(reflectance=ReflectanceConfig(texture_size=256))
     options: Document = {"seed": arguments.seed, "progress": progress, "force": True, "watch": show}
-    result = fit_into(out, capture, model, ("left", "right"), config=config, **options)
+    result = fit_into(out, capture, model, cameras=("left", "right"), config=config, **options)
     remember(out, [path.name for path in first])  # after the fit, which clears away what a result before it left
     judged: Document = {"timesteps": None, "passes": False, "fitted": False, "strict": False, "baseline": True}
     judged |= {"camera": "third", "region": "face", "capture": folder, "json": out / "third.json"}
