@@ -6,6 +6,7 @@ import json
 import math
 import warnings
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -251,12 +252,12 @@ def _read_map(path: Path, channels: int, size: int | None = None) -> NDArray[np.
     return np.ascontiguousarray(image, dtype=np.float32)
 
 
-def _read_maps(paths: Sequence[Path], channels: int) -> NDArray[np.float32]:
-    """Maps of one size, one after the other."""
+def _read_maps(folder: Path, name: str, timesteps: Sequence[int], channels: int) -> NDArray[np.float32]:
+    """The maps of a name, all of one size, one timestep after the other."""
+    paths = [folder / "maps" / f"{name}_{t:04d}.exr" for t in timesteps]
     first = _read_map(paths[0], channels)
     rows = Rows(len(paths), first.shape, np.float32)
-    rows.add(first)
-    return rows.extend(_read_map(path, channels, len(first)) for path in paths[1:])
+    return rows.extend(chain([first], (_read_map(path, channels, len(first)) for path in paths[1:])))
 
 
 def _reflectance(folder: Path, document: Document) -> ReflectanceEstimate | None:
@@ -264,8 +265,7 @@ def _reflectance(folder: Path, document: Document) -> ReflectanceEstimate | None
         return None
     lighting = document["lighting"]
     order = int(lighting["order"])
-    # Results of older versions have one light or none, and a lobe whose kind follows from the model.
-    lights = lighting["lights"] if "lights" in lighting else [lighting["key"]] if lighting.get("key") else []
+    lights = lighting["lights"]
     if len(lights) > MAX_LIGHTS:
         raise ValueError(f"lights: found {len(lights)}, expected at most {MAX_LIGHTS}")
     model = models.get(str(lighting["shading_model"]))
@@ -273,7 +273,7 @@ def _reflectance(folder: Path, document: Document) -> ReflectanceEstimate | None
     lobe = Lobe(
         _positive(lighting["exponent"], "exponent"),
         None if fresnel is None else float(_array(fresnel, (), "fresnel")),
-        bool(lighting.get("normalized", model.normalized)),
+        bool(lighting["normalized"]),
     )
     radiance = _array(lighting["radiance"], (order * order, 3), "radiance")
     ambient = float(_array(lighting["ambient"], (), "ambient"))
@@ -319,9 +319,10 @@ def _normals(folder: Path, document: Document) -> NormalsEstimate | None:
     if "normals" not in document["stages"]:
         return None
     timesteps = [int(s["timestep"]) for s in document["timesteps"] if s["refined_normals"]]
-    paths = [folder / "maps" / f"normal_object_{t:04d}.exr" for t in timesteps]
     tracked = {int(s["timestep"]): str(s["tracked"]) for s in document["timesteps"] if s["tracked"]}
-    return NormalsEstimate(tuple(timesteps), _read_maps(paths, 3), _report(document, "normals"), tracked)
+    return NormalsEstimate(
+        tuple(timesteps), _read_maps(folder, "normal_object", timesteps, 3), _report(document, "normals"), tracked
+    )
 
 
 def _residual(folder: Path, document: Document, size: int) -> ResidualEstimate | None:
@@ -347,14 +348,6 @@ def _mesh(folder: Path, document: Document, model: MorphableModel, geometry: Geo
         row = topology.matrix @ geometry.vertices[geometry.index(timestep)]
         row[mesh.origin] = _read_mesh(folder / "refined" / f"{timestep:04d}.ply", mesh)["vertices"]
         vertices.add(row)
-    heights = [folder / "maps" / f"displacement_{t:04d}.exr" for t in timesteps]
-    return MeshEstimate(
-        timesteps,
-        vertices.all,
-        topology.faces,
-        topology.faces_uv,
-        topology.uv,
-        _read_maps(heights, 1),
-        report,
-        subdivisions,
-    )
+    heights = _read_maps(folder, "displacement", timesteps, 1)
+    atlas = topology.faces, topology.faces_uv, topology.uv
+    return MeshEstimate(timesteps, vertices.all, *atlas, heights, report, subdivisions)
