@@ -110,7 +110,7 @@ def _rotation(value: float | NDArray) -> NDArray[np.float64]:
     return turn
 
 
-def write_relit(  # noqa: PLR0913
+def write_relit(
     result: Reconstruction,
     environment: str | Path,
     folder: str | Path,
@@ -120,7 +120,6 @@ def write_relit(  # noqa: PLR0913
     video: str | Path | None = None,
     fps: float = 12.0,
     integrator: Literal["local", "path"] = "local",
-    samples: int = 144,
     check: bool = False,
     seed: int = 0,
     progress: Progress = silent,
@@ -140,8 +139,8 @@ def write_relit(  # noqa: PLR0913
         As in `Reconstruction.relight`.
     video : path, optional
         ``.mp4`` or ``.webp`` to write the turning light to, ``fps`` rotations per second, in place of images.
-    integrator, samples, seed
-        ``local`` traces no paths; ``path`` traces so many per pixel. See `Reconstruction.render`.
+    integrator, seed
+        ``local`` traces no paths; ``path`` traces 144 per pixel. See `Reconstruction.render`.
     check : bool
         Compare both integrators in one small view: the first camera's at a quarter of the size.
 
@@ -178,7 +177,8 @@ def write_relit(  # noqa: PLR0913
                 surface, material = shared[c]
                 image = shade_methods(lits[k], surface, timestep, ("full",), material)["full"]
             else:
-                image = render_view(lits[k], camera, timestep, integrator=integrator, samples=samples, seed=seed)
+                samples = 144 if integrator == "path" else None
+                image = render_view(lits[k], camera, timestep, "full", integrator, samples, seed)
             images.append(image)
             if video is None:
                 number = f"_{k:03d}" if len(lits) > 1 else ""
@@ -205,15 +205,15 @@ def write_relit(  # noqa: PLR0913
         "files": written,
     }
     if check:
-        figures["check"] = _check(lits[0], views[0].resized(0.25), timestep, samples, seed)
+        figures["check"] = _check(lits[0], views[0].resized(0.25), timestep, seed)
     write_text(folder / "relight.json", json.dumps(figures, indent=1) + "\n")
     return figures
 
 
-def _check(lit: Reconstruction, camera: Camera, timestep: int, samples: int, seed: int) -> dict[str, float]:
+def _check(lit: Reconstruction, camera: Camera, timestep: int, seed: int) -> dict[str, float]:
     """Error of a fast view against the path-traced one, over the pixels that the head covers."""
     fast = render_view(lit, camera, timestep)
-    path = render_view(lit, camera, timestep, integrator="path", samples=samples, seed=seed)
+    path = render_view(lit, camera, timestep, integrator="path", samples=144, seed=seed)
     covered = (fast[..., 3] == 1) & (path[..., 3] > 0.99)
     a, b = to_8_bit(fast[..., :3])[covered][None], to_8_bit(path[..., :3])[covered][None]
     return {"psnr": psnr(a, b), "rmse": rmse(a, b)}

@@ -130,8 +130,8 @@ def test_relit_views_are_fast_and_can_be_checked_by_path_tracing(flat, variant, 
     assert 25 < found["check"]["psnr"] < 60
     assert found["exposure"] == pytest.approx(found["capture_exposure"])
     assert found["mean_radiance"] == pytest.approx(flat.lighting.coefficients[0] @ LUMINANCE / np.sqrt(4 * np.pi))
-    path = flat.relight(smooth_environment(), 20.0).render(flat.cameras[0], 0, integrator="path", samples=64)
-    found = write_relit(flat, tmp_path / "studio.hdr", out, flat.cameras[:1], [20.0], integrator="path", samples=64)
+    path = flat.relight(smooth_environment(), 20.0).render(flat.cameras[0], 0, integrator="path", samples=144)
+    found = write_relit(flat, tmp_path / "studio.hdr", out, flat.cameras[:1], [20.0], integrator="path")
     assert found["exposure"] == 1.0 and "check" not in found
     covered = path[..., 3] == 1
     shown = read_image(out / "left.png")[..., :3][covered]
