@@ -16,7 +16,6 @@ from mifit.cli.arguments import one_line
 from mifit.cli.console import drop_chatter
 from mifit.cli.options import build_parser as build_parser
 from mifit.core.files import FULL
-from mifit.core.process import keep_freed_memory
 from mifit.errors import InputError, MifitError
 
 
@@ -37,7 +36,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     arguments = parser.parse_args(argv)
     if argv is None:
-        keep_freed_memory()
         if not arguments.debug:
             drop_chatter()
             warnings.simplefilter("ignore", RuntimeWarning)  # of NumPy, in terms of arrays; results are checked

@@ -1,9 +1,8 @@
-"""What a process may use and print: processor cores, memory that is kept, what C libraries say while they decode."""
+"""What a process may use and print: processor cores, and what C libraries say while they decode."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -65,20 +64,6 @@ def one_blas_thread() -> Iterator[None]:
     """
     with threadpool_limits(1, user_api="blas"):
         yield
-
-
-def keep_freed_memory() -> bool:
-    """Keep what is freed for the arrays that come next; for programs that own their process. True where it took effect.
-
-    NumPy asks for each intermediate array anew. glibc gets those above some hundred kilobytes from the system and gives
-    them back: the system clears the pages every time, which takes longer than most sums over them.
-    """
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (OSError, AttributeError, TypeError):  # another C library
-        return False
-    trim, map_above = -1, -3  # glibc's M_TRIM_THRESHOLD and M_MMAP_THRESHOLD
-    return bool(mallopt(trim, 1 << 30)) and bool(mallopt(map_above, 1 << 25))
 
 
 _around: Callable[[], AbstractContextManager[None]] = nullcontext
