@@ -45,6 +45,7 @@ from mifit.core.estimate import (
     ReflectanceEstimate,
     ResidualEstimate,
 )
+from mifit.core.files import Document
 from mifit.core.process import one_blas_thread
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
@@ -97,7 +98,7 @@ class Source:
         return self.capture, self.model, self.cameras
 
     @property
-    def key(self) -> dict[str, Any]:
+    def key(self) -> Document:
         """All that a result depends on besides settings, as JSON values."""
         return {
             "version": mifit.__version__,
@@ -294,7 +295,7 @@ def fit_into(
     return result
 
 
-def _is_there(folder: Path, wanted: dict[str, Any], until: Stage) -> bool:
+def _is_there(folder: Path, wanted: Document, until: Stage) -> bool:
     """Whether the folder's result has all that is wanted; InputError when a new one would lose some of it."""
     document = read_document(folder)
     try:

@@ -24,6 +24,7 @@ from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, from_mapping
 from mifit.core.arrays import Rows
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, Report
+from mifit.core.files import Document
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.process import one_blas_thread
 from mifit.core.uv import TexelMap, bend, rasterize_uv, tangent_plane, transport, unbend
@@ -350,7 +351,7 @@ def extend(
     With a refiner its refined mesh is made too. With ``room``, in which the result's arrays lie, they aren't copied.
     """
     rows = {name: getattr(frame.geometry, name)[0] for name in PER_TIMESTEP["geometry"]}
-    parts: dict[str, Any] = {"geometry": _longer(result.geometry, "geometry", frame.timestep, rows, room)}
+    parts: Document = {"geometry": _longer(result.geometry, "geometry", frame.timestep, rows, room)}
     before = result.normals or NormalsEstimate((), frame.normal_object[None][:0], Report("converged"))
     seconds, warnings = before.report.seconds + frame.seconds, (*before.report.warnings, *frame.warnings)
     parts["normals"] = replace(
@@ -376,12 +377,12 @@ def _longer(estimate: Any, part: str, timestep: int, rows: Mapping[str, NDArray]
 
 def _without(result: Reconstruction, dropped: Sequence[int]) -> Reconstruction:
     """A result less some of its tracked timesteps."""
-    parts: dict[str, Any] = {}
+    parts: Document = {}
     for part, names in PER_TIMESTEP.items() if dropped else ():
         estimate = getattr(result, part)
         if estimate is not None:
             kept = [i for i, t in enumerate(estimate.timesteps) if t not in dropped]
-            arrays: dict[str, Any] = {}
+            arrays: Document = {}
             for name in names:
                 array = getattr(estimate, name)
                 arrays[name] = Rows(len(kept), array.shape[1:], array.dtype).extend(array[i] for i in kept)

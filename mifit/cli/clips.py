@@ -8,11 +8,11 @@ import shutil
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mifit.cli.arguments import say
 from mifit.cli.console import console_progress
-from mifit.core.files import read_text, write_text
+from mifit.core.files import Document, read_text, write_text
 from mifit.core.limits import MAX_DOCUMENT_BYTES
 from mifit.errors import InputError
 
@@ -67,7 +67,7 @@ def capture_of(arguments: Namespace) -> Path:
     return folder
 
 
-def _origin(arguments: Namespace) -> dict[str, Any]:
+def _origin(arguments: Namespace) -> Document:
     """What decides what a capture made of clips holds, as JSON values."""
     files = [*arguments.capture, *(arguments.board or []), *([arguments.calibration] if arguments.calibration else [])]
     known = {}
@@ -89,7 +89,7 @@ def _make(arguments: Namespace, paths: Sequence[Path], folder: Path) -> None:
     progress = console_progress(arguments.quiet)
     if arguments.calibration and arguments.board:
         raise InputError(f"--board: found with --calibration {arguments.calibration}, expected one of the two")
-    kinds: dict[str, Any] = {"videos": paths} if _are_videos(paths) else {"images": paths}
+    kinds: Document = {"videos": paths} if _are_videos(paths) else {"images": paths}
     sources = open_sources(kinds.get("videos", ()), kinds.get("images", ()))
     starts = start_times(arguments, sources, progress)
     if arguments.board:

@@ -10,6 +10,7 @@ from typing import Any
 
 import mifit
 from mifit.cli.arguments import READERS, Parser, whole
+from mifit.core.files import Document
 from mifit.core.limits import MAX_TIMESTEPS
 
 COMMON = """
@@ -306,7 +307,7 @@ def _add(parser: argparse.ArgumentParser, lines: str) -> None:
     for row in rows:
         kind = _KIND.fullmatch(row["kind"])
         assert kind is not None
-        options: dict[str, Any] = {"help": row["help"]} | _reader(kind["kind"])
+        options: Document = {"help": row["help"]} | _reader(kind["kind"])
         options |= {key: kind[key] for key in ("default", "metavar") if kind[key]}
         if row["name"].startswith("--"):
             options |= {"dest": row["dest"]} if row["dest"] else {}
@@ -316,7 +317,7 @@ def _add(parser: argparse.ArgumentParser, lines: str) -> None:
         parser.add_argument(row["name"], **options)
 
 
-def _reader(kind: str) -> dict[str, Any]:
+def _reader(kind: str) -> Document:
     """What argparse is told of a kind of argument."""
     if kind == "flag":
         return {"action": "store_true"}

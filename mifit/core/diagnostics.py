@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Literal
+
+from mifit.core.files import Document
 
 Severity = Literal["fault", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("fault", "warning", "note")
@@ -28,12 +30,12 @@ class Diagnostic:
     def __str__(self) -> str:
         return self.text
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Document:
         """Plain values for JSON."""
         return asdict(self)
 
     @classmethod
-    def of(cls, document: dict[str, Any]) -> Diagnostic:
+    def of(cls, document: Document) -> Diagnostic:
         """From `document`; ValueError for another severity, KeyError for a missing key."""
         code, text, severity, camera = (document[key] for key in ("code", "text", "severity", "camera"))
         if severity not in SEVERITIES:

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.files import Document
+
 
 @dataclass(frozen=True)
 class Photometry:
@@ -32,7 +34,7 @@ class Photometry:
         gain = np.array(self.gain.get(camera, (1.0, 1.0, 1.0)), dtype=np.float32)
         return gain * np.float32(self.exposure.get((camera, timestep), 1.0))
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Document:
         """As JSON values: ``gain`` by camera, ``exposure`` by camera and timestep."""
         exposure: dict[str, dict[str, float]] = {}
         for (camera, timestep), factor in self.exposure.items():

@@ -19,14 +19,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import mifit
 from mifit import cache
-from mifit.core.files import FULL, file_name, read_text, write_text
+from mifit.core.files import FULL, Document, file_name, read_text, write_text
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError, MifitError
 from mifit.experiments.plan import Experiment, Plan, Run, SynthRun, load_plan
@@ -84,7 +83,7 @@ def run_experiment(
     return summary
 
 
-def finished(folder: Path, run: Run) -> dict[str, Any] | None:
+def finished(folder: Path, run: Run) -> Document | None:
     """The record of a run that ended well, or None."""
     try:
         record = json.loads(read_text(folder / "run.json", MAX_SETTINGS_BYTES))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from mifit.core.camera import Camera
+from mifit.core.files import Document
 from mifit.core.image import to_8_bit
 from mifit.errors import InputError
 from mifit.output.compare import Errors, pass_region, separation, skin_region
@@ -60,7 +61,7 @@ def evaluate(
     baseline: bool = False,
     watch: Callable[[Comparison], None] | None = None,
     passes: bool = False,
-) -> dict[str, Any]:
+) -> Document:
     """Errors of renders against photographs over the face area, in 8-bit sRGB.
 
     The region is the same for all methods. A pixel of it that the fitted model doesn't cover counts as black; pixels
@@ -144,7 +145,7 @@ def evaluate(
     return out
 
 
-def _figures(errors: Mapping[str, Errors]) -> dict[str, Any]:
+def _figures(errors: Mapping[str, Errors]) -> Document:
     """Pixels, which all methods share, and figures by method."""
     pixels = next((e.pixels for e in errors.values()), 0)
     return {"region_pixels": pixels, "methods": {name: e.figures() for name, e in errors.items()}}

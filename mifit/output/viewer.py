@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import base64
 import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.files import Document
 from mifit.core.image import to_8_bit
 from mifit.core.sh import SHLighting, bands, cosine_coefficients
 from mifit.output.figures import jpeg_uri, png_uri
@@ -42,7 +43,7 @@ def viewer_data(result: Reconstruction, timestep: int) -> str:
     wide = len(origin) > 65535
     maps = surface_maps(result, timestep, skin=True)
     peak = max(float(maps.specular.max()), 1e-3)
-    data: dict[str, Any] = {
+    data: Document = {
         "vertices": len(origin),
         "position": _base64(np.round((position - centre) / radius * 32767), "<i2"),
         "uv": _base64(np.round(np.clip(uv, 0, 1) * 65535), "<u2"),
@@ -65,7 +66,7 @@ def viewer_data(result: Reconstruction, timestep: int) -> str:
     return json.dumps(data)
 
 
-def _lighting(result: Reconstruction) -> dict[str, Any]:
+def _lighting(result: Reconstruction) -> Document:
     """Recovered lighting as the view's shader wants it.
 
     9 coefficients of what white reflects, and for the lobe a lat-long picture of the lighting that is convolved with

@@ -14,6 +14,8 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from mifit.core.files import Document
+
 KINDS = {
     "blendbsdf": "bsdf",
     "blinnphong": "bsdf",
@@ -46,7 +48,7 @@ class Parameter:
     default: int | float | str
 
 
-def to_mitsuba(description: Mapping[str, Any]) -> dict[str, Any]:
+def to_mitsuba(description: Mapping[str, Any]) -> Document:
     """The description for ``mi.load_dict``: transforms as Mitsuba's, parameters as their defaults."""
     import mitsuba as mi
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mifit.core.files import Document
 from mifit.render.gbuffer import MESH_BUFFERS
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ class FirstHits:
 
     def __init__(self) -> None:
         self.sensor: mi.Sensor = None
-        self.kept: dict[tuple[int, int], dict[str, Any]] = {}
+        self.kept: dict[tuple[int, int], Document] = {}
 
     def find(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> tuple[Any, Any]:
         """The points that a sensor's rays meet, and the numbers of their rays; None where each ray has an entry."""

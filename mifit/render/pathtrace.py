@@ -8,12 +8,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
+from mifit.core.files import Document
 from mifit.render.gbuffer import make_mesh
 from mifit.render.sensor import make_sensor
 
@@ -64,7 +64,7 @@ class PathTracer:
         materials: dict[str, Material],
         environment: NDArray,
         max_depth: int = 4,
-        lamps: Sequence[dict[str, Any]] = (),
+        lamps: Sequence[Document] = (),
         specular: bool = True,
     ) -> None:
         import mitsuba as mi
@@ -86,7 +86,7 @@ class PathTracer:
         import mitsuba as mi
 
         spp = _stratified_count(spp)
-        content: dict[str, Any] = {"type": "scene", "environment": self._emitter, **self._lamps}
+        content: Document = {"type": "scene", "environment": self._emitter, **self._lamps}
         for i, surface in enumerate(surfaces):
             content[f"surface{i}"] = make_mesh(
                 surface.vertices,
@@ -110,8 +110,8 @@ def _stratified_count(spp: int) -> int:
     return side * (side - 1) if side * (side - 1) >= spp else side * side
 
 
-def _bsdf(material: Material, strength: float) -> dict[str, Any]:
-    def lobe(specular: float, roughness: NDArray) -> dict[str, Any]:
+def _bsdf(material: Material, strength: float) -> Document:
+    def lobe(specular: float, roughness: NDArray) -> Document:
         return {
             "type": "principled",
             "base_color": _texture(material.albedo),
@@ -131,7 +131,7 @@ def _bsdf(material: Material, strength: float) -> dict[str, Any]:
     }
 
 
-def _texture(values: NDArray) -> dict[str, Any]:
+def _texture(values: NDArray) -> Document:
     import mitsuba as mi
 
     data = np.ascontiguousarray(values, dtype=np.float32)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mifit.core.camera import Camera
+from mifit.core.files import Document
 from mifit.errors import InputError
 from mifit.render.description import Parameter, to_mitsuba
 
@@ -15,7 +16,7 @@ MITSUBA_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
 """OpenCV's camera axes (x right, y down) to Mitsuba's (x left, y up); both look along +z."""
 
 
-def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str = "multijitter") -> dict[str, Any]:
+def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str = "multijitter") -> Document:
     """The sensor of an undistorted camera, as a plain dictionary (`render.description`).
 
     Square pixels give Mitsuba's ``perspective``, others mifit's ``pinhole``; see `Camera.with_square_pixels` for what
@@ -25,7 +26,7 @@ def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str =
     if any(camera.distortion):
         raise InputError(f"camera {camera.name}: found lens distortion, expected an undistorted camera")
     if abs(camera.fx / camera.fy - 1.0) <= 1e-6:  # a thousandth of a pixel in 1000
-        lens: dict[str, Any] = {
+        lens: Document = {
             "type": "perspective",
             "fov": math.degrees(2.0 * math.atan(0.5 * camera.width / camera.fx)),
             "fov_axis": "x",

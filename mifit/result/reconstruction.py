@@ -26,6 +26,7 @@ from mifit.core.estimate import (
     Report,
     ResidualEstimate,
 )
+from mifit.core.files import Document
 from mifit.core.mesh import split_faces
 from mifit.core.sh import SHLighting, radiance_of_shading
 from mifit.errors import InputError
@@ -301,7 +302,7 @@ class Reconstruction:
                 f"{name}: found shape {array.shape} with values {np.min(array):g} to {np.max(array):g}, "
                 f"expected {before.shape} with reflectances 0 to 1"
             )
-        change: dict[str, Any] = {name: array}
+        change: Document = {name: array}
         return replace(self, reflectance=replace(self.reflectance, **change), residual=None)
 
     def with_illumination(self, illumination: Illumination) -> Reconstruction:

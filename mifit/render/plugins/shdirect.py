@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mifit.core.arrays import Recent
+from mifit.core.files import Document
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
 
@@ -79,7 +80,7 @@ def make() -> type:
             self.samples = int(props.get("samples", 256))
             self.bounce_albedo = float(props.get("bounce_albedo", 0.0))
             self.hide = bool(props.get("hide_emitters", False))
-            self._traced: dict[str, Any] = {}
+            self._traced: Document = {}
             self._hits = FirstHits()
             self._lobes = Recent[kernels.PreparedLobe](8)
 
