@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import filelock
 import numpy as np
 
-from mifit.appearance.illumination import Illumination, light_from
+from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.core.arrays import read_npz
 from mifit.core.diagnostics import Diagnostic
@@ -30,9 +30,9 @@ from mifit.core.files import replacing
 from mifit.core.photometry import Photometry
 
 T = TypeVar("T")
-RECORDS: dict[str, type] = {cls.__name__: cls for cls in (Report, Diagnostic, Illumination, Lobe)}
+RECORDS: dict[str, type] = {cls.__name__: cls for cls in (Report, Diagnostic, Illumination, DistantLight, Lobe)}
 """Dataclasses that an estimate may hold."""
-ARRAY, RECORD, LIGHT, PHOTOMETRY = "$array", "$record", "$light", "$photometry"
+ARRAY, RECORD, PHOTOMETRY = "$array", "$record", "$photometry"
 
 
 def digest(value: Any) -> str:
@@ -114,8 +114,6 @@ def _plain(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
         }
     if isinstance(value, Photometry):
         return {PHOTOMETRY: value.document()}
-    if hasattr(value, "document"):
-        return {LIGHT: value.document()}
     if isinstance(value, (tuple, list)):
         return [_plain(item, f"{name}.{k}", arrays) for k, item in enumerate(value)]
     return value.item() if isinstance(value, np.generic) else value
@@ -129,8 +127,6 @@ def _restored(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
         return value
     if ARRAY in value:
         return arrays[value[ARRAY]]
-    if LIGHT in value:
-        return light_from(value[LIGHT])
     if PHOTOMETRY in value:
         return Photometry.from_document(value[PHOTOMETRY])
     if RECORD in value:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from mifit.core.arrays import same
 from mifit.errors import InputError
@@ -119,8 +120,8 @@ class Camera:
         if distance is not None and not distance > 0:
             raise InputError(f"distance: found {distance}, expected a number above 0")
         centre, axis = np.asarray(target, dtype=np.float64), np.asarray(up, dtype=np.float64)
-        turn = _rotation(axis, yaw)
-        turn = _rotation(turn @ self.rotation[0], -pitch) @ turn
+        turn = _about(axis, yaw)
+        turn = _about(turn @ self.rotation[0], -pitch) @ turn
         away = turn @ (self.position - centre)
         if distance is not None:
             away *= distance / np.linalg.norm(away)
@@ -213,9 +214,6 @@ class Camera:
         return np.stack([x + 0.5, y + 0.5], axis=-1)
 
 
-def _rotation(axis: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
-    """(3, 3) rotation about an axis by the right-hand rule (Rodrigues)."""
-    x, y, z = axis / np.linalg.norm(axis)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    angle = math.radians(degrees)
-    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+def _about(axis: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
+    """(3, 3) rotation about an axis by the right-hand rule."""
+    return Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,14 +19,13 @@ from mifit.errors import InputError
 from mifit.output.compare import Errors, pass_region, separation, skin_region
 from mifit.output.deferred import shade_methods, visible_surface
 from mifit.output.placement import needs_resection, pose_head, resect
-from mifit.output.truth import TrueMesh, landmarks_of, true_mesh, true_passes
+from mifit.output.truth import landmarks_of, true_mesh, true_passes
 from mifit.progress import Progress, silent
 from mifit.render.image_based import BLENDS, image_based
 from mifit.render.visible import trace_mesh
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
-    from mifit.morphable import MorphableModel
     from mifit.result import Method, Reconstruction
 
 Region = Literal["face", "skin", "truth"]
@@ -199,7 +199,9 @@ def compare(
     if region == "face":
         area = face_area(vertices, model.faces, model.face_mask, view)
     elif region == "skin":
-        true = _true_mesh_or_none(capture, timestep, model)
+        true = None
+        with suppress(InputError):  # a truth whose faces nobody knows
+            true = true_mesh(capture, timestep, model)
         points, corners = (vertices, model.faces) if true is None else (true.vertices, true.faces)
         fitted = moments if true is None else None
         sight = image_based(
@@ -228,14 +230,6 @@ def compare(
     names = {blend: "image_based" if blend == BLENDS[0] else f"image_based_{blend}" for blend in BLENDS}
     blended = {names[blend]: to_8_bit(image) for blend, image in base.colours.items()}
     return Comparison(timestep, photograph, area, renders, blended, area & base.seen, off)
-
-
-def _true_mesh_or_none(capture: Capture, timestep: int, model: MorphableModel) -> TrueMesh | None:
-    """The true mesh; None where there is none, or none whose faces are known."""
-    try:
-        return true_mesh(capture, timestep, model)
-    except InputError:
-        return None
 
 
 def held_out(result: Reconstruction, found: Mapping[str, Any]) -> bool:

@@ -131,7 +131,7 @@ def _load_model(entry: Document, path: Path) -> MorphableModel:
 
 
 def _camera(entry: Document) -> Camera:
-    """A camera from the keys of `_camera_document`, all of its numbers finite and its sizes positive."""
+    """A camera from the keys of `writing.CAMERA`, all of its numbers finite and its sizes positive."""
     size, focal = (_array([entry[k] for k in keys], (2,), "camera") for keys in (("width", "height"), ("fx", "fy")))
     if not (size.min() >= 1 and size.prod() <= MAX_PIXELS and focal.min() > 0):
         raise ValueError(f"camera: found size {size.tolist()}, focal lengths {focal.tolist()}, expected positive ones")

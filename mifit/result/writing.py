@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 import mifit
 from mifit.core.arrays import write_ply
-from mifit.core.camera import Camera
 from mifit.core.estimate import Report
-from mifit.core.files import Document, file_name, replacing, write_bytes, write_text
+from mifit.core.files import Document, file_name, write_bytes, write_text
 from mifit.core.image import encode_png, write_image
 from mifit.core.mesh import SplitMesh, split_at_seams, split_faces, tangent_space_map, vertex_normals
 from mifit.core.process import on_all_cores
@@ -25,6 +24,8 @@ from mifit.result.ownership import replacing_files
 from mifit.result.reconstruction import Reconstruction
 
 FORMAT_VERSION = 1
+CAMERA = ("name", "width", "height", "fx", "fy", "cx", "cy", "world_to_camera")
+"""What is kept of a camera; images are undistorted when they are read."""
 
 
 def label_file(camera: str, timestep: int) -> Path:
@@ -48,7 +49,7 @@ def save(result: Reconstruction, folder: Path, write_scene: Callable[[Path], Non
                     files.append(partial(write_image, new / "maps" / f"{name}.exr", found))
             files.append(partial(write_image, new / "lighting.exr", result.lighting.to_latlong()))
             for (camera, timestep), labels in zip(result.reflectance.labelled, result.reflectance.labels, strict=True):
-                files.append(partial(_write_labels, new / label_file(camera, timestep), labels))
+                files.append(partial(write_bytes, new / label_file(camera, timestep), encode_png(labels)))
         on_all_cores(lambda write: write(), files)
         if result.geometry.displacement is not None:
             np.savez(new / "geometry" / "displacement.npz", displacement=result.geometry.displacement)
@@ -106,7 +107,8 @@ def _write_timestep(result: Reconstruction, folder: Path, timestep: int, surface
             refined, (vertices @ rotation)[at], (normals @ rotation)[at], fitted.mesh, result.model.face_mask
         )
         write_image(folder / "maps" / f"normal_object_{timestep:04d}.exr", refined)
-        write_data_png(folder / "maps" / f"normal_tangent_{timestep:04d}.png", 0.5 + 0.5 * tangent)
+        codes = np.round(255 * np.clip(0.5 + 0.5 * tangent, 0, 1)).astype(np.uint8)  # no colours: no transfer curve
+        write_bytes(folder / "maps" / f"normal_tangent_{timestep:04d}.png", encode_png(codes))
     residual = None if result.residual is None else result.residual.at(timestep)
     if residual is not None:
         write_image(folder / "maps" / f"residual_{timestep:04d}.exr", residual)
@@ -115,16 +117,6 @@ def _write_timestep(result: Reconstruction, folder: Path, timestep: int, surface
         vertices = result.mesh.vertices[k]
         surfaces[1].write(folder, timestep, vertices, vertex_normals(vertices, result.mesh.faces))
         write_image(folder / "maps" / f"displacement_{timestep:04d}.exr", result.mesh.displacement[k])
-
-
-def _write_labels(path: Path, labels: NDArray[np.uint8]) -> None:
-    write_bytes(path, encode_png(labels))
-
-
-def write_data_png(path: Path, values: NDArray) -> None:
-    """Write values 0..1 that are no colours (normals) as an 8-bit PNG without a transfer curve."""
-    with replacing(path) as temporary:
-        temporary.write_bytes(encode_png(np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)))
 
 
 def _document(result: Reconstruction) -> Document:
@@ -153,7 +145,7 @@ def _document(result: Reconstruction) -> Document:
                 "digest": result.capture_digest,
                 "units": result.units,
                 "unit_mm": result.unit_mm,
-                "cameras": [_camera_document(c) for c in result.cameras],
+                "cameras": [{k: getattr(c, k) for k in CAMERA} for c in result.cameras],
                 "photometry": geometry.photometry.document(),
                 "landmark_noise": float(geometry.landmark_noise),
                 "face_width": float(geometry.face_width),
@@ -194,11 +186,6 @@ def _source(source: str) -> str:
     """A model's source that still holds when the working folder changes."""
     named = source.partition(":")[0] == "builtin"
     return str(Path(source).resolve()) if source and not named and Path(source).exists() else source
-
-
-def _camera_document(camera: Camera) -> Document:
-    keys = ("name", "width", "height", "fx", "fy", "cx", "cy")
-    return {k: getattr(camera, k) for k in keys} | {"world_to_camera": camera.world_to_camera.tolist()}
 
 
 def _report_document(report: Report) -> Document:
