@@ -179,11 +179,9 @@ def compare(
     camera: str,
     timestep: int,
     region: Region = "face",
-    methods: tuple[Method, ...] | None = None,
-    oversampling: int = 2,
     baseline: bool = False,
 ) -> Comparison:
-    """Render one view by some methods (default: all) and find the region in which to compare it; see `evaluate`."""
+    """Render one view by all methods and find the region in which to compare it; see `evaluate`."""
     capture = located(capture, result, camera)
     view = capture.camera(camera)
     shown, moments, off = result, None, None
@@ -193,8 +191,7 @@ def compare(
     elif timestep not in capture.timesteps:
         raise InputError(f"timestep {timestep} is not in the capture; it has {', '.join(map(str, capture.timesteps))}")
     frame = capture.frame(camera, timestep)
-    surface = visible_surface(shown, view, timestep, oversampling)
-    linear = shade_methods(shown, surface, timestep, methods or shown.methods)
+    linear = shade_methods(shown, visible_surface(shown, view, timestep), timestep, shown.methods)
     model, vertices = shown.model, shown.geometry.vertices[shown.index(timestep)]
     if region == "face":
         area = face_area(vertices, model.faces, model.face_mask, view)
@@ -202,11 +199,8 @@ def compare(
         true = None
         with suppress(InputError):  # a truth whose faces nobody knows
             true = true_mesh(capture, timestep, model)
-        points, corners = (vertices, model.faces) if true is None else (true.vertices, true.faces)
-        fitted = moments if true is None else None
-        sight = image_based(
-            capture, shown.cameras, view, timestep, points, corners, moments=fitted, oversampling=oversampling
-        )
+        mesh = (vertices, model.faces, None, moments) if true is None else (true.vertices, true.faces)
+        sight = image_based(capture, shown.cameras, view, timestep, *mesh, oversampling=2)
         area = skin_region(landmarks_of(capture, camera, timestep), view) & sight.seen
     elif region == "truth":
         truth = true_mesh(capture, timestep, result.model)
@@ -226,7 +220,7 @@ def compare(
     if not baseline:
         return Comparison(timestep, photograph, area, renders, landmark_pixels=off)
     given = capture, shown.cameras, view, timestep, vertices, model.faces
-    base = image_based(*given, moments=moments, blends=BLENDS, oversampling=oversampling)
+    base = image_based(*given, moments=moments, blends=BLENDS, oversampling=2)
     names = {blend: "image_based" if blend == BLENDS[0] else f"image_based_{blend}" for blend in BLENDS}
     blended = {names[blend]: to_8_bit(image) for blend, image in base.colours.items()}
     return Comparison(timestep, photograph, area, renders, blended, area & base.seen, off)
