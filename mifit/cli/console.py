@@ -14,12 +14,11 @@ from mifit.core.process import set_decoding_context
 from mifit.progress import Progress, silent
 
 
-def console_progress(quiet: bool = False, stream: TextIO | None = None) -> Progress:
+def console_progress(quiet: bool = False) -> Progress:
     """Progress callable for the command line; silent when ``quiet``."""
     if quiet:
         return silent
-    out = stream or sys.stderr
-    return _bars(out) if out.isatty() else _lines(out)
+    return _bars(sys.stderr) if sys.stderr.isatty() else _lines(sys.stderr)
 
 
 def drop_chatter() -> None:

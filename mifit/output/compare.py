@@ -104,8 +104,9 @@ def _figures(sums: NDArray, pixels: int) -> dict[str, float]:
     return {**figures, "pixels": pixels}
 
 
-def _around(region: Region, margin: int = 48) -> tuple[slice, slice]:
+def _around(region: Region) -> tuple[slice, slice]:
     """The region's box with a margin wider than any window of a measure."""
+    margin = 48
     sides = [np.flatnonzero(region.any(axis=axis)) for axis in (1, 0)]
     low = [max(int(side[0]) - margin, 0) for side in sides]
     return slice(low[0], int(sides[0][-1]) + margin + 1), slice(low[1], int(sides[1][-1]) + margin + 1)

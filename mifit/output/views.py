@@ -61,7 +61,6 @@ def write_turntable(
     start: float = -35.0,
     stop: float = 35.0,
     steps: int = 7,
-    timestep: int | None = None,
     progress: Progress = silent,
 ) -> None:
     """Write views about the vertical axis with and without specular, as in the paper's figure of novel views.
@@ -70,7 +69,7 @@ def write_turntable(
     row per method, and ``turntable.webp``, an animation. A result of stage 1 alone gives ``pca_NN.png``.
     """
     folder = Path(folder)
-    timestep = result.timesteps[0] if timestep is None else timestep
+    timestep = result.timesteps[0]
     methods: tuple[Method, ...] = ("full", "diffuse") if result.reflectance is not None else ("pca",)
     rows: dict[Method, list[NDArray]] = {m: [] for m in methods}
     angles = np.linspace(start, stop, steps)

@@ -51,8 +51,6 @@ class PathTracer:
     ----------
     environment : (H, W, 3)
         Lat-long radiance in Mitsuba's ``envmap`` layout: row 0 up, u = 0 along -z, u = 1/4 along +x.
-    max_depth : int
-        Longest path in segments; 4 is two bounces of light between skin and skin.
     lamps : sequence of dict
         Emitters beside the environment, as Mitsuba's dictionaries.
     specular : bool
@@ -63,7 +61,6 @@ class PathTracer:
         self,
         materials: dict[str, Material],
         environment: NDArray,
-        max_depth: int = 4,
         lamps: Sequence[Document] = (),
         specular: bool = True,
     ) -> None:
@@ -73,7 +70,7 @@ class PathTracer:
         bitmap = mi.Bitmap(np.ascontiguousarray(environment, dtype=np.float32))
         self._emitter = mi.load_dict({"type": "envmap", "bitmap": bitmap})
         self._lamps = {f"lamp{i}": mi.load_dict(lamp) for i, lamp in enumerate(lamps)}
-        self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
+        self._integrator = mi.load_dict({"type": "path", "max_depth": 4, "hide_emitters": True})  # two bounces
 
     def render(
         self, surfaces: Sequence[Surface], cameras: Sequence[Camera], spp: int, seed: int
