@@ -151,7 +151,7 @@ MUTATIONS = (
     M("refined normals turned the wrong way for the residual", "find_residual._difference", "rotation.T", "rotation",
       "tests/stages/test_find_residual.py"),
     # Solvers.
-    M("a step that raises the energy is taken", "minimize.TrustRatio.judge", "self.minimum_ratio", "-10.0",
+    M("a step that raises the energy is taken", "minimize.trust", "1e-4", "-10.0",
       "tests/optim/test_solve.py"),
     M("Geman and McClure's weight not squared", "robust.geman_mcclure", "q * q", "q", "tests/optim/test_solve.py"),
     # Paper.
@@ -162,7 +162,7 @@ MUTATIONS = (
     # What is kept.
     M("the cache's key without what a step is given", "fitting.keys", "{part: current[part] for part in step.inputs}",
       "{}", "tests/test_fitting.py tests/test_pipeline.py"),
-    M("residual shown under another light", "record.Result.with_illumination",
+    M("residual shown under another light", "reconstruction.Reconstruction.with_illumination",
       "replace(self, reflectance=reflectance, residual=None, environment=None, environment_rotation=None)",
       "replace(self, reflectance=reflectance, environment=None, environment_rotation=None)",
       "tests/output/test_residual_shown.py"),
