@@ -7,10 +7,10 @@ refers to an object of the scene's top level, whose id is its key there.
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -65,22 +65,17 @@ def to_mitsuba(description: Mapping[str, Any]) -> Document:
 
 
 def to_xml(description: Mapping[str, Any], comment: str = "") -> str:
-    """The description of a whole scene as Mitsuba XML; files are named as they are.
-
-    Raises
-    ------
-    KeyError
-        A plugin that `KINDS` doesn't list.
-    """
-    lines = ['<scene version="3.0.0">']
+    """The description of a whole scene as Mitsuba XML; KeyError for a plugin that `KINDS` doesn't list."""
+    root = ET.Element("scene", version="3.0.0")
     if comment:
-        lines.append(f"    <!-- {comment} -->")
+        root.append(ET.Comment(f" {comment} "))
     for parameter in _parameters(description).values():
-        lines.append(f'    <default name="{parameter.name}" value={quoteattr(str(parameter.default))}/>')
+        ET.SubElement(root, "default", name=parameter.name, value=str(parameter.default))
     for key, value in description.items():
         if key != "type":
-            lines += _element(key, value, "    ", top=True)
-    return "\n".join([*lines, "</scene>", ""])
+            _add(root, key, value, "id")
+    ET.indent(root, "    ")
+    return ET.tostring(root, encoding="unicode") + "\n"
 
 
 def _parameters(description: Mapping[str, Any]) -> dict[str, Parameter]:
@@ -93,26 +88,27 @@ def _parameters(description: Mapping[str, Any]) -> dict[str, Parameter]:
     return found
 
 
-def _element(name: str, value: Any, indent: str, top: bool = False) -> list[str]:
-    """Lines of one property or object; floats with all their digits, so that the file says what was described."""
-    label = f"name={quoteattr(name)}"
+def _add(parent: ET.Element, name: str, value: Any, label: str = "name") -> None:
+    """Add a property or object; floats with all their digits, so that the file says what was described."""
     if isinstance(value, Parameter):
-        return [f'{indent}<{_tag(value.default)} {label} value="${value.name}"/>']
-    if isinstance(value, np.ndarray):
+        ET.SubElement(parent, _tag(value.default), name=name, value=f"${value.name}")
+    elif isinstance(value, np.ndarray):
         numbers = " ".join(repr(float(x)) for x in value.ravel())
-        return [f'{indent}<transform {label}><matrix value="{numbers}"/></transform>']
-    if isinstance(value, (list, tuple)):
-        return [f'{indent}<vector {label} value="{", ".join(repr(float(x)) for x in value)}"/>']
-    if not isinstance(value, Mapping):
-        return [f"{indent}<{_tag(value)} {label} value={quoteattr(_text(value))}/>"]
-    if value["type"] == "ref":
-        return [f"{indent}<ref id={quoteattr(value['id'])} {label}/>"]
-    if value["type"] == "rgb":
-        return [f'{indent}<rgb {label} value="{", ".join(repr(float(x)) for x in value["value"])}"/>']
-    tag = name if name == "integrator" else KINDS[value["type"]]
-    inner = [line for key, item in value.items() if key != "type" for line in _element(key, item, indent + "    ")]
-    start = f'{indent}<{tag} type="{value["type"]}" {f"id={quoteattr(name)}" if top else label}'
-    return [start + ">", *inner, f"{indent}</{tag}>"] if inner else [start + "/>"]
+        ET.SubElement(ET.SubElement(parent, "transform", name=name), "matrix", value=numbers)
+    elif isinstance(value, (list, tuple)):
+        ET.SubElement(parent, "vector", name=name, value=", ".join(repr(float(x)) for x in value))
+    elif not isinstance(value, Mapping):
+        ET.SubElement(parent, _tag(value), name=name, value=_text(value))
+    elif value["type"] == "ref":
+        ET.SubElement(parent, "ref", id=value["id"], name=name)
+    elif value["type"] == "rgb":
+        ET.SubElement(parent, "rgb", name=name, value=", ".join(repr(float(x)) for x in value["value"]))
+    else:
+        tag = name if name == "integrator" else KINDS[value["type"]]
+        added = ET.SubElement(parent, tag, {"type": value["type"], label: name})
+        for key, item in value.items():
+            if key != "type":
+                _add(added, key, item)
 
 
 def _tag(value: Any) -> str:
