@@ -48,14 +48,11 @@ def read_landmark_file(path: Path) -> NDArray[np.int64]:
     return np.array(values)
 
 
-def adjacency(faces: NDArray, n_vertices: int, lengths_of: NDArray | None = None) -> sp.csr_matrix:
-    """(V, V) symmetric graph of edges, with weight 1 or the edge's length in the given vertices."""
+def adjacency(faces: NDArray, n_vertices: int) -> sp.csr_matrix:
+    """(V, V) symmetric graph of edges, with weight 1."""
     e, _ = edges(faces)
-    w = np.ones(len(e)) if lengths_of is None else np.linalg.norm(lengths_of[e[:, 0]] - lengths_of[e[:, 1]], axis=1)
-    w = np.maximum(w, 1e-12)  # an explicit zero would be no edge
-    return sp.csr_matrix(
-        (np.r_[w, w], (np.r_[e[:, 0], e[:, 1]], np.r_[e[:, 1], e[:, 0]])), shape=(n_vertices, n_vertices)
-    )
+    rows, columns = np.r_[e[:, 0], e[:, 1]], np.r_[e[:, 1], e[:, 0]]
+    return sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n_vertices, n_vertices))
 
 
 def closed_borders(faces: NDArray) -> list[NDArray[np.int64]]:
@@ -116,11 +113,11 @@ def mirror_map(mean: NDArray, tolerance: float) -> NDArray[np.int32] | None:
     return partner.astype(np.int32)
 
 
-def farthest_points(points: NDArray, count: int, start: int = 0) -> NDArray[np.int64]:
+def farthest_points(points: NDArray, count: int) -> NDArray[np.int64]:
     """Indices of ``count`` points, each the farthest from those before it."""
     chosen = np.empty(min(count, len(points)), dtype=np.int64)
-    chosen[0] = start
-    distance = ((points - points[start]) ** 2).sum(1)
+    chosen[0] = 0
+    distance = ((points - points[0]) ** 2).sum(1)
     for k in range(1, len(chosen)):
         chosen[k] = distance.argmax()
         np.minimum(distance, ((points - points[chosen[k]]) ** 2).sum(1), out=distance)
