@@ -71,12 +71,9 @@ class Face:
     points : (478, 3) float64
         Face Mesh points and two irises (centre, then four on its rim): x and y in pixels, the first pixel's centre at
         (0.5, 0.5), and depth in pixels, growing away from the camera, its origin within the head.
-    presence : float
-        Probability that it is a face.
     """
 
     points: NDArray[np.float64]
-    presence: float
 
     @property
     def area(self) -> float:
@@ -249,9 +246,8 @@ class FaceMesh:
                 return None
             square = _Square.about(points[:, :2], points[EYE_CORNERS[0][0], :2], points[EYE_CORNERS[1][0], :2], MARGIN)
         turned = [replace(square, angle=square.angle + turn) for turn in (-0.2, 0.0, 0.2)]
-        looks = [self._look(image, one, mirrored) for one in turned for mirrored in (False, True)]
-        mean = np.mean([points for points, _ in looks], axis=0)
-        return Face(self._with_eyes(image, mean), min(presence for _, presence in looks))
+        looks = [self._look(image, one, mirrored)[0] for one in turned for mirrored in (False, True)]
+        return Face(self._with_eyes(image, np.mean(looks, axis=0)))
 
     def _look(self, image: NDArray, square: _Square, mirrored: bool = False) -> tuple[NDArray[np.float64], float]:
         """(468, 3) mesh points of a square, in pixels of the image, and the probability that it shows a face."""

@@ -235,7 +235,7 @@ def eyes_opened(by: float) -> Face:
         for k, (_, _, above, below) in enumerate(pairs):
             points[above, :2] = (x + 30.0 + 40.0 * k, 300.0 - 50.0 * by)
             points[below, :2] = (x + 30.0 + 40.0 * k, 300.0 + 50.0 * by)
-    return Face(points, 1.0)
+    return Face(points)
 
 
 def test_landmarks_of_closed_lids_close() -> None:
