@@ -167,9 +167,9 @@ def _short(value: object) -> str:
 
 _REFUSED = {
     "INST", "OBJ", "EXT1", "EXT2", "EXT4", "PERSID", "BINPERSID", "NEWOBJ_EX", "EMPTY_SET", "ADDITEMS", "FROZENSET",
-    "BYTEARRAY8", "NEXT_BUFFER", "READONLY_BUFFER",
+    "NEXT_BUFFER", "READONLY_BUFFER",
 }  # fmt: skip
-"""Instructions that make objects in other ways, or believe a size."""
+"""Instructions that make objects in other ways. Sizes are checked where the instructions are counted."""
 
 
 def is_pickle(path: Path) -> bool:
