@@ -281,8 +281,16 @@ def lighting_problem(
     diffuse, specular = forward.transfers(seen, light)
     weight = seen.weight[..., None] * noise_weight(seen.colour, robust)
     there = seen.weight > 0
-    every = (values[there] for values in (seen.colour, weight, seen.clipped, diffuse, specular))
-    return LightingProblem(np.nonzero(there)[0], *every, albedo, forward.order)
+    return LightingProblem(
+        np.nonzero(there)[0],
+        seen.colour[there],
+        weight[there],
+        seen.clipped[there],
+        diffuse[there],
+        specular[there],
+        albedo,
+        forward.order,
+    )
 
 
 def fit_lighting(
