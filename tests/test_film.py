@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 import mifit
 from mifit.capture import Capture
-from mifit.capture.detectors import available
+from mifit.capture.detect import available
 from mifit.capture.stereo import write_stereo
 from mifit.cli import main
 from mifit.core.image import to_8_bit

@@ -39,7 +39,7 @@ def capture_of(arguments: Namespace) -> Path:
             if getattr(arguments, option) is not None:
                 raise InputError(f"--{option}: found with the capture {paths[0]}, expected it with clips")
         return paths[0]
-    from mifit.capture.detectors import available
+    from mifit.capture.detect import available
     from mifit.capture.face_networks import missing
     from mifit.result.ownership import add_folder, clear
 

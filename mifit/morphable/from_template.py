@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from mifit.errors import InputError
 from mifit.morphable.assemble import check_mesh, complete, find_face_mask, transfer_landmarks
-from mifit.morphable.builtin.identity import deformation_modes
+from mifit.morphable.gaussian_process import deformation_modes
 from mifit.morphable.model import MorphableModel, provides
 
 _EXPRESSION_KERNELS = ((22.0, 40, (1.2, 1.5, 1.2)), (11.0, 90, (0.5, 0.7, 0.5)))

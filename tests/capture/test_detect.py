@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mifit.capture import Capture, detect_landmarks
-from mifit.capture.detectors import open_detector
+from mifit.capture.detect import open_detector
 from mifit.capture.face_mesh import EYE_CORNERS, LIDS, Face, FaceMesh, _Square, landmark_map
 from mifit.capture.face_networks import FILES, install_networks, missing, networks_folder
 from mifit.capture.outliers import epipolar_outliers, fundamental_matrix, temporal_outliers

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mifit.extras.board_adjustment import adjust
-from mifit.extras.board_calibration import _together
+from mifit.extras.board_calibration import _together, adjust
 from mifit.extras.board_camera import Watched
 from mifit.extras.boards import Board, BoardPoints
 from tests.extras.board_video import opencv_matrix, pair, poses

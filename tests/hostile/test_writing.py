@@ -339,11 +339,3 @@ def test_the_cache_is_never_in_the_current_folder(tmp_path: Path, monkeypatch: p
             cache_folder()
     else:
         assert cache_folder() == tmp_path / "cache" / "mifit"
-
-
-def test_a_broken_cascade_is_named(tmp_path: Path) -> None:
-    from mifit.capture.detectors import _cascade
-
-    (tmp_path / "c.xml").write_text("<opencv_storage><a/></opencv_storage>")
-    with pytest.raises(InputError, match=r"c\.xml: not a readable Haar cascade"):
-        _cascade(tmp_path / "c.xml")

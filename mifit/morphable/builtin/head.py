@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.morphable.builtin import sculpt
 from mifit.morphable.builtin.expressions import expression_modes
-from mifit.morphable.builtin.identity import identity_modes
 from mifit.morphable.builtin.landmarks import landmark_vertices
 from mifit.morphable.builtin.template import EYEBALL, POUCH, SKIN, Template, make_template
+from mifit.morphable.gaussian_process import deformation_modes
 from mifit.morphable.model import MorphableModel
 from mifit.morphable.openings import IRIS_ALBEDO, MOUTH_ALBEDO, PUPIL_ALBEDO, SCLERA_ALBEDO
 from mifit.morphable.pigment import skin_model
@@ -55,3 +56,15 @@ def template_face_mask(t: Template) -> NDArray[np.bool_]:
     for margin in (t.upper_lids, t.lower_lids, t.upper_lip, t.lower_lip):
         hidden[margin] = True
     return out & ~hidden[t.faces].any(1)
+
+
+def identity_modes(template: Template, count: int) -> NDArray[np.float32]:
+    """Identity modes (V, 3, count) in mm; eyeballs move as wholes so that they stay round."""
+    v = template.vertices
+    modes = deformation_modes(v, (v[:, 2] > -30.0) & (v[:, 1] > -125.0), count)
+    for sign in (-1, 1):
+        ball = (template.part == EYEBALL) & (np.sign(v[:, 0]) == sign)
+        rim = np.linalg.norm(v[:, :2] - sculpt.EYE[:2] * (sign, 1), axis=1)
+        lids = (template.part != EYEBALL) & (rim < 16.0) & (v[:, 2] > 60.0)
+        modes[ball] = modes[lids].mean(0)
+    return modes
