@@ -37,6 +37,7 @@ from mifit.config import (
     ResidualConfig,
     SurfaceConfig,
 )
+from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import (
     GeometryEstimate,
@@ -68,6 +69,8 @@ if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
 
 T = TypeVar("T")
+ONE_COLOUR = 1e-3
+"""Range of an image's pixels, over the largest, up to which it shows nothing."""
 Stage = Literal["geometry", "reflectance", "normals"]
 STAGES: tuple[Stage, ...] = ("geometry", "reflectance", "normals")
 Part = Literal["geometry", "reflectance", "normals", "mesh", "residual"]
@@ -131,6 +134,7 @@ class Step:
     run: Callable[..., Any]
 
 
+@checked
 @one_blas_thread()
 def fit(
     capture: Capture,
@@ -144,6 +148,7 @@ def fit(
     checkpoints: str | Path | None = None,
     shared: bool = False,
     watch: Callable[[Reconstruction], None] | None = None,
+    tell: Callable[[Sequence[Diagnostic]], None] | None = None,
 ) -> Reconstruction:
     """Recover geometry, reflectance, lighting and normals of a face from a capture.
 
@@ -171,6 +176,8 @@ def fit(
         Whether fits with other settings use that folder too: the stages that they have in common run once.
     watch : callable, optional
         Called after each step with the result so far.
+    tell : callable, optional
+        Called before the first step with what is wrong with the capture, where something is.
 
     Returns
     -------
@@ -199,6 +206,8 @@ def fit(
         raise InputError(f"until: found {until!r}, expected one of {', '.join(STAGES)}")
     check_images(capture, cameras, timesteps)
     checked = check_capture(capture, model, cameras, timesteps)
+    if checked and tell:
+        tell(checked)
     capture_digest = capture.digest(cameras, timesteps)
     given, model = model, fitted_model(model, config)
     estimated: tuple[Diagnostic, ...] = ()
@@ -216,7 +225,7 @@ def fit(
         found = [*checked, *check_fit(capture, model, geometry, cameras)]
         return Reconstruction(
             model=model,
-            **cast(dict, {**estimates, "geometry": judged(geometry, found)}),
+            **cast(dict, judged(estimates, found)),
             config={**dataclasses.asdict(config), "seed": seed},
             cameras=tuple(capture.camera(name) for name in cameras),
             capture_digest=capture_digest,
@@ -251,10 +260,9 @@ def fit_into(
     config: FitConfig | None = None,
     until: Stage = "normals",
     seed: int = 0,
-    progress: Progress = silent,
     resume: bool = False,
     force: bool = False,
-    watch: Callable[[Reconstruction], None] | None = None,
+    **options: Any,
 ) -> Reconstruction:
     """Fit, and write the result folder; stages that end are kept in it, so that a killed run goes on.
 
@@ -266,8 +274,10 @@ def fit_into(
         Go on with what an earlier run left. A result that has all that is asked for, and perhaps more, stays as it is.
     force : bool
         Replace an existing result, or write beside files that aren't ours; those are never deleted.
-    capture, model, cameras, timesteps, config, until, seed, progress, watch
+    capture, model, cameras, timesteps, config, until, seed
         As in `mifit.fit`.
+    options
+        ``progress``, ``watch`` and ``tell`` of `mifit.fit`.
 
     Raises
     ------
@@ -290,7 +300,13 @@ def fit_into(
         elif (folder / "result.json").exists() and _is_there(folder, wanted, until):
             return Reconstruction.load(folder, model)
         kept = folder / CHECKPOINTS
-        result = fit(capture, model, cameras, timesteps, config, until, seed, progress, kept, watch=watch)
+        began = not kept.exists()
+        try:
+            result = fit(capture, model, cameras, timesteps, config, until, seed, checkpoints=kept, **options)
+        except InputError:  # nothing to go on with
+            if began:
+                shutil.rmtree(kept, ignore_errors=True)
+            raise
         result.save(folder, force)
     return result
 
@@ -380,7 +396,13 @@ def run_steps(
     for step in listed:
         inputs = {part: estimates[part] for part in step.inputs}
         run = functools.partial(step.run, source.seen(inputs), inputs, progress, *step.settings)
-        done = cache.get(step.name, PARTS[step.part], made[step.name], run)
+        try:
+            done = cache.get(step.name, PARTS[step.part], made[step.name], run)
+        except np.linalg.LinAlgError as error:
+            raise InputError(
+                f"{step.name}: equations without a solution ({error}), expected images of one face that all cameras "
+                "show; `mifit doctor CAPTURE` examines them"
+            ) from error
         if step.part in estimates and step.part not in step.inputs:
             before += estimates[step.part].report.seconds  # one that goes on from another counts its time
         estimates[step.part] = done
@@ -434,13 +456,16 @@ def _find_residual(source: Source, inputs: Inputs, progress: Progress, config: R
 
 
 def check_images(capture: Capture, cameras: Sequence[str], timesteps: Sequence[int]) -> None:
-    """Raise InputError for an image that is black or clipped throughout: nothing of the face can be measured in it."""
+    """Raise InputError for an image that is black, clipped or of one colour: nothing can be measured in it."""
     for timestep in timesteps:
         for name in cameras:
             frame = capture.frame(name, timestep)
-            if not (frame.image[frame.valid & ~frame.clipped] > 0).any():
+            usable = frame.image[frame.valid & ~frame.clipped]
+            black = not (usable > 0).any()
+            if black or (np.ptp(usable, axis=0) <= ONE_COLOUR * usable.max()).all():
                 raise InputError(
-                    f"camera {name}, timestep {timestep}: every usable pixel is black or clipped, expected a photo; "
+                    f"camera {name}, timestep {timestep}: every usable pixel is "
+                    f"{'black or clipped' if black else 'of one colour'}, expected a photo; "
                     "leave the camera or the timestep out, or check its mask"
                 )
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, from_mapping
 from mifit.core.arrays import Rows
+from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, Report
 from mifit.core.files import Document
@@ -64,6 +65,7 @@ class TrackedFrame:
     warnings: tuple[Diagnostic, ...]
 
 
+@checked
 def track(
     capture: Capture,
     result: Reconstruction,

@@ -217,6 +217,9 @@ def test_warnings_are_lines_on_stderr_the_worst_first(capsys):
     assert tell(Namespace(quiet=False, strict=True), notes) == 0
     assert capsys.readouterr().err == "mifit: note: four\n"
     assert tell(Namespace(quiet=True, strict=True), found) == 3
+    assert len(capsys.readouterr().err.splitlines()) == 3
+    assert tell(Namespace(quiet=True, strict=True), found, told=found[1:]) == 3
+    assert capsys.readouterr().err == "mifit: warning: one\n"
 
 
 def options(parser, name=""):

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 import mifit
+import mifit.fitting
 from mifit.cli import fits
 from mifit.config import FitConfig, MeshConfig, ReflectanceConfig
+from mifit.core.diagnostics import Diagnostic
 from mifit.errors import InputError
 from mifit.fitting import fit_into, fitted_to
 from mifit.morphable import MorphableModel
@@ -114,6 +116,16 @@ def test_tracked_frames_stay(fit, tracked):
     with pytest.raises(InputError, match="timesteps 3, which were tracked"):
         fit(tracked, resume=True, timesteps=[0], config=FitConfig(mesh=MeshConfig(detail=0.4)))
     assert tree(tracked) == before
+
+
+def test_what_is_wrong_with_a_capture_is_told_before_the_work(fit, tmp_path, monkeypatch):
+    found, events = [Diagnostic("mirrored", "text", "fault", "left")], []
+    geometry = mifit.fitting.fit_geometry
+    monkeypatch.setattr("mifit.fitting.check_capture", lambda *_: found)
+    monkeypatch.setattr("mifit.fitting.fit_geometry", lambda *a, **k: events.append("work") or geometry(*a, **k))
+    fit(tmp_path / "out", tell=events.append)
+    assert events == [found, "work"]
+    assert fit(tmp_path / "out", tell=events.append, resume=True) == [] and events == [found, "work"]
 
 
 def test_two_fits_into_one_folder_exclude_each_other(fit, tmp_path):

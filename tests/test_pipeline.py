@@ -32,6 +32,9 @@ def test_an_image_without_light_is_refused():
         check_images(capture_of(image, image[..., 0] == 0), ["left"], [3])
     with pytest.raises(InputError, match="clipped"):
         check_images(capture_of(image + 1, valid, clipped=True), ["left"], [3])
+    for value in (0.3, 1e-30):
+        with pytest.raises(InputError, match="of one colour"):
+            check_images(capture_of(np.full_like(image, value), valid), ["left"], [3])
 
 
 def test_the_order_in_which_timesteps_are_named_does_not_matter():
@@ -183,7 +186,7 @@ class Stages:
 
 def made_up_capture(digest="digest", timesteps=(0, 3)):
     """What `mifit.fit` asks of a capture before and after its stages."""
-    image = np.ones((4, 5, 3), np.float32)
+    image = np.linspace(0.1, 1.0, 60, dtype=np.float32).reshape(4, 5, 3)
     frame = SimpleNamespace(image=image, valid=image[..., 0] > 0, clipped=image[..., 0] > 2, visible=np.ones(68, bool))
     cameras = {c.name: c for c in ball_result().cameras}
     return SimpleNamespace(

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mifit.core.calls import finite, whole
 from mifit.core.limits import MAX_NUMBER
-from mifit.core.sh import SHLighting, basis, order_of
+from mifit.core.sh import SHLighting, basis, check_order, order_of
 from mifit.errors import InputError
 
 RAYS = 16
@@ -41,9 +42,19 @@ class DistantLight:
     radius: float
     colour: NDArray[np.float64]
 
+    def __post_init__(self) -> None:
+        direction, colour = finite(self.direction, (3,), "direction"), finite(self.colour, (3,), "colour")
+        if not direction.any() or not 0.0 <= self.radius <= np.pi:
+            raise InputError(
+                f"light: found direction {self.direction!r} and radius {self.radius!r}, expected a unit vector and "
+                "0 to pi"
+            )
+        object.__setattr__(self, "direction", direction)
+        object.__setattr__(self, "colour", colour)
+
     def samples(self, count: int = RAYS) -> NDArray[np.float64]:
         """(count, 3) directions that cover the disc evenly."""
-        return disc(self.direction, self.radius, count)
+        return disc(self.direction, self.radius, whole(count, 1, "count"))
 
     def with_colour(self, colour: ArrayLike) -> DistantLight:
         """The same light in another colour."""
@@ -138,6 +149,7 @@ class Illumination:
     @classmethod
     def dark(cls, order: int, lights: Sequence[DistantLight] = ()) -> Illumination:
         """No light from B bands, and compact lights of no colour: the shape of what is to be fitted."""
+        check_order(order)
         return cls(np.zeros((order * order, 3)), tuple(light.with_colour(np.zeros(3)) for light in lights))
 
     @property
@@ -165,6 +177,7 @@ class Illumination:
 
     def scaled(self, factor: float) -> Illumination:
         """Everything brighter by a factor."""
+        factor = float(finite(factor, (), "factor"))
         lights = tuple(light.with_colour(factor * light.colour) for light in self.lights)
         return Illumination(factor * self.radiance, lights, factor * self.ambient)
 

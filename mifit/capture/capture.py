@@ -255,10 +255,14 @@ class Capture:
 
     def with_estimate(self, cameras: Sequence[Camera]) -> Capture:
         """The same capture with estimated cameras; whether it is `calibrated` stays as it is."""
+        if not all(isinstance(camera, Camera) for camera in cameras):
+            raise TypeError("with_estimate: cameras: found other objects, expected Camera")
         return dataclasses.replace(self, estimated={camera.name: camera for camera in cameras}, _cache=self._cache)
 
     def with_photometry(self, photometry: Photometry) -> Capture:
         """The same capture with images divided by gains and exposures, in place of any that it has."""
+        if not isinstance(photometry, Photometry):
+            raise TypeError(f"with_photometry: found {type(photometry).__name__}, expected Photometry")
         return dataclasses.replace(self, photometry=photometry, _cache=self._cache)
 
     def with_fitted(self, cameras: Sequence[Camera]) -> Capture:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.capture.outliers import fundamental_matrix
+from mifit.core.calls import checked, whole
 from mifit.errors import InputError
 
 if TYPE_CHECKING:
@@ -75,6 +76,7 @@ class FrameChoice:
         }
 
 
+@checked
 def choose_frames(
     capture: Capture,
     cameras: Sequence[str],
@@ -109,6 +111,7 @@ def choose_frames(
     """
     if not cameras:
         raise InputError("choose_frames: found no camera, expected at least one")
+    whole(count, 1, "count")
     steps = np.array(sorted({*(capture.timesteps if timesteps is None else timesteps), *beside}))
     points = np.stack([_landmarks(capture, name, steps) for name in cameras])  # (C, T, 68, 2)
     known = np.isfinite(points).all((2, 3))

@@ -6,7 +6,7 @@ import argparse
 import functools
 import sys
 from argparse import Namespace
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -80,14 +80,16 @@ def use_variant(arguments: Namespace) -> str:
     return set_fitting_variant(arguments.variant)
 
 
-def tell(arguments: Namespace, found: Iterable[Diagnostic]) -> int:
-    """Print diagnostics on standard error, a line each, the worst first; notes not with ``--quiet``.
+def tell(arguments: Namespace, found: Iterable[Diagnostic], told: Collection[Diagnostic] = ()) -> int:
+    """Print diagnostics but those already ``told`` on standard error, a line each, the worst first.
+
+    Notes are not printed with ``--quiet``.
 
     Returns the command's exit code: 3 with ``--strict`` where one of them is a named fault, else 0.
     """
     found = worst_first(found)
     for one in found:
-        if one.severity != "note" or not arguments.quiet:
+        if one not in told and (one.severity != "note" or not arguments.quiet):
             print(f"mifit: {one.severity}: {one_line(one.text)}", file=sys.stderr, flush=True)
     return 3 if arguments.strict and any(one.severity == "fault" for one in found) else 0
 

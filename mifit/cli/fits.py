@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from mifit.cli.clips import capture_of
 from mifit.cli.console import console_progress
 from mifit.cli.results import judge
 from mifit.config import PRESETS, FitConfig, NormalsConfig, ReflectanceConfig, from_mapping
+from mifit.core.diagnostics import Diagnostic
 from mifit.core.files import Document, check_file, write_bytes
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
@@ -103,6 +105,12 @@ def fit(arguments: Namespace) -> int:
     if isinstance(timesteps, int):
         timesteps = _chosen(arguments, capture, timesteps)
     progress, view = console_progress(arguments.quiet), None
+    told: list[Diagnostic] = []
+
+    def tell_now(found: Sequence[Diagnostic]) -> None:
+        told.extend(found)
+        tell(arguments, found)
+
     if arguments.view:
         from mifit.extras.live_view import FitView
 
@@ -120,10 +128,11 @@ def fit(arguments: Namespace) -> int:
         resume=arguments.resume,
         force=arguments.force,
         watch=view.watch if view else None,
+        tell=tell_now,
     )
     with replacing_files(out, force=arguments.force) as new:
         write_report(new, result, capture)
-    code = tell(arguments, result.diagnostics)
+    code = tell(arguments, result.diagnostics, told)
     print(f"Result: {out}", flush=True)
     if view:
         from mifit.extras.live_view import serve

@@ -17,6 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from mifit.core.arrays import same
+from mifit.core.calls import finite, whole
+from mifit.core.limits import MAX_PIXELS
 from mifit.errors import InputError
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -49,11 +51,16 @@ class Camera:
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if min(self.width, self.height) < 1 or not (0 < self.fx < math.inf and 0 < self.fy < math.inf):
-            raise InputError(
-                f"camera {self.name!r}: found {self.width} x {self.height} pixels and focal lengths {self.fx:g}, "
-                f"{self.fy:g}, expected positive numbers"
-            )
+        name = f"camera {self.name!r}"
+        for size in (self.width, self.height):
+            whole(size, 1, f"{name}: width and height")
+        if not (0 < self.fx < math.inf and 0 < self.fy < math.inf):
+            raise InputError(f"{name}: found focal lengths {self.fx:g}, {self.fy:g}, expected positive numbers")
+        finite((self.cx, self.cy, *self.distortion), (-1,), f"{name}: principal point and distortion")
+        pose = finite(self.world_to_camera, (4, 4), f"{name}: world_to_camera")
+        if not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-2):
+            raise InputError(f"{name}: world_to_camera: found no rotation in its first three columns, expected one")
+        object.__setattr__(self, "world_to_camera", pose)
 
     def __eq__(self, other: object) -> bool:
         return same(self, other) if isinstance(other, Camera) else NotImplemented
@@ -80,9 +87,9 @@ class Camera:
         """
         if not 0.0 < fov < 180.0:
             raise InputError(f"fov: found {fov}, expected degrees above 0 and below 180")
-        start = np.asarray(eye, dtype=np.float64)
-        forward = np.asarray(target, dtype=np.float64) - start
-        right = np.cross(forward, np.asarray(up, dtype=np.float64))
+        start = finite(eye, (3,), "eye")
+        forward = finite(target, (3,), "target") - start
+        right = np.cross(forward, finite(up, (3,), "up"))
         lengths = np.linalg.norm(forward), np.linalg.norm(right)
         if not min(lengths) > 1e-9 * max(1.0, *np.abs(start)):
             raise InputError(f"look_at: found eye {eye!r}, target {target!r}, up {up!r}, expected a view")
@@ -116,10 +123,18 @@ class Camera:
             From the target, the capture's units, above 0; default: as it is.
         name : str, optional
             Default: this camera's name with the angles.
+
+        Raises
+        ------
+        InputError
+            A distance that isn't positive, angles or vectors that aren't finite, or an ``up`` of no length.
         """
-        if distance is not None and not distance > 0:
+        if distance is not None and not 0 < distance < math.inf:
             raise InputError(f"distance: found {distance}, expected a number above 0")
-        centre, axis = np.asarray(target, dtype=np.float64), np.asarray(up, dtype=np.float64)
+        finite((yaw, pitch), (2,), "yaw, pitch")
+        centre, axis = finite(target, (3,), "target"), finite(up, (3,), "up")
+        if not axis.any() or (distance is not None and np.array_equal(centre, self.position)):
+            raise InputError(f"orbit: found up {up!r}, target {target!r}, expected an axis and a place off the camera")
         turn = _about(axis, yaw)
         turn = _about(turn @ self.rotation[0], -pitch) @ turn
         away = turn @ (self.position - centre)
@@ -172,13 +187,15 @@ class Camera:
 
     def resized(self, factor: float) -> Camera:
         """This camera with an image of another size: ``factor`` pixels per pixel, to the nearest whole number."""
+        if not 0 < factor * max(self.width, self.height) <= MAX_PIXELS:
+            raise InputError(f"resized: found factor {factor}, expected one above 0 that leaves an image")
         width, height = (max(round(n * factor), 1) for n in (self.width, self.height))
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y)
 
     def to_camera(self, points: NDArray) -> NDArray:
         """World points (..., 3) -> camera points (..., 3)."""
-        return points @ self.rotation.T + self.translation
+        return np.asarray(points) @ self.rotation.T + self.translation
 
     def project(self, points: NDArray) -> NDArray:
         """World points (..., 3) -> ideal (undistorted) pixel coordinates (..., 2).
@@ -191,6 +208,9 @@ class Camera:
 
     def pixel_rays(self, pixels: NDArray) -> NDArray:
         """Pixel coordinates (..., 2) -> unit world-space directions (..., 3) away from the camera."""
+        pixels = np.asarray(pixels)
+        if pixels.shape[-1:] != (2,):
+            raise InputError(f"pixels: found shape {pixels.shape}, expected (..., 2)")
         x = (pixels[..., 0] - self.cx) / self.fx
         y = (pixels[..., 1] - self.cy) / self.fy
         length = np.sqrt(x * x + y * y + 1.0)

@@ -1,10 +1,10 @@
 """Image files: PNG, JPEG, TIFF, OpenEXR and Radiance HDR, read to linear float32 and written whole or not at all.
 
 8- and 16-bit files hold sRGB-coded values, or those of a PNG's own gamma, and are decoded to linear Rec. 709, 0..1;
-floating-point files (EXR, HDR) are linear already. The primaries of an EXR and the exposure of a Radiance file are
-heeded; files of luminance and chroma or XYZ are refused. The kind of a file is told by its first bytes, not by its
-name. Sizes are read from the header and checked before a pixel is decoded, so a small file can't claim gigabytes. An
-orientation tag is not applied: pixel coordinates of a calibration refer to the pixels as stored.
+floating-point files (EXR, HDR) are linear already. Their primaries and the exposure of a Radiance file are heeded;
+files of luminance and chroma or XYZ are refused. The kind of a file is told by its first bytes, not by its name. Sizes
+are read from the header and checked before a pixel is decoded, so a small file can't claim gigabytes. An orientation
+tag is not applied: pixel coordinates of a calibration refer to the pixels as stored.
 """
 
 from __future__ import annotations
@@ -276,13 +276,15 @@ def _decode_hdr(data: bytes, path: str | Path) -> Image:
     _check_size((width, height), path)
     if width * height > (len(data) - start) * 16:  # a run of 127 values of four channels takes two bytes
         raise _damaged(path)
-    factor = np.ones(3)
+    factor, primaries = np.ones(3), None
     for line in data[:start].decode("latin-1").splitlines():
         key, _, value = line.partition("=")
         if key == "FORMAT" and value.strip() != "32-bit_rle_rgbe":
             raise InputError(f"{path}: found FORMAT={value.strip()[:40]}, expected 32-bit_rle_rgbe; save it as RGB")
         if key in ("EXPOSURE", "COLORCORR"):  # what the pixels were multiplied by; of several lines the product
             factor = factor * np.array(value.split(), dtype=np.float64)
+        if key == "PRIMARIES" and value.split() != ["0"] * 8:  # which Photoshop writes for none
+            primaries = np.array(value.split(), dtype=np.float64)
     if not ((factor >= 1e-9) & (factor <= 1e9)).all():
         raise InputError(f"{path}: found an exposure of {factor.tolist()}, expected positive numbers within 1e9")
     # OpenCV gets a header of ours: it can't find another resolution than the one that was checked
@@ -290,7 +292,8 @@ def _decode_hdr(data: bytes, path: str | Path) -> Image:
     pixels = cv2.imdecode(np.frombuffer(head + data[start:], np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.shape != (height, width, 3):
         raise _damaged(path)
-    return _float_image(pixels[..., ::-1] / factor.astype(np.float32), None)
+    colour = pixels[..., ::-1] / factor.astype(np.float32)
+    return _float_image(colour if primaries is None else _from_primaries(colour, primaries, path), None)
 
 
 def read_environment(path: str | Path) -> NDArray[np.float32]:

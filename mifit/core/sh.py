@@ -24,8 +24,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mifit.core.calls import whole
 from mifit.errors import InputError
 
+MAX_SIDE = 2**14
+"""Rows and columns of a lat-long image at most."""
 Array = NDArray[np.float64]
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -218,7 +221,10 @@ class SHLighting:
                 return cls(project_latlong(pixels, order))
             except InputError as error:
                 raise InputError(f"{source}: {error}") from None
-        return cls(project_latlong(source, order))
+        pixels = np.asarray(source)
+        if pixels.ndim > 1 and pixels.shape[1] != 2 * pixels.shape[0]:
+            raise InputError(f"environment map: found shape {pixels.shape}, expected twice as wide as high (H, 2 H, 3)")
+        return cls(project_latlong(pixels, order))
 
     @property
     def order(self) -> int:
@@ -262,4 +268,6 @@ class SHLighting:
 
     def to_latlong(self, height: int = 128, width: int = 256) -> Array:
         """Radiance as a lat-long image (H, W, 3)."""
+        for name, size in (("height", height), ("width", width)):
+            whole(size, 1, name, MAX_SIDE)
         return self.evaluate(latlong_directions(height, width))

@@ -14,6 +14,7 @@ import numpy as np
 
 from mifit.capture.choose_frames import choose_frames
 from mifit.config import FitConfig, from_mapping
+from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.process import one_blas_thread
@@ -36,6 +37,7 @@ MOST = 16
 """Frames that enter, fitted ones included."""
 
 
+@checked
 @one_blas_thread()
 def refine(
     result: Reconstruction,

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
+from mifit.core.calls import finite, whole
 from mifit.core.limits import MAX_NUMBER
 from mifit.core.mesh import face_cross
 from mifit.core.uv import rasterize_uv
@@ -237,7 +238,7 @@ class MorphableModel:
         identity (Ki,), expression (Ke,), albedo (Ka,) : float32
             Normal draws; expressions are clipped to their bounds.
         """
-        rng = np.random.default_rng(seed)
+        rng, scale = np.random.default_rng(seed), float(finite(scale, (), "scale"))
         identity, expression, albedo = (
             (scale * rng.standard_normal(k)).astype(np.float32)
             for k in (self.n_identity, self.n_expression, self.n_albedo)
@@ -262,7 +263,13 @@ class MorphableModel:
         region : (F,) bool, optional
             Faces that may stay in ``face_mask``.
         """
-        i, e, a = (slice(k) if isinstance(k, int) else (k or slice(None)) for k in (identity, expression, albedo))
+
+        def modes(kept: int | slice | None, name: str) -> slice:
+            return kept if isinstance(kept, slice) else slice(kept if kept is None else whole(kept, 0, name))
+
+        i, e, a = modes(identity, "identity"), modes(expression, "expression"), modes(albedo, "albedo")
+        if region is not None and (np.shape(region) != self.face_mask.shape or np.asarray(region).dtype != bool):
+            raise InputError(f"region: found shape {np.shape(region)}, expected {self.face_mask.shape} of bool")
         return replace(
             self,
             identity=np.ascontiguousarray(self.identity[:, :, i]),
@@ -411,4 +418,6 @@ def _product(basis: NDArray[np.float32], coefficients: ArrayLike, key: str, name
     c = np.asarray(coefficients, dtype=np.float32)
     if c.ndim != 1 or len(c) > basis.shape[1]:
         raise InputError(f"{name}: {key} coefficients have shape {c.shape}, expected at most ({basis.shape[1]},)")
+    if not np.isfinite(c).all():
+        raise InputError(f"{name}: found {key} coefficients that are not finite, expected standard deviations")
     return basis @ c if len(c) == basis.shape[1] else basis[:, : len(c)] @ c

@@ -87,6 +87,8 @@ def shade_methods(
     Shadows, where the model has them, are traced at the vertices and interpolated, as in the fit. ``material`` is what
     `surface_material` has found before, for the same face under another light.
     """
+    if not len(surface.face):
+        return dict.fromkeys(methods, surface.image(np.zeros((0, 3), np.float32)))
     out: dict[Method, NDArray[np.float32]] = {}
     if "pca" in methods:
         out["pca"] = surface.image(_shade_stage_1(result, surface, timestep))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
+from mifit.core.calls import checked
 from mifit.core.camera import Camera
 from mifit.core.files import Document
 from mifit.core.image import to_8_bit
@@ -51,6 +52,7 @@ class Comparison:
     landmark_pixels: float | None = None
 
 
+@checked
 def evaluate(
     result: Reconstruction,
     capture: Capture,
@@ -106,6 +108,8 @@ def evaluate(
         a face area that is not visible.
     """
     steps = result.timesteps if timesteps is None else tuple(timesteps)
+    if not steps:
+        raise InputError("timesteps: found none, expected at least one")
     placed = resect(result, capture, camera) if needs_resection(result, capture, camera) else None
     if placed is not None:
         capture = capture.with_estimate([*result.cameras, placed[0]])

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from mifit.core.arrays import write_ply
+from mifit.core.calls import checked
 from mifit.core.files import check_overwriting, write_bytes, write_text
 from mifit.core.image import encode_png, to_8_bit, write_image
 from mifit.errors import InputError
@@ -29,6 +30,7 @@ OBJ_SPECULAR = 0.08
 Mesh = Literal["fitted", "refined"]
 
 
+@checked
 def export(
     result: Reconstruction,
     format: Format,
@@ -77,6 +79,8 @@ def export(
         check_overwriting(path.with_name(path.stem + end))
     if animate and format != "glb":
         raise InputError(f"animate: found format {format!r}, expected 'glb', the only one that holds an animation")
+    if not 1e-3 <= fps <= 1e3:
+        raise InputError(f"fps: found {fps}, expected 0.001 to 1000")
     if units is not None and (format not in ("obj", "ply") or units not in PER_UNIT):
         raise InputError(f"units: found {units!r} for {format}, expected m, cm or mm for obj or ply")
     factor = 1.0 if units is None else result.unit_mm / PER_UNIT[units]

@@ -94,7 +94,8 @@ def draw_landmarks(
     projected = camera.project(fitted)
     for i, model_point in enumerate(projected):
         if detected is not None and visible[i]:
-            cv2.line(out, fixed(detected[i]), fixed(model_point), (255, 255, 255), 1, cv2.LINE_AA, shift)
+            if np.isfinite(model_point).all():
+                cv2.line(out, fixed(detected[i]), fixed(model_point), (255, 255, 255), 1, cv2.LINE_AA, shift)
             cv2.circle(out, fixed(detected[i]), 3 * scale, (0, 220, 255), 1, cv2.LINE_AA, shift)
         if np.isfinite(model_point).all():
             cv2.circle(out, fixed(model_point), 2 * scale - 4, (255, 90, 60), -1, cv2.LINE_AA, shift)

@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 
 from mifit.appearance.lobe import Lobe
 from mifit.core.arrays import write_ply
+from mifit.core.calls import whole
 from mifit.core.camera import Camera
 from mifit.core.files import Document, write_text
 from mifit.core.image import write_image
+from mifit.core.limits import MAX_SAMPLES
 from mifit.core.mesh import interpolate, normalize
 from mifit.core.sh import SHLighting
 from mifit.core.uv import rasterize_uv
@@ -86,6 +88,8 @@ def render_view(
     """(H, W, 4) one view of a result; see `Reconstruction.render`."""
     check_shown(result, timestep, method)
     check_active_variant()
+    if samples is not None:
+        whole(samples, 1, "samples", MAX_SAMPLES)
     if integrator == "local":
         return render_local(result, camera, timestep, method, samples or 2)
     if integrator == "path":
@@ -186,7 +190,11 @@ def load_result_scene(
     """A loaded ``mi.Scene`` of one timestep; see `Reconstruction.scene`."""
     from mifit.render.scene import load_scene
 
+    check_active_variant()
     check_shown(result, timestep, method)
+    whole(samples, 1, "samples", MAX_SAMPLES)
+    if not all(isinstance(camera, Camera) for camera in cameras):
+        raise TypeError("scene: cameras: found other objects, expected Camera")
     chosen = {"type": integrator} if isinstance(integrator, str) else dict(integrator)
     if chosen.get("type") == "shdirect":
         # What it shades is the smooth light, whatever an environment has beside it.

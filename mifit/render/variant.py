@@ -114,6 +114,8 @@ def set_variant(name: str = "auto") -> str:
     VariantError
         The variant doesn't exist, or the CUDA or LLVM behind it doesn't work; the message names the fix.
     """
+    if not isinstance(name, str):
+        raise TypeError(f"set_variant: name: found {type(name).__name__}, expected str")
     llvm = check_llvm() if name == "auto" or name.startswith("llvm") else None
     import drjit as dr
     import mitsuba as mi

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from mifit.appearance.illumination import Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.core.arrays import same
+from mifit.core.calls import checked
 from mifit.core.camera import Camera
 from mifit.core.diagnostics import Diagnostic, worst_first
 from mifit.core.estimate import (
@@ -149,6 +150,7 @@ class Reconstruction:
 
         return load(Path(folder), model)
 
+    @checked
     def render(
         self,
         camera: Camera,

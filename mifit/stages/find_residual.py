@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mifit.appearance.formation import Appearance, form_image
 from mifit.appearance.occlusion import MeshPoints
 from mifit.config import ResidualConfig
+from mifit.core.calls import checked
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report, ResidualEstimate, hidden
 from mifit.core.mesh import normalize
 from mifit.core.process import one_blas_thread
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
 
 
+@checked
 @one_blas_thread()
 def find_residual(
     capture: Capture,

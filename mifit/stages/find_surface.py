@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mifit.config import GeometryConfig, SurfaceConfig
+from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, Report
 from mifit.core.process import one_blas_thread
@@ -44,6 +45,7 @@ NARROWEST = 0.03
 """Least parallax; below it, about 2 degrees between the views, depth isn't measured."""
 
 
+@checked
 @one_blas_thread()
 def find_surface(
     capture: Capture,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mifit.capture import Capture
 from mifit.config import GeometryConfig
+from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.process import one_blas_thread
@@ -29,6 +30,7 @@ from mifit.stages.geometry.visibility import Visibility, spread_points, unseen_w
 __all__ = ["fit_geometry", "fit_pose_expression", "texture_reference"]
 
 
+@checked
 @one_blas_thread()
 def fit_geometry(
     capture: Capture,

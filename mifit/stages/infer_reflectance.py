@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mifit.config import ReflectanceConfig
+from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report, hidden
 from mifit.core.mesh import interpolate
@@ -36,6 +37,7 @@ GAUGE = (
 )
 
 
+@checked
 @one_blas_thread()
 def infer_reflectance(
     capture: Capture,

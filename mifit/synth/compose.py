@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ from mifit.morphable.openings import RADIUS_MM, eyeballs, openings
 from mifit.progress import Progress, silent
 from mifit.render.gbuffer import SurfaceScene
 from mifit.render.pathtrace import Material, PathTracer, Surface
+from mifit.render.variant import check_active_variant
 from mifit.synth import detector, head
 from mifit.synth.procedural import studio_environment
 from mifit.synth.skin import SkinMaps, SkinStyle, paint
@@ -123,6 +125,9 @@ def synthesize(  # noqa: PLR0913
         ("seed", seed, 0, MAX_SEED),
     ):
         check_range(name, value, low, high)
+    if motion not in get_args(head.Motion):
+        raise InputError(f"motion: found {motion!r}, expected one of {', '.join(get_args(head.Motion))}")
+    check_active_variant()
     for name, length in (("outside", outside), ("landmark_bias", landmark_bias)):
         if not 0 <= length <= MOST_MM:
             raise InputError(f"{name}: found {length}, expected 0 to {MOST_MM:g} mm")

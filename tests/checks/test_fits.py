@@ -32,13 +32,15 @@ PAIR = ("left", "right")
     ],
 )
 def test_a_fit_whose_images_contradict_one_another_has_not_converged(found, outcome):
-    geometry = dataclasses.replace(ball_result().geometry, report=Report("converged"))
-    assert judged(geometry, found).report.outcome == outcome
-    mine = dataclasses.replace(geometry, report=Report("converged", warnings=tuple(found)))
-    assert judged(mine, []).report.outcome == outcome
+    result = ball_result()
+    parts = {"geometry": result.geometry, "reflectance": result.reflectance, "normals": result.normals}
+    parts = {part: dataclasses.replace(one, report=Report("converged")) for part, one in parts.items()}
+    assert {one.report.outcome for one in judged(parts, found).values()} == {outcome}
+    mine = dataclasses.replace(parts["geometry"], report=Report("converged", warnings=tuple(found)))
+    assert {one.report.outcome for one in judged({**parts, "geometry": mine}, []).values()} == {outcome}
 
 
-@pytest.mark.parametrize("shift", [0.0, 0.4, 0.8])
+@pytest.mark.parametrize("shift", [0.0, 0.6, 1.0])
 def test_landmarks_beside_the_fitted_face_are_named(shift, shared, monkeypatch):
     """Of the true face of a capture, whose landmarks are moved by parts of a detector's deviation."""
     from mifit.stages.checks import fit_checks
@@ -54,8 +56,8 @@ def test_landmarks_beside_the_fitted_face_are_named(shift, shared, monkeypatch):
     moved = [dataclasses.replace(shot, pixels=shot.pixels + np.array([0.0, by])) for shot in shots]
     monkeypatch.setattr(fit_checks, "landmark_shots", lambda *_: moved)
     found = check_fit(capture, model, geometry, PAIR)
-    assert [one.code for one in found] == (["landmarks-shifted"] if shift > 0.6 else [])
-    assert not found or "in all cameras alike, expected within 4.1" in found[0].text
+    assert [one.code for one in found] == (["landmarks-shifted"] if shift > 0.8 else [])
+    assert not found or "in all cameras alike, expected within 5.5" in found[0].text
 
 
 @pytest.mark.parametrize(
@@ -76,7 +78,10 @@ def test_doctor_examines_a_capture(name, code, verdict, shared, tmp_path, capsys
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "codes"), [("landmarks shifted", ["landmarks-shifted"]), ("one turned, yaw", [])])
+@pytest.mark.parametrize(
+    ("name", "codes"),
+    [("landmarks shifted", ["landmarks-shifted"]), ("one turned, yaw", [])],
+)
 def test_a_cheap_fit_names_what_only_it_can_tell(name, codes, shared, tmp_path, variant):
     """Where it names nothing, nothing is said either: no false alarm."""
     capture = Capture.load(make(name, shared / "captures/soft", tmp_path, timesteps=2))

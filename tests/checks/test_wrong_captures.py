@@ -9,7 +9,7 @@ import pytest
 from mifit.capture import Capture
 from mifit.morphable import MorphableModel
 from mifit.stages.checks.capture_checks import check_capture
-from tests.checks.wrong_captures import WRONG, make
+from tests.checks.wrong_captures import WRONG, frontal, make, read, write
 
 PAIR = ("left", "right")
 NAMED = {
@@ -48,6 +48,7 @@ AFTERWARDS = {"landmarks shifted"}
 """Named once the face is fitted (`test_fits`)."""
 UNKNOWABLE = {
     "both mirrored, swapped", "focal 1.15", "baseline", "one turned, yaw", "linear in PNG", "tone curve",
+    "lens left out", "two people",
 }  # fmt: skip
 """What no image tells; docs/limits.md says why, and what it costs."""
 SAID = {
@@ -56,7 +57,7 @@ SAID = {
     "lengths x 10": 'in millimetres, the capture says one is 10 mm; correct "units" in transforms.json, or',
     "all mirrored": ", or all cameras: images are mirrored",
     "one late": "camera right is 1 timestep late",
-    "one turned, pitch": "camera left or right",
+    "one turned, pitch": "landmarks of camera right lie (",
     "upside down": "turn them by 180 degrees",
 }
 
@@ -89,6 +90,15 @@ def test_what_is_wrong_is_named(name, shared, model, tmp_path):
 def test_what_no_image_tells_is_not_called_something_else(name, shared, model, tmp_path):
     capture = Capture.load(make(name, shared / "captures/soft", tmp_path, timesteps=2))
     assert findings(capture, model) == []
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_a_detector_that_fails_on_a_profile_is_named(half, shared, model, tmp_path):
+    views = ("c3", "c1", "c6")  # a front and the profiles
+    rough = read(shared / "captures/emily", 1, cameras=views)
+    frontal(rough.of("c6"), rough.frames["c3", 0], half)
+    found = findings(Capture.load(write(rough, tmp_path)), model, views)
+    assert [(one.code, one.camera) for one in found] == [("landmarks-unexplained", "c6")]
 
 
 @pytest.mark.parametrize("name", ["soft", "gloss", "hard", "scan_city", "scan_studio", "scan_sun"])

@@ -24,10 +24,11 @@ CAMERAS = ("left", "right", "third")
 
 @dataclass
 class Rough:
-    """A capture in memory that may be made wrong: frames by (camera, timestep), and what the file says of lengths."""
+    """A capture in memory that may be made wrong: frames by (camera, timestep), units, and its folder."""
 
     frames: dict[tuple[str, int], dict]
     units: str
+    good: Path
 
     def of(self, *cameras: str) -> list[dict]:
         return [frame for (name, _), frame in self.frames.items() if name in cameras]
@@ -57,7 +58,7 @@ def read(folder: Path, timesteps: int = 3, factor: float = 0.5, cameras: tuple[s
             "lens": {key: entry[key] for key in ("k1", "k2", "p1", "p2")},
             **{key: factor * entry[key] for key in ("fl_x", "fl_y", "cx", "cy")},
         }
-    return Rough(frames, document["units"])
+    return Rough(frames, document["units"], folder)
 
 
 def write(rough: Rough, out: Path) -> Path:
@@ -219,6 +220,38 @@ def s_curve(value: NDArray) -> NDArray:
     return value**2 * (3 - 2 * value)
 
 
+def another_person(rough: Rough, name: str) -> None:
+    """A camera shows another head, which stands where the first one does."""
+    other = read(rough.good.parent / "gloss", len(rough.steps))
+    for step in rough.steps:
+        rough.frames[name, step].update({key: other.frames[name, step][key] for key in SHOT})
+
+
+def lens(frames: list[dict], k1: float) -> None:
+    """Images through a lens of which the file says nothing."""
+    for frame in frames:
+        focal, centre = np.array([frame["fl_x"], frame["fl_y"]]), np.array([frame["cx"], frame["cy"]])
+        matrix = np.array([[focal[0], 0, centre[0] - 0.5], [0, focal[1], centre[1] - 0.5], [0, 0, 1]])
+        grid = np.stack(np.meshgrid(*map(np.arange, frame["image"].shape[1::-1])), axis=-1)
+        ideal = cv2.undistortPoints(grid.reshape(-1, 1, 2).astype(float), matrix, np.array([k1, 0, 0, 0]), P=matrix)
+        x, y = ideal.reshape(*grid.shape).astype(np.float32).transpose(2, 0, 1)
+        frame["image"] = cv2.remap(frame["image"], x, y, cv2.INTER_LINEAR)
+        seen = (frame["points"] - centre) / focal
+        frame["points"] = seen * (1 + k1 * (seen**2).sum(1, keepdims=True)) * focal + centre
+
+
+def frontal(frames: list[dict], front: dict, half: bool = False) -> None:
+    """Landmarks of a detector that takes a profile for a front, or lays the hidden half of a face on the seen one."""
+    for frame in frames:
+        seen = frame["points"][frame["visible"]]
+        low, size = seen.min(0), np.ptp(seen, axis=0)
+        if half:
+            frame["points"] = frame["points"] + np.outer(np.arange(68) % 2, (0.15 * size[0], 0))
+        else:
+            frame["points"] = (front["points"] - front["points"].min(0)) / np.ptp(front["points"], axis=0) * size + low
+        frame["visible"] = np.ones(68, dtype=bool)
+
+
 Change = Callable[[Rough], None]
 both: Callable[[Rough], list[dict]] = lambda rough: rough.of("left", "right")  # noqa: E731
 
@@ -248,7 +281,9 @@ WRONG: dict[str, Change] = {
     "linear in PNG": lambda r: codes(both(r), decoded),
     "tone curve": lambda r: codes(both(r), s_curve),
     "lengths x 10": lambda r: lengths(r, 10.0),
-    # ten more
+    "two people": lambda r: another_person(r, "right"),
+    "lens left out": lambda r: lens(both(r), -1.5),
+    # more
     "all mirrored": lambda r: flip(both(r), detected_after=True),
     "feet": lambda r: lengths(r, 1 / 30.48),
     "one upside down": lambda r: turn(r.of("left")),

@@ -75,6 +75,21 @@ def test_exposure_of_a_radiance_file_is_undone(tmp_path: Path) -> None:
             read_image(radiance(path, header))
 
 
+def test_primaries_of_a_radiance_file_are_converted(tmp_path: Path) -> None:
+    path, rgbe = tmp_path / "e.hdr", "FORMAT=32-bit_rle_rgbe\n"
+    plain = read_image(radiance(path, rgbe))[0, 0]
+    same = read_image(radiance(path, rgbe + "PRIMARIES=0.640 0.330 0.300 0.600 0.150 0.060 0.3127 0.3290\n"))[0, 0]
+    np.testing.assert_array_equal(same, plain)
+    none = read_image(radiance(path, rgbe + "PRIMARIES=0 0 0 0 0 0 0 0\n"))[0, 0]
+    np.testing.assert_array_equal(none, plain)
+    exr = write_exr(tmp_path / "e.exr", flat(*plain), chromaticities=REC_2020)
+    wide = read_image(radiance(path, rgbe + "PRIMARIES=" + " ".join(map(str, REC_2020)) + "\n"))[0, 0]
+    np.testing.assert_allclose(wide, read_image(exr)[0, 0], rtol=1e-5)
+    for value in ("0.3 0.3 0.3 0.3 0.3 0.3 0.3 0.3", "0.64 0.33", "x", "nan " * 8, ""):
+        with pytest.raises(InputError, match=r"e\.hdr: "):
+            read_image(radiance(path, rgbe + f"PRIMARIES={value}\n"))
+
+
 @pytest.mark.parametrize("bits", [8, 16])
 def test_gamma_of_a_png_is_heeded(tmp_path: Path, bits: int) -> None:
     import cv2

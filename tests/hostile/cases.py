@@ -1199,7 +1199,8 @@ def colours(base: Path) -> Iterator[Case]:
     for name, prepare in {
         "xyze": radiance(b"FORMAT=32-bit_rle_xyze\n"), "format": radiance(b"FORMAT=something\n"), "exposure 0": radiance(b"FORMAT=32-bit_rle_rgbe\nEXPOSURE=0\n"),
         "exposure nan": radiance(b"FORMAT=32-bit_rle_rgbe\nEXPOSURE=nan\n"), "exposure text": radiance(b"FORMAT=32-bit_rle_rgbe\nEXPOSURE=x\n"),
-        "exposure huge": radiance(b"FORMAT=32-bit_rle_rgbe\nEXPOSURE=1e-300\n"), "square": radiance(b"FORMAT=32-bit_rle_rgbe\n", b"-Y 16 +X 16"),
+        "exposure huge": radiance(b"FORMAT=32-bit_rle_rgbe\nEXPOSURE=1e-300\n"), "primaries": radiance(b"FORMAT=32-bit_rle_rgbe\nPRIMARIES=0.3 0.3 0.3 0.3 0.3 0.3 0.3 0.3\n"),
+        "square": radiance(b"FORMAT=32-bit_rle_rgbe\n", b"-Y 16 +X 16"),
     }.items():  # fmt: skip
         yield Case(
             f"colours:hdr {name}",

@@ -121,28 +121,32 @@ def landmark_diagnostics(shots: Sequence[Shot], later: Sequence[Shot], face: Fac
     given = explain(shots, face)
     if given.cost <= SOUND:
         return _size_diagnostics(given, face.unit_mm)
-    tried = [(one, explain(one.shots, face)) for one in hypotheses(shots, later)]
-    shifts = {name: explain(shots, face, name) for name in given.offsets} if len(given.offsets) > 1 else {}
-    least = min([how.cost for _, how in tried] + [how.cost for how in shifts.values()], default=np.inf)
-    if least > BETTER * given.cost:
-        return _size_diagnostics(given, face.unit_mm) + ([_unexplained(given)] if given.cost > DOUBTFUL else [])
-    alike = [(one, how) for one, how in tried if how.cost <= ALIKE * least]
-    if not alike:
-        return [_shifted(given, shifts)]
+    tried = [(one, explain(one.shots, face, one.shifted)) for one in hypotheses(shots, later)]
+    least = min((how.cost for _, how in tried), default=np.inf)
+    if least > min(BETTER * given.cost, DOUBTFUL):
+        return [_unexplained(given)] if given.cost > DOUBTFUL else _size_diagnostics(given, face.unit_mm)
 
-    def odd(pair: tuple[Hypothesis, Explanation]) -> tuple[bool, bool, bool]:
-        """What landmarks don't tell apart: but people stand upright, are of human size, and lenses are centred."""
+    def odd(pair: tuple[Hypothesis, Explanation]) -> tuple[bool, ...]:
+        """What landmarks don't tell apart: but people stand upright, are of human size, and lenses are centred.
+
+        A shift has two unknowns more than other mistakes, so that it comes last.
+        """
         one, how = pair
         off_centre = any(_off_centre(shot.camera) > 2 * OFF_CENTRE for shot in one.shots)
-        return not _upright(one.shots), not 1 / LARGEST_FACE <= how.size <= LARGEST_FACE, off_centre
+        human = 1 / LARGEST_FACE <= how.size <= LARGEST_FACE
+        return one.shifted is not None, not _upright(one.shots), not human, off_centre
 
+    alike = [(one, how) for one, how in tried if how.cost <= ALIKE * least]
     likely = min(map(odd, alike))
     mistakes = [(one, how) for one, how in alike if odd((one, how)) == likely]
-    text = ", or ".join(dict.fromkeys(one.text for one, _ in mistakes))
+    shift = "({:.0f}, {:.0f})"
+    texts = [one.text.replace("(x, y)", shift.format(*-how.shift) if one.shifted else "") for one, how in mistakes]
+    text = ", or ".join(dict.fromkeys(texts))
     remedy = "; or ".join(dict.fromkeys(one.remedy for one, _ in mistakes))
     figures = f"a face then explains the landmarks at a cost of {least:.2f} each in place of {given.cost:.2f}"
     first, right = mistakes[0]
-    named = Diagnostic(first.code, f"{text}: {figures}; {remedy}", "fault", first.camera)
+    camera = first.camera if len({one.camera for one, _ in mistakes if one.shifted}) < 2 else None
+    named = Diagnostic(first.code, f"{text}: {figures}; {remedy}", "fault", camera)
     return [named, *_size_diagnostics(right, face.unit_mm)]
 
 
@@ -162,18 +166,6 @@ def _unexplained(given: Explanation) -> Diagnostic:
     return Diagnostic("landmarks-unexplained", text, camera=name)
 
 
-def _shifted(given: Explanation, shifts: dict[str, Explanation]) -> Diagnostic:
-    name = min(shifts, key=lambda name: shifts[name].cost)
-    x, y = -shifts[name].shift
-    who = " or ".join(shifts) if len(shifts) == 2 else name
-    text = (
-        f"landmarks of camera {who} lie ({x:.0f}, {y:.0f}) pixels off where the other cameras' put them (a cost of "
-        f"{given.cost:.2f} each, {shifts[name].cost:.2f} without): the camera was turned after calibration, or its "
-        "principal point or landmarks are off; calibrate again"
-    )
-    return Diagnostic("camera-turned", text, "fault", None if len(shifts) == 2 else name)
-
-
 def _size_diagnostics(right: Explanation, unit_mm: float) -> list[Diagnostic]:
     """What the size of the face says, once other mistakes are undone."""
     size = right.size
@@ -191,7 +183,7 @@ def _size_diagnostics(right: Explanation, unit_mm: float) -> list[Diagnostic]:
         )
     else:
         text = (
-            f"the face is {size:.2f} times a human one, expected {1 / LARGEST_FACE:.2f} to {LARGEST_FACE:.2f}: the "
+            f"the face is {size:.3g} times a human one, expected {1 / LARGEST_FACE:.2f} to {LARGEST_FACE:.2f}: the "
             "focal length, the distance between the cameras or the unit of length is wrong; calibrate again"
         )
     return [Diagnostic("lengths-wrong", text, "fault")]
@@ -232,10 +224,14 @@ def copy_diagnostics(capture: Capture, cameras: Sequence[str], timesteps: Sequen
     codes = {(name, t): _codes(capture, name, t) for t in timesteps for name in cameras}
     found = []
     for a, b in combinations(cameras, 2):
-        for how, change in (("a copy", np.asarray), ("a mirrored copy", np.fliplr)):
-            if all(_same(change(codes[a, t]), codes[b, t]) for t in timesteps):
-                text = f"camera {b}: its images are {how} of those of camera {a}; import the images of each camera"
-                found.append(Diagnostic("images-copied", text, "fault", b))
+        how = [
+            how
+            for how, change in (("a copy", np.asarray), ("a mirrored copy", np.fliplr))
+            if all(_same(change(codes[a, t]), codes[b, t]) for t in timesteps)
+        ]
+        if how:
+            text = f"camera {b}: its images are {how[0]} of those of camera {a}; import the images of each camera"
+            found.append(Diagnostic("images-copied", text, "fault", b))
     for first, second in combinations(timesteps, 2):
         if all(_same(codes[name, first], codes[name, second]) for name in cameras):
             text = f"timesteps {first} and {second} are copies of one another and tell nothing more; leave one out"
@@ -285,9 +281,10 @@ def colour_diagnostics(capture: Capture, cameras: Sequence[str], timesteps: Sequ
 
 
 def _codes(capture: Capture, name: str, timestep: int) -> NDArray[np.float32]:
-    """(H, W) green as 8-bit sRGB codes would have it, roughly."""
+    """(H, W) green as 8-bit sRGB codes of a well exposed image would have it, roughly."""
     image = capture.frame(name, timestep).image[..., 1]
-    return np.asarray(255.0 * np.clip(image, 0.0, 1.0) ** (1 / 2.2), dtype=np.float32)
+    white = max(float(np.percentile(image, 99)), 1e-30)
+    return np.asarray(255.0 * np.clip(image / white, 0.0, 1.0) ** (1 / 2.2), dtype=np.float32)
 
 
 def _same(a: NDArray, b: NDArray) -> bool:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,10 +15,11 @@ from mifit.morphable import MorphableModel
 from mifit.stages.checks.capture_checks import landmark_shots
 from mifit.stages.checks.landmark_model import INNER, noise_of
 
-SHIFT = 0.6
+T = TypeVar("T", bound=str)
+SHIFT = 0.8
 """Shift that the landmarks of all cameras share from the face that the images show, in deviations of one landmark,
 beyond which it is no detector's: the fit gives way to two thirds of it."""
-CONTRADICTIONS = ("views-disagree", "landmarks-shifted")
+CONTRADICTIONS = ("views-disagree", "landmarks-shifted", "landmarks-unexplained", "landmarks-scatter")
 """Codes of what a fit that explains its images doesn't have."""
 INCONSISTENT = "inconsistent"
 """Outcome of a stage whose search has ended where the views, or images and landmarks, contradict one another."""
@@ -57,8 +59,18 @@ def check_fit(
     return [Diagnostic("landmarks-shifted", text)]
 
 
-def judged(geometry: GeometryEstimate, found: Sequence[Diagnostic]) -> GeometryEstimate:
-    """The fit, its outcome `INCONSISTENT` where the capture has a named fault or the fit contradicts its images."""
-    report = geometry.report
-    bad = any(one.severity == "fault" or one.code in CONTRADICTIONS for one in (*found, *report.warnings))
-    return replace(geometry, report=replace(report, outcome=INCONSISTENT)) if bad else geometry
+def judged(estimates: Mapping[T, Any], found: Sequence[Diagnostic]) -> dict[T, Any]:
+    """The estimates; all end `INCONSISTENT` where the capture has a named fault or the fit contradicts its images.
+
+    Parameters
+    ----------
+    estimates : mapping
+        By part, ``"geometry"`` among them.
+    found : sequence of Diagnostic
+        Of the capture and of the fit.
+    """
+    found = (*found, *estimates["geometry"].report.warnings)
+    if not any(one.severity == "fault" or one.code in CONTRADICTIONS for one in found):
+        return dict(estimates)
+    reports = {part: replace(estimate.report, outcome=INCONSISTENT) for part, estimate in estimates.items()}
+    return {part: replace(estimate, report=reports[part]) for part, estimate in estimates.items()}

@@ -24,13 +24,17 @@ LARGEST_DELAY = 3
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A mistake: its code, the words for it and for its remedy, the camera, and the shots with it undone."""
+    """A mistake: its code, the words for it and for its remedy, the shots with it undone, and the camera.
+
+    ``shifted`` names a camera whose landmarks may all lie off by the same pixels, ``(x, y)`` in the text.
+    """
 
     code: str
     text: str
     remedy: str
     shots: tuple[Shot, ...]
     camera: str | None = None
+    shifted: str | None = None
 
 
 # Changes of one shot
@@ -206,6 +210,10 @@ def hypotheses(shots: Sequence[Shot], later: Sequence[Shot] = ()) -> Iterator[Hy
     for change in INVERTED:
         text = "world-to-camera matrices are given where camera-to-world ones belong, or the reverse"
         yield Hypothesis("poses-inverted", text, "invert transform_matrix", tuple(map(change, shots)))
+    for name in names:
+        text = f"landmarks of camera {name} lie (x, y) pixels off where the other cameras' put them"
+        remedy = "the camera was turned after calibration, or its principal point or landmarks are off; calibrate again"
+        yield Hypothesis("camera-turned", text, remedy, tuple(shots), name, name)
     for name in names[1:] if len(names) == 2 else names:
         for late in range(-LARGEST_DELAY, LARGEST_DELAY + 1):
             moved = tuple(

@@ -178,7 +178,7 @@ class ConsistencyProblem:
             products = square(shared, local, residual, factor * row_weight)
             w = row_weight.astype(np.float32)[:, None]
             n = len(view.points)
-            return products, (w * shared).reshape(n, channels, s), (w * local).reshape(n, channels, -1)
+            return products, (w * shared).reshape(n, channels, s), (w * local).reshape(n, channels, local.shape[-1])
 
         for view, found in zip(self.views, on_all_cores(columns, range(len(self.views))), strict=True):
             products, shared, local = found

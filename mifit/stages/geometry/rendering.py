@@ -127,7 +127,8 @@ class Surface:
         through = sp.csr_matrix(
             (by_sum.ravel(), columns.ravel(), np.arange(0, 27 * n + 1, 9)), shape=(3 * n, 3 * len(touched))
         )
-        return (through @ self._normal_sum_modes(touched)).reshape(n, 3, -1)
+        modes = through @ self._normal_sum_modes(touched)
+        return modes.reshape(n, 3, modes.shape[-1])
 
     def _normal_sum_modes(self, vertices: NDArray) -> NDArray:
         """(3N, Ki + Ke) derivative of the summed face normals around some vertices (N,) by the coefficients."""
@@ -149,13 +150,11 @@ class Surface:
         around = sp.csr_matrix(
             (np.ones((wanted >= 0).sum(), dtype), (wanted[wanted >= 0], which[wanted >= 0])), shape=(len(vertices), n)
         )
-        return np.concatenate(
-            [
-                (around @ (by_vertex @ modes.reshape(3 * len(modes), -1)).reshape(n, -1)).reshape(3 * len(vertices), -1)
-                for modes in (model.identity, model.expression)
-            ],
-            axis=1,
-        )
+        parts = []
+        for modes, k in ((m, m.shape[-1]) for m in (model.identity, model.expression)):
+            by_modes = by_vertex @ modes.reshape(3 * len(modes), k)
+            parts.append((around @ by_modes.reshape(n, 3 * k)).reshape(3 * len(vertices), k))
+        return np.concatenate(parts, axis=1)
 
 
 @dataclass(frozen=True)
@@ -222,10 +221,11 @@ class RenderingProblem:
         for view in self.views:
             n = len(view.face)
             points = PointBasis.on_faces(model, view.face, view.weights)
-            position = np.concatenate([points.identity, points.expression], axis=1).reshape(n, 3, -1)
+            position = np.concatenate([points.identity, points.expression], axis=1)
+            position = position.reshape(n, 3, position.shape[-1])
             mix = corner_matrix(model.faces, view.face, view.weights, len(model.mean))
             modes = mix @ model.albedo_modes.reshape(len(model.mean), -1)
-            out.append(PixelRows(position, mix @ model.mean_albedo, modes.reshape(n, 3, -1)))
+            out.append(PixelRows(position, mix @ model.mean_albedo, modes.reshape(n, 3, modes.shape[-1] // 3)))
         return out
 
     @cached_property
@@ -355,4 +355,4 @@ class RenderingProblem:
         by_pose[:, :, :3] -= by_normal @ cross_matrix(o.normal) @ pose.left_jacobian
         out[:, :, shared + layout.expression : -1] = by_pose
         out[:, :, -1] = root[:, 0] * o.residual
-        return out.reshape(3 * n, -1)
+        return out.reshape(3 * n, out.shape[2])

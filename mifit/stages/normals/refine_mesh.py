@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.config import MeshConfig
+from mifit.core.calls import checked
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, Report
 from mifit.core.mesh import interpolate, normalize, split_faces, vertex_normals
 from mifit.core.mesh_solve import MeshUpdater, displacement, interior_vertices, wanted_face_normals
@@ -25,6 +26,7 @@ SETTLED = 0.01
 """Part of the displacement by which the last iteration may still move the vertices."""
 
 
+@checked
 def refine_mesh(
     model: MorphableModel,
     geometry: GeometryEstimate,

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from mifit.appearance.formation import Appearance, BentShading, form_image
 from mifit.appearance.occlusion import MeshPoints
 from mifit.config import NormalsConfig
+from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
 from mifit.core.mesh import normalize
@@ -49,6 +50,7 @@ SETTLED, SOLVED = 1e-3, 0.03
 """Part of the energy that the last step may promise, and of the residual that conjugate gradients leave."""
 
 
+@checked
 @one_blas_thread()
 def refine_normals(
     capture: Capture,
