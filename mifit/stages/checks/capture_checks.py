@@ -43,8 +43,8 @@ RED_OVER_BLUE = 0.85
 """Red over blue of skin below which the channels are exchanged. It is 1.5 to 4 in linear light, and above 1 under
 every light from candles to blue sky (Stoerring 2004)."""
 RED_OVER_GREEN = (1.25, 3.2)
-"""Red over green of skin in linear light, as camera and white balance give it: 1.4 to 2.9 (ISO/TR 16066 set of skins), a
-tenth less where the room is bluish. Codes of sRGB that are taken for linear halve its logarithm."""
+"""Red over green of skin in linear light, as camera and white balance give it: 1.4 to 2.9 (ISO/TR 16066 set of skins),
+a tenth less where the room is bluish. Codes of sRGB that are taken for linear halve its logarithm."""
 COLOURS_APART = 0.4
 """Difference of the logarithms of red over blue between cameras at which their colours are questioned."""
 CODE_ROUNDING = 0.02
