@@ -92,7 +92,7 @@ class Part:
 
 
 def _prior_alone(colour: Any, weight: Any, wrong: Any, *rest: Any) -> Any:
-    """In place of `trust.agreement`: an observation's own probability, whatever other cameras see."""
+    """In place of `visibility.inlier_probability`: an observation's own probability, whatever other cameras see."""
     return (1.0 - wrong).astype(np.float32)
 
 
@@ -115,7 +115,7 @@ PARTS = (
     Part("stage 2: segmentation", {"reflectance.segment": False}),
     Part(
         "stage 2: agreement of the observations of a point",
-        patches={"mifit.stages.observations.agreement": _prior_alone},
+        patches={"mifit.sampling.observations.inlier_probability": _prior_alone},
         step="reflectance",
     ),
     Part("stage 2: robust weights and what needs them", {"reflectance.robust": False}),

@@ -149,7 +149,7 @@ def outcome(result: Reconstruction) -> dict[str, Any]:
         "unconverged": [name for name, report in reports.items() if report.outcome != "converged"],
         "seconds": {name: round(report.seconds, 1) for name, report in reports.items()},
         "compact_lights": len(lights),
-        "exponent": result.reflectance.lobe.typical if result.reflectance else None,
+        "exponent": result.reflectance.lobe.exponent if result.reflectance else None,
         "warnings": [one.text for one in result.diagnostics],
     }
 

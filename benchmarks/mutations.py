@@ -132,7 +132,7 @@ MUTATIONS = (
     M("the nearest view is the farthest", "image_based._weight", "2.0 + nearness", "2.0 - nearness",
       "tests/test_foreign.py"),
     # Light, shadow and skin.
-    M("shadowed normals see what the mesh's see", "shadowed.ShadowedModel.about", "blocked - passed * open_sky",
+    M("shadowed normals see what the mesh's see", "models.ShadowedModel.about", "blocked - passed * open_sky",
       "blocked - open_sky", "tests/appearance/test_models.py"),
     M("the lobe's energy not normalised", "lobe.normalization", "8.0 * np.pi", "4.0 * np.pi",
       "tests/appearance/test_lobe.py"),
@@ -140,12 +140,12 @@ MUTATIONS = (
       "rotation_matrix(np.transpose(rotation), self.order)", "tests/core/test_sh.py"),
     # Observations.
     M("a twin of a view adds to what it is believed", "observations.Surface._observe",
-      "weight *= np.minimum(right, 1.0 - wrong)", "weight *= right", "tests/stages/test_observations.py"),
+      "weight *= np.minimum(inlier, 1.0 - outlier)", "weight *= inlier", "tests/sampling/test_observations.py"),
     M("texels seen at a slant are of as good a quality", "observations.Surface.quality", "np.clip(cosine, 0.0, 1.0)",
-      "1.0", "tests/stages/test_observations.py"),
-    M("distances to the outline in pixels, not in millimetres", "surface_image.Placed.read",
-      "bilinear(image.outline, x, y) * depth / camera.fx", "bilinear(image.outline, x, y)",
-      "tests/stages/test_observations.py"),
+      "1.0", "tests/sampling/test_observations.py"),
+    M("distances to the outline in pixels, not in millimetres", "observations.Surface._observe",
+      "bilinear(image.outline, *pixel.T) * depth / camera.fx", "bilinear(image.outline, *pixel.T)",
+      "tests/sampling/test_observations.py"),
     M("a coarser camera is half a pixel off", "prediction_between_views.every", "0.5 * (step - 1)", "0.0",
       "tests/stages/test_prediction_between_views.py"),
     M("refined normals turned the wrong way for the residual", "find_residual._difference", "rotation.T", "rotation",
@@ -156,7 +156,7 @@ MUTATIONS = (
     M("Geman and McClure's weight not squared", "robust.geman_mcclure", "q * q", "q", "tests/optim/test_solve.py"),
     # Paper.
     M("1 / |F_view| dropped", "refine.paper_problem", "max(len(view.index), 1)", "1", "tests/test_paper.py"),
-    M("the paper's exponent 10", "paper.PaperModel", "exponent = 5.0", "exponent = 10.0", "tests/test_paper.py"),
+    M("the paper's exponent 10", "models.PaperModel", "exponent = 5.0", "exponent = 10.0", "tests/test_paper.py"),
     M("lambda_H for values of 0..1", "config.FitConfig.paper", "0.001 / 255.0", "0.001", "tests/test_paper.py"),
     M("preset with w2 ten times the paper's", "config.FitConfig.paper", "0.3", "3.0", "tests/test_paper.py"),
     # What is kept.

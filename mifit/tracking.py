@@ -34,6 +34,7 @@ from mifit.progress import Progress, silent
 from mifit.result import Reconstruction
 from mifit.result.ownership import locked
 from mifit.result.writing import add_timestep
+from mifit.sampling.observations import Surface
 from mifit.stages.fit_geometry import fit_pose_expression
 from mifit.stages.geometry.refine import texture_reference
 from mifit.stages.normals.refine_mesh import MeshRefiner
@@ -123,7 +124,8 @@ def track(
         began = time.perf_counter()
         found, refound, warnings = follower.next(timestep)
         prior = memory.offsets(found)
-        frame = refine_frame(capture, model, found, reflectance, cameras, config, texels, prior, seed)
+        surface = Surface(capture, model, found, cameras, texels.size, texels=texels)
+        frame = refine_frame(surface, reflectance, config, prior, seed)
         if frame.measured == 0.0:
             text = f"timestep {timestep}: no camera measures the face; normals are those of the frames before"
             warnings.append(Diagnostic("face-unseen", text))

@@ -12,7 +12,7 @@ import pytest
 from benchmarks import ablation, mutations
 from benchmarks.mutations import Mutation
 from benchmarks.record import RESULTS, renew_tables
-from mifit.stages import observations
+from mifit.sampling import observations
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
@@ -68,11 +68,11 @@ def test_parts_are_told_against_the_base_of_their_head_and_set():
 
 
 def test_a_part_is_off_only_while_its_row_is_fitted():
-    (part,) = (part for part in ablation.PARTS if "mifit.stages.observations.agreement" in part.patches)
-    before = observations.agreement
+    (part,) = (part for part in ablation.PARTS if "mifit.sampling.observations.inlier_probability" in part.patches)
+    before = observations.inlier_probability
     with part.applied():
-        assert observations.agreement is not before
-    assert observations.agreement is before
+        assert observations.inlier_probability is not before
+    assert observations.inlier_probability is before
 
 
 def test_a_part_that_there_is_no_more_is_named(monkeypatch):

@@ -205,7 +205,7 @@ def test_the_maps_are_smoothed_as_an_offset_from_the_models_albedo():
     systems = TexelSystems.accumulate(
         noisy.reshape(256, 1, 3).astype(np.float32), ones, ones, 0 * ones, np.zeros((0, 2), int), 0.0
     )  # fmt: skip
-    found = solve_maps(systems, index, prior, Smoothness(1.0, 1.0), iterations=300)[..., :3] - prior[..., :3]
+    found = solve_maps(systems, index, prior, Smoothness(1.0, 1.0), iterations=300)[0][..., :3] - prior[..., :3]
     assert found.mean() == pytest.approx(0.1, abs=0.02) and np.abs(laplacian(found)).mean() < 0.02
 
 
@@ -221,7 +221,7 @@ def test_the_printed_highlight_is_the_quotient(variant):
     import mitsuba as mi
 
     from mifit.appearance.arrays import on_device
-    from mifit.appearance.models.paper import SMALLEST, paper_specular
+    from mifit.appearance.models import SMALLEST, paper_specular
 
     n = RNG.normal(size=(200, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
@@ -242,6 +242,7 @@ def test_the_printed_highlight_is_the_quotient(variant):
 
 def test_weights_of_stage_3_are_for_images_and_normal_maps_of_8_bits(variant):
     from mifit.core.uv import rasterize_uv
+    from mifit.sampling.observations import Surface
     from mifit.stages.normals.refine_normals import frame_problem
     from tests.stages.normal_scene import build
 
@@ -249,8 +250,8 @@ def test_weights_of_stage_3_are_for_images_and_normal_maps_of_8_bits(variant):
     size = small.reflectance.diffuse.shape[0]
     texels = rasterize_uv(small.model.uv, small.model.faces_uv, size, small.model.face_mask)
     config = NormalsConfig(laplacian_weight=2e-3, magnitude_weight=0.3)
-    cameras = ("left", "right")
-    problem, rows, base = frame_problem(small, small.model, small.geometry, small.reflectance, cameras, config, texels)
+    surface = Surface(small, small.model, small.geometry, ("left", "right"), size, texels=texels)
+    problem, rows, base = frame_problem(surface, small.reflectance, config)
     offsets = 0.1 * np.random.default_rng(0).normal(size=(len(rows), 2))
     found = problem.energies(offsets)
     turned = base[rows]
@@ -258,7 +259,7 @@ def test_weights_of_stage_3_are_for_images_and_normal_maps_of_8_bits(variant):
     # 255^2 E = sum |255 residual|^2 + w1 |127.5 Laplacian|_1 + w2 |127.5 delta|^2
     assert found["magnitude"] == pytest.approx(0.3 * (127.5**2) * (delta**2).sum() / 255**2, rel=1e-3)
     plain = replace(config, laplacian_weight=4e-3)
-    twice = frame_problem(small, small.model, small.geometry, small.reflectance, cameras, plain, texels)[0]
+    twice = frame_problem(surface, small.reflectance, plain)[0]
     from mifit.core.uv import texel_neighbours
 
     near = texel_neighbours(TexelMap(size, texels.index[rows], texels.face[rows], texels.weights[rows]))

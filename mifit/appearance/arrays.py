@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mifit.errors import InputError
 
 ALIGNMENT = 64
+Jit: TypeAlias = Any
+"""A Dr.Jit array, vector or colour: its class belongs to the active variant, so no type can name it."""
 
 
-def aligned(values: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray[Any]:
+def aligned(values: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray:
     """Copy values into contiguous memory that starts at a multiple of `ALIGNMENT` bytes.
 
     Dr.Jit reads NumPy's memory where it lies, and its LLVM backend writes the memory's alignment into the kernel. NumPy
@@ -28,12 +30,12 @@ def aligned(values: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray[Any]:
     return out
 
 
-def on_device(kind: Any, values: NDArray) -> Any:
+def on_device(kind: Jit, values: NDArray) -> Jit:
     """(N, 3) array -> Dr.Jit vector of a kind, such as ``mi.Vector3f``."""
     return kind(*map(aligned, np.asarray(values).T))
 
 
-def stored(values: list[Any], count: int) -> NDArray[np.float32]:
+def stored(values: list[Jit], count: int) -> NDArray[np.float32]:
     """Floats, of width N or 1, computed in one kernel -> (N, number of values)."""
     import drjit as dr
     import mitsuba as mi
@@ -45,7 +47,7 @@ def stored(values: list[Any], count: int) -> NDArray[np.float32]:
     return np.stack([np.broadcast_to(np.array(f, dtype=np.float32), (count,)) for f in floats], axis=1)
 
 
-def expect(values: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float32]:
+def expect(values: ArrayLike, shape: tuple[int, ...], name: str) -> NDArray[np.float32]:
     """The values as float32; InputError names the shape found and the one expected."""
     array = np.asarray(values, dtype=np.float32)
     if array.shape != shape:

@@ -8,46 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mifit.appearance import models
-from mifit.appearance.arrays import aligned, expect, on_device, stored
+from mifit.appearance.arrays import Jit, aligned, expect, on_device, stored
 from mifit.appearance.illumination import DistantLight, Illumination
-from mifit.appearance.kernels import PreparedLobe, prepare
+from mifit.appearance.kernels import PreparedLobe, light_transfer, prepare
 from mifit.appearance.lobe import Lobe
-from mifit.appearance.models import ShadingModel
-from mifit.appearance.models.base import Shade
+from mifit.appearance.models import Shade, ShadingModel
 from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, VertexTransfer
 from mifit.errors import InputError
 
 OPEN = Occlusion()
 
 
-def form_image(ambient: Any, albedo: Any, diffuse: Any, specular_albedo: Any, specular: Any) -> Any:
+def form_image(ambient: Jit, albedo: Jit, diffuse: Jit, specular_albedo: Jit, specular: Jit) -> Jit:
     """The image of points, from diffuse and specular radiance at unit albedo; NumPy or Dr.Jit, shapes broadcast."""
     return ambient + albedo * diffuse + specular_albedo * specular
-
-
-class Reflectance(Protocol):
-    """What `Appearance.of` reads of stage 2's estimate."""
-
-    @property
-    def illumination(self) -> Illumination:
-        """The light."""
-        ...
-
-    @property
-    def lobe(self) -> Lobe:
-        """The specular lobe."""
-        ...
-
-    @property
-    def shading_model(self) -> str:
-        """Name of the shading model."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -59,17 +37,11 @@ class Appearance:
     model : ShadingModel
     illumination : Illumination
     lobe : Lobe
-        One exponent, or one for each of the points that are shaded.
     """
 
     model: ShadingModel
     illumination: Illumination
     lobe: Lobe
-
-    @classmethod
-    def of(cls, reflectance: Reflectance, lobe: Lobe | None = None) -> Appearance:
-        """That of an estimate; ``lobe`` stands for its own, e.g. looked up at the points."""
-        return cls(models.get(reflectance.shading_model), reflectance.illumination, lobe or reflectance.lobe)
 
     @property
     def order(self) -> int:
@@ -159,7 +131,7 @@ class Appearance:
         n, v = (dr.gather(mi.Vector3f, x, point) for x in (scene.n, scene.v))
         d = dr.gather(mi.Vector3f, towards, light)
         seen = mi.UInt(aligned(visible, np.uint32).ravel())
-        both = stored(list(self.model.light(n, v, scene.lobe, [d], seen)), shape[0] * shape[1])
+        both = stored(list(light_transfer(n, v, scene.lobe, [d], seen)), shape[0] * shape[1])
         return both[:, 0].reshape(shape), both[:, 1].reshape(shape)
 
     def _smooth(self, scene: _Scene) -> Shade:
@@ -248,14 +220,14 @@ class _Scene:
         """Shading of bent normals, compact lights included."""
         return self.with_lights(self.model.about(self.n, self.v, self.lobe, self.coefficients, self.shadowed))
 
-    def light(self, light: DistantLight, visible: Any) -> Shade:
+    def light(self, light: DistantLight, visible: Jit) -> Shade:
         """Radiance at unit albedo per unit of a light's colour, as a function of normal and view."""
         import drjit as dr
         import mitsuba as mi
 
         directions = [mi.Vector3f(*map(float, d)) for d in light.samples()]
         dr.make_opaque(directions)
-        return lambda n, v: self.model.light(n, v, self.lobe, directions, visible)
+        return lambda n, v: light_transfer(n, v, self.lobe, directions, visible)
 
     def with_lights(self, smooth: Shade) -> Shade:
         """Add the compact lights to the shading by smooth light."""
@@ -269,7 +241,7 @@ class _Scene:
         colours = [mi.Color3f(*map(float, light.colour)) for light in lights]
         dr.make_opaque(colours)
 
-        def shade(n: Any, v: Any) -> tuple[Any, Any]:
+        def shade(n: Jit, v: Jit) -> tuple[Jit, Jit]:
             diffuse, specular = smooth(n, v)
             for part, colour in zip(parts, colours, strict=True):
                 d, s = part(n, v)
@@ -278,7 +250,7 @@ class _Scene:
 
         return shade
 
-    def store(self, shaded: tuple[Any, Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def store(self, shaded: tuple[Jit, Jit]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Two colours -> two arrays (N, 3)."""
         import mitsuba as mi
 
@@ -287,7 +259,7 @@ class _Scene:
         return both[:, :3], both[:, 3:]
 
 
-def _read_transfer(transfer: VertexTransfer, count: int, order: int) -> list[Any]:
+def _read_transfer(transfer: VertexTransfer, count: int, order: int) -> list[Jit]:
     """B*B Floats, not evaluated: kernels gather them from rows in memory, four at a time."""
     import drjit as dr
     import mitsuba as mi
@@ -299,7 +271,7 @@ def _read_transfer(transfer: VertexTransfer, count: int, order: int) -> list[Any
     weights = [mi.Float(aligned(column)) for column in transfer.weights.T]
     packets = -(-size // 4)
     flat = mi.Float(aligned(np.pad(values, ((0, 0), (0, 4 * packets - size)))).ravel())
-    found: list[Any] = []
+    found: list[Jit] = []
     for packet in range(packets):
         read = [dr.gather(mi.Vector4f, flat, row * packets + packet) for row in rows]
         found += [weights[0] * read[0][i] + weights[1] * read[1][i] + weights[2] * read[2][i] for i in range(4)]

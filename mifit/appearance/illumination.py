@@ -53,8 +53,8 @@ class DistantLight:
         object.__setattr__(self, "colour", colour)
 
     def samples(self, count: int = RAYS) -> NDArray[np.float64]:
-        """(count, 3) directions that cover the disc evenly."""
-        return disc(self.direction, self.radius, whole(count, 1, "count"))
+        """(count, 3) directions that cover the disc evenly; one of a point."""
+        return disc(self.direction, self.radius, whole(count, 1, "count") if self.radius > 0.0 else 1)
 
     def with_colour(self, colour: ArrayLike) -> DistantLight:
         """The same light in another colour."""

@@ -10,25 +10,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from mifit.appearance.arrays import aligned
+from mifit.appearance.arrays import Jit
 from mifit.appearance.lobe import EXPONENT_MAX, EXPONENT_MIN, Lobe, lobe_table
-from mifit.appearance.lobe import normalization as normalization_of
 from mifit.core.sh import bands, cosine_coefficients
 from mifit.errors import InputError
 
 
-def sh_basis(d: Any, order: int) -> list[Any]:
+def sh_basis(d: Jit, order: int) -> list[Jit]:
     """The basis functions at unit directions, B*B of them."""
     import drjit as dr
 
     return dr.sh_eval(d, order - 1)
 
 
-def colours(flat: Any, order: int, width: int = 1) -> list[Any]:
+def colours(flat: Jit, order: int, width: int = 1) -> list[Jit]:
     """Flat coefficients (B*B*3) -> B*B colours, repeated for ``width`` points.
 
     Repeated ones have the same values but a cheaper gradient: the sums over all points are taken in the kernel that
@@ -41,13 +39,13 @@ def colours(flat: Any, order: int, width: int = 1) -> list[Any]:
     if not dr.is_jit_v(mi.Float):
         return [mi.Color3f(*(flat[3 * k + c] for c in range(3))) for k in range(order * order)]
 
-    def entry(index: int) -> Any:
+    def entry(index: int) -> Jit:
         return dr.gather(mi.Float, flat, dr.full(mi.UInt32, index, width), mode=dr.ReduceMode.Expand)
 
     return [mi.Color3f(*(entry(3 * k + c) for c in range(3))) for k in range(order * order)]
 
 
-def radiance(transfer: Sequence[Any], coefficients: Sequence[Any]) -> Any:
+def radiance(transfer: Sequence[Jit], coefficients: Sequence[Jit]) -> Jit:
     """Dot product of a transfer vector with SH coefficients (B*B colours)."""
     total = transfer[0] * coefficients[0]
     for t, c in zip(transfer[1:], coefficients[1:], strict=True):
@@ -55,7 +53,7 @@ def radiance(transfer: Sequence[Any], coefficients: Sequence[Any]) -> Any:
     return total
 
 
-def diffuse_transfer(n: Any, order: int) -> list[Any]:
+def diffuse_transfer(n: Jit, order: int) -> list[Jit]:
     """Transfer vector of a white Lambertian point: ``A_l / pi * Y_lm(n)``."""
     factors = cosine_coefficients(order)[bands(order)] / np.pi
     return [float(f) * y for f, y in zip(factors, sh_basis(n, order), strict=True)]
@@ -63,7 +61,7 @@ def diffuse_transfer(n: Any, order: int) -> list[Any]:
 
 @dataclass(frozen=True)
 class PreparedLobe:
-    """A lobe of one exponent, or of one per point, on the device and ready to be prefiltered.
+    """A lobe on the device, ready to be prefiltered.
 
     Attributes
     ----------
@@ -81,36 +79,25 @@ class PreparedLobe:
     """
 
     order: int
-    polynomials: list[list[Any]]
-    scale: Any
-    exponent: Any
-    peak: Any
-    fresnel: Any = None
+    polynomials: list[list[Jit]]
+    scale: Jit
+    exponent: Jit
+    peak: Jit
+    fresnel: Jit = None
 
 
 def prepare(lobe: Lobe, order: int) -> PreparedLobe:
-    """Load a lobe: one exponent, or one per point."""
+    """Load a lobe."""
     import drjit as dr
     import mitsuba as mi
 
-    if np.ndim(lobe.exponent):
-        values = np.asarray(lobe.exponent)
-        if not (values > 0).all():
-            raise InputError(f"exponent: found {values.min()}, expected numbers from 1 to 10000")
-        return prepare_exponent(mi.Float(aligned(values)), order, lobe.normalized, lobe.fresnel)
-    exponent = float(lobe.exponent)
-    table = lobe_table(order).coefficients
-    y = 2.0 * np.log(_clamped(exponent)) / np.log(EXPONENT_MAX) - 1.0
-    values = table @ np.polynomial.chebyshev.chebvander(y, table.shape[2] - 1).ravel()
+    if not lobe.exponent > 0:
+        raise InputError(f"exponent: found {float(lobe.exponent)}, expected a number from 1 to 10000")
     # Opaque: a kernel is compiled once, not once per exponent.
-    polynomials = [[dr.opaque(mi.Float, float(a)) for a in row] for row in values]
-    ratio = normalization_of(exponent, lobe.normalized) / normalization_of(exponent)
-    peak = float(normalization_of(exponent, lobe.normalized))
-    scale, width, top = (dr.opaque(mi.Float, float(value)) for value in (ratio, exponent, peak))
-    return PreparedLobe(order, polynomials, scale, width, top, lobe.fresnel)
+    return prepare_exponent(dr.opaque(mi.Float, float(lobe.exponent)), order, lobe.normalized, lobe.fresnel)
 
 
-def prepare_exponent(exponent: Any, order: int, normalized: bool = True, fresnel: Any = None) -> PreparedLobe:
+def prepare_exponent(exponent: Jit, order: int, normalized: bool = True, fresnel: Jit = None) -> PreparedLobe:
     """Prepare the lobe of a Dr.Jit exponent, differentiable and of any width."""
     import drjit as dr
 
@@ -127,13 +114,7 @@ def prepare_exponent(exponent: Any, order: int, normalized: bool = True, fresnel
     return PreparedLobe(order, polynomials, 1.0 / (dr.pi * peak), exponent, 1.0 / dr.pi, fresnel)
 
 
-def _clamped(exponent: float) -> float:
-    if not exponent > 0:
-        raise InputError(f"exponent: found {exponent!r}, expected a number from 1 to 10000")
-    return min(max(exponent, EXPONENT_MIN), EXPONENT_MAX)
-
-
-def _chebyshev(x: Any, count: int) -> list[Any]:
+def _chebyshev(x: Jit, count: int) -> list[Jit]:
     """T_0 .. T_(count - 1) at x."""
     t = [1.0, x]
     for _ in range(2, count):
@@ -141,32 +122,32 @@ def _chebyshev(x: Any, count: int) -> list[Any]:
     return t[:count]
 
 
-def _dot(a: Sequence[Any], t: Sequence[Any]) -> Any:
+def _dot(a: Sequence[Jit], t: Sequence[Jit]) -> Jit:
     total = _scalar(a[0]) * t[0] + _scalar(a[1]) * t[1]
     for ai, ti in zip(a[2:], t[2:], strict=True):
         total = total + _scalar(ai) * ti
     return total
 
 
-def _scalar(value: Any) -> Any:
+def _scalar(value: Jit) -> Jit:
     return float(value) if isinstance(value, np.floating) else value
 
 
-def normalization(exponent: Any) -> Any:
+def normalization(exponent: Jit) -> Jit:
     """The normalised lobe's factor N(m), see ``lobe.normalization``."""
     import drjit as dr
 
     return (exponent + 2.0) * (exponent + 4.0) / (8.0 * dr.pi * (exponent + dr.exp2(-0.5 * exponent)))
 
 
-def fresnel_factor(cosine: Any, fresnel: Any) -> Any:
+def fresnel_factor(cosine: Jit, fresnel: Jit) -> Jit:
     """Factor on the specular albedo towards grazing angles, Schlick's ``1 + fresnel (1 - cosine)^5``."""
     import drjit as dr
 
     return 1.0 + fresnel * (1.0 - dr.clip(cosine, 0.0, 1.0)) ** 5
 
 
-def carried_lobe(wi: Any, wo: Any, n: Any, exponent: Any) -> tuple[Any, Any]:
+def carried_lobe(wi: Jit, wo: Jit, n: Jit, exponent: Jit) -> tuple[Jit, Jit]:
     """The lobe about the mirror direction for single directions, see ``appearance.lobe``.
 
     Returns
@@ -184,12 +165,12 @@ def carried_lobe(wi: Any, wo: Any, n: Any, exponent: Any) -> tuple[Any, Any]:
     return value, power * (exponent + 2.0) * (0.125 / float(np.pi))
 
 
-def specular_transfer(n: Any, v: Any, lobe: PreparedLobe) -> list[Any]:
+def specular_transfer(n: Jit, v: Jit, lobe: PreparedLobe) -> list[Jit]:
     """Transfer vector of the lobe with unit specular albedo, prefiltered about its mean direction."""
     return lobe_transfer(lobe, *lobe_axis(n, v, lobe))
 
 
-def lobe_axis(n: Any, v: Any, lobe: PreparedLobe) -> tuple[Any, list[Any]]:
+def lobe_axis(n: Jit, v: Jit, lobe: PreparedLobe) -> tuple[Jit, list[Jit]]:
     """Mean direction of the reflected lobe, and the lobe's moments."""
     import drjit as dr
 
@@ -205,14 +186,14 @@ def lobe_axis(n: Any, v: Any, lobe: PreparedLobe) -> tuple[Any, list[Any]]:
     return axis * dr.rsqrt(dr.maximum(dr.squared_norm(axis), 1e-12)), moments
 
 
-def lobe_transfer(lobe: PreparedLobe, axis: Any, moments: list[Any]) -> list[Any]:
+def lobe_transfer(lobe: PreparedLobe, axis: Jit, moments: list[Jit]) -> list[Jit]:
     """Transfer vector of the zonal lobe with these moments about an axis, see `lobe_axis`."""
     albedo = moments[0] * lobe.scale
     factors = [albedo, *(albedo * c for c in moments[2:])]
     return [factors[band] * y for band, y in zip(bands(lobe.order), sh_basis(axis, lobe.order), strict=True)]
 
 
-def dominant_direction(coefficients: Sequence[Any]) -> Any:
+def dominant_direction(coefficients: Sequence[Jit]) -> Jit:
     """Unit direction towards the brightest side, from the linear band (Sloan 2008).
 
     Lighting without a linear band has none: the result is (0, 0, 1) there, with finite derivatives.
@@ -229,7 +210,7 @@ def dominant_direction(coefficients: Sequence[Any]) -> Any:
     return dr.select(length > floor, d * dr.rsqrt(dr.maximum(length, floor)), mi.Vector3f(0.0, 0.0, 1.0))
 
 
-def light_transfer(n: Any, v: Any, lobe: PreparedLobe, directions: Sequence[Any], visible: Any) -> tuple[Any, Any]:
+def light_transfer(n: Jit, v: Jit, lobe: PreparedLobe, directions: Sequence[Jit], visible: Jit) -> tuple[Jit, Jit]:
     """Radiance of a white diffuse and of a fully specular point per unit of a compact light's colour.
 
     Nothing is band limited here: cosine and lobe are those of the light's own directions, and shadows are traced.
@@ -272,11 +253,11 @@ def light_transfer(n: Any, v: Any, lobe: PreparedLobe, directions: Sequence[Any]
     return diffuse * (share / np.pi), specular * (share * peak)
 
 
-def unoccluded(n: Any, axis: Any, traced: Sequence[Any], order: int) -> Any:
+def unoccluded(n: Jit, axis: Jit, traced: Sequence[Jit], order: int) -> Jit:
     """Part of the light from around an axis that shadows let through, 0..1, read off a traced transfer vector.
 
     The traced vector holds the product of visibility and cosine. Its value at the axis, relative to that of
-    the unshadowed vector, tells the visibility there as sharply as B bands can.
+    the unshadowed vector, is the visibility there as sharply as B bands can.
     """
     import drjit as dr
 

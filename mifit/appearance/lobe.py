@@ -31,8 +31,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,12 +47,12 @@ _DEGREE_COSINE, _DEGREE_EXPONENT = 7, 11
 
 @dataclass(frozen=True)
 class Lobe:
-    """The Blinn-Phong lobe of a surface, or of one that varies over it.
+    """The Blinn-Phong lobe of a surface.
 
     Attributes
     ----------
-    exponent : float, (N,) or (S, S) array
-        1 to 10000: one number, one per point, or a map.
+    exponent : float
+        1 to 10000.
     fresnel : float or None
         Strength of the lobe at grazing views over that of a view along the normal, less 1; None for plain Blinn-Phong,
         a number for the lobe carried about the mirror direction.
@@ -61,25 +60,14 @@ class Lobe:
         Which N(m), see above.
     """
 
-    exponent: float | Array
+    exponent: float
     fresnel: float | None = None
     normalized: bool = True
 
     @property
-    def typical(self) -> float:
-        """One exponent that stands for all: the median."""
-        return float(np.median(self.exponent))
-
-    def at(self, look_up: Callable[[Array], Array]) -> Lobe:
-        """The lobe at points of a map: ``look_up`` turns a map (S, S) into values (N,); one exponent stays one."""
-        if np.ndim(self.exponent) == 0:
-            return self
-        return replace(self, exponent=look_up(np.asarray(self.exponent)))
-
-    @property
     def roughness(self) -> float:
         """Beckmann's alpha, and GGX's, of the microfacet lobe that is about as wide."""
-        return math.sqrt(2.0 / (self.typical + 2.0))
+        return math.sqrt(2.0 / (self.exponent + 2.0))
 
     @property
     def grazing(self) -> float:
@@ -89,7 +77,7 @@ class Lobe:
     def parameters(self) -> dict[str, float | bool]:
         """The lobe as parameters of the ``blinnphong`` plugin and as ``result.json`` has it."""
         fresnel = {} if self.fresnel is None else {"fresnel": float(self.fresnel)}
-        return {"exponent": self.typical, "normalized": self.normalized, **fresnel}
+        return {"exponent": self.exponent, "normalized": self.normalized, **fresnel}
 
     def zonal(self, order: int, cosines: Array) -> tuple[Array, Array, Array]:
         """The lobe as few numbers, for a viewer.
@@ -101,7 +89,7 @@ class Lobe:
         factors : (B,)
             Legendre factors of the bands, those of a middling view.
         """
-        moments = lobe_table(order)(cosines, self.typical)
+        moments = lobe_table(order)(cosines, self.exponent)
         albedo, tilt = moments[0], moments[1]
         middling = int(np.searchsorted(cosines, 0.7))
         if self.fresnel is not None:
@@ -111,8 +99,8 @@ class Lobe:
         return self.factor() * albedo, tilt, np.concatenate([[1.0], moments[2:, middling]])
 
     def factor(self) -> float:
-        """Albedo of the lobe relative to that of the normalised one, at the typical exponent."""
-        return float(normalization(self.typical, self.normalized) / normalization(self.typical))
+        """Albedo of the lobe relative to that of the normalised one."""
+        return float(normalization(self.exponent, self.normalized) / normalization(self.exponent))
 
 
 def normalization(exponent: ArrayLike, normalized: bool = True) -> Array:

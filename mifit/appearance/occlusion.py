@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from mifit.appearance.arrays import on_device, stored
+from mifit.appearance.arrays import Jit, on_device, stored
 from mifit.appearance.illumination import Illumination
 from mifit.appearance.kernels import diffuse_transfer, sh_basis
 from mifit.core.mesh import vertex_normals
@@ -222,7 +222,7 @@ class _Hits:
         self._u, self._v = dr.zeros(mi.Float, count * samples), dr.zeros(mi.Float, count * samples)
         dr.eval(self._face, self._u, self._v)
 
-    def keep(self, point: Any, ray: Any, hit: Any, blocked: Any) -> None:
+    def keep(self, point: Jit, ray: Jit, hit: Jit, blocked: Jit) -> None:
         """Write down the hit of one ray of each point."""
         import drjit as dr
 
@@ -242,7 +242,7 @@ class _Hits:
 
 
 def _trace(
-    scene: Any, offset: float, points: NDArray, normals: NDArray, order: int, samples: int, seed: int, hits: Any = None
+    scene: Jit, offset: float, points: NDArray, normals: NDArray, order: int, samples: int, seed: int, hits: Jit = None
 ) -> NDArray[np.float32]:
     """One kernel: a thread per point, a loop over its rays, B*B sums in registers.
 
@@ -262,7 +262,7 @@ def _trace(
     shift_u, shift_v = shift.next_float32(), shift.next_float32()
     point = dr.arange(mi.UInt, count)
 
-    def body(i: Any, seen: Any, whole: list[Any], sums: list[Any]) -> tuple[Any, Any, list[Any], list[Any]]:
+    def body(i: Jit, seen: Jit, whole: list[Jit], sums: list[Jit]) -> tuple[Jit, Jit, list[Jit], list[Jit]]:
         # A rank-1 lattice, shifted at random per point: far less noise than independent rays.
         u = dr.fma(mi.Float(i), 0.7548776662466927, shift_u)
         v = dr.fma(mi.Float(i), 0.5698402909980532, shift_v)

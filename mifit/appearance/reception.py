@@ -7,14 +7,15 @@ that each light, and each rotation of one, costs a product.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from mifit.appearance.arrays import aligned, on_device, stored
+from mifit.appearance.arrays import Jit, aligned, on_device, stored
+from mifit.appearance.occlusion import OFFSET
 from mifit.core.mesh import normalize, vertex_normals
 from mifit.core.sh import LUMINANCE
 
@@ -24,9 +25,7 @@ if TYPE_CHECKING:
 DIRECTIONS = 512
 """Directions of the sky, a multiple of 32: 7 degrees apart."""
 GATHERS = 64
-"""Directions in which a vertex looks for light from the mesh."""
-OFFSET = 1e-3
-"""Distance by which rays start off the surface, relative to the mesh's diagonal."""
+"""Directions in which light from the mesh is gathered at a vertex."""
 _kept: WeakKeyDictionary[SurfaceScene, tuple[NDArray, Reception]] = WeakKeyDictionary()
 
 
@@ -68,7 +67,7 @@ class Reception:
         bits, vertex = mi.UInt(aligned(self.open_sky, np.uint32).ravel()), dr.arange(mi.UInt, len(self.normals))
         lights = mi.Float(aligned(np.concatenate([middle, summed(power)], axis=1)).ravel())
 
-        def body(i: Any, total: Any) -> tuple[Any, Any]:
+        def body(i: Jit, total: Jit) -> tuple[Jit, Jit]:
             x, y, z, *colour = (dr.gather(mi.Float, lights, 6 * i + k) for k in range(6))
             open_bit = (dr.gather(mi.UInt, bits, vertex * words + i // 32) >> (i % 32)) & 1
             return i + 1, total + dr.maximum(n.x * x + n.y * y + n.z * z, 0.0) * open_bit * mi.Color3f(*colour)
@@ -101,18 +100,18 @@ def _trace(scene: SurfaceScene) -> Reception:
 
 
 def _exchange(scene: SurfaceScene, positions: NDArray, normals: NDArray) -> csr_matrix:
-    """Cosine-distributed looks of every vertex, as a matrix over the vertices that they meet."""
+    """Cosine-distributed rays of every vertex, as a matrix over the vertices that they meet."""
     import drjit as dr
     import mitsuba as mi
 
     count = len(positions)
     # Opaque: the kernel is compiled once, not once for every mesh.
-    offset: Any = dr.opaque(mi.Float, OFFSET * float(np.linalg.norm(np.ptp(positions, axis=0))))
+    offset: Jit = dr.opaque(mi.Float, OFFSET * float(np.linalg.norm(np.ptp(positions, axis=0))))
     number = dr.arange(mi.UInt, count * GATHERS)
-    vertex, look = number // GATHERS, mi.Float(number % GATHERS)
+    vertex, ray = number // GATHERS, mi.Float(number % GATHERS)
     n = dr.gather(mi.Vector3f, on_device(mi.Vector3f, normals), vertex)
     origin = dr.gather(mi.Vector3f, on_device(mi.Vector3f, positions), vertex) + offset * n
-    u, v = dr.fma(look, 0.7548776662466927, 0.5), dr.fma(look, 0.5698402909980532, 0.5)
+    u, v = dr.fma(ray, 0.7548776662466927, 0.5), dr.fma(ray, 0.5698402909980532, 0.5)
     d = mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u - dr.floor(u), v - dr.floor(v))))
     hit = scene.rays.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(origin), d))
     dr.eval(hit.t, hit.prim_uv, hit.prim_index)  # one kernel: each array read would trace the rays again

@@ -6,13 +6,14 @@ optimisers share.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.environment import EnvironmentLight
+from mifit.appearance import models
+from mifit.appearance.environment import diffuse_light
 from mifit.appearance.formation import Appearance, form_image
 from mifit.appearance.occlusion import MeshPoints
 from mifit.core.camera import Camera
@@ -99,21 +100,22 @@ def shade_methods(
         model, vertices = result.model, result.geometry.vertices[result.index(timestep)]
         material = material or surface_material(result, surface, timestep)
         base = material.base
-        appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: _look_up(model, surface, m)))
+        appearance = Appearance(models.get(reflectance.shading_model), reflectance.illumination, reflectance.lobe)
         points = MeshPoints(surface.points, base, surface.face, surface.weights)
         mesh = occluding_mesh(vertices, model.faces)
+        given = material.normal, base, surface.view, appearance.trace(mesh, points)
+        diffuse, specular_light = appearance.shade_bent(*given)
         if result.environment is not None and appearance.lobe.fresnel is not None:
-            turn = result.environment_rotation
-            light = EnvironmentLight(result.environment, np.eye(3) if turn is None else turn)
-            albedo, lobe, view = vertex_materials(result)[:, :3], appearance.lobe, surface.view
-            shaded = light.shade(mesh.scene, points, material.normal, view, lobe, albedo, surface.group)
-        else:
-            occlusion = appearance.trace(mesh, points)
-            shaded = appearance.shade_bent(material.normal, base, surface.view, occlusion)
+            lights = appearance.illumination
+            lamps = replace(lights, radiance=np.zeros_like(lights.radiance))
+            diffuse, _ = replace(appearance, illumination=lamps).shade_bent(*given)
+            turn = np.eye(3) if result.environment_rotation is None else result.environment_rotation
+            place = mesh.scene, points, material.normal, vertex_materials(result)[:, :3]
+            diffuse = diffuse + diffuse_light(result.environment, turn, lights.lights, *place)
         ambient = np.float32(reflectance.illumination.ambient)
         for method in finer:
             specular = material.specular[:, None] if method == "full" else np.float32(0.0)
-            colour = form_image(ambient, material.diffuse, shaded[0], specular, shaded[1])
+            colour = form_image(ambient, material.diffuse, diffuse, specular, specular_light)
             out[method] = surface.image(_with_residual(result, surface, timestep, colour, method))
     return {m: out[m] for m in methods}
 

@@ -122,7 +122,7 @@ def _write_obj(result: Reconstruction, path: Path, timestep: int, factor: float,
         path.with_suffix(".mtl"),
         # Pr, of physically based programs, is glTF's roughness. Blender reads a normal map from map_Bump, and takes its
         # values as they are in an .exr alone; other programs read norm.
-        f"newmtl skin\nillum 2\nKd 1 1 1\nKs {specular}\nNs {result.lobe.typical:.6g}\n"
+        f"newmtl skin\nillum 2\nKd 1 1 1\nKs {specular}\nNs {result.lobe.exponent:.6g}\n"
         f"Pr {math.sqrt(result.lobe.roughness):.4f}\nmap_Kd {stem}_diffuse.png\nmap_Ks {stem}_specular.png\n"
         f"norm {stem}_normal.png\nmap_Bump -bm 1.0 {stem}_normal.exr\n\n"
         f"newmtl rest\nillum 1\nKd {colour}\nKs 0 0 0\n",

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from mifit.appearance.environment import illumination_of
 from mifit.appearance.illumination import Illumination
 from mifit.core.files import Document, file_name, write_text
 from mifit.core.image import check_environment, read_environment, to_8_bit, write_image
@@ -58,15 +59,19 @@ def relit(
             raise InputError("exposure: found 'auto', expected a number: this lighting has a level of its own")
         lit = lighting.scaled(exposure)
         return [result.with_illumination(lit.rotated(turn)) for turn in turns]
+    image, order = None, result.lighting.order
     if isinstance(lighting, SHLighting):
-        image, smooth = None, lighting
+        found = Illumination(lighting.coefficients)
     else:
         image = _environment(lighting)
-        smooth = SHLighting.from_envmap(image, result.lighting.order)
-    level = _level(result.lighting) / _level(smooth)
+        plain = reflectance.lobe.fresnel is None  # the paper's model knows harmonics alone
+        found = (
+            Illumination(SHLighting.from_envmap(image, order).coefficients) if plain else illumination_of(image, order)
+        )
+    level = _level(result.lighting) / _level(found.smooth())
     factor = level if exposure == "auto" else float(exposure)
     # The ambient term stands for light that the model leaves out, such as interreflection: it grows with the light.
-    lit = Illumination(factor * smooth.coefficients, ambient=reflectance.illumination.ambient * factor / level)
+    lit = replace(found.scaled(factor), ambient=reflectance.illumination.ambient * factor / level)
     shown = None if image is None else (factor * image).astype(np.float32)
     return [
         replace(

@@ -197,8 +197,9 @@ def load_result_scene(
         raise TypeError("scene: cameras: found other objects, expected Camera")
     chosen = {"type": integrator} if isinstance(integrator, str) else dict(integrator)
     if chosen.get("type") == "shdirect":
-        # What it shades is the smooth light, whatever an environment has beside it.
-        result = replace(result, environment=None, environment_rotation=None)
+        if result.environment is not None:  # what it shades is smooth light
+            smooth = replace(result.illumination, radiance=result.lighting.coefficients, lights=())
+            result = result.with_illumination(smooth)
         fitted = None if method == "pca" else result.reflectance
         ambient = result.geometry.ambient if fitted is None else fitted.illumination.ambient
         model = "prefiltered" if fitted is None else fitted.shading_model
@@ -247,7 +248,8 @@ def scene_description(
         rows = result.illumination.radiance
         text = ",  ".join(" ".join(f"{x:.9g}" for x in row) for row in rows)
         scene["light"] = {"type": "shenv", "coefficients": text}
-    for number, light in enumerate(result.illumination.lights, 1):
+    lamps = result.illumination.lights if result.environment is None else ()  # it holds them
+    for number, light in enumerate(lamps, 1):
         scene[f"light_{number}"] = light.emitter()
     return scene
 

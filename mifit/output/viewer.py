@@ -85,7 +85,7 @@ def _lighting(result: Reconstruction) -> Document:
         "lobe_albedo": np.polynomial.polynomial.polyfit(cosines, albedo, 5).tolist(),
         "lobe_tilt": np.polynomial.polynomial.polyfit(cosines, tilt, 5).tolist(),
         "ambient": float(result.illumination.ambient),
-        "exponent": result.lobe.typical,
+        "exponent": result.lobe.exponent,
     }
 
 

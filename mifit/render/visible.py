@@ -37,12 +37,6 @@ class VisibleSurface:
         k, width = self.oversampling, self.shape[1]
         return self.index // (width * k) // k * width + self.index % (width * k) // k
 
-    @property
-    def group(self) -> tuple[NDArray[np.int64], int]:
-        """Number of each sample in its pixel, and how many samples a pixel has."""
-        k, width = self.oversampling, self.shape[1]
-        return self.index // (width * k) % k * k + self.index % k, k * k
-
     def image(self, values: NDArray) -> NDArray[np.float32]:
         """Mean of sample values (N, C) in each pixel, 0 where none is, and coverage: (H, W, C + 1)."""
         pixel, size = self.pixel, self.shape[0] * self.shape[1]

@@ -17,16 +17,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.formation import Appearance, form_image
-from mifit.appearance.occlusion import MeshPoints
 from mifit.config import ResidualConfig
 from mifit.core.calls import checked
-from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report, ResidualEstimate, hidden
+from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report, ResidualEstimate
 from mifit.core.mesh import normalize
 from mifit.core.process import one_blas_thread
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
-from mifit.stages.observations import Surface
+from mifit.sampling.observations import Surface
+from mifit.stages.normals.refine_normals import texel_images
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -89,12 +88,6 @@ def find_residual(
     for i, timestep in enumerate(geometry.timesteps):
         surface = Surface(capture, model, geometry.at([timestep]), cameras, size, whole=True, texels=texels)
         texels = surface.texels
-        labels = [reflectance.label(camera, timestep) for camera in cameras]
-        if any(label is not None for label in labels):
-            shape = [(camera.height, camera.width) for camera in map(capture.camera, cameras)]
-            surface = surface.without(
-                [np.zeros(s, bool) if label is None else hidden(label) for label, s in zip(labels, shape, strict=True)]
-            )
         refined = None
         if normals is not None and timestep in normals.timesteps:
             refined = texels.from_map(normals.normal_object[normals.timesteps.index(timestep)])
@@ -121,22 +114,11 @@ def _difference(
 
     The weight is the probability that the image shows the point: 1 for a view that does for sure, however it sees it.
     """
-    every = surface.observe(np.arange(len(surface)))
-    rows = np.flatnonzero((every.measured > 0).any(1))
-    seen, texels = every.take(rows), surface.texels
-    base = seen.normal[:, 0]
-    normal = base
+    rows, seen, images = texel_images(surface, reflectance, seed)
+    normal = seen.normal[:, 0]
     if refined is not None:
         known = np.any(refined[rows] != 0, axis=1)
-        normal = np.where(known[:, None], normalize(refined[rows] @ rotation.T), base).astype(np.float32)
-    diffuse, specular = (texels.from_map(m)[rows] for m in (reflectance.lit_diffuse, reflectance.specular))
-    appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: texels.from_map(m)[rows]))
-    points = MeshPoints(seen.point[:, 0], base, seen.face, seen.barycentric)
-    occlusion = appearance.trace(surface.meshes[0], points, seed)
-    ambient = np.float32(appearance.illumination.ambient)
-    difference = np.empty(seen.colour.shape, dtype=np.float32)
-    for j in range(len(seen.step)):
-        d, s = appearance.shade_bent(normal, base, seen.view[:, j], occlusion)
-        difference[:, j] = seen.colour[:, j] - form_image(ambient, diffuse, d, specular[:, None], s)
-    weight = np.where(seen.measured > 0, seen.right, np.float32(0.0)).astype(np.float32)
+        normal = np.where(known[:, None], normalize(refined[rows] @ rotation.T), normal).astype(np.float32)
+    difference = seen.colour - np.stack([image(normal)[0] for image in images], axis=1)
+    weight = np.where(seen.measured > 0, seen.inlier, np.float32(0.0)).astype(np.float32)
     return rows, np.where(weight[..., None] > 0, difference, np.float32(0.0)), weight

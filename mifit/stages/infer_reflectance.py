@@ -18,12 +18,12 @@ from mifit.core.sh import LUMINANCE
 from mifit.errors import ConvergenceError
 from mifit.optim import Outcome
 from mifit.progress import Progress, silent
-from mifit.stages.observations import Surface
+from mifit.sampling.observations import Surface
 from mifit.stages.reflectance.als import find_forward, fit_als
 from mifit.stages.reflectance.fill import blend_unseen
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.paper_energy import energies, fit_paper
-from mifit.stages.reflectance.relief import SYMMETRIC_SPREAD, part_relief
+from mifit.stages.reflectance.residual_shading import SYMMETRIC_SPREAD, separate_shading
 from mifit.stages.segment import segment
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def infer_reflectance(
     details: dict = {
         "shading": {
             "model": fitted.appearance.model.name,
-            "exponent": fitted.appearance.lobe.typical,
+            "exponent": fitted.appearance.lobe.exponent,
             "lights": len(illumination.lights),
         },
         "gauge": GAUGE,
@@ -131,7 +131,7 @@ def infer_reflectance(
         # the lighting's error changes an albedo by as much as skin varies, skin is the better guess.
         quality = surface.quality(first.unexplained / SYMMETRIC_SPREAD)
         filled = blend_unseen(model, surface.texels, solved.maps, quality, solved.observability)
-        parted = part_relief(model, surface.texels, filled.diffuse, filled.confidence)
+        parted = separate_shading(model, surface.texels, filled.diffuse, filled.confidence)
         shade = (shown.diffuse @ LUMINANCE) / np.maximum(filled.diffuse @ LUMINANCE, 1e-3)
         diffuse, relief = parted.skin, parted.relief * np.where(surface.texels.mask, np.clip(shade, 0.0, 1.0), 1.0)
         details["spread"] = {"symmetric": parted.symmetric, "sided": parted.sided}

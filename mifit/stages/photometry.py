@@ -29,7 +29,8 @@ from mifit.core.photometry import Photometry
 from mifit.core.sh import bands, basis, cosine_coefficients
 from mifit.optim.robust import geman_mcclure
 from mifit.progress import Progress, silent
-from mifit.stages.observations import Observations, Surface
+from mifit.sampling.observations import Observations, Surface
+from mifit.sampling.visibility import GRAZING
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -37,11 +38,11 @@ if TYPE_CHECKING:
 
 MAP_SIZE, VALUES, FEWEST_POINTS = 256, 16_000, 50
 """Texels along the side of the map; observations (points times images) that are compared; fewest points that serve."""
-DARKEST, LEAST_COSINE = 0.02, 0.4
-"""Linear colour and cosine of the view angle below which a colour tells nothing of the factor."""
-BANDS, GLOSS = 4, 0.03
+DARKEST, FRONTAL = 0.02, 3.0
+"""Linear colour, and multiple of the grazing cosine, below which a colour says nothing of the factor."""
+BANDS, SPECULAR = 4, 0.03
 """Bands of the lighting; specular level of skin at normal incidence (refractive index 1.4)."""
-FACTOR_SPREAD, ALBEDO_SPREAD, GLOSS_SPREAD = 0.3, 0.3, 0.5
+FACTOR_SPREAD, ALBEDO_SPREAD, SPECULAR_SPREAD = 0.3, 0.3, 0.5
 """Prior standard deviations of logarithms: factors of images, albedo about the model's, specular level."""
 NEIGHBOURS = 0.03
 """Independent measurements per observation: neighbours share errors of the mesh."""
@@ -185,8 +186,8 @@ def estimate_photometry(
 
 def usable(seen: Observations) -> NDArray[np.bool_]:
     """(N, J) observations that are bright and frontal enough for a ratio."""
-    cosine = np.einsum("njk,njk->nj", seen.image_normal, seen.view)
-    return (seen.measured > 0) & (cosine > LEAST_COSINE) & (seen.colour.min(axis=2) > DARKEST)
+    frontal = np.einsum("njk,njk->nj", seen.image_normal, seen.view) > FRONTAL * GRAZING
+    return (seen.measured > 0) & frontal & (seen.colour.min(axis=2) > DARKEST)
 
 
 def shared_points(parts: Sequence[Observations], count: int, rng: np.random.Generator) -> Observations:
@@ -205,7 +206,7 @@ def solve_factors(seen: Observations, albedo: NDArray, factors: Factors) -> Solu
     k, u = BANDS**2, len(factors.group)
     light_at = [slice(u + c * k, u + (c + 1) * k) for c in range(3)]
     # Unknowns: factors, light per channel, log of the specular level over skin's. The albedo starts at the model's.
-    prior = np.concatenate([np.full(u, FACTOR_SPREAD**-2.0), np.zeros(3 * k), [GLOSS_SPREAD**-2.0]])
+    prior = np.concatenate([np.full(u, FACTOR_SPREAD**-2.0), np.zeros(3 * k), [SPECULAR_SPREAD**-2.0]])
     rough = np.tile((bands(BANDS) * (bands(BANDS) + 1.0)) ** 2, 3)
     expected = np.log(albedo)
     log_albedo, x, sigma = expected.copy(), np.zeros(u + 3 * k + 1), ALBEDO_SPREAD / 2.0
@@ -216,7 +217,7 @@ def solve_factors(seen: Observations, albedo: NDArray, factors: Factors) -> Solu
     prior[u : u + 3 * k] = rough / mean_light**2
     for number in range(ITERATIONS):
         light = np.stack([x[at] for at in light_at], axis=1)
-        a, s = np.exp(log_albedo)[:, None], GLOSS * np.exp(x[-1])
+        a, s = np.exp(log_albedo)[:, None], SPECULAR * np.exp(x[-1])
         diffuse, specular = a * np.maximum(phi @ light, 1e-3), s * np.maximum(psi @ light, 0.0)
         fitted = diffuse + specular
         residual = level - np.log(fitted) - factors.design @ x[:u]
@@ -253,7 +254,7 @@ def _harmonics(seen: Observations) -> tuple[NDArray[np.float64], NDArray[np.floa
     normal, view = seen.image_normal.astype(np.float64), seen.view.astype(np.float64)
     cosine = (normal * view).sum(axis=-1, keepdims=True)
     mirrored = 2.0 * cosine * normal - view
-    rise = 1.0 + (1.0 / GLOSS - 1.0) * (1.0 - np.clip(cosine, 0.0, 1.0)) ** 5  # Schlick, over normal incidence
+    rise = 1.0 + (1.0 / SPECULAR - 1.0) * (1.0 - np.clip(cosine, 0.0, 1.0)) ** 5  # Schlick, over normal incidence
     lambert = cosine_coefficients(BANDS)[bands(BANDS)] / np.pi
     shape = (*normal.shape[:2], BANDS**2)
     phi = basis(normal.reshape(-1, 3), BANDS).reshape(shape) * lambert

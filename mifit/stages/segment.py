@@ -23,12 +23,12 @@ from mifit.core.estimate import Label
 from mifit.core.image import to_8_bit
 from mifit.core.mesh import interpolate
 from mifit.core.process import on_all_cores
-from mifit.stages.trust import DARKEST
+from mifit.sampling.visibility import DARKEST
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
-    from mifit.stages.observations import Seen, Surface
+    from mifit.sampling.observations import Seen, Surface
     from mifit.stages.reflectance.forward import Forward
 
 OPPONENT = np.array([[1 / 3, 1 / 3, 1 / 3], [1.0, -1.0, 0.0], [0.5, 0.5, -1.0]])

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 
-from mifit.appearance.environment import EnvironmentLight, cut
+from mifit.appearance.environment import cut, diffuse_light, illumination_of
 from mifit.appearance.formation import Appearance
-from mifit.appearance.illumination import Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import get
-from mifit.appearance.occlusion import MeshPoints
+from mifit.appearance.occlusion import MeshPoints, OccludingMesh
 from mifit.appearance.reception import reception
 from mifit.core import sh
 from mifit.render.gbuffer import SurfaceScene
@@ -51,43 +52,51 @@ def test_the_cut_keeps_power_and_mean_direction() -> None:
     assert power.sum(1).max() < 4.0 * power.sum(1).mean()
 
 
-def test_an_even_sky_lights_a_ball_evenly(ball) -> None:
+def shaded(ball, image, turn=None) -> tuple[np.ndarray, np.ndarray]:
+    """Diffuse and specular radiance of a black ball under an environment."""
     scene, points, view = ball
-    light = EnvironmentLight(np.full((32, 64, 3), 0.7, np.float32), np.eye(3))
-    diffuse, specular = light.shade(scene, points, points.normal, view, LOBE, np.zeros((len(scene.vertices), 3)))
+    turn = np.eye(3) if turn is None else turn
+    found = illumination_of(image.astype(np.float32), 10).rotated(turn)
+    look = Appearance(get("shadowed"), found, LOBE)
+    given = points.normal, view, look.trace(OccludingMesh(scene), points)
+    bare = replace(look, illumination=replace(found, radiance=np.zeros_like(found.radiance)))
+    black = np.zeros((len(scene.vertices), 3))
+    smooth = diffuse_light(image.astype(np.float32), turn, found.lights, scene, points, points.normal, black)
+    return bare.shade(*given)[0] + smooth, look.shade(*given)[1]
+
+
+def test_an_even_sky_lights_a_ball_evenly(ball) -> None:
+    diffuse, _ = shaded(ball, np.full((32, 64, 3), 0.7))
     np.testing.assert_allclose(diffuse, 0.7, rtol=0.03)
-    head_on = points.normal[:, 2] > 0.98
-    smooth = Appearance(get("prefiltered"), Illumination(np.array([[0.7 * np.sqrt(4 * np.pi)] * 3])), LOBE)
-    expected = smooth.shade(points.normal[head_on], view[head_on])[1]
-    np.testing.assert_allclose(specular[head_on], expected, rtol=0.05)
 
 
 def test_smooth_light_agrees_with_spherical_harmonics(ball) -> None:
-    scene, points, view = ball
     coefficients = np.zeros((9, 3))
     coefficients[0], coefficients[2], coefficients[3], coefficients[6] = 3.0, 0.8, -0.5, 0.3
-    image = sh.SHLighting(coefficients).to_latlong(64, 128).astype(np.float32)
-    turn = sh_rotation(0.7)
-    light = EnvironmentLight(image, turn)
-    diffuse, specular = light.shade(scene, points, points.normal, view, LOBE, np.zeros((len(scene.vertices), 3)))
-    smooth = Appearance(get("prefiltered"), Illumination(coefficients).rotated(turn), LOBE)
-    d, s = smooth.shade(points.normal, view)
-    assert np.abs(diffuse / d - 1.0).max() < 0.04
-    facing = points.normal[:, 2] > 0.8  # further round the lobe dips below the horizon, where nothing comes from
-    assert np.abs(specular / s - 1.0)[facing].max() < 0.08
+    image, turn = sh.SHLighting(coefficients).to_latlong(64, 128).astype(np.float32), sh_rotation(0.7)
+    found = illumination_of(image, 3)
+    assert found.lights == ()
+    np.testing.assert_allclose(found.radiance, coefficients, atol=5e-3)
+    expected = sh.SHLighting(coefficients).rotate(turn).irradiance(ball[1].normal) / np.pi
+    assert np.abs(shaded(ball, image, turn)[0] / expected - 1.0).max() < 0.04
 
 
-def test_a_lamp_is_as_sharp_as_it_is_and_nothing_is_negative(ball) -> None:
-    scene, points, view = ball
+def test_a_lamp_is_as_sharp_as_it_is(ball) -> None:
     image, toward = lamp()
-    light = EnvironmentLight(image.astype(np.float32), np.eye(3))
-    diffuse, specular = light.shade(scene, points, points.normal, view, LOBE, np.zeros((len(scene.vertices), 3)))
-    assert diffuse.min() >= 0.0 and specular.min() >= 0.0
+    diffuse, specular = shaded(ball, image)
+    points = ball[1]
+    assert diffuse.min() >= 0.0
     expected = 3.0 / np.pi * np.maximum(points.normal @ toward, 0.0)
     assert np.abs(diffuse[:, 0] - expected).max() < 0.03
     half = toward + np.array([0.0, 0.0, 1.0])
     brightest = points.normal[specular[:, 0].argmax()]
     assert np.degrees(np.arccos(brightest @ half / np.linalg.norm(half))) < 8.0
+
+
+def test_nothing_of_the_power_is_lost() -> None:
+    image = lamp()[0].astype(np.float32) + np.float32(0.1)
+    whole = sh.SHLighting.from_envmap(image, 3).coefficients
+    np.testing.assert_allclose(illumination_of(image, 3).smooth().coefficients, whole, rtol=0.02, atol=0.02)
 
 
 def sh_rotation(angle: float) -> np.ndarray:
@@ -106,18 +115,11 @@ def test_inside_a_ball_the_mesh_is_all_that_is_seen(variant) -> None:
 
 
 def test_a_mesh_is_traced_once_for_all_rotations(ball) -> None:
-    scene = ball[0]
-    image = np.tile(np.linspace(0.0, 1.0, 64, dtype=np.float32)[:, None], (32, 1, 3))  # darker on one side
-    albedo = np.zeros((len(scene.vertices), 3))
-    kept = reception(scene)
-    lit = [EnvironmentLight(image, sh_rotation(a)).at_vertices(scene, albedo)[1] for a in (0.0, 0.5)]
-    assert reception(scene) is kept
-    vertices = np.asarray(scene.vertices, dtype=np.float64)
-    turned = SurfaceScene(vertices @ sh_rotation(0.5).T, scene.faces)
-    again = EnvironmentLight(image, sh_rotation(0.5)).at_vertices(turned, albedo)[1]
-    assert reception(turned) is not kept
-    assert np.abs(lit[1] - lit[0]).max() > 0.1
-    np.testing.assert_allclose(again, lit[0], rtol=0.05)  # light and mesh turned alike
+    kept = reception(ball[0])
+    image = np.tile(np.linspace(0.0, 1.0, 64)[:, None], (32, 1, 3))  # darker on one side
+    lit = [shaded(ball, image, sh_rotation(angle))[0] for angle in (0.0, 0.5)]
+    assert reception(ball[0]) is kept
+    assert np.abs(lit[1] - lit[0]).max() > 0.03
 
 
 def test_a_mesh_that_moves_is_traced_again(variant) -> None:
@@ -128,22 +130,3 @@ def test_a_mesh_that_moves_is_traced_again(variant) -> None:
     after = reception(scene)
     assert after is not before
     assert np.abs(after.normals - before.normals).max() > 0.1
-
-
-def test_neither_a_turn_of_the_light_nor_another_mesh_is_another_kernel(ball) -> None:
-    import drjit as dr
-
-    ours, points, view = ball
-    albedo = np.full((len(ours.vertices), 3), 0.4)
-
-    def kernels(angle: float, size: float) -> set[str]:
-        scene = SurfaceScene(size * np.asarray(ours.vertices), ours.faces)
-        dr.kernel_history_clear()
-        EnvironmentLight(lamp()[0] + np.float32(0.1), sh_rotation(angle)).shade(
-            scene, points, points.normal, view, Lobe(30.0, 1.0), albedo
-        )
-        return {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
-
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        first = kernels(0.3, 1.0)
-        assert first and kernels(0.9, 1.3) == first

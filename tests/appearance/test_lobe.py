@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from mifit.appearance import lobe as bp
-from mifit.appearance import reference
 from mifit.core import sh
 from mifit.errors import InputError
+from tests import reference
 
 EXPONENTS = (1.0, 5.0, 50.0, 1000.0)
 

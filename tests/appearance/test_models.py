@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mifit.appearance import reference
 from mifit.appearance.lobe import normalization
-from mifit.appearance.models.paper import GUARD
+from mifit.appearance.models import GUARD
 from mifit.core import sh
 from mifit.errors import InputError
+from tests import reference
 from tests.shaded import appearance, diffuse_matrix, shade_points, shadows, specular_matrix
 
 MODELS = ("paper", "prefiltered", "shadowed")

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mifit.appearance import kernels, models, reference
+from mifit.appearance import kernels, models
 from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.lobe import Lobe
-from mifit.appearance.models.paper import GUARD, SMALLEST
+from mifit.appearance.models import GUARD, SMALLEST
 from mifit.core import sh
+from tests import reference
 from tests.shaded import diffuse_matrix, light_columns, shade_points
 
 LOBES = [Lobe(5.0), Lobe(60.0, 8.0), Lobe(1000.0, 8.0), Lobe(1000.0), Lobe(20.0, None, False)]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import mifit
-from mifit.appearance import reference
 from mifit.core import sh
+from tests import reference
 
 EXPONENTS = (1.0, 5.0, 50.0, 1000.0)
 ANGLES = (0.0, 45.0, 80.0)

@@ -11,15 +11,15 @@ from stages.reflectance_scene import EXPONENT, SIZE, TurningDome, turning_dome
 from mifit.appearance.formation import OPEN
 from mifit.appearance.illumination import DistantLight, disc
 from mifit.appearance.occlusion import trace_transfer
-from mifit.appearance.reference import specular_brdf
 from mifit.config import ReflectanceConfig
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import sample_map
 from mifit.errors import InputError
 from mifit.render.gbuffer import SurfaceScene
+from mifit.sampling.observations import Surface
 from mifit.stages.infer_reflectance import infer_reflectance
-from mifit.stages.observations import Surface
 from mifit.stages.reflectance.forward import Forward
+from tests.reference import specular_brdf
 from tests.shaded import appearance, light_columns, shade_points
 
 CONFIG = ReflectanceConfig(texture_size=SIZE, bands=4, exponent=EXPONENT, smoothness_weight=1e-5)

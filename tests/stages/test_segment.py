@@ -14,8 +14,8 @@ from mifit.core.estimate import GeometryEstimate, Label, ReflectanceEstimate, Re
 from mifit.core.image import linear_to_srgb, srgb_to_linear
 from mifit.core.process import one_blas_thread
 from mifit.morphable import MorphableModel
+from mifit.sampling.observations import Surface
 from mifit.stages.infer_reflectance import infer_reflectance
-from mifit.stages.observations import Surface
 from mifit.stages.reflectance.als import find_forward
 from mifit.stages.segment import segment
 

@@ -58,7 +58,7 @@ def make() -> type:
 
         - `paper`: $I_a + C_d \frac{E(n)}{\pi} + C_s \frac{E(n)}{\pi\,(n \cdot d)} (n \cdot h)^m$ with the dominant
           direction $d$ of the lighting (Sloan 2008) and $h$ between $v$ and $d$. The quotient is guarded, see
-          `mifit.appearance.models.paper`. Always the plain lobe.
+          `mifit.appearance.models`. Always the plain lobe.
         - `prefiltered`: $I_a + C_d \frac{E(n)}{\pi} + C_s \sum_{lm} a\, c_l\, L_{lm} Y_{lm}(\bar r)$, the lobe
           convolved with the lighting about its mean direction $\bar r$; $a$ is its directional albedo and $c_l$ its
           Legendre factors for this angle and exponent. With `fresnel` those of the view along the normal, about the

@@ -23,19 +23,20 @@ import numpy as np
 import scipy.sparse.linalg as ssl
 from numpy.typing import NDArray
 
+from mifit.appearance import models
 from mifit.appearance.formation import Appearance, BentShading, form_image
 from mifit.appearance.occlusion import MeshPoints
 from mifit.config import NormalsConfig
 from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
-from mifit.core.mesh import normalize
+from mifit.core.mesh import interpolate, normalize
 from mifit.core.process import one_blas_thread
 from mifit.core.uv import TexelMap, bend, bend_jacobian, rasterize_uv, tangent_plane, texel_neighbours
 from mifit.errors import InputError
 from mifit.optim import Outcome, Solution, minimize
 from mifit.progress import Progress, silent
-from mifit.stages.observations import Surface
+from mifit.sampling.observations import Observations, Surface
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -48,6 +49,9 @@ MOST = 1.0
 """Offset along either tangent at the most: 53 degrees, where a mesh of the face is never off by as much."""
 SETTLED, SOLVED = 1e-3, 0.03
 """Part of the energy that the last step may promise, and of the residual that conjugate gradients leave."""
+
+TexelImage = Callable[..., tuple[NDArray, list[NDArray]]]
+"""Image colours (N, 3) of texels with normals (N, 3), and their derivatives along changes of the normals."""
 
 
 @checked
@@ -90,8 +94,8 @@ def refine_normals(
     frames, warnings = [], []
     for i, timestep in enumerate(geometry.timesteps):
         progress("refine normals", i, len(geometry.timesteps))
-        at = geometry.at((timestep,))
-        frames.append(refine_frame(capture, model, at, reflectance, cameras, config, texels, seed=seed))
+        surface = Surface(capture, model, geometry.at((timestep,)), cameras, texels.size, texels=texels)
+        frames.append(refine_frame(surface, reflectance, config, seed=seed))
         if frames[-1].measured == 0.0:
             text = f"timestep {timestep}: no camera measures the face; normals are the model's"
             warnings.append(Diagnostic("face-unseen", text))
@@ -135,22 +139,18 @@ class FrameNormals:
 
 @one_blas_thread()
 def refine_frame(
-    capture: Capture,
-    model: MorphableModel,
-    geometry: GeometryEstimate,
+    surface: Surface,
     reflectance: ReflectanceEstimate,
-    cameras: Sequence[str],
     config: NormalsConfig,
-    texels: TexelMap,
     prior: NDArray | None = None,
     seed: int = 0,
 ) -> FrameNormals:
-    """Refine the normals of a geometry of one timestep; parameters as in `refine_normals`.
+    """Refine the normals of a surface of one timestep.
 
     ``prior`` (N, 2) are offsets in the base normal's tangent plane (`core.uv`) that the correction is drawn
     to instead of to zero, and from which it starts.
     """
-    problem, rows, base = frame_problem(capture, model, geometry, reflectance, cameras, config, texels, prior, seed)
+    problem, rows, base = frame_problem(surface, reflectance, config, prior, seed)
     offsets = np.zeros((len(base), 2)) if prior is None else prior.copy()
     solution = None
     if problem is not None:
@@ -167,45 +167,57 @@ def solve_normals(problem: NormalProblem, max_iterations: int, start: NDArray, t
     return minimize(problem, flat, lower=-most, upper=most, max_iterations=max_iterations, energy_tolerance=tolerance)
 
 
+def texel_images(
+    surface: Surface, reflectance: ReflectanceEstimate, seed: int
+) -> tuple[NDArray[np.intp], Observations, list[TexelImage]]:
+    """Texels (n,) that images of a surface's one timestep measure, what these show, and the model's image of each.
+
+    What stage 2 found in front of the face is left out.
+    """
+    surface, texels = surface.without_hidden(reflectance), surface.texels
+    every = surface.observe(np.arange(len(texels.index)))
+    rows = np.flatnonzero((every.measured > 0).any(1))
+    seen = every.take(rows)
+    diffuse, specular = (texels.from_map(m)[rows] for m in (reflectance.lit_diffuse, reflectance.specular))
+    appearance = Appearance(models.get(reflectance.shading_model), reflectance.illumination, reflectance.lobe)
+    base, ambient = seen.normal[:, 0], np.float32(reflectance.illumination.ambient)
+    points = MeshPoints(seen.point[:, 0], base, seen.face, seen.barycentric)
+    occlusion = appearance.trace(surface.meshes[0], points, seed)
+
+    def image_of(shading: BentShading) -> TexelImage:
+        def image(normals: NDArray, turns: Sequence[NDArray] = ()) -> tuple[NDArray, list[NDArray]]:
+            d, s, slopes = shading(normals, turns)
+            along = [form_image(0.0, diffuse, dd, specular[:, None], ds) for dd, ds in slopes]
+            return form_image(ambient, diffuse, d, specular[:, None], s), along
+
+        return image
+
+    views = range(len(seen.step))
+    return rows, seen, [image_of(BentShading(appearance, base, seen.view[:, j], occlusion)) for j in views]
+
+
 def frame_problem(
-    capture: Capture,
-    model: MorphableModel,
-    geometry: GeometryEstimate,
+    surface: Surface,
     reflectance: ReflectanceEstimate,
-    cameras: Sequence[str],
     config: NormalsConfig,
-    texels: TexelMap,
     prior: NDArray | None = None,
     seed: int = 0,
 ) -> tuple[NormalProblem | None, NDArray, NDArray]:
-    """The optimisation of one timestep, the texels (rows of ``texels``) that it solves for, and all base normals.
+    """The optimisation of one timestep, the texels of the surface that it solves for, and all base normals.
 
     Normals are those of object space. Without a measured texel there is no optimisation: None.
     """
-    rotation = geometry.rotation[0]
-    surface = Surface(capture, model, geometry, cameras, texels.size, texels=texels)
-    seen = surface.observe(np.arange(len(texels.index)))
-    base = seen.normal[:, 0].astype(np.float64) @ rotation
-    rows = np.flatnonzero((seen.measured > 0).any(1))
+    rotation, texels = surface.geometry.rotation[0], surface.texels
+    rows, seen, images = texel_images(surface, reflectance, seed)
+    corners = surface.faces, texels.face, texels.weights
+    base = normalize(interpolate(surface.normals[0], *corners)).astype(np.float64) @ rotation
     if not len(rows):
         return None, rows, base
-    part = seen.take(rows)
-    diffuse, specular = (texels.from_map(m)[rows] for m in (reflectance.lit_diffuse, reflectance.specular))
-    appearance = Appearance.of(reflectance, reflectance.lobe.at(lambda m: texels.from_map(m)[rows]))
-    world = part.normal[:, 0]
-    points = MeshPoints(part.point[:, 0], world, part.face, part.barycentric)
-    occlusion = appearance.trace(surface.meshes[0], points, seed)
-    ambient = appearance.illumination.ambient
-    views = []
-    for j in range(len(part.step)):
-        shading = BentShading(appearance, world, part.view[:, j], occlusion)
 
-        def shade(n: NDArray, turns: Sequence[NDArray] = (), shading=shading) -> tuple[NDArray, list[NDArray]]:
-            d, s, slopes = shading(n @ rotation.T, [turn @ rotation.T for turn in turns])
-            image = form_image(ambient, diffuse, d, specular[:, None], s)
-            return image, [form_image(0.0, diffuse, turned, specular[:, None], sheen) for turned, sheen in slopes]
+    def turned(image: TexelImage) -> TexelImage:
+        return lambda normals, turns=(): image(normals @ rotation.T, [turn @ rotation.T for turn in turns])
 
-        views.append(NormalView(part.colour[:, j], part.measured[:, j], shade))
+    views = [NormalView(seen.colour[:, j], seen.measured[:, j], turned(image)) for j, image in enumerate(images)]
     patch = TexelMap(texels.size, texels.index[rows], texels.face[rows], texels.weights[rows])
     problem = NormalProblem(
         base[rows],
@@ -227,13 +239,12 @@ class NormalView:
     ----------
     colour : (N, 3), weight : (N,)
         Linear image colour, and weight of its squared residual; 0 where the image doesn't measure the texel.
-    shade : callable
-        Image colour (N, 3) of normals (N, 3), and its derivatives along changes of the normals.
+    shade : TexelImage
     """
 
     colour: NDArray
     weight: NDArray
-    shade: Callable[..., tuple[NDArray, list[NDArray]]]
+    shade: TexelImage
 
 
 class NormalProblem:

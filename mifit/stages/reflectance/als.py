@@ -16,12 +16,12 @@ from mifit.core.process import on_all_cores
 from mifit.core.uv import TexelMap
 from mifit.optim import Outcome
 from mifit.progress import Progress
-from mifit.stages.observations import Surface
+from mifit.sampling.observations import Surface
 from mifit.stages.reflectance.compact_lights import EXPONENT, OBSERVATIONS, best_exponent, find_lights
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution, active_weight, fit_lighting, noise_weight
 from mifit.stages.reflectance.lighting_equations import specular_pull
-from mifit.stages.reflectance.maps import Smoothness, Splits, TexelSystems, solve_maps
+from mifit.stages.reflectance.maps import Pull, Smoothness, TexelSystems, solve_maps
 
 LIGHTING_TEXELS = 6000
 """Texels that determine the lighting; a few hundred unknowns against 24 values of eight images each."""
@@ -234,7 +234,7 @@ def solve_texels(
     chunks, index = surface.chunks(), surface.texels.index
     smoothness = Smoothness(config.smoothness_weight, config.smoothness_weight * config.specular_smoothness)
     passes, expected = MAP_PASSES if config.robust else 1, float(prior[0, 0, 3])
-    maps, energy, sigma, splits = start, [], found.sigma, Splits()
+    maps, energy, sigma, outcome = start, [], found.sigma, Outcome.MAX_ITERATIONS
     observability = np.ones(len(index), np.float32)
     kept: _Shaded | None = None
     for number in range(passes):
@@ -264,13 +264,11 @@ def solve_texels(
         if config.robust:
             found_albedo = None if maps is None else maps.reshape(-1, 4)[index, :3]
             joined = with_skin_chroma(joined, prior.reshape(-1, 4)[index, :3], found_albedo, sigma)
-        pull, splits = specular_pull(expected, sigma) if config.robust else 0.0, Splits()
-        maps = solve_maps(
-            joined, index, prior, smoothness, maps, specular_pull=pull, iterations=MAP_ITERATIONS, splits=splits
-        )
+        pull = Pull(specular=specular_pull(expected, sigma) if config.robust else 0.0)
+        maps, outcome = solve_maps(joined, index, prior, smoothness, maps, pull, MAP_ITERATIONS)
     progress("Reflectance maps", passes * len(chunks), passes * len(chunks))
     assert maps is not None
-    return SolvedMaps(maps, energy, sigma, splits.outcome, observability)
+    return SolvedMaps(maps, energy, sigma, outcome, observability)
 
 
 def with_skin_chroma(systems: TexelSystems, expected: NDArray, found: NDArray | None, sigma: float) -> TexelSystems:

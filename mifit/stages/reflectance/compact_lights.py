@@ -23,7 +23,7 @@ from mifit.appearance.illumination import DistantLight
 from mifit.appearance.reception import fibonacci_sphere
 from mifit.core.mesh import normalize
 from mifit.core.sh import LUMINANCE
-from mifit.stages.observations import Observations
+from mifit.sampling.observations import Observations
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import (
     LightingSolution,

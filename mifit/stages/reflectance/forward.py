@@ -12,7 +12,7 @@ from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
 from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, VertexTransfer
-from mifit.stages.observations import Observations
+from mifit.sampling.observations import Observations
 
 CHUNK = 1 << 19
 """Points shaded at a time: bounds the memory of the basis functions."""

@@ -19,7 +19,7 @@ from mifit.appearance.reception import fibonacci_sphere
 from mifit.core.process import on_all_cores
 from mifit.core.sh import bands, basis
 from mifit.optim import Outcome
-from mifit.stages.observations import Observations
+from mifit.sampling.observations import Observations
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting_equations import (
     BLOCK,

@@ -9,7 +9,7 @@ map is inverted at once by cosine transforms.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -88,14 +88,6 @@ class TexelSystems:
         """(N,) curvature of the specular albedo once the diffuse ones follow it."""
         taken = self.ds**2 / np.maximum(self.dd, np.float32(1e-12))
         return np.maximum(self.ss - taken.sum(1), np.float32(0.0))
-
-    def solve(self, x0: NDArray, y0: NDArray, px: NDArray | float, py: NDArray | float) -> tuple[NDArray, NDArray]:
-        """Minimise each block plus ``px |x - x0|^2 + py (y - y0)^2`` within 0..1: x (N, 3) and y (N,)."""
-        weight = np.append(np.broadcast_to(px, 3), py).astype(self.dd.dtype)[:, None]
-        target = np.concatenate([np.broadcast_to(x0, self.dd.shape).T, np.broadcast_to(y0, (1, len(self.sr)))])
-        found = np.empty_like(target, self.dd.dtype)
-        _Blocks.of(self, np.arange(len(self.sr)), weight, np.zeros_like(found), weight).solve(target, found)
-        return found[:3].T, found[3]
 
 
 @dataclass(frozen=True)
@@ -196,29 +188,6 @@ def _over_channels(values: NDArray) -> NDArray:
     return values[0] + values[1] + values[2]
 
 
-@dataclass
-class Splits:
-    """ADMM's copies and multipliers, planes (4, S, S): handed on, they make the next solve a short one.
-
-    A multiplier is kept as the sum of itself and the copy that it belongs to.
-
-    Attributes
-    ----------
-    smooth : smooth copy of the maps without their base
-    level : the same plus the multiplier of its split from the maps
-    bend : its Laplacian plus the multiplier of that split
-    outcome : Outcome
-        Of the solve that left them.
-    iterations : int
-    """
-
-    smooth: NDArray[np.float32] | None = None
-    level: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
-    bend: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
-    outcome: Outcome = Outcome.MAX_ITERATIONS
-    iterations: int = 0
-
-
 def plane_laplacian(planes: NDArray) -> NDArray:
     """Five-point Laplacian of planes (..., S, S) with mirrored borders."""
     if planes.ndim > 2:
@@ -252,18 +221,32 @@ class Smoothness:
     specular: float
 
 
+@dataclass(frozen=True)
+class Pull:
+    """Weights of what is expected of the maps.
+
+    Attributes
+    ----------
+    weak : float
+        Of all of them, relative to the median block: decides where no image measures.
+    specular : float
+        Of the specular albedo in the blocks' own units, where it is above the weak one.
+    """
+
+    weak: float = 1e-4
+    specular: float = 0.0
+
+
 def solve_maps(
     systems: TexelSystems,
     index: NDArray[np.int64],
     prior: NDArray,
     smoothness: Smoothness,
     start: NDArray | None = None,
-    prior_weight: float = 1e-4,
-    specular_pull: float = 0.0,
+    towards_prior: Pull = Pull(),
     iterations: int = 60,
     tolerance: float = 1e-4,
-    splits: Splits | None = None,
-) -> NDArray[np.float32]:
+) -> tuple[NDArray[np.float32], Outcome]:
     """Minimise the texels' blocks + lambda_H (|Laplacian delta C_d|_1 + |Laplacian C_s|_1) within 0..1.
 
     Parameters
@@ -277,21 +260,16 @@ def solve_maps(
     smoothness : Smoothness
     start : (S, S, 4), optional
         Start; the prior by default.
-    prior_weight : float
-        Weak pull to the prior, relative to the median block, that decides where the images are silent.
-    specular_pull : float
-        Pull of the specular albedo to its prior in the blocks' own units, where it is above the weak one.
+    towards_prior : Pull
     iterations : int
     tolerance : float
         Stop when no map moves by more than this.
-    splits : Splits, optional
-        Those of an earlier solve with nearly the same blocks, to go on from instead of from ``start``; they take those
-        of this one, and say how it ended.
 
     Returns
     -------
     (S, S, 4) float32
         Diffuse albedo and specular albedo.
+    Outcome
     """
     size = prior.shape[0]
     prior = np.ascontiguousarray(prior.transpose(2, 0, 1), dtype=np.float32)
@@ -299,17 +277,15 @@ def solve_maps(
     base[3] = 0.0  # the paper smooths the offset from the model's albedo, and C_s itself
     scale = np.array([float(np.median(systems.dd))] * 3 + [float(np.median(systems.ss))], dtype=np.float32)
     scale = np.maximum(scale, 1e-6)
-    pull = prior_weight * scale
-    pull[3] = max(pull[3], specular_pull)
+    pull = towards_prior.weak * scale
+    pull[3] = max(pull[3], towards_prior.specular)
     # Splitting weights near the blocks' own curvature let both sides of a split move at the same pace.
     rho = (SPLIT * scale)[:, None]
     threshold = np.array([smoothness.diffuse] * 3 + [smoothness.specular], dtype=np.float32)[:, None] / rho
     inverse = 1.0 / (1.0 + laplacian_eigenvalues(size) ** 2)
-    splits = Splits() if splits is None else splits
-    if splits.smooth is None:
-        splits.smooth = (prior if start is None else start.transpose(2, 0, 1).astype(np.float32)) - base
-        splits.level, splits.bend = splits.smooth.copy(), plane_laplacian(splits.smooth)
-    smooth, level, bend = splits.smooth, splits.level, splits.bend
+    # Planes (4, S, S) without their base: the smooth copy, and the sums of each split's copy and its multiplier.
+    smooth = (prior if start is None else start.transpose(2, 0, 1).astype(np.float32)) - base
+    level, bend = smooth.copy(), plane_laplacian(smooth)
     # Texels without a block are solved like all others, by what draws them alone.
     flat = prior.reshape(4, -1), base.reshape(4, -1)
     drawn = pull[:, None] * flat[0] + 0.5 * rho * flat[1]
@@ -317,7 +293,7 @@ def solve_maps(
     rows = [slice(at, at + CHUNK) for at in range(0, size * size, CHUNK)]
     lines = [slice(at, at + CHUNK // size) for at in range(0, size, CHUNK // size)]
     parts = [(every.take(r), r) for r in rows]
-    texel, splits.outcome, splits.iterations = prior.copy(), Outcome.MAX_ITERATIONS, 0
+    texel, outcome = prior.copy(), Outcome.MAX_ITERATIONS
 
     def solve_blocks(part: tuple[_Blocks, slice]) -> None:
         blocks, rows = part
@@ -351,9 +327,8 @@ def solve_maps(
     # Planes are independent but for the blocks, and those of each other; NumPy and SciPy let go of the interpreter.
     with ThreadPoolExecutor(min(4, threads())) as pool:
         for _ in range(iterations):
-            splits.iterations += 1
             list(pool.map(solve_blocks, parts))
             if max(pool.map(smooth_plane, range(4))) < tolerance:
-                splits.outcome = Outcome.CONVERGED
+                outcome = Outcome.CONVERGED
                 break
-    return np.ascontiguousarray(texel.transpose(1, 2, 0), dtype=np.float32)
+    return np.ascontiguousarray(texel.transpose(1, 2, 0), dtype=np.float32), outcome

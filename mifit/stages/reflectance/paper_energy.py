@@ -19,7 +19,7 @@ from mifit.config import ReflectanceConfig
 from mifit.core.sh import LUMINANCE
 from mifit.optim import Outcome
 from mifit.progress import Progress
-from mifit.stages.observations import Observations, Surface
+from mifit.sampling.observations import Observations, Surface
 from mifit.stages.reflectance.als import Fitted, lighting_of_subset, solve_texels
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution

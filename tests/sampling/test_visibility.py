@@ -1,11 +1,11 @@
-"""Trust: what lies beside the fitted head is told from the head by the other views."""
+"""Visibility: what lies beside the fitted head is told from the head by the other views."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from mifit.stages.trust import LEAST, agreement, background, elsewhere, outline_distance
+from mifit.sampling.visibility import OUTLIER, background, inlier_probability, outlier_prior, outline_distance
 
 SKIN, BACKGROUND = (0.5, 0.3, 0.25), (0.02, 0.02, 0.03)
 
@@ -13,7 +13,7 @@ SKIN, BACKGROUND = (0.5, 0.3, 0.25), (0.02, 0.02, 0.03)
 def judge(colours, wrong, weight=None, clipped=None, step=None):
     colour = np.array(colours, dtype=np.float32)[None]
     n = colour.shape[1]
-    return agreement(
+    return inlier_probability(
         colour,
         np.ones((1, n), np.float32) if weight is None else np.array([weight], np.float32),
         np.array([wrong], dtype=np.float32),
@@ -34,7 +34,7 @@ def test_views_that_agree_confirm_one_another() -> None:
 
 
 def test_a_highlight_seen_head_on_stays() -> None:
-    right = judge([(0.8, 0.6, 0.55), SKIN], [LEAST, LEAST])
+    right = judge([(0.8, 0.6, 0.55), SKIN], [OUTLIER[0]] * 2)
     assert right.min() > 0.9
 
 
@@ -46,9 +46,9 @@ def test_a_lone_a_clipped_and_another_steps_observation_keep_their_own_probabili
 
 def test_doubt_rises_to_the_outline_and_with_the_angle() -> None:
     cosine, distance = np.linspace(1, 0, 9), np.linspace(60, 0, 9)
-    assert (np.diff(elsewhere(cosine, np.full(9, 1e3))) > 0).all()
-    assert (np.diff(elsewhere(np.ones(9), distance)) > 0).all()
-    assert elsewhere(np.array(1.0), np.array(1e3)) == pytest.approx(LEAST)
+    assert (np.diff(outlier_prior(cosine, np.full(9, 1e3))) > 0).all()
+    assert (np.diff(outlier_prior(np.ones(9), distance)) > 0).all()
+    assert outlier_prior(np.array(1.0), np.array(1e3)) == pytest.approx(OUTLIER[0])
 
 
 def test_outlines_are_steps_of_depth_not_slopes() -> None:

@@ -54,7 +54,7 @@ def paper_light(
     radiance : (B*B, 3)
     exponent : float
     guard : float
-        ``1 / (n . d)`` is ``c / (c^2 + guard^2)`` with ``c = max(n . d, 0)``, see ``models.paper``.
+        ``1 / (n . d)`` is ``c / (c^2 + guard^2)`` with ``c = max(n . d, 0)``, see ``appearance.models``.
     """
     n, v = (np.asarray(x, dtype=np.float64) for x in (normals, view))
     light = SHLighting(np.asarray(radiance))

@@ -1,9 +1,9 @@
-"""What the images say about each texel: colour, validity, weight, normal and view of every timestep and camera.
+"""Images read at the texels of a map: colour, validity, weight, normal and view of every timestep and camera.
 
 Photometric terms are sums over pixels. Here they are sums over texels, each weighted by the number of pixels that
-it covers in a view, so that both sums agree whatever the size of the map, and a texel seen at a grazing angle or
-from far away counts for less. Where the images are to be trusted only as far as the mesh is, an observation also weighs
-no more than the probability that it shows the point (`stages.trust`).
+it covers in a view, so that both sums agree whatever the size of the map, and a texel seen at an oblique angle or
+from far away counts for less. Where the images are reliable only as far as the mesh is, an observation also weighs
+no more than the probability that it shows the point (`sampling.visibility`).
 """
 
 from __future__ import annotations
@@ -11,21 +11,27 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.occlusion import OccludingMesh
 from mifit.core.camera import Camera
-from mifit.core.estimate import GeometryEstimate
+from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, hidden
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.process import on_all_cores
 from mifit.core.uv import TexelMap, bilinear, rasterize_uv
 from mifit.errors import InputError
-from mifit.stages.shown import face_pixels, footprint, texel_area
-from mifit.stages.surface_image import Placed, SurfaceImage
-from mifit.stages.trust import agreement, background
+from mifit.sampling.visibility import (
+    FacePixels,
+    background,
+    facing,
+    footprint,
+    inlier_probability,
+    outlier_prior,
+    texel_area,
+)
 
 if TYPE_CHECKING:
     from mifit.capture import Capture, Frame
@@ -34,29 +40,31 @@ if TYPE_CHECKING:
 
 CHUNK_VALUES = 1 << 22
 """Texels x images that are held at a time."""
-JUDGED = 1 << 14
+COMPARED = 1 << 14
 """Texels whose images are compared at a time: what they need stays in a core's cache."""
+SHARED = ("step", "camera")
+"""Fields of `Observations` that are the same for all texels."""
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Observations of N texels by J images; image j is timestep ``step[j]`` of the geometry seen by ``view[j]``.
+    """Observations of N texels by J images; image j is timestep ``step[j]`` of the geometry seen by ``camera[j]``.
 
     Attributes
     ----------
+    step, camera : (J,) int
+        Index of the timestep in the geometry and of the camera in the list of cameras.
     texel : (N,) int64
         Position of each texel in the `TexelMap`.
     face : (N,) int32, barycentric : (N, 3) float32
         Where on the mesh each texel lies.
-    step, camera : (J,) int
-        Index of the timestep in the geometry and of the camera in the list of cameras.
     colour : (N, J, 3) float32
         Linear image colour, bilinear; 0 where not observed.
     weight : (N, J) float32
-        Pixels that the texel covers, faded at grazing angles, times ``right``; 0 where occluded, outside or invalid.
+        Pixels that the texel covers, less at grazing angles, times ``inlier``; 0 where occluded, outside or invalid.
     clipped : (N, J) bool
         The colour touches a clipped pixel: a lower bound, not a measurement.
-    right : (N, J) float32
+    inlier : (N, J) float32
         Probability that the image shows the point, and not something beside or in front of it.
     point : (N, T, 3), normal : (N, T, 3) float32
         World position and unit normal per timestep.
@@ -64,15 +72,15 @@ class Observations:
         Unit vectors towards the camera.
     """
 
+    step: NDArray[np.int64]
+    camera: NDArray[np.int64]
     texel: NDArray[np.int64]
     face: NDArray[np.int32]
     barycentric: NDArray[np.float32]
-    step: NDArray[np.int64]
-    camera: NDArray[np.int64]
     colour: NDArray[np.float32]
     weight: NDArray[np.float32]
     clipped: NDArray[np.bool_]
-    right: NDArray[np.float32]
+    inlier: NDArray[np.float32]
     point: NDArray[np.float32]
     normal: NDArray[np.float32]
     view: NDArray[np.float32]
@@ -90,26 +98,13 @@ class Observations:
     @classmethod
     def join(cls, parts: Sequence[Observations]) -> Observations:
         """The observations of several sets of texels by the same images."""
-        shared: dict[str, Any] = {"step": parts[0].step, "camera": parts[0].camera}
-        names = [f.name for f in fields(cls) if f.name not in shared]
-        return cls(**shared, **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+        names = [f.name for f in fields(cls) if f.name not in SHARED]
+        return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
     def take(self, rows: NDArray | slice) -> Observations:
         """The observations of some of the texels."""
-        return Observations(
-            self.texel[rows],
-            self.face[rows],
-            self.barycentric[rows],
-            self.step,
-            self.camera,
-            self.colour[rows],
-            self.weight[rows],
-            self.clipped[rows],
-            self.right[rows],
-            self.point[rows],
-            self.normal[rows],
-            self.view[rows],
-        )
+        names = [f.name for f in fields(self) if f.name not in SHARED]
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
 
 @dataclass(frozen=True)
@@ -124,6 +119,34 @@ class Seen:
     weights: NDArray[np.float32]
 
 
+@dataclass(frozen=True)
+class SurfaceImage:
+    """One image with what is needed to read it at surface points.
+
+    Attributes
+    ----------
+    step, camera_index : int
+    camera : Camera
+    colour : (H, W, 3)
+        0 where unusable.
+    unusable, clipped : (H, W)
+        1 where invalid, not the face area or at an occlusion edge; 1 where clipped.
+    footprint : (F,)
+        Pixels per texel, 0 for faces that face away.
+    outline : (H, W)
+        Pixels to the nearest outline times millimetres per unit of length.
+    """
+
+    step: int
+    camera_index: int
+    camera: Camera
+    colour: NDArray[np.float32]
+    unusable: NDArray[np.float32]
+    clipped: NDArray[np.float32]
+    footprint: NDArray[np.float32]
+    outline: NDArray[np.float32]
+
+
 class Surface:
     """The images of a capture, read at the surface points of a map.
 
@@ -135,7 +158,7 @@ class Surface:
         Cameras to read; no other camera of the capture is touched.
     size : int
         Side of the map in texels.
-    trust : bool
+    robust : bool
         Weigh observations by how likely they show the point; without it by pixels alone, as the paper's sums do.
     whole : bool
         All texels that the model's maps hold, neck, scalp and eyes included, and not those of its face area alone.
@@ -155,7 +178,7 @@ class Surface:
         geometry: GeometryEstimate,
         cameras: Sequence[str],
         size: int,
-        trust: bool = True,
+        robust: bool = True,
         whole: bool = False,
         texels: TexelMap | None = None,
     ) -> None:
@@ -165,28 +188,24 @@ class Surface:
             )
         from mifit.render.visible import occluding_mesh
 
-        shown = model.mapped if whole else model.face_mask
-        self.texels: TexelMap = rasterize_uv(model.uv, model.faces_uv, size, shown) if texels is None else texels
+        mapped = model.mapped if whole else model.face_mask
+        self.texels: TexelMap = rasterize_uv(model.uv, model.faces_uv, size, mapped) if texels is None else texels
         self.facial: NDArray[np.bool_] = model.face_mask[self.texels.face]
         if not len(self.texels.index):
             raise InputError(f"model {model.name}: its face area covers no texel of a map of {size} texels a side")
-        self.trust, self.geometry = trust, geometry
-        self.faces = model.faces
+        self.robust, self.geometry, self.faces = robust, geometry, model.faces
         self.vertices = [np.asarray(v, dtype=np.float64) for v in geometry.vertices]
         self.normals = [vertex_normals(v, model.faces) for v in self.vertices]
         self.meshes: tuple[OccludingMesh, ...] = tuple(occluding_mesh(v, model.faces) for v in self.vertices)
-        self.scenes = [mesh.scene for mesh in self.meshes]
-        area = texel_area(model.uv, model.faces_uv, size)
+        area, millimetres = texel_area(model.uv, model.faces_uv, size), model.unit_mm / geometry.scale
         self._kept: Observations | None = None
         self._images: list[SurfaceImage] = []
 
-        def look(i: int, k: int, camera: Camera, frame: Frame, buffer: GBuffer) -> SurfaceImage:
-            covered, edge, outline, facial = face_pixels(
-                buffer, self.vertices[i], model.faces, shown, camera, model.face_mask
-            )
-            unusable = edge | ~covered | ~frame.valid | ~np.isfinite(frame.image).all(-1)
+        def prepare(i: int, k: int, camera: Camera, frame: Frame, buffer: GBuffer) -> SurfaceImage:
+            pixels = FacePixels.of(buffer, self.vertices[i], model.faces, camera, (mapped, model.face_mask))
+            unusable = pixels.edge | ~pixels.covered | ~frame.valid | ~np.isfinite(frame.image).all(-1)
             if whole:
-                unusable |= background(frame.image, outline > 0, facial)
+                unusable |= background(frame.image, pixels.outline > 0, pixels.facial)
             return SurfaceImage(
                 i,
                 k,
@@ -195,13 +214,13 @@ class Surface:
                 unusable.astype(np.float32),
                 frame.clipped.astype(np.float32),
                 footprint(self.vertices[i], model.faces, camera, area),
-                (outline * (model.unit_mm / geometry.scale)).astype(np.float32),
+                (pixels.outline * millimetres).astype(np.float32),
             )
 
         for i, timestep in enumerate(geometry.timesteps):
             views = [(k, capture.camera(name), capture.frame(name, timestep)) for k, name in enumerate(cameras)]
-            found = [(i, *view, self.scenes[i].gbuffer(view[1])) for view in views]
-            self._images += on_all_cores(lambda one: look(*one), found)
+            found = [(i, *view, self.meshes[i].scene.gbuffer(view[1])) for view in views]
+            self._images += on_all_cores(lambda one: prepare(*one), found)
 
     def __len__(self) -> int:
         return len(self.texels.index)
@@ -209,11 +228,11 @@ class Surface:
     def views(self) -> Iterator[Seen]:
         """Every image's camera and mesh, in the order of the images."""
         for image in self._images:
-            i, buffer = image.step, self.scenes[image.step].gbuffer(image.camera)
+            i, buffer = image.step, self.meshes[image.step].scene.gbuffer(image.camera)
             timestep = self.geometry.timesteps[i]
             yield Seen(image.camera, timestep, self.vertices[i], self.normals[i], buffer.face, buffer.weights)
 
-    def without(self, hidden: Sequence[NDArray[np.bool_]]) -> Surface:
+    def without(self, masks: Sequence[NDArray[np.bool_]]) -> Surface:
         """The same surface with pixels (H, W) of every image left out."""
         less = copy.copy(self)
         less._kept = None
@@ -223,25 +242,18 @@ class Surface:
                 colour=np.where(left_out[..., None], np.float32(0), image.colour),
                 unusable=np.maximum(image.unusable, left_out.astype(np.float32)),
             )
-            for image, left_out in zip(self._images, hidden, strict=True)
+            for image, left_out in zip(self._images, masks, strict=True)
         ]
-        if self._kept is not None:
-            less._kept = self._reread(self._kept, less)
         return less
 
-    def _reread(self, kept: Observations, less: Surface) -> Observations:
-        """Observations of all texels with those read anew that are near pixels that another surface leaves out."""
-        touched = np.zeros(len(kept.texel), dtype=bool)
-        for k, (image, other) in enumerate(zip(self._images, less._images, strict=True)):
-            rows = np.flatnonzero(kept.weight[:, k] > 0)
-            pixel = image.camera.project(kept.point[rows, image.step].astype(np.float64)) - 0.5
-            touched[rows] |= bilinear(other.unusable - image.unusable, pixel[:, 0], pixel[:, 1]) > 0
-        rows = np.flatnonzero(touched)
-        again = less._observe(rows)
-        changed = {name: getattr(kept, name).copy() for name in ("colour", "weight", "clipped", "right")}
-        for name, values in changed.items():
-            values[rows] = getattr(again, name)
-        return replace(kept, **changed)
+    def without_hidden(self, reflectance: ReflectanceEstimate) -> Surface:
+        """The same surface without what stage 2 found in front of the face; as it is where images have no labels."""
+        found = [reflectance.label(image.camera.name, self.geometry.timesteps[image.step]) for image in self._images]
+        if all(labels is None for labels in found):
+            return self
+        shapes = [image.unusable.shape for image in self._images]
+        pairs = zip(found, shapes, strict=True)
+        return self.without([np.zeros(shape, bool) if labels is None else hidden(labels) for labels, shape in pairs])
 
     @property
     def image_count(self) -> int:
@@ -294,7 +306,7 @@ class Surface:
         for part in self.chunks():
             seen = self.observe(part)
             cosine = np.einsum("njk,njk->nj", seen.image_normal, seen.view)
-            good = np.where(seen.measured > 0, np.clip(cosine, 0.0, 1.0) * seen.right, 0.0)
+            good = np.where(seen.measured > 0, np.clip(cosine, 0.0, 1.0) * seen.inlier, 0.0)
             good *= np.maximum(1.0 - (dark / np.maximum(seen.colour.mean(-1), 1e-12)) ** 2, 0.0)
             out[part] = np.minimum(good.sum(1) / max(1.0, 0.35 * self.image_count), 1.0)
         return out
@@ -313,46 +325,54 @@ class Surface:
     def _observe(self, texel: NDArray[np.int64]) -> Observations:
         face, weights = self.texels.face[texel], self.texels.weights[texel]
         n, j, t = len(texel), len(self._images), len(self.vertices)
-        colour = np.zeros((n, j, 3), dtype=np.float32)
-        weight = np.zeros((n, j), dtype=np.float32)
+        colour, view = (np.zeros((n, j, 3), dtype=np.float32) for _ in range(2))
+        weight, outlier = (np.zeros((n, j), dtype=np.float32) for _ in range(2))
         clipped = np.zeros((n, j), dtype=bool)
-        wrong = np.zeros((n, j), dtype=np.float32)
-        view = np.zeros((n, j, 3), dtype=np.float32)
-        point = np.zeros((n, t, 3), dtype=np.float32)
-        normal = np.zeros((n, t, 3), dtype=np.float32)
+        point, normal = (np.zeros((n, t, 3), dtype=np.float32) for _ in range(2))
         for i in range(t):
             point[:, i] = interpolate(self.vertices[i], self.faces, face, weights)
             normal[:, i] = normalize(interpolate(self.normals[i], self.faces, face, weights))
 
-        def place(image: SurfaceImage) -> Placed:
-            return Placed.of(image, point[:, image.step].astype(np.float64), normal[:, image.step], face)
+        def place(k: int) -> tuple[NDArray, NDArray]:
+            """Texels that face camera k before usable pixels, and where in the image."""
+            image, camera = self._images[k], self._images[k].camera
+            place = point[:, image.step].astype(np.float64)
+            view[:, k] = normalize(camera.position - place)
+            pixel = np.nan_to_num(camera.project(place), nan=-1e6) - 0.5
+            inside = (pixel >= 0).all(-1) & (pixel <= (camera.width - 1, camera.height - 1)).all(-1)
+            weight[:, k] = image.footprint[face] * facing(np.sum(normal[:, image.step] * view[:, k], axis=-1)) * inside
+            rows = np.flatnonzero(weight[:, k] > 0)
+            usable = bilinear(image.unusable, *pixel[rows].T) < 0.5
+            weight[rows[~usable], k] = 0.0
+            return rows[usable], pixel[rows[usable]]
 
-        def read(number: int) -> None:
-            view[:, number] = placed[number].view
-            placed[number].read(self.trust, colour[:, number], weight[:, number], clipped[:, number], wrong[:, number])
+        def read(k: int) -> None:
+            image, camera, (rows, pixel) = self._images[k], self._images[k].camera, places[k]
+            usable = 1.0 - bilinear(image.unusable, *pixel.T)
+            colour[rows, k] = bilinear(image.colour, *pixel.T) / usable[:, None]  # of the usable pixels alone
+            clipped[rows, k] = bilinear(image.clipped, *pixel.T) > 0.0
+            if self.robust:
+                depth = np.sum((point[rows, image.step] - camera.position) * camera.rotation[2], axis=1)
+                cosine = np.sum(normal[rows, image.step] * view[rows, k], axis=-1)
+                outlier[rows, k] = outlier_prior(cosine, bilinear(image.outline, *pixel.T) * depth / camera.fx)
 
-        placed = on_all_cores(place, self._images)
-        # Rays take all cores by themselves.
-        placed = [each.seen(self.scenes[each.image.step]) for each in placed]
+        places = on_all_cores(place, range(j))
+        for k, (image, (rows, pixel)) in enumerate(zip(self._images, places, strict=True)):
+            # Rays take all cores by themselves.
+            visible = self.meshes[image.step].scene.visible_from(point[rows, image.step], image.camera.position)
+            weight[rows[~visible], k] = 0.0
+            places[k] = rows[visible], pixel[visible]
         on_all_cores(read, range(j))
-        step = np.array([m.step for m in self._images])
-        right = np.float32(1.0) - wrong
-        if self.trust:
-            rows = [slice(at, at + JUDGED) for at in range(0, n, JUDGED)]
-            parts = on_all_cores(lambda r: agreement(colour[r], weight[r], wrong[r], clipped[r], step), rows)
-            right = np.concatenate(parts) if parts else right
-            weight *= np.minimum(right, 1.0 - wrong)  # confirmed or not, a twin of a view adds nothing new
+        step = np.array([image.step for image in self._images])
+        inlier = np.float32(1.0) - outlier
+        if self.robust:
+            parts = [slice(at, at + COMPARED) for at in range(0, n, COMPARED)]
+            compared = on_all_cores(
+                lambda r: inlier_probability(colour[r], weight[r], outlier[r], clipped[r], step), parts
+            )
+            inlier = np.concatenate(compared) if compared else inlier
+            weight *= np.minimum(inlier, 1.0 - outlier)  # confirmed or not, a twin of a view adds nothing new
+        camera = np.array([image.camera_index for image in self._images])
         return Observations(
-            texel,
-            face,
-            weights,
-            step,
-            np.array([m.camera_index for m in self._images]),
-            colour,
-            weight,
-            clipped,
-            right,
-            point,
-            normal,
-            view,
+            step, camera, texel, face, weights, colour, weight, clipped, inlier, point, normal, view
         )

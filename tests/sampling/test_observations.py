@@ -102,10 +102,10 @@ def capture(angles=(0.0,), image=None, valid=None, clipped=None, distance=4.0):
     )
 
 
-def observe(shot, model=None, cameras=("left",), geo=None, trust=False):
-    from mifit.stages.observations import Surface
+def observe(shot, model=None, cameras=("left",), geo=None, robust=False):
+    from mifit.sampling.observations import Surface
 
-    surface = Surface(shot, model or quad(), geo or geometry(), cameras, SIZE, trust)
+    surface = Surface(shot, model or quad(), geo or geometry(), cameras, SIZE, robust)
     return surface, surface.observe(np.arange(len(surface)))
 
 
@@ -144,7 +144,7 @@ def test_the_background_beside_a_mesh_that_is_too_wide_counts_for_little(variant
     dark = np.full_like(image, 0.01)
     photo._images["right"] = replace(photo._images["left"], image=dark)  # grazing, and of something else
     _, plain = observe(photo, cameras=("left", "right"))
-    surface, seen = observe(photo, cameras=("left", "right"), trust=True)
+    surface, seen = observe(photo, cameras=("left", "right"), robust=True)
     both = (plain.weight > 0).all(1)
     assert both.sum() > 50
     assert (seen.weight[both, 1] < 0.1 * plain.weight[both, 1]).all()
@@ -155,7 +155,7 @@ def test_the_background_beside_a_mesh_that_is_too_wide_counts_for_little(variant
 
 
 def test_pixels_left_out_are_read_as_if_they_had_never_been_there(variant):
-    from mifit.stages.observations import Surface
+    from mifit.sampling.observations import Surface
 
     shot, everywhere = capture((-0.2, 0.2)), np.arange(SIZE * SIZE)
     hidden = [np.zeros((48, 48), bool) for _ in range(2)]
@@ -164,15 +164,15 @@ def test_pixels_left_out_are_read_as_if_they_had_never_been_there(variant):
     read = Surface(shot, quad(), geometry(), ("left", "right"), SIZE)
     before = read.observe(everywhere)
     after, expected = read.without(hidden).observe(everywhere), fresh.observe(everywhere)
-    for name in ("colour", "weight", "clipped", "right"):
+    for name in ("colour", "weight", "clipped", "inlier"):
         np.testing.assert_array_equal(getattr(after, name), getattr(expected, name))
     assert ((before.weight > 0) & (after.weight == 0))[:, 0].any()
-    assert (before.right != after.right)[:, 1].any()  # what the other view confirmed
+    assert (before.inlier != after.inlier)[:, 1].any()  # what the other view confirmed
     np.testing.assert_array_equal(read.observe(everywhere).weight, before.weight)
 
 
 def test_equal_meshes_are_made_and_their_shadows_traced_once(variant):
-    from mifit.stages.observations import Surface
+    from mifit.sampling.observations import Surface
 
     shot, model = capture(), quad()
     first, second = (Surface(shot, model, geometry(), ("left",), SIZE) for _ in range(2))
@@ -226,7 +226,7 @@ def test_an_occluder_hides_what_is_behind_it(variant):
 
 
 def test_nothing_to_observe_is_an_error_with_a_reason(variant):
-    from mifit.stages.observations import Surface
+    from mifit.sampling.observations import Surface
 
     with pytest.raises(InputError, match="0 cameras"):
         Surface(capture(), quad(), geometry(), [], SIZE)
@@ -240,11 +240,11 @@ def test_nothing_to_observe_is_an_error_with_a_reason(variant):
 def test_a_twin_of_a_view_adds_nothing_to_what_it_is_believed(variant):
     """Two cameras at one grazing place agree, whatever they show: each counts by its own probability alone."""
     _, plain = observe(capture((1.2,)))
-    _, one = observe(capture((1.2,)), trust=True)
-    _, two = observe(capture((1.2, 1.2)), cameras=("left", "right"), trust=True)
+    _, one = observe(capture((1.2,)), robust=True)
+    _, two = observe(capture((1.2, 1.2)), cameras=("left", "right"), robust=True)
     both = plain.weight[:, 0] > 0
     np.testing.assert_allclose(two.weight[both, 0], one.weight[both, 0], rtol=1e-5)
-    assert (two.right[both, 0] > one.right[both, 0] + 0.05).mean() > 0.5  # though they are believed more
+    assert (two.inlier[both, 0] > one.inlier[both, 0] + 0.05).mean() > 0.5  # though they are believed more
 
 
 def test_the_outlines_reach_is_in_millimetres_whatever_the_pixels(variant):
@@ -256,7 +256,7 @@ def test_the_outlines_reach_is_in_millimetres_whatever_the_pixels(variant):
     model, beside = quad(), geometry(0.3 * VERTICES)  # 6 millimetres wide: all of it is near the outline
     share = []
     for shot in (grey, large):
-        (_, plain), (_, seen) = (observe(shot, model, geo=beside, trust=trust) for trust in (False, True))
+        (_, plain), (_, seen) = (observe(shot, model, geo=beside, robust=robust) for robust in (False, True))
         middle = np.linalg.norm(plain.point[:, 0, :2], axis=1) < 0.1
         share.append((seen.weight[middle, 0] / plain.weight[middle, 0]).mean())
     assert 0.5 < share[0] < 0.95 and share[1] == pytest.approx(share[0], abs=0.04)

@@ -10,7 +10,7 @@ import pytest
 from mifit.core.mesh import interpolate
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
-from mifit.stages.reflectance.relief import SIDED_SPREAD, SYMMETRIC_SPREAD, facial_share, part_relief
+from mifit.stages.reflectance.residual_shading import SIDED_SPREAD, SYMMETRIC_SPREAD, facial_share, separate_shading
 
 SIZE = 96
 
@@ -39,7 +39,7 @@ def one_sided(head, strength):
 
 
 def spreads(head, albedo):
-    parted = part_relief(*head, albedo, np.ones((SIZE, SIZE), np.float32))
+    parted = separate_shading(*head, albedo, np.ones((SIZE, SIZE), np.float32))
     return parted.symmetric, parted.sided
 
 
@@ -58,7 +58,7 @@ def test_the_face_without_eyes_and_mouth_is_judged(head):
 
 def test_skin_as_it_is_stays(head):
     albedo = skin(head, 0.15)
-    parted = part_relief(*head, albedo, np.ones((SIZE, SIZE), np.float32))
+    parted = separate_shading(*head, albedo, np.ones((SIZE, SIZE), np.float32))
     assert parted.symmetric == pytest.approx(0.15, abs=0.02) and parted.sided < 0.02
     np.testing.assert_allclose(parted.skin, albedo, atol=1e-5)
     np.testing.assert_allclose(parted.relief, 1.0, atol=1e-4)
@@ -68,7 +68,7 @@ def test_skin_as_it_is_stays(head):
 def test_light_from_one_side_is_parted(head, strength):
     true = skin(head)
     found = np.clip(true * one_sided(head, strength)[..., None], 0, 1)
-    parted = part_relief(*head, found, np.ones((SIZE, SIZE), np.float32))
+    parted = separate_shading(*head, found, np.ones((SIZE, SIZE), np.float32))
     inside = head[1].to_map(facial_share(*head).astype(np.float32)) > 0.99
 
     def error(albedo):
@@ -84,7 +84,7 @@ def test_light_from_one_side_is_parted(head, strength):
 
 def test_more_contrast_than_skin_has_is_parted(head):
     found = np.clip(skin(head, 0.6), 0, 1)
-    parted = part_relief(*head, found, np.ones((SIZE, SIZE), np.float32))
+    parted = separate_shading(*head, found, np.ones((SIZE, SIZE), np.float32))
     assert spreads(head, parted.skin)[0] < 1.1 * SYMMETRIC_SPREAD
     ratio = parted.skin / np.maximum(found, 1e-6)
     covered = found.min(axis=-1) > 0.01
@@ -93,14 +93,14 @@ def test_more_contrast_than_skin_has_is_parted(head):
 
 def test_a_face_that_was_hardly_seen_is_left_alone(head):
     found = skin(head, 0.6)
-    parted = part_relief(*head, found, np.zeros((SIZE, SIZE), np.float32))
+    parted = separate_shading(*head, found, np.zeros((SIZE, SIZE), np.float32))
     assert parted.symmetric is None and parted.skin is found and (parted.relief == 1.0).all()
 
 
 def test_without_a_symmetry_all_contrast_is_judged_as_one(head):
     model, texels = replace(head[0], symmetry=None), head[1]
     found = skin(head) * one_sided(head, 0.6)[..., None]
-    parted = part_relief(model, texels, np.clip(found, 0, 1), np.ones((SIZE, SIZE), np.float32))
+    parted = separate_shading(model, texels, np.clip(found, 0, 1), np.ones((SIZE, SIZE), np.float32))
     assert parted.sided == 0.0 and parted.symmetric > 0.5
     inside = texels.to_map(facial_share(model, texels).astype(np.float32)) > 0.99
     assert np.log(parted.skin[inside]).mean(axis=1).std() < 1.1 * SYMMETRIC_SPREAD
