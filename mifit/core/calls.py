@@ -42,7 +42,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     Raises
     ------
     TypeError
-        An object of another class. What has ``cameras`` counts as a capture.
+        An object of another class. What has ``cameras`` or a ``frame`` counts as a capture.
     InputError
         A geometry, or a result's, that doesn't have the vertices of the model that it comes with.
     """
@@ -58,7 +58,8 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
             if value is None and str(signature.parameters[name].annotation).endswith("None"):
                 continue
             known = {cls.__name__ for cls in type(value).__mro__}
-            if kind not in known and not (kind == "Capture" and hasattr(value, "cameras")):
+            stand_in = kind == "Capture" and (hasattr(value, "cameras") or hasattr(value, "frame"))
+            if kind not in known and not stand_in:
                 raise TypeError(f"{function.__name__}: {name}: found {type(value).__name__}, expected {kind}")
         model, geometry = given.get("model"), given.get("geometry")
         if model is not None and geometry is not None and geometry.vertices.shape[1] != len(model.mean):
