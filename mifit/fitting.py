@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
@@ -225,7 +225,7 @@ def fit(
         found = [*checked, *check_fit(capture, model, geometry, cameras)]
         return Reconstruction(
             model=model,
-            **cast(dict, judged(estimates, found)),
+            **judged(estimates, found),
             config={**dataclasses.asdict(config), "seed": seed},
             cameras=tuple(capture.camera(name) for name in cameras),
             capture_digest=capture_digest,

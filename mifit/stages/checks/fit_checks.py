@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from mifit.morphable import MorphableModel
 from mifit.stages.checks.capture_checks import landmark_shots
 from mifit.stages.checks.landmark_model import INNER, noise_of
 
-T = TypeVar("T", bound=str)
 SHIFT = 0.8
 """Shift that the landmarks of all cameras share from the face that the images show, in deviations of one landmark,
 beyond which it is no detector's: the fit gives way to two thirds of it."""
@@ -59,7 +58,7 @@ def check_fit(
     return [Diagnostic("landmarks-shifted", text)]
 
 
-def judged(estimates: Mapping[T, Any], found: Sequence[Diagnostic]) -> dict[T, Any]:
+def judged(estimates: Mapping[Any, Any], found: Sequence[Diagnostic]) -> dict[Any, Any]:
     """The estimates; all end `INCONSISTENT` where the capture has a named fault or the fit contradicts its images.
 
     Parameters
