@@ -289,7 +289,7 @@ def with_skin_chroma(systems: TexelSystems, expected: NDArray, found: NDArray | 
         level = (systems.dr * reference).sum(1) / np.maximum((systems.dd * reference**2).sum(1), 1e-12)
     else:
         level = (found * reference).sum(1) / (reference**2).sum(1)
-        seen = systems.dd.min(1) > 0.1 * np.median(systems.dd)
+        seen = systems.dd.min(1) >= 0.1 * np.median(systems.dd)
         reference = reference * np.median(found[seen] / np.maximum(reference[seen] * level[seen, None], 1e-3), axis=0)
     pull = (sigma / (CHROMA_SPREAD * float(np.median(reference)))) ** 2
     toward = pull * level[:, None] * reference
