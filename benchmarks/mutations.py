@@ -146,8 +146,6 @@ MUTATIONS = (
     M("distances to the outline in pixels, not in millimetres", "observations.Surface._observe",
       "bilinear(image.outline, *pixel.T) * depth / camera.fx", "bilinear(image.outline, *pixel.T)",
       "tests/sampling/test_observations.py"),
-    M("a coarser camera is half a pixel off", "prediction_between_views.every", "0.5 * (step - 1)", "0.0",
-      "tests/stages/test_prediction_between_views.py"),
     M("refined normals turned the wrong way for the residual", "find_residual._difference", "rotation.T", "rotation",
       "tests/stages/test_find_residual.py"),
     # Solvers.

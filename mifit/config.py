@@ -190,17 +190,14 @@ class SurfaceConfig:
     """The surface beyond the model's span (``stages.find_surface``); needs two views or more."""
 
     enabled: bool = flag(True, "move the surface to where all views agree; false: it stays in the model's span")
-    reach: float = number(4.0, "distance from the model's surface that is searched", "millimetres", above=0, most=100)
+    reach: float = number(
+        8.0, "distance from the surface that the first sweep searches", "millimetres", above=0, most=100
+    )
     stiffness: float = number(
-        2.0,
-        "least resistance of the displacements to bending; what the images show raises it",
+        4.0,
+        "resistance of the displacement to bending, relative to the precision of measurements; chosen on scan_city",
         above=0,
         most=WEIGHT,
-    )
-    refit: bool = flag(
-        True,
-        "where landmarks are biased, fit the model again by colours and by sweeps of its surface, and keep the fit if "
-        "views then predict each other better",
     )
     close_lips: bool = flag(True, "close the lips on the lip line where the images show a closed mouth")
     close_lids: bool = flag(True, "close the lids where the images show closed eyes")

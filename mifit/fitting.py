@@ -349,7 +349,7 @@ def steps(config: FitConfig, until: Stage = "normals") -> list[Step]:
     """The steps of a fit with these settings, in order."""
     found = [Step("geometry", "geometry", (), (config.geometry,), _fit_geometry)]
     if config.surface.enabled:
-        found.append(Step("surface", "geometry", ("geometry",), (config.surface, config.geometry), _find_surface))
+        found.append(Step("surface", "geometry", ("geometry",), (config.surface,), _find_surface))
     if config.photometry.enabled:
         found.append(Step("photometry", "geometry", ("geometry",), (config.photometry,), _find_photometry))
     if until == "geometry":
@@ -417,11 +417,9 @@ def _fit_geometry(source: Source, inputs: Inputs, progress: Progress, config: Ge
     return behind_lids(model, found)
 
 
-def _find_surface(
-    source: Source, inputs: Inputs, progress: Progress, config: SurfaceConfig, geometry: GeometryConfig
-) -> GeometryEstimate:
+def _find_surface(source: Source, inputs: Inputs, progress: Progress, config: SurfaceConfig) -> GeometryEstimate:
     capture, model, cameras = source.images
-    return behind_lids(model, find_surface(capture, model, inputs["geometry"], cameras, config, progress, geometry))
+    return behind_lids(model, find_surface(capture, model, inputs["geometry"], cameras, config, progress))
 
 
 def _find_photometry(source: Source, inputs: Inputs, progress: Progress, config: PhotometryConfig) -> GeometryEstimate:

@@ -37,10 +37,10 @@ from mifit.result.writing import add_timestep
 from mifit.sampling.observations import Surface
 from mifit.stages.fit_geometry import fit_pose_expression
 from mifit.stages.geometry.refine import texture_reference
+from mifit.stages.geometry.summary import landmarks_are_biased
 from mifit.stages.normals.refine_mesh import MeshRefiner
 from mifit.stages.normals.refine_normals import check_maps, refine_frame
 from mifit.stages.surface.kept_texture import KeptTexture
-from mifit.stages.surface.model_fit import landmarks_are_biased
 
 if TYPE_CHECKING:
     from mifit.capture import Capture

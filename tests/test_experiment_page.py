@@ -70,7 +70,6 @@ def test_the_page_runs_on_gloss(variant, shared, tmp_path, monkeypatch):
         '"auto"': f'"{VARIANT}"',
         "range(0, 360, 10)": "range(0, 360, 120)",
         "texture_size=256": "texture_size=128, bands=6",
-        "FitConfig(": "FitConfig(surface=mifit.SurfaceConfig(refit=False), ",
     }
     names, seconds = run_page(tmp_path, monkeypatch, changes)
     check(names, 3)

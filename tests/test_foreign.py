@@ -205,7 +205,7 @@ def test_the_independent_scorer_finds_the_same_figures(tmp_path, monkeypatch, ca
     capture, model = mifit.Capture.load(case.path), mifit.MorphableModel.load(case.model)
     config = foreign.replace_size(mifit.FitConfig(), 64)
     maps = replace(config.reflectance, shading="prefiltered", bands=4, exponent=40)
-    config = replace(config, surface=replace(config.surface, refit=False), reflectance=maps)
+    config = replace(config, reflectance=maps)
     result = mifit.fit(capture, model, case.fitted, case.timesteps, config, until="reflectance")
     replace(result, model_source="builtin").save(tmp_path / "result")
 

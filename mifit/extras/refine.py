@@ -88,7 +88,7 @@ def refine(
     left_out = {} if chosen is None else {t: why for t, why in chosen.left_out.items() if t in further}
     geometry, failed = _followed(result, capture, () if chosen is None else chosen.timesteps, config, seed, progress)
     if geometry.displacement is not None:
-        found = find_surface(capture, model, geometry, names, config.surface, progress, config.geometry)
+        found = find_surface(capture, model, geometry, names, config.surface, progress)
         geometry = behind_lids(model, found)
     if config.photometry.enabled:
         photometry = find_photometry(plain, model, geometry, names, config.photometry, seed, progress)

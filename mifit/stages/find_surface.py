@@ -1,48 +1,83 @@
-"""Stage 1b: the surface beyond the model's span, where the images of all views and timesteps together ask for it."""
+"""Stage 1b: the surface that the images of all views and timesteps show together.
+
+The surface is the model's modes and a smooth displacement under one Gaussian prior (`surface.displace`). It is
+measured by sweeps along its normals, which find where the views agree best (`surface.sweep`), and by the outlines of
+the head (`surface.outline`). Sweeps and solutions take turns, coarse to fine, at each level until the surface rests:
+coarse levels reach far in few samples, and the prior holds what they don't measure. Stage 1 is only a start.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from itertools import combinations
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
 
-from mifit.config import GeometryConfig, SurfaceConfig
+from mifit.config import SurfaceConfig
 from mifit.core.calls import checked
+from mifit.core.camera import Camera
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, Report
+from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.process import one_blas_thread
+from mifit.core.uv import TexelMap, rasterize_uv
+from mifit.morphable.openings import leading_faces, skin_weights
 from mifit.optim import Outcome
 from mifit.progress import Progress, silent
-from mifit.stages.eyes import behind_lids
+from mifit.stages.geometry.points import corner_matrix
+from mifit.stages.geometry.scenes import Scenes
+from mifit.stages.surface.align_timesteps import align_timesteps
 from mifit.stages.surface.close_openings import LIDS, LIPS, close_again, close_openings
-from mifit.stages.surface.coarse_to_fine import Reached, Search, sweeps
-from mifit.stages.surface.model_fit import SHADING_ROUNDS, fit_model, landmarks_are_biased
-from mifit.stages.surface.prediction_between_views import errors_between_views
+from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surface
+from mifit.stages.surface.epipolar import epipolar_residual
+from mifit.stages.surface.outline import REACH, Borders, find_borders, joined
+from mifit.stages.surface.sweep import Found, Posed, across_time, sweep
 from mifit.stages.surface.thin_walls import keep_walls
-from mifit.stages.surface.views import Resolution
+from mifit.stages.surface.views import Resolution, pose_texels, texture_size
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
-ROUNDS, RESTS = 6, 0.25
-"""Rounds of the coarse levels at the most, and the movement that ends them, in parallax of a pixel."""
-SETTLING = 2
-"""Further sweeps at the finest level, at the most, until it has."""
-FINEST_AGAIN = 2
-"""Further sweeps at the finest level while the model alone moves."""
-CLOSED_LAYERS = 8
-"""Offsets to either side in the first sweep of lids that have been closed."""
-TRIES = 2
-"""Refits with other points and pixels, at the most, of a single timestep, where a refit may end in a wrong place."""
-OFF_PIXELS = 1.0
-"""Median distance from epipolar lines that deserves a warning."""
 NARROWEST = 0.03
 """Least parallax; below it, about 2 degrees between the views, depth isn't measured."""
+NEIGHBOURS = 2
+"""Views that each view is compared with, those whose directions are nearest."""
+STEP_PIXELS = 0.7
+"""Parallax between neighbouring offsets of a sweep, pixels of the level."""
+FAR_LAYERS, LAYERS = 6, 4
+"""Offsets to either side in a level's first sweep, and in those after it."""
+WINDOW = 11
+"""Side of the windows that are compared, texels; a texel is about a pixel of the level."""
+COARSEST = 3
+"""Times that the images are halved at most."""
+LARGEST_MAP = 1024
+SETTLED = 0.25
+"""Part of a sweep's step below which a level is at rest (root mean square over what is measured)."""
+MOST_SWEEPS, SWEEPS_OF_LIDS = 5, 2
+"""Of a level, and of the finest one once more where lids have been closed."""
+ROBUST_STEPS = 0.7
+"""Distance from the surface, in steps of the sweep, where an offset counts as an outlier."""
+JAW = 17
+"""Landmarks of the jaw, which come first."""
+INDEPENDENT = 0.1
+"""Part of the landmarks that count as measured on their own: neighbours are off alike."""
+OUTLIER_DEVIATIONS = 4.0
+"""Distance from the surface, in deviations, where a landmark counts as an outlier."""
+THIN = 2
+"""Every so many texels along rows and columns are measurements: windows overlap, so that nothing is lost."""
+FORGET_MM = 150.0
+"""Wavelength above which displacements fall back to the model where nothing is measured."""
+CONTACT_MM = 1.5
+"""Gap below which opposed parts of the surface, such as closed lips, move together."""
+SLACK = 0.01
+"""Pixels that the surface may move by before what rays meet is built anew."""
+OFF_PIXELS = 1.0
+"""Median distance from epipolar lines that deserves a warning."""
 
 
 @checked
@@ -54,127 +89,407 @@ def find_surface(
     cameras: Sequence[str],
     config: SurfaceConfig | None = None,
     progress: Progress = silent,
-    geometry_config: GeometryConfig | None = None,
 ) -> GeometryEstimate:
-    """Displace a fitted surface to where all views agree.
+    """The surface on which all views agree.
 
     Parameters
     ----------
     capture, model
         Images, and the model that was fitted.
     geometry : GeometryEstimate
-        Result of stage 1.
+        Where to start: the result of stage 1, or of this function.
     cameras : sequence of str
         Cameras to read; no other camera of the capture is touched.
     config : SurfaceConfig, optional
     progress : Progress
-    geometry_config : GeometryConfig, optional
-        Stage 1's, whose texture, landmark and prior terms go on where the model is refitted.
 
     Returns
     -------
     GeometryEstimate
-        With ``displacement``, one for all timesteps, and the vertices that follow it. With fewer than two views, or
-        views from nearly one place, ``geometry`` with a warning.
-
-    Notes
-    -----
-    Coarse to fine: at every level the texels of the current surface are moved along their normals to where the views
-    agree best (`surface.sweep`), and the mesh follows by sparse least squares (`surface.displace`). The coarse
-    levels are swept again until the surface rests: a head far from the model's span takes several rounds. Where
-    landmarks are biased, pose and expression of the timesteps follow the images too (`surface.align_timesteps`).
+        With ``displacement``, one for all timesteps, other coefficients, and the vertices that follow. With fewer
+        than two views, or views from nearly one place, ``geometry`` with a warning.
     """
     began = time.perf_counter()
     config = config or SurfaceConfig()
     views = [capture.camera(name) for name in cameras]
-    pairs = list(combinations(range(len(views)), 2))
     world = geometry.vertices.astype(np.float64)
+    pairs = neighbours(views, world[0].mean(axis=0))
     if not pairs:
         return _unchanged(geometry, "one view: the surface stays in the model's span", began)
     resolution = Resolution.of(views, world[0].mean(axis=0), pairs)
     if resolution.parallax < NARROWEST:
         return _unchanged(geometry, "views from nearly one place: the surface stays in the model's span", began)
-    levels = sweeps(resolution, config, capture.unit_mm)
-    # Landmarks that agree with the fit say more of a face within the model's span than shading and sweeps do.
-    beyond = landmarks_are_biased(geometry)
-    tries = (TRIES if len(geometry.timesteps) == 1 else 1) * (config.refit and beyond)
-    coarse, finest = levels[:-1], levels[-1:]
-    spanned, over_lids = [*levels, *finest * FINEST_AGAIN], [(config.finest, CLOSED_LAYERS), *finest]
-    total = (
-        len(coarse) * ROUNDS
-        + 1
-        + SETTLING
-        + (len(coarse) + len(spanned) + SHADING_ROUNDS) * tries
-        + len(over_lids) * beyond
+    level_step = STEP_PIXELS * resolution.pixel / resolution.parallax  # of level 0, world length
+    coarsest = config.finest
+    while coarsest < COARSEST and FAR_LAYERS * level_step * 2**coarsest * capture.unit_mm < config.reach:
+        coarsest += 1
+
+    # The prior: modes and plate on the skin, which pieces that were added to the model, such as eyes, go along with.
+    skin = Skin.of(model)
+    prior = SurfacePrior.of(
+        model.shape(geometry.identity)[: skin.count],
+        skin.faces,
+        np.concatenate([model.identity, model.expression], axis=2)[: skin.count],
+        FORGET_MM / model.unit_mm,
+        CONTACT_MM / model.unit_mm,
     )
-    search = Search(capture, model, cameras, resolution, pairs, config, progress, total, beyond)
-    last = search.descend(Reached.at(geometry), coarse)
-    between: list[float] = []  # without and with it
-    refit = False
-    for seed in range(tries):
-        fitted = fit_model(
-            capture,
-            model,
-            last.geometry,
-            cameras,
-            # A head beyond the model's span has other outlines: they lead there, and what is matched has the last word.
-            lambda world, sweep: search.planes(geometry.timesteps, world, *sweep, outlines=sweep in coarse),
-            spanned,
-            geometry_config or GeometryConfig(),
-            seed,
-            progress=search.advance,
-            scenes=search.scenes,
-        )
-        other = search.descend(Reached.at(fitted), coarse)
-        # Colours mislead where the albedo model doesn't explain them; through the truer surface views predict others.
-        # What the finest sweep adds is small beside what parts the two, and dear.
-        between = errors_between_views(capture, model, cameras, geometry.timesteps, [last.world, other.world])
-        refit = between[1] < between[0]
-        if refit:
-            last = other
-            break
-    rounds = 1
-    while coarse and rounds < ROUNDS:  # each round sees further, from where the last one has brought the surface
-        before = last.world
-        last, rounds = search.descend(Reached.at(last.estimate), coarse), rounds + 1
-        step = np.linalg.norm(last.world - before, axis=2)[:, np.unique(model.faces[model.face_mask])]
-        if float(np.sqrt(np.mean(step**2))) < RESTS * resolution.pixel / resolution.parallax:
-            break
-    last = search.descend(last, finest)
-    again = 0
-    while again < SETTLING and last.outcome is not Outcome.CONVERGED:
-        last, again = search.descend(last, finest), again + 1
-    openings = LIPS * config.close_lips + LIDS * config.close_lids
-    found, closed = close_openings(capture, model, last.estimate, cameras, openings)
-    lids = [set(closed[opening.name]["closed"]) for opening in LIDS if opening.name in closed]
-    covering = beyond and any(seen == set(geometry.timesteps) for seen in lids)
-    if covering:
-        # Lids that have just met over the eyes lie where they fade into the skin around them: now they are measured.
-        covered = Reached.at(behind_lids(model, found), last.stiffness)
-        last = search.descend(covered, over_lids)
-        found = close_again(model, last.estimate, closed, openings)
-    search.finish()
-    found, crossed = keep_walls(model, found)
-    residuals = search.epipolar_residuals(found, found.vertices.astype(np.float64), config.finest)
+    scenes = Scenes(skin.faces, np.unique(model.faces[model.face_mask]), SLACK * resolution.pixel)
+    sight = Sight(capture, model, tuple(cameras), scenes, resolution.pixel, config.reach / capture.unit_mm)
+    landmarks = Landmarks.of(capture, model, cameras, geometry)
+    search = Search(geometry, model, pairs, skin, prior, landmarks, sight, level_step, config.stiffness, progress)
+
+    # Sweep and solve in turn, each level until the surface rests.
+    rest = Rest(State.of(model, geometry))
+    for level in range(coarsest, config.finest - 1, -1):
+        rest = search.settle(rest, level, MOST_SWEEPS)
+    # Lids that have just closed lie where they fade into the skin around them: the finest levels measure them.
+    lips, lids = LIPS * config.close_lips, LIDS * config.close_lids
+    shut, closed = close_openings(capture, model, rest.state.estimate(geometry, model), cameras, lids)
+    if any(opening["closed"] for opening in closed.values()):
+        rest = replace(rest, state=State.of(model, shut))
+        for level in range(min(coarsest, config.finest + 1), config.finest - 1, -1):
+            rest = search.settle(rest, level, SWEEPS_OF_LIDS)
+    progress("find surface", len(rest.levels), len(rest.levels))
+
+    # Closed mouths and eyes, and thin walls that the displacement crossed.
+    result = close_again(model, rest.state.estimate(geometry, model), closed, lids)
+    result, closed_lips = close_openings(capture, model, result, cameras, lips)
+    result, crossed = keep_walls(model, result)
+    world = result.vertices.astype(np.float64)
+    residuals = sight.epipolar_residuals(views, pairs, result.timesteps, world, config.finest)
     seconds = time.perf_counter() - began
-    moved = np.linalg.norm(last.displacement, axis=1)[np.unique(model.faces[model.face_mask])] * model.unit_mm
+    moved = np.linalg.norm(rest.state.displacement, axis=1)[np.unique(model.faces[model.face_mask])] * model.unit_mm
     phase = {
         "name": "surface",
-        "outcome": last.outcome.value,
-        "moved_last_mm": last.moved * capture.unit_mm,
-        "levels": [level for level, _ in (*coarse * rounds, *finest * (1 + again), *over_lids * covering)],
-        "matched": last.matched,
-        "rounds": rounds,
-        "refitted": refit,
-        "between_views": between,
-        "stiffness": last.stiffness,
+        "outcome": rest.outcome.value,
+        "moved_last_mm": rest.moved * capture.unit_mm,
+        "levels": rest.levels,
+        "matched": rest.matched,
         "displacement_mm": float(np.sqrt(np.mean(moved**2))),
         "epipolar_pixels": residuals,
-        "openings": closed,
+        "openings": closed | closed_lips,
         "walls_crossed": crossed,
         "seconds": seconds,
     }
-    return replace(found, report=_extended(geometry.report, seconds, phase, epipolar_warnings(residuals)))
+    return replace(result, report=_extended(geometry.report, seconds, phase, epipolar_warnings(residuals)))
+
+
+def neighbours(cameras: Sequence[Camera], centre: NDArray) -> list[tuple[int, int]]:
+    """Pairs of cameras to compare: each with those whose directions from a point (3,) are nearest to its own."""
+    towards = normalize(np.array([camera.position - centre for camera in cameras]))
+    nearest = np.argsort(-(towards @ towards.T), axis=1, kind="stable")
+    return sorted(
+        {(min(a, b), max(a, b)) for a, row in enumerate(nearest) for b in row[row != a][:NEIGHBOURS].tolist()}
+    )
+
+
+@dataclass(frozen=True)
+class Skin:
+    """The model's own skin.
+
+    Attributes
+    ----------
+    count : int
+        Its vertices come first.
+    weights : (V, count) sparse or None
+        What all vertices move with; None where nothing was added.
+    faces : (F, 3) int
+        Rays meet the skin alone: through eyes that were added, windows at the lids would match what balls mirror.
+    """
+
+    count: int
+    weights: sp.csr_matrix | None
+    faces: NDArray
+
+    @classmethod
+    def of(cls, model: MorphableModel) -> Skin:
+        """Of a model with eyes that were added to it, or without."""
+        weights = skin_weights(model)
+        count = model.n_vertices if weights is None else weights.shape[1]
+        return cls(count, weights, model.faces[leading_faces(model, count)])
+
+    def spread(self, displacement: NDArray) -> NDArray[np.float64]:
+        """(V, 3) displacement of all vertices by that of the skin."""
+        return displacement if self.weights is None else self.weights @ displacement
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Detected points but for the jaw's, which lie on silhouettes and not on the skin.
+
+    A detector's errors are the same in all images of a head: all of them together count as one,
+    a weak hold where nothing else is measured.
+
+    Attributes
+    ----------
+    views : sequence of (step, Camera, model vertices (n,), pixels (n, 2))
+    deviation : float
+        Of a coordinate, pixels.
+    """
+
+    n_vertices: int
+    views: Sequence[tuple[int, Camera, NDArray, NDArray]]
+    deviation: float
+
+    @classmethod
+    def of(
+        cls, capture: Capture, model: MorphableModel, cameras: Sequence[str], geometry: GeometryEstimate
+    ) -> Landmarks:
+        """Of all images."""
+        views = []
+        for step, timestep in enumerate(geometry.timesteps):
+            for name in cameras:
+                frame = capture.frame(name, timestep)
+                if frame.landmarks is not None:
+                    index = np.flatnonzero(frame.visible[JAW:]) + JAW
+                    pixels = np.asarray(frame.landmarks[index], np.float64)
+                    views.append((step, capture.camera(name), model.landmarks[index], pixels))
+        return cls(model.n_vertices, views, max(geometry.landmark_noise, 1.0))
+
+    def at(self, world: NDArray, rotation: NDArray) -> Measurements:
+        """What they measure at a surface (T, V, 3), with directions in object space."""
+        rows, directions, offsets, precisions = [np.zeros(0, int)], [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0)]
+        for step, camera, vertices, pixels in self.views:
+            depth = camera.to_camera(world[step][vertices])[:, 2]
+            apart = pixels - camera.project(world[step][vertices])
+            good = np.flatnonzero((depth > 0) & np.isfinite(apart).all(axis=1))
+            for axis, focal in ((0, camera.fx), (1, camera.fy)):
+                pixel = depth[good] / focal
+                rows.append(vertices[good])
+                directions.append(np.tile(camera.rotation[axis] @ rotation[step], (len(good), 1)))
+                offsets.append(apart[good, axis] * pixel)
+                precisions.append(1.0 / (len(self.views) * (self.deviation * pixel) ** 2))
+        index = np.concatenate(rows)
+        ones = np.ones(len(index), np.float32)
+        points = sp.csr_matrix((ones, index, np.arange(len(index) + 1)), shape=(len(index), self.n_vertices))
+        precision = INDEPENDENT * np.concatenate(precisions)
+        far = OUTLIER_DEVIATIONS / np.sqrt(precision)
+        return Measurements(points, np.concatenate(directions), np.concatenate(offsets), precision, far)
+
+
+@dataclass(frozen=True)
+class State:
+    """The unknowns: coefficients, poses, and the displacement (V, 3) in the model's neutral space."""
+
+    timesteps: tuple[int, ...]
+    identity: NDArray[np.float64]
+    expression: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    scale: float
+    displacement: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, model: MorphableModel, geometry: GeometryEstimate) -> State:
+        """A fit, displaced or not."""
+        before = geometry.displacement
+        return cls(
+            geometry.timesteps,
+            np.asarray(geometry.identity, np.float64),
+            np.asarray(geometry.expression, np.float64),
+            np.asarray(geometry.rotation, np.float64),
+            np.asarray(geometry.translation, np.float64),
+            float(geometry.scale),
+            np.zeros((model.n_vertices, 3)) if before is None else before.astype(np.float64),
+        )
+
+    def posed_as(self, geometry: GeometryEstimate) -> State:
+        """With the poses and expressions of a fit."""
+        return replace(
+            self,
+            expression=np.asarray(geometry.expression, np.float64),
+            rotation=np.asarray(geometry.rotation, np.float64),
+            translation=np.asarray(geometry.translation, np.float64),
+        )
+
+    def world(self, model: MorphableModel) -> NDArray[np.float64]:
+        """(T, V, 3) vertices."""
+        shapes = [model.shape(self.identity, e).astype(np.float64) + self.displacement for e in self.expression]
+        return self.scale * np.stack(shapes) @ self.rotation.transpose(0, 2, 1) + self.translation[:, None]
+
+    def estimate(self, geometry: GeometryEstimate, model: MorphableModel) -> GeometryEstimate:
+        """The fit with these unknowns."""
+        return replace(
+            geometry,
+            identity=self.identity,
+            expression=self.expression,
+            rotation=self.rotation,
+            translation=self.translation,
+            vertices=self.world(model).astype(np.float32),
+            displacement=self.displacement.astype(np.float32),
+        )
+
+
+@dataclass(frozen=True)
+class Sight:
+    """The views of the surface at one level of the image pyramid."""
+
+    capture: Capture
+    model: MorphableModel
+    cameras: tuple[str, ...]
+    scenes: Scenes
+    pixel: float
+    reach: float
+
+    def texels(self, vertices: NDArray, level: int) -> TexelMap:
+        """Texels of a surface (V, 3) that are about as large as a level's pixels."""
+        model = self.model
+        size = texture_size(model, vertices, self.pixel * 2.0**level, LARGEST_MAP)
+        return rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+
+    def posed(self, timestep: int, vertices: NDArray, texels: TexelMap, level: int) -> Posed:
+        """Texels of one timestep's surface (V, 3), and the views of them."""
+        scene = self.scenes.at(timestep, vertices)
+        given = scene, vertices, self.model.faces, texels, self.cameras, timestep, 0.5**level
+        return pose_texels(self.capture, *given)
+
+    def borders(self, timestep: int, vertices: NDArray, level: int) -> Borders:
+        """Outlines of one timestep's surface in all views."""
+        finer = min(2.0 * 0.5**level, 1.0)  # where a pixel mixes skin and background the border is doubtful
+        if level:
+            finer = min(REACH * self.pixel / self.reach, 1.0)
+        scene = self.scenes.at(timestep, vertices)
+        return find_borders(self.capture, scene, self.cameras, timestep, finer)
+
+    def epipolar_residuals(
+        self,
+        views: Sequence[Camera],
+        pairs: Sequence,
+        timesteps: Sequence[int],
+        world: NDArray,
+        level: int,
+    ) -> dict[str, float | None]:
+        """Median distance from one another's epipolar lines for each pair of views, pixels of the images."""
+        texels = self.texels(world[0], level)
+        posed = [self.posed(timesteps[k], world[k], texels, level) for k in sorted({0, len(world) - 1})]
+        found: dict[str, float | None] = {}
+        for a, b in pairs:
+            residual = epipolar_residual(texels, posed, views, (a, b), self.pixel * 2.0**level, WINDOW)
+            found[f"{self.cameras[a]}, {self.cameras[b]}"] = None if residual is None else residual * 2.0**level
+        return found
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Where sweeps have ended: ``moved`` is the root mean square of the last one's change, world length."""
+
+    state: State
+    levels: tuple[int, ...] = ()
+    matched: float = 0.0
+    moved: float = np.inf
+    outcome: Outcome = Outcome.MAX_ITERATIONS
+
+
+@dataclass(frozen=True)
+class Search:
+    """What stays the same from sweep to sweep; ``level_step`` is the step between offsets at level 0, world length."""
+
+    geometry: GeometryEstimate
+    model: MorphableModel
+    pairs: Sequence[tuple[int, int]]
+    skin: Skin
+    prior: SurfacePrior
+    landmarks: Landmarks
+    sight: Sight
+    level_step: float
+    stiffness: float
+    progress: Progress
+
+    def settle(self, rest: Rest, level: int, most: int) -> Rest:
+        """Sweep one level until the surface rests, ``most`` times at the most."""
+        model, sight, skin = self.model, self.sight, self.skin
+        step = self.level_step * 2.0**level
+        state, factor = rest.state, None
+        for number in range(most):
+            world = state.world(model)
+            texels = sight.texels(world[0], level)
+            posed = [sight.posed(t, at, texels, level) for t, at in zip(state.timesteps, world, strict=True)]
+            further: Sequence = ()
+            if len(posed) > 1:
+                aligned = align_timesteps(model, state.estimate(self.geometry, model), texels, posed)
+                state = state.posed_as(aligned)
+                posed = moved_with(model, texels, posed, state.world(model) - world)
+                world = state.world(model)
+                further = across_time(posed, state.rotation)
+            borders = joined(
+                [
+                    sight.borders(t, at, level).turned(rotation)
+                    for t, at, rotation in zip(state.timesteps, world, state.rotation, strict=True)
+                ]
+            )
+            half = LAYERS if number else FAR_LAYERS
+            joint = [((k, a), (k, b)) for k in range(len(posed)) for a, b in self.pairs]
+            found = sweep(texels, posed, step * np.arange(-half, half + 1), WINDOW, [*joint, *further])
+            if not (found.precision > 0).any():
+                break
+
+            # Object space, all timesteps alike: the surface that explains offsets, outlines and landmarks.
+            marks = self.landmarks.at(world, state.rotation)
+            robust = ROBUST_STEPS * step * max(4.0 * 0.5**number, 1.0)
+            rows = measurements(state, model, texels, posed, found, borders, marks, robust)
+            if skin.weights is not None:
+                rows = replace(rows, points=rows.points @ skin.weights)
+            mean = state.expression.mean(axis=0)
+            start = state.displacement[: skin.count], np.concatenate([state.identity, mean])
+            factor = factor or self.prior.factor(rows, self.stiffness)
+            moved_by, coefficients = solve_surface(self.prior, rows, *start, self.stiffness, factor)
+            identity, changed = np.split(coefficients, [len(state.identity)])
+            expression = state.expression + (changed - mean)
+            state = replace(state, identity=identity, expression=expression, displacement=skin.spread(moved_by))
+
+            measured = np.unique(model.faces[texels.face[found.precision > 0]])
+            moved = along_normals(state.world(model) - world, world, model.faces, measured)
+            outcome = Outcome.CONVERGED if moved < SETTLED * step else Outcome.MAX_ITERATIONS
+            rest = Rest(state, (*rest.levels, level), float((found.precision > 0).mean()), moved, outcome)
+            self.progress("find surface", len(rest.levels), len(rest.levels) + MOST_SWEEPS * level + most - number - 1)
+            if outcome is Outcome.CONVERGED and number >= 2:
+                break
+        return rest
+
+
+def measurements(
+    state: State,
+    model: MorphableModel,
+    texels: TexelMap,
+    posed: Sequence[Posed],
+    found: Found,
+    borders: Borders,
+    marks: Measurements,
+    robust: float,
+) -> Measurements:
+    """Offsets that a sweep found, outlines and landmarks, all in object space."""
+    some, scale = thinned(texels), state.scale
+    normals = np.mean([one.normal[some] @ r for one, r in zip(posed, state.rotation, strict=True)], axis=0)
+    face = np.concatenate([texels.face[some], borders.face])
+    weights = np.concatenate([texels.weights[some], borders.weights])
+    points = sp.vstack([corner_matrix(model.faces, face, weights, model.n_vertices), marks.points]).tocsr()
+    return Measurements(
+        points,
+        np.concatenate([normalize(normals), borders.normal, marks.normals]),
+        np.concatenate([found.offset[some], borders.offset, marks.offsets]) / scale,
+        np.concatenate([found.precision[some] * THIN**2, borders.precision, marks.precision]) * scale**2,
+        np.concatenate([np.full(len(face), robust), marks.robust]) / scale,
+    )
+
+
+def thinned(texels: TexelMap) -> NDArray[np.intp]:
+    """Every `THIN`-th texel along rows and columns."""
+    row, column = np.divmod(texels.index, texels.size)
+    return np.flatnonzero((row % THIN == 0) & (column % THIN == 0))
+
+
+def moved_with(model: MorphableModel, texels: TexelMap, posed: Sequence[Posed], moved: NDArray) -> list[Posed]:
+    """Texels of a surface whose vertices have moved by (T, V, 3), a pixel or so: what is seen of them stays."""
+    by = [interpolate(way, model.faces, texels.face, texels.weights) for way in moved]
+    return [replace(one, position=one.position + way) for one, way in zip(posed, by, strict=True)]
+
+
+def along_normals(change: NDArray, world: NDArray, faces: NDArray, vertices: NDArray) -> float:
+    """Root mean square of a movement (T, V, 3) along the normals at some vertices."""
+    if not len(vertices):
+        return 0.0
+    normals = np.stack([vertex_normals(one, faces) for one in world])
+    return float(np.sqrt(np.mean((change * normals).sum(axis=2)[:, vertices] ** 2)))
 
 
 def _unchanged(geometry: GeometryEstimate, text: str, began: float) -> GeometryEstimate:

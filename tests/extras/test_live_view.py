@@ -101,7 +101,6 @@ def test_a_fit_is_shown_while_it_is_fitted(variant, tiny_capture, tmp_path, monk
 
     config = mifit.FitConfig(
         geometry=mifit.GeometryConfig(rounds=1),
-        surface=mifit.SurfaceConfig(refit=False),
         reflectance=mifit.ReflectanceConfig(texture_size=64, shading="prefiltered", bands=4, exponent=100),
     )
     capture, model = mifit.Capture.load(tiny_capture), mifit.MorphableModel.load("builtin:coarse")

@@ -137,7 +137,7 @@ def test_a_frame_without_a_face_is_left_out_by_name(scene, result, quick, monkey
 
 
 def test_the_surface_is_found_from_all_frames_where_the_fit_has_one(scene, result, quick, monkeypatch):
-    def find(capture, model, geometry, names, config, progress, geometry_config):
+    def find(capture, model, geometry, names, config, progress):
         assert geometry.timesteps == tuple(range(FRAMES)) and tuple(names) == CAMERAS
         return replace(geometry, displacement=geometry.displacement + np.float32(0.1))
 

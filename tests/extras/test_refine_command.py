@@ -10,8 +10,6 @@ import pytest
 from mifit.cli import main
 
 CONFIG = """
-[surface]
-refit = false
 [reflectance]
 texture_size = 64
 shading = "prefiltered"

@@ -24,8 +24,6 @@ COARSE = ("--model", "builtin:coarse", "--quiet")
 CONFIG = """
 [geometry]
 rounds = 1
-[surface]
-refit = false
 [reflectance]
 texture_size = 32
 shading = "prefiltered"

@@ -19,7 +19,6 @@ from mifit.stages.geometry.landmarks import LandmarkProblem, LandmarkTerm, Landm
 from mifit.stages.geometry.parameters import Frames, Layout, exponential, left_jacobian, rotation_angle
 from mifit.stages.geometry.points import PointBasis
 from mifit.stages.geometry.rendering import Patch, PixelView, RenderingProblem, Surface
-from mifit.stages.surface.model_fit import JointProblem
 
 
 def head(rng, n=9, identity=4, expression=3, albedo=2):
@@ -223,38 +222,6 @@ def test_held_slopes_of_the_normals_are_those_at_the_point_where_they_are_held(s
     assert held.energies(away) == problem.energies(away)
     off = held.linearize(away).gradient - problem.linearize(away).gradient
     assert 0 < np.abs(off).max() < 0.1 * np.abs(exact.gradient).max()
-
-
-def test_joint_jacobian(scene):
-    """Colours, texture and landmarks, of which only the colours know appearance, in one vector."""
-    colours, texture = [], []
-    for step in range(2):
-        for cam in scene.cameras:
-            face, weights = random_points(scene.rng, scene.model, 40)
-            colours.append(PixelView(step, cam, smooth_image(scene.rng), face, weights))
-            points = basis_on(scene.model, face, weights)
-            texture.append(TextureView(step, cam, smooth_image(scene.rng), np.arange(40), np.ones(40), points))
-    rendering = RenderingProblem(
-        scene.model,
-        scene.layout,
-        scene.frames,
-        tuple(colours),
-        LandmarkTerm((), np.inf),
-        200.0,
-        {"albedo": 0.2, "ambient": 10.0},
-    )
-    consistency = ConsistencyProblem(
-        replace(scene.layout, albedo=0, shading=0, ambient=0),
-        scene.frames,
-        40,
-        tuple(texture),
-        0.1,
-        np.inf,
-        0.5,
-        LandmarkTerm(landmark_views(scene), 50.0),
-        {"identity": 0.3, "expression": 0.4, "log_scale": 2.0},
-    )
-    check_gradient(JointProblem(rendering, consistency, 0.3), scene.x, 1e-4)
 
 
 def test_rendering_normals_matter(scene):

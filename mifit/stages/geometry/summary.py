@@ -16,6 +16,9 @@ from mifit.stages.geometry.landmarks import LandmarkTerm, LandmarkView
 from mifit.stages.geometry.start import State, coordinate_deviation
 
 FARTHEST_IDENTITY = 8.0  # standard deviations; heads beyond a model's span reach six, wrong cameras ten
+SCATTER_OF_FACE, LEAST_SCATTER = 0.005, 1.1
+"""Deviation of a landmark between images of one head, as a part of the face's width and at least in pixels; what
+exceeds it is bias. Good detectors scatter by 0.3 per cent and about a pixel, and are off by one to four per cent."""
 SCATTER_OF_WIDTH = 0.015  # deviation of landmarks from the fit, as part of the image's width, that deserves a warning
 
 
@@ -171,3 +174,13 @@ def _deviations(state: State, solution: Solution) -> dict[str, list]:
         "rotation_degrees": [listed(np.degrees(deviation[layout.at("rotation", k)])) for k in steps],
         "translation": [listed(deviation[layout.at("translation", k)]) for k in steps],
     }
+
+
+def scatter_pixels(geometry: GeometryEstimate) -> float:
+    """Deviation of a landmark coordinate that a good detector has between images of this face, pixels."""
+    return max(LEAST_SCATTER, SCATTER_OF_FACE * geometry.face_width)
+
+
+def landmarks_are_biased(geometry: GeometryEstimate) -> bool:
+    """Whether the landmarks lie farther from the fit than a good detector scatters."""
+    return geometry.landmark_noise > scatter_pixels(geometry)

@@ -1,19 +1,18 @@
-"""Displacements of a mesh from offsets measured along its normals: sparse least squares with a thin-plate prior.
+"""A surface from offsets measured along its normals: the model's modes and a thin plate, in one least squares.
 
-Minimised over vectors d at the vertices (object space):
+A surface ``mean + U`` over V vertices is ``U = M m + d``, with the modes M of the model (coefficients m of unit
+deviation) and a smooth displacement d. Minimised over both, in object space:
 
-    sum_i p_i rho(n_i . (W d)_i - o_i) + stiffness * (E(d) + B(d) + sided B(d - m))
-    B(d) = sum_v |(L d)_v|^2 / a_v,    E(d) = sum_v (2 pi / longest)^4 a_v |d_v|^2
+    sum_i p_i rho(n_i . (W U)_i - o_i) + stiffness * E(d) + |m|^2
+    E(d) = sum_v |(L d)_v|^2 / a_v + (2 pi / longest)^4 a_v |d_v|^2
 
 with the measured points W (barycentric), their normals n, offsets o and precisions p, the cotangent Laplacian L and
-areas a of the rest mesh. Faces are nearly symmetric: m is the displacement of the other half, mirrored, so that a flank
-of the nose that no two views show follows the one that they do rather than the cheek beside it. It is that of the
-round before, which leaves one plate, stiffer, and all axes apart. Only the normal component of d is measured: a point
-that slides on the surface costs nothing, so that what the views show decides where the surface lies and the prior
-decides how the mesh lies on it.
-The system couples x, y, z through the normals; it is solved by conjugate gradients with the decoupled system as
-preconditioner, whose one sparse factorisation serves all three axes and all reweightings. That one is in single
-precision: it steers the iterations, whose residuals are double.
+areas a of the rest mesh. Only the normal component of U is measured: a point that slides on the surface costs nothing,
+so that what the views show decides where the surface lies and the prior decides how the mesh lies on it.
+
+The coefficients are eliminated: with the plate's matrix K and the stiffness s, the best ones for a surface are
+``m = G^-1 s M'K U`` with ``G = s M'KM + 1``. What remains is solved for U by conjugate gradients, with the
+plate and the measurements, axes decoupled, as preconditioner: one sparse factorisation serves all axes.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
@@ -31,78 +31,109 @@ from mifit.core.mesh_solve import cotangent_laplacian
 
 CONTACT_WEIGHT = 30.0
 """Of vertices that nearly touch, times the squared distance at which they do."""
-SIDED = 10.0
-"""Stiffness against bending unlike the other half, relative to that against bending at all."""
-USUAL, KNOWN = 8.0, 4.0
-"""Stiffness of the displacements that heads beyond a model's span ask for, and degrees of freedom that it counts as."""
-PROBES = 16
-"""Random vectors that estimate a trace."""
 OPPOSED = -0.2
 """Cosine between the normals of sheets that face each other."""
-RELATIVE = 1e-3
-"""Residual at which conjugate gradients stop, of the right side's: hundredths of a millimetre at the most."""
+RELATIVE = 0.1
+"""Residual at which conjugate gradients stop, of that at the start: more sweeps follow."""
+MOST_ITERATIONS = 60
 ACROSS = 0.7
 """Cosine of the angle between the normals and the way from one sheet to the other."""
+SLIDE = 0.02
+"""Part of a point's weight that holds it along the surface, where it is."""
 
 
 @dataclass(frozen=True)
-class Plate:
-    """The prior's matrix on one mesh.
+class Measurements:
+    """Offsets from a surface.
 
     Attributes
     ----------
-    matrix : (V, V) sparse
-        Thin-plate energy, scale free: the energy of a displacement doesn't change when mesh and displacement are
-        scaled together.
-    bending : (V, V) sparse
-        The part of it that no shift and hardly a turn of the whole adds to: a pose that is off isn't symmetric.
-    symmetry : (V,) int or None
-        For each vertex its mirror image's index in x -> -x; None where halves aren't compared.
+    points : (N, V) sparse
+        Barycentric weights of the measured points.
+    normals : (N, 3)
+        The directions that are measured.
+    offsets, precision : (N,)
+        And their inverse variance; 0 where nothing is measured.
+    robust : (N,)
+        Residual where Geman and McClure's penalty turns.
     """
 
-    matrix: sp.csr_matrix
-    bending: sp.csr_matrix
-    symmetry: NDArray[np.int32] | None = None
+    points: sp.csr_matrix
+    normals: NDArray[np.float64]
+    offsets: NDArray[np.float64]
+    precision: NDArray[np.float64]
+    robust: NDArray[np.float64]
+
+    def where(self, used: NDArray[np.bool_]) -> Measurements:
+        """Some of them."""
+        return Measurements(*(getattr(self, name)[used] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class SurfacePrior:
+    """Thin plate and modes on one mesh.
+
+    Attributes
+    ----------
+    plate : (V, V) sparse
+        Thin-plate energy, scale free: the energy of a displacement doesn't change when mesh and displacement are
+        scaled together.
+    modes : (3 V, K) float32
+        Change of the vertices by coefficients of unit deviation.
+    bent : (3 V, K) float32
+        ``plate`` times the modes.
+    gram : (K, K)
+        Energies of the modes.
+    """
+
+    plate: sp.csr_matrix
+    modes: NDArray[np.float32]
+    bent: NDArray[np.float32]
+    gram: NDArray[np.float64]
 
     @classmethod
     def of(
         cls,
         vertices: NDArray,
         faces: NDArray,
+        modes: NDArray,
         longest: float,
         contact: float = 0.0,
-        symmetry: NDArray[np.int32] | None = None,
-    ) -> Plate:
-        """Of a rest mesh (V, 3), (F, 3).
+    ) -> SurfacePrior:
+        """Of a rest mesh (V, 3), (F, 3) and modes (V, 3, K).
 
         Waves longer than ``longest`` are held by their height rather than by their bending; sheets closer than
-        ``contact``, such as closed lips, move together; halves that mirror each other by ``symmetry`` move alike.
+        ``contact``, such as closed lips, move together.
         """
         rest = np.asarray(vertices, dtype=np.float64)
         laplacian = cotangent_laplacian(rest, faces)
         size = np.linalg.norm(face_cross(rest, faces), axis=1) / 6.0
         area = np.bincount(faces.ravel(), np.repeat(size, 3), minlength=len(rest))
         area = np.maximum(area, 1e-3 * max(float(np.median(area)), 1e-12))
-        bending = (laplacian.T @ sp.diags(1.0 / area) @ laplacian).tocsr()
-        matrix = bending + (2.0 * np.pi / longest) ** 4 * sp.diags(area)
+        plate = laplacian.T @ sp.diags(1.0 / area) @ laplacian + (2.0 * np.pi / longest) ** 4 * sp.diags(area)
         if contact > 0:
-            matrix = matrix + CONTACT_WEIGHT / contact**2 * _contacts(rest, faces, contact)
-        return cls(matrix.tocsr(), bending, symmetry)
+            plate = plate + CONTACT_WEIGHT / contact**2 * _contacts(rest, faces, contact)
+        plate = plate.tocsr()
+        flat = np.ascontiguousarray(modes, np.float32).reshape(len(rest), -1)
+        bent = np.asarray(plate @ flat, np.float32).reshape(3 * len(rest), -1)
+        flat = flat.reshape(3 * len(rest), -1)
+        return cls(plate, flat, bent, (flat.T @ bent).astype(np.float64))
 
-    @property
-    def sided(self) -> sp.csr_matrix:
-        """(V, V) of what the halves don't share."""
-        return (0.0 if self.symmetry is None else SIDED) * self.bending
+    def factor(self, measured: Measurements, stiffness: float) -> spl.SuperLU:
+        """Of the plate and the measurements with decoupled axes, in single precision: it steers the iterations."""
+        points = measured.points
+        matrix = stiffness * self.plate + points.T @ sp.diags(measured.precision) @ points
+        return spl.splu(
+            matrix.tocsc().astype(np.float32),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
 
-    def mirrored(self, displacement: NDArray) -> NDArray[np.float64]:
-        """(V, 3) what the other half's displacement is on this one."""
-        return displacement if self.symmetry is None else displacement[self.symmetry] * (-1.0, 1.0, 1.0)
-
-    def energy(self, displacement: NDArray) -> float:
-        """Of a displacement (V, 3), at stiffness 1."""
-        apart = displacement - self.mirrored(displacement)
-        parts = (self.matrix, displacement), (self.sided, apart)
-        return sum(float((d * (matrix @ d)).sum()) for matrix, d in parts)
+    def move(self, coefficients: NDArray) -> NDArray[np.float64]:
+        """(V, 3) change of the vertices by coefficients (K,)."""
+        moved: NDArray = self.modes @ np.asarray(coefficients, np.float32)
+        return moved.astype(np.float64).reshape(-1, 3)
 
 
 def _contacts(vertices: NDArray, faces: NDArray, distance: float) -> sp.csr_matrix:
@@ -126,128 +157,69 @@ def _contacts(vertices: NDArray, faces: NDArray, distance: float) -> sp.csr_matr
     return (sp.diags(np.asarray(edges.sum(1)).ravel()) - edges).tocsr()
 
 
-@dataclass(frozen=True)
-class Displaced:
-    """A solution.
-
-    Attributes
-    ----------
-    displacement : (V, 3)
-    measured : float
-        Number of degrees of freedom along the normals that the measurements determine rather than the prior.
-    energy : float
-        Of the prior, at stiffness 1.
-    """
-
-    displacement: NDArray[np.float64]
-    measured: float
-    energy: float
-
-    def likely_stiffness(self, low: float, high: float) -> float:
-        """Stiffness under which the displacement is as large as one expects, within bounds (MacKay 1992, eq. 4.8).
-
-        A head that the model spans needs no displacement: what little is found then is noise, and is held down.
-        ``USUAL`` counts as ``KNOWN`` further degrees of freedom (a gamma prior), so that a coarse sweep that measures
-        next to nothing doesn't hold down all that come after it.
-        """
-        return float(np.clip((self.measured + KNOWN) / max(self.energy + KNOWN / USUAL, 1e-30), low, high))
-
-
-def solve_displacement(
-    plate: Plate,
-    points: sp.csr_matrix,
-    normals: NDArray,
-    offsets: NDArray,
-    precision: NDArray,
-    start: NDArray,
+def solve_surface(
+    prior: SurfacePrior,
+    measured: Measurements,
+    displacement: NDArray,
+    coefficients: NDArray,
     stiffness: float,
-    robust: float,
-    rounds: int = 3,
-    slide: float = 0.02,
-) -> Displaced:
-    """Displacements (V, 3) from offsets measured relative to ``start``.
+    factor: spl.SuperLU | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The displacement (V, 3) and the coefficients (K,) of least energy.
 
     Parameters
     ----------
-    plate : Plate
-    points : (N, V) sparse
-        Barycentric weights of the measured points.
-    normals : (N, 3)
-    offsets, precision : (N,)
-        Relative to the mesh displaced by ``start``, and their inverse variance.
-    start : (V, 3)
-        Current displacement; the offsets are added to it.
+    prior : SurfacePrior
+    measured : Measurements
+        Relative to the current surface.
+    displacement, coefficients : (V, 3), (K,)
+        The current surface.
     stiffness : float
-        Weight of the prior.
-    robust : float
-        Residual where Geman and McClure's penalty turns.
-    rounds : int
-        Reweightings; the penalty turns at twice the residual in each one before the last.
-    slide : float
-        Part of a point's weight that holds it along the surface.
+        Weight of the plate.
+    factor : SuperLU, optional
+        ``prior.factor`` of these measurements, or of others that are alike.
     """
-    used = precision > 0
-    points, normals, precision = points[used], normals[used], precision[used]
-    at_start = points @ start
-    normal_start = (at_start * normals).sum(1)
-    target = normal_start + offsets[used]
-    held = at_start - normal_start[:, None] * normals
-    sided = stiffness * plate.sided
-    prior = stiffness * plate.matrix + sided
-    factor = spl.splu(
-        (prior + points.T @ sp.diags(precision) @ points).tocsc().astype(np.float32),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
+    factor = factor or prior.factor(measured, stiffness)
+    measured = measured.where(measured.precision > 0)
+    points, normals, precision = measured.points, measured.normals, measured.precision
     transposed = points.T.tocsr()
-    d, weight = start.copy(), precision
-    for number in range(rounds):
-        scale = robust * 2.0 ** (rounds - 1 - number)
-        residual = ((points @ d) * normals).sum(1) - target
-        weight = precision / (1.0 + (residual / scale) ** 2) ** 2
-        d = _solve(
-            prior, sided @ plate.mirrored(d), points, transposed, normals, weight, target, held, d, factor, slide
-        )
-    probes = np.random.default_rng(0).choice((-1.0, 1.0), (plate.matrix.shape[0], PROBES))
-    weighted = transposed @ (weight[:, None] * (points @ probes))
-    measured = float((probes * factor.solve(weighted.astype(np.float32))).sum()) / PROBES
-    return Displaced(d, measured, plate.energy(d))
+    start = prior.move(coefficients) + displacement
+    at_start = points @ start
+    along_start = (at_start * normals).sum(1)
+    target = along_start + measured.offsets
+    held = at_start - along_start[:, None] * normals
 
+    def precondition(r: NDArray) -> NDArray:
+        return np.asarray(factor.solve(r.reshape(-1, 3).astype(np.float32)).ravel(), np.float64)
 
-def _solve(
-    prior: sp.csr_matrix,
-    alike: NDArray,
-    points: sp.csr_matrix,
-    transposed: sp.csr_matrix,
-    normals: NDArray,
-    weight: NDArray,
-    target: NDArray,
-    held: NDArray,
-    start: NDArray,
-    factor: spl.SuperLU,
-    slide: float,
-) -> NDArray[np.float64]:
-    """The minimum for given weights, by conjugate gradients from ``start``; ``alike`` (V, 3) pulls to the mirror."""
-    along = slide * weight[:, None]
+    inner = la.cho_factor(stiffness * prior.gram + np.eye(len(coefficients)))
+
+    def modes_of(surface: NDArray) -> NDArray[np.float64]:
+        """(K,) best coefficients for a surface."""
+        along_modes = prior.bent.T @ surface.ravel().astype(np.float32)
+        return np.asarray(la.cho_solve(inner, stiffness * along_modes.astype(np.float64)))
+
+    # Geman and McClure's weights at the current surface; the sweeps that follow weight anew.
+    weight = precision / (1.0 + (measured.offsets / measured.robust) ** 2) ** 2
+    along = SLIDE * weight[:, None]
     across = weight[:, None] - along
 
     def apply(flat: NDArray) -> NDArray:
         x = flat.reshape(-1, 3)
         at = points @ x
         normal = (at * normals).sum(1, keepdims=True) * normals
-        return (prior @ x + transposed @ (across * normal + along * at)).ravel()
+        out = (stiffness * (prior.plate @ x) + transposed @ (across * normal + along * at)).ravel()
+        return np.asarray(out - stiffness * (prior.bent @ modes_of(x).astype(np.float32)))
 
-    right = transposed @ ((weight * target)[:, None] * normals + along * held) + alike
-    size = start.size
-    d, _ = spl.cg(
-        spl.LinearOperator((size, size), matvec=apply),
-        right.ravel(),
-        x0=start.ravel(),
+    right = transposed @ ((weight * target)[:, None] * normals + along * held)
+    size = (start.size, start.size)
+    change, _ = spl.cg(
+        spl.LinearOperator(size, matvec=apply),
+        right.ravel() - apply(start),
         rtol=RELATIVE,
-        maxiter=60,
-        M=spl.LinearOperator(
-            (size, size), matvec=lambda r: factor.solve(r.reshape(-1, 3).astype(np.float32)).astype(np.float64).ravel()
-        ),
+        maxiter=MOST_ITERATIONS,
+        M=spl.LinearOperator(size, matvec=precondition),
     )
-    return d.reshape(-1, 3)
+    surface = start + change.reshape(-1, 3)
+    coefficients = modes_of(surface)
+    return surface - prior.move(coefficients), coefficients

@@ -10,7 +10,7 @@ solved exactly by one pass in either direction).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -82,6 +82,10 @@ class Borders:
     normal: NDArray[np.float64]
     offset: NDArray[np.float64]
     precision: NDArray[np.float64]
+
+    def turned(self, rotation: NDArray) -> Borders:
+        """With normals in the object space that a rotation (3, 3) takes to world space."""
+        return replace(self, normal=self.normal @ rotation)
 
 
 def find_borders(capture: Capture, scene: SurfaceScene, names: Sequence[str], timestep: int, factor: float) -> Borders:

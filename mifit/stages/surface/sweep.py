@@ -105,8 +105,7 @@ def sweep(
         Views to compare, each named by its step and its place in it.
     """
     count, layers = len(texels.index), len(offsets)
-    total = np.zeros((layers, count), np.float32)
-    weight = np.zeros(count, np.float32)
+    total, weight = np.zeros((2, layers, count), np.float32)
     named = list(dict.fromkeys(view for pair in pairs for view in pair))
     with ThreadPoolExecutor(threads()) as pool:
         shown = dict(zip(named, pool.map(lambda view: _shown(steps[view[0]], view[1], offsets), named), strict=True))
@@ -120,13 +119,13 @@ def sweep(
             if scores is not None:
                 total += scores[0]
                 weight += scores[1]
-    score = total / np.maximum(weight, 1e-6)
+    score = np.where(weight > 0, total / np.maximum(weight, 1e-6), np.float32(-1))
     return _peak(score, weight, offsets)
 
 
 @dataclass(frozen=True)
 class _Shown:
-    """One view of the texels: feature (K, N) at each offset, whether all are in the image, and log brightness."""
+    """One view of the texels: feature (K, N) at each offset, whether the image shows it, and log brightness (N,)."""
 
     feature: NDArray[np.float32]
     valid: NDArray[np.bool_]
@@ -143,29 +142,30 @@ def _shown(step: Posed, view: int, offsets: NDArray) -> _Shown:
         still = step.images[view].sample(step.position[rows], way[rows], np.zeros(1))
         at = np.broadcast_to(still, (len(offsets), *still.shape[1:]))
     feature = np.zeros((len(offsets), len(step.position)), np.float32)
-    valid, bright = np.zeros(feature.shape[1], bool), np.zeros(feature.shape[1], np.float32)
+    valid, bright = np.zeros(feature.shape, bool), np.zeros(feature.shape[1], np.float32)
     feature[:, rows], bright[rows] = at[..., 0], at[len(offsets) // 2, :, 2]
-    valid[rows] = (at[..., 1] > 0.99).all(axis=0)
+    valid[:, rows] = at[..., 1] > 0.99
     return _Shown(feature, valid, bright)
 
 
 def _compared(
     texels: TexelMap, views: Sequence[_Shown], trust: NDArray, window: int, deviations: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """(K, N) correlation of two views times its weight, and that (N,); None where nothing is seen in both."""
+    """(K, N) correlation of two views times its weight, and that (K, N); None where nothing is seen in both."""
     one, other = views
     valid = one.valid & other.valid & (trust > 0)
     if not valid.any():
         return None
-    trust = trust * _without_glare(one.bright - other.bright, valid, deviations)
-    mask = texels.to_map(valid.astype(np.float32))
-    inside = cv2.blur(mask, (window, window))
-    enough = texels.from_map(inside) > 0.5
-    use = np.where(valid & enough, trust, np.float32(0))
-    scores = np.empty_like(one.feature)
-    for k, (x, y) in enumerate(zip(one.feature, other.feature, strict=True)):
-        scores[k] = use * texels.from_map(_correlate(texels, mask, inside, x, y, window))
-    return scores, use
+    trust = trust * _without_glare(one.bright - other.bright, valid[len(valid) // 2], deviations)
+    scores, weights = np.zeros((2, *one.feature.shape), np.float32)
+    for k, shown in enumerate(valid):
+        if shown.any():
+            mask = texels.to_map(shown.astype(np.float32))
+            inside = cv2.blur(mask, (window, window))
+            weights[k] = np.where(shown & (texels.from_map(inside) > 0.5), trust, np.float32(0))
+            correlation = _correlate(texels, mask, inside, one.feature[k], other.feature[k], window)
+            scores[k] = weights[k] * texels.from_map(correlation)
+    return scores, weights
 
 
 def across_time(steps: Sequence[Posed], rotation: NDArray) -> list[tuple[View, View]]:
@@ -247,7 +247,8 @@ def _peak(score: NDArray, weight: NDArray, offsets: NDArray) -> Found:
     top = mid + 0.25 * (high - low) * shift
     other = np.where(np.abs(np.arange(layers)[:, None] - best) > 2, score, -1.0).max(0)
     unique = np.clip((top - other) / UNIQUE, 0.0, 1.0)
-    usable = (best == inner) & (weight > 0) & (top > LEAST_SCORE)
+    around = np.minimum(np.minimum(weight[inner - 1, column], weight[inner, column]), weight[inner + 1, column])
+    usable = (best == inner) & (around > 0) & (top > LEAST_SCORE)
     sharpness = unique * np.maximum(curvature, 0.0) / np.maximum(1.0 - top + FLOOR, FLOOR)
-    precision = np.where(usable, INDEPENDENT * weight * sharpness**POWER / step**2, 0.0)
+    precision = np.where(usable, INDEPENDENT * around * sharpness**POWER / step**2, 0.0)
     return Found(offset.astype(np.float64), precision.astype(np.float64), top)
