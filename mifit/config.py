@@ -194,7 +194,7 @@ class SurfaceConfig:
         8.0, "distance from the surface that the first sweep searches", "millimetres", above=0, most=100
     )
     stiffness: float = number(
-        3.0,
+        4.0,
         "resistance of the displacement to bending, relative to the precision of measurements; chosen on scan_city",
         above=0,
         most=WEIGHT,

@@ -56,7 +56,7 @@ WINDOW = 11
 COARSEST = 3
 """Times that the images are halved at most."""
 LARGEST_MAP = 1024
-SETTLED = 0.25
+SETTLED = 0.15
 """Part of a sweep's step below which a level is at rest (root mean square over what is measured)."""
 MOST_SWEEPS, SWEEPS_OF_LIDS = 5, 2
 """Of a level, and of the finest one once more where lids have been closed."""
