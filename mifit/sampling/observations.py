@@ -297,18 +297,23 @@ class Surface:
             )
         return np.sort(np.concatenate(found)[:count])
 
-    def quality(self, dark: float = 0.0) -> NDArray[np.float32]:
-        """(N,) how often, how well and how surely each texel was measured: 0 never, 1 by half of the images or more.
-
-        At linear colours of ``dark`` and below light isn't known well enough to measure an albedo.
-        """
+    def quality(self) -> NDArray[np.float32]:
+        """(N,) how often, how well and how surely each texel was measured: 0 never, 1 by half of the images or more."""
         out = np.zeros(len(self), dtype=np.float32)
         for part in self.chunks():
             seen = self.observe(part)
             cosine = np.einsum("njk,njk->nj", seen.image_normal, seen.view)
             good = np.where(seen.measured > 0, np.clip(cosine, 0.0, 1.0) * seen.inlier, 0.0)
-            good *= np.maximum(1.0 - (dark / np.maximum(seen.colour.mean(-1), 1e-12)) ** 2, 0.0)
             out[part] = np.minimum(good.sum(1) / max(1.0, 0.35 * self.image_count), 1.0)
+        return out
+
+    def brightness(self) -> NDArray[np.float32]:
+        """(N,) mean linear colour that images show of each texel, over channels too; 0 where none does."""
+        out = np.zeros(len(self), dtype=np.float32)
+        for part in self.chunks():
+            seen = self.observe(part)
+            total = (seen.measured * seen.colour.mean(-1)).sum(1)
+            out[part] = total / np.maximum(seen.measured.sum(1), 1e-12)
         return out
 
     def observe(self, texel: NDArray[np.int64]) -> Observations:

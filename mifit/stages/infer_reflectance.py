@@ -20,7 +20,7 @@ from mifit.optim import Outcome
 from mifit.progress import Progress, silent
 from mifit.sampling.observations import Surface
 from mifit.stages.reflectance.als import find_forward, fit_als
-from mifit.stages.reflectance.fill import blend_unseen
+from mifit.stages.reflectance.fill import blend_unseen, light_known
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.paper_energy import energies, fit_paper
 from mifit.stages.reflectance.residual_shading import SYMMETRIC_SPREAD, separate_shading
@@ -129,7 +129,8 @@ def infer_reflectance(
     if first is not None and config.relief:
         # What no light reached is as dark as it was seen under the capture's own light, and skin under any other. Where
         # the lighting's error changes an albedo by as much as skin varies, skin is the better guess.
-        quality = surface.quality(first.unexplained / SYMMETRIC_SPREAD)
+        level = surface.texels.to_map(surface.brightness())
+        quality *= surface.texels.from_map(light_known(level, first.unexplained / SYMMETRIC_SPREAD))
         filled = blend_unseen(model, surface.texels, solved.maps, quality, solved.observability)
         parted = separate_shading(model, surface.texels, filled.diffuse, filled.confidence)
         shade = (shown.diffuse @ LUMINANCE) / np.maximum(filled.diffuse @ LUMINANCE, 1e-3)

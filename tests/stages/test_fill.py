@@ -8,7 +8,7 @@ import pytest
 from mifit.core.mesh import interpolate
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
-from mifit.stages.reflectance.fill import blend_unseen
+from mifit.stages.reflectance.fill import blend_unseen, light_known
 
 
 @pytest.fixture(scope="module")
@@ -59,3 +59,11 @@ def test_far_from_all_that_was_seen_skin_has_its_typical_colour(half_seen):
     blend = blend_unseen(replace(model, symmetry=None), texels, texels.to_map(found), confidence, told)
     far = texels.from_map(blend.diffuse)[x < -40.0]
     assert np.median(far) > 0.6 * np.median(truth[:, :3]) and (texels.from_map(blend.confidence)[x < 0] == 0).all()
+
+
+def test_a_dark_feature_is_no_want_of_light():
+    level = np.full((100, 100), 0.3, np.float32)
+    level[40:46, 20:60] = 0.01
+    level[:, 80:] = 0.01
+    known = light_known(level, 0.03)
+    assert (known[:, :75] > 0.98).all() and (known[:, 80:] == 0).all()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +18,8 @@ BLEND = 0.05
 """Confidence at which a texel's own estimate counts as much as its surroundings'."""
 TYPICAL = 3e-3
 """Weight of the typical value of skin beside that of a texel of confidence 1: it decides far from what was seen."""
+FEATURE = 0.1
+"""Extent of the widest dark feature of a face, relative to the map: brows."""
 DARKEST = 1e-3
 """Albedo below which ratios mean nothing."""
 STIFFNESS = 0.02
@@ -81,6 +84,17 @@ def blend_unseen(model: MorphableModel, texels: TexelMap, maps: NDArray, confide
     image = texels.to_map(np.clip(blended, 0.0, 1.0).astype(np.float32))
     trusted, glossy = (texels.to_map(np.asarray(x, np.float32)) for x in (confidence, confidence * told))
     return Filled(image[..., :3], image[..., 3], trusted, glossy)
+
+
+def light_known(level: NDArray[np.float32], dark: float) -> NDArray[np.float32]:
+    """(S, S) how far the light on texels is known, 0..1, from how bright (S, S) they are: 0 at ``dark`` and below.
+
+    Light changes over larger distances than brows and nostrils do: what is dark over less than `FEATURE` is itself dark
+    in the light of its surroundings.
+    """
+    side = 2 * round(0.5 * FEATURE * len(level)) + 1
+    light = cv2.morphologyEx(level, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))
+    return np.maximum(1.0 - (dark / np.maximum(light, 1e-12)) ** 2, 0.0).astype(np.float32)
 
 
 def mirrored_coordinates(model: MorphableModel, texels: TexelMap) -> NDArray[np.float64]:
