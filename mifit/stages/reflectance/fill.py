@@ -18,7 +18,7 @@ BLEND = 0.05
 """Confidence at which a texel's own estimate counts as much as its surroundings'."""
 TYPICAL = 3e-3
 """Weight of the typical value of skin beside that of a texel of confidence 1: it decides far from what was seen."""
-FEATURE = 0.1
+FEATURE = 0.06
 """Extent of the widest dark feature of a face, relative to the map: brows."""
 DARKEST = 1e-3
 """Albedo below which ratios mean nothing."""
