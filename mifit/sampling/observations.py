@@ -378,6 +378,4 @@ class Surface:
             inlier = np.concatenate(compared) if compared else inlier
             weight *= np.minimum(inlier, 1.0 - outlier)  # confirmed or not, a twin of a view adds nothing new
         camera = np.array([image.camera_index for image in self._images])
-        return Observations(
-            step, camera, texel, face, weights, colour, weight, clipped, inlier, point, normal, view
-        )
+        return Observations(step, camera, texel, face, weights, colour, weight, clipped, inlier, point, normal, view)

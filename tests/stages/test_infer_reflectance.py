@@ -12,7 +12,6 @@ from mifit.config import ReflectanceConfig
 from mifit.errors import InputError
 from mifit.sampling.observations import Surface
 from mifit.stages.infer_reflectance import infer_reflectance
-from mifit.stages.reflectance.als import with_skin_chroma
 from mifit.stages.reflectance.lighting_equations import SPECULAR_LIMIT, expected_specular, specular_pull
 from mifit.stages.reflectance.maps import Pull, Smoothness, TexelSystems, laplacian, solve_maps
 
@@ -274,28 +273,3 @@ def test_noise_decides_how_far_the_specular_albedo_is_told_by_the_images():
     values = [solve_maps(systems, np.arange(n * n), prior, Smoothness(0, 0), None, pull)[0] for pull in pulls]
     np.testing.assert_allclose([v[..., 3].mean() for v in values], [0.1, 0.055, 0.01], atol=2e-3)
     np.testing.assert_allclose([v[..., :3].mean() for v in values], 0.4, atol=2e-3)
-
-
-def solved(systems: TexelSystems, x0, y0, px, py):
-    """Albedos of each block plus ``px |x - x0|^2 + py (y - y0)^2``."""
-    matrix = np.zeros((len(systems.ss), 4, 4))
-    matrix[:, range(3), range(3)], matrix[:, 3, 3] = systems.dd + px, systems.ss + py
-    matrix[:, :3, 3] = matrix[:, 3, :3] = systems.ds
-    right = np.concatenate([systems.dr + px * x0, (systems.sr + py * y0)[:, None]], axis=1)
-    found = np.clip(np.linalg.solve(matrix, right[..., None])[..., 0], 0.0, 1.0)
-    return found[:, :3], found[:, 3]
-
-
-def test_colour_parts_what_views_leave_open():
-    """Light that is alike in all images: skin's chroma alone tells where there is more gloss."""
-    rng = np.random.default_rng(0)
-    skin = np.array([0.5, 0.3, 0.2]) * rng.uniform(0.5, 1.5, (50, 1))
-    gloss, light = rng.uniform(0.0, 0.2, 50), np.ones((50, 4, 3), np.float32)
-    colour = ((skin + gloss[:, None])[:, None] * light).astype(np.float32)
-    systems = TexelSystems.accumulate(colour, light, light, light, np.zeros((0, 2), np.int64), 0.0)
-    expected, likely, found = np.tile([0.5, 0.3, 0.2], (50, 1)), np.full(50, 0.1), None
-    without = solved(systems, expected, likely, 1e-9, 1e-6)[1]
-    for _ in range(3):
-        pulled = with_skin_chroma(systems, expected, found, 0.02)
-        found, specular = solved(pulled, expected, likely, 1e-9, 1e-6)
-    assert np.corrcoef(specular, gloss)[0, 1] > 0.9 > np.corrcoef(without, gloss)[0, 1] + 0.2

@@ -36,8 +36,6 @@ FIRST_ITERATIONS = 12
 """Gauss-Newton iterations of the lighting by which objects in front of the face are found."""
 START_ITERATIONS = 5
 """Gauss-Newton iterations where they are only a start: the objective over all texels is minimised afterwards."""
-CHROMA_SPREAD = 0.05
-"""Standard deviation of skin's albedo over a face in a channel, at equal brightness and relative to it."""
 SURROUNDINGS = 1 / 128
 """Half the side of the square of texels over which residuals are averaged, relative to the map."""
 
@@ -261,39 +259,11 @@ def solve_texels(
         if sizes:
             usual, each = float(np.median([usual for usual, _ in sizes])), np.concatenate([each for _, each in sizes])
             observability = specular_observability(surface.texels, joined, each, usual, expected)
-        if config.robust:
-            found_albedo = None if maps is None else maps.reshape(-1, 4)[index, :3]
-            joined = with_skin_chroma(joined, prior.reshape(-1, 4)[index, :3], found_albedo, sigma)
         pull = Pull(specular=specular_pull(expected, sigma) if config.robust else 0.0)
         maps, outcome = solve_maps(joined, index, prior, smoothness, maps, pull, MAP_ITERATIONS)
     progress("Reflectance maps", passes * len(chunks), passes * len(chunks))
     assert maps is not None
     return SolvedMaps(maps, energy, sigma, outcome, observability)
-
-
-def with_skin_chroma(systems: TexelSystems, expected: NDArray, found: NDArray | None, sigma: float) -> TexelSystems:
-    """Blocks that pull each texel's chroma to that of skin, beside residuals of deviation `sigma`.
-
-    Skin's brightness varies more than its chroma, and a highlight has the light's. So where views and timesteps leave
-    it open how much of a texel's light is specular, its colour decides.
-
-    Parameters
-    ----------
-    systems : TexelSystems
-    expected, found : (N, 3)
-        Diffuse albedo of the model, and that of the last pass; without one the blocks say how bright texels are.
-    sigma : float
-    """
-    reference = expected.astype(np.float64)
-    if found is None:
-        level = (systems.dr * reference).sum(1) / np.maximum((systems.dd * reference**2).sum(1), 1e-12)
-    else:
-        level = (found * reference).sum(1) / (reference**2).sum(1)
-        seen = systems.dd.min(1) >= 0.1 * np.median(systems.dd)
-        reference = reference * np.median(found[seen] / np.maximum(reference[seen] * level[seen, None], 1e-3), axis=0)
-    pull = (sigma / (CHROMA_SPREAD * float(np.median(reference)))) ** 2
-    toward = pull * level[:, None] * reference
-    return replace(systems, dd=(systems.dd + pull).astype(np.float32), dr=(systems.dr + toward).astype(np.float32))
 
 
 # How far images determine the specular albedo ------------------------------------------------------------------------

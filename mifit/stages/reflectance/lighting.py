@@ -34,6 +34,8 @@ from mifit.stages.reflectance.lighting_equations import (
 
 NEGATIVE_DIRECTIONS = 400
 """Directions at which negative radiance is penalised."""
+STILL = 3
+"""Steps without a lower energy that end the iterations."""
 SLACK = 1.02
 """A step may raise the energy by this factor: robust weights and the gauge move between steps."""
 GROSS = 0.1
@@ -164,7 +166,7 @@ def solve_lighting(
         Give outliers less weight (Cauchy).
     iterations : int
     tolerance : float
-        Stop when the energy changes by less than this part.
+        Stop when the energy changes by less than this part, or has not fallen by it in the last `STILL` steps.
     """
     n = len(problem.albedo)
     seen = problem.sums(problem.weight)
@@ -183,8 +185,10 @@ def solve_lighting(
                 outcome = Outcome.STALLED
                 break
         else:
-            settled = bool(energy) and abs(energy[-1] - found.energy) < tolerance * energy[-1]
             energy.append(found.energy)
+            settled = len(energy) > 1 and abs(energy[-2] - energy[-1]) < tolerance * energy[-2]
+            # The priors' energy goes on falling where the data's, which is kept here, no longer does.
+            settled |= min(energy[-STILL:]) > (1.0 - tolerance) * min(energy[:-STILL], default=np.inf)
             best, damping = found, max(0.1 * damping, 1e-5)
             if settled:
                 outcome = Outcome.CONVERGED
