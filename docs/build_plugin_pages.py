@@ -2,14 +2,16 @@
 
     python docs/build_plugin_pages.py [--text-only]
 
-Each page has the docstring, the scene scenes/plugins/NAME.xml, the same plugin as a dictionary, and the picture that
-the scene renders to. ``--text-only`` leaves the pictures as they are.
+Each page has the docstring, the plugin as it stands in scenes/plugins/NAME.xml and as a dictionary, and the picture
+that the scene renders to. ``--text-only`` leaves the pictures as they are.
 """
 
 from __future__ import annotations
 
 import argparse
 import inspect
+import re
+import textwrap
 from pathlib import Path
 
 import mifit
@@ -56,12 +58,15 @@ def page(name: str, plugin: type) -> str:
     """The text of one page."""
     lines = inspect.cleandoc(plugin.__doc__ or "").splitlines()
     title, body = lines[0], "\n".join(lines[2:]).strip()
-    scene = (SCENES / f"{name}.xml").read_text(encoding="utf-8").strip()
+    scene = (SCENES / f"{name}.xml").read_text(encoding="utf-8")
+    *_, last = re.finditer(rf'^ *<(\w+) type="{name}">.*?</\1>', scene, re.DOTALL | re.MULTILINE)
+    element = textwrap.dedent(last[0])
     dictionary = inspect.cleandoc("\n" + DICTIONARIES[name])
     return (
         f"# {title}\n\n{body}\n\n"
         f"## Example\n\n![{title}]({name}.png)\n\n"
-        f"`scenes/plugins/{name}.xml`, loaded with `mifit.load_scene`:\n\n```xml\n{scene}\n```\n\n"
+        f"The picture's scene is `scenes/plugins/{name}.xml`; `mifit.load_scene` loads it. In it:\n\n"
+        f"```xml\n{element}\n```\n\n"
         f"As a dictionary, after `mifit.register_plugins()`:\n\n```python\n{dictionary}\n```\n"
     )
 

@@ -1,4 +1,4 @@
-"""What mkdocs fills in while it builds: tables that are made from the code itself."""
+"""What mkdocs does to pages while it builds: entries of the API become their docstrings, formulas become MathML."""
 
 from __future__ import annotations
 
@@ -6,50 +6,15 @@ import html
 import re
 from typing import Any
 
-SETTINGS = "<!-- settings of {name} -->"
-
-
-def settings_tables(text: str) -> str:
-    """Put a table in the place of every ``<!-- settings of NAME -->``."""
-    from mifit import config
-    from mifit.experiments.plan import Experiment
-
-    tables = {
-        "fit": (config.FitConfig, ""),
-        "experiment": (Experiment, ""),
-    }
-    for name, (cls, prefix) in tables.items():
-        text = text.replace(SETTINGS.format(name=name), settings_table(cls, prefix, skip=name == "experiment"))
-    return text
-
-
-def settings_table(cls: type, prefix: str, skip: bool = False) -> str:
-    """A Markdown table of all settings below a class; ``skip``: without those of the stages."""
-    from mifit.config import FitConfig, list_settings
-
-    stages = {f"fit.{key}" for key, *_ in list_settings(FitConfig)} if skip else set()
-    lines = ["| key | default | expected | meaning |", "| --- | --- | --- | --- |"]
-    for key, default, expected, meaning in list_settings(cls, prefix):
-        if key not in stages:
-            shown = "" if default is None else f"`{_toml(default)}`"
-            lines.append(f"| `{key}` | {shown} | {expected} | {meaning} |")
-    return "\n".join(lines)
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_toml, value))}]"
-    return f'"{value}"' if isinstance(value, str) else str(value)
-
-
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Fill in a page (mkdocs calls this)."""
-    return settings_tables(markdown)
-
-
+ENTRY = re.compile(r"^- `(mifit\.[\w.]+)`.*$", re.MULTILINE)
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Put docstrings in the place of the entries of api.md (mkdocs calls this)."""
+    if page.file.src_uri != "api.md":
+        return markdown
+    return ENTRY.sub(r"\n::: \1\n", markdown)
 
 
 def with_formulas(page: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -145,7 +146,7 @@ def test_every_public_name_loads():
 
 def test_the_api_page_has_every_public_name():
     page = (PACKAGE.parent / "docs" / "api.md").read_text(encoding="utf-8")
-    listed = {line.removeprefix("::: ").strip() for line in page.splitlines() if line.startswith("::: ")}
+    listed = set(re.findall(r"^- `([\w.]+)`", page, re.MULTILINE))
     for name in set(mifit.__all__) - {"__version__"}:
         value = getattr(mifit, name)
         assert {f"{value.__module__}.{value.__qualname__}", value.__module__} & listed, name
