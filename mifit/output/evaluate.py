@@ -203,8 +203,10 @@ def compare(
         true = None
         with suppress(InputError):  # a truth whose faces nobody knows
             true = true_mesh(capture, timestep, model)
-        mesh = (vertices, model.faces, None, moments) if true is None else (true.vertices, true.faces)
-        sight = image_based(capture, shown.cameras, view, timestep, *mesh, oversampling=2)
+        mesh, moved = (vertices, model.faces), moments
+        if true is not None:
+            mesh, moved = (true.vertices, true.faces), None
+        sight = image_based(capture, shown.cameras, view, timestep, *mesh, moments=moved, oversampling=2)
         area = skin_region(landmarks_of(capture, camera, timestep), view) & sight.seen
     elif region == "truth":
         truth = true_mesh(capture, timestep, result.model)
