@@ -203,10 +203,11 @@ def compare(
         true = None
         with suppress(InputError):  # a truth whose faces nobody knows
             true = true_mesh(capture, timestep, model)
-        mesh, moved = (vertices, model.faces), moments
+        points, moved = vertices, moments
+        faces: NDArray = model.faces
         if true is not None:
-            mesh, moved = (true.vertices, true.faces), None
-        sight = image_based(capture, shown.cameras, view, timestep, *mesh, moments=moved, oversampling=2)
+            points, faces, moved = true.vertices, true.faces, None
+        sight = image_based(capture, shown.cameras, view, timestep, points, faces, moments=moved, oversampling=2)
         area = skin_region(landmarks_of(capture, camera, timestep), view) & sight.seen
     elif region == "truth":
         truth = true_mesh(capture, timestep, result.model)
