@@ -56,7 +56,7 @@ def _summary(name: str) -> str:
 
 def _short(expected: str) -> str:
     """What a setting takes, as an interval."""
-    text = re.sub(r"^a (?:finite|whole) number ", "", expected).replace("1e+09", "1e9")
+    text = re.sub(r"^a (?:finite|whole) number ", "", expected).replace("1e+09", "1e9").replace("true or false", "bool")
     text = re.sub(r"^from (\S+) to (\S+)", r"\1..\2", text)
     return re.sub(r"^above (\S+), at most (\S+)", r">\1..\2", text)
 

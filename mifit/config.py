@@ -130,7 +130,7 @@ class GeometryConfig:
     objective: Literal["consistency", "paper"] = one_of("consistency", "what is minimised")
     eyes: bool = flag(
         True,
-        "give a model whose eyes are holes simple eyes and the inside of a mouth; its maps' layout moves up by 9 %",
+        "give a model whose eyes are holes simple eyes and the inside of a mouth",
     )
     rounds: int = number(2, "outer steps: visibility is found anew in each", least=0, most=100)
     landmark_noise: float = number(
@@ -153,8 +153,7 @@ class GeometryConfig:
     )
     as_written: bool = flag(
         False,
-        "objective paper: the paper's terms and no others, so no robust penalty, no contour that slides, no pull of "
-        "the ambient term, no blur, and light and albedo as they come",
+        "objective paper: the paper's terms and no others",
     )
     surface_points: int = number(3000, "points of the surface that are compared between images", least=1, most=200_000)
     texture_weight: float = number(
@@ -221,13 +220,12 @@ class ReflectanceConfig:
     texture_size: int = number(512, "side of the maps", "texels", least=16, most=4096)
     shading: Annotated[str, pydantic.AfterValidator(_known_shading)] = one_of(
         "auto",
-        "image-formation model: paper, printed, prefiltered, shadowed (with distant compact lights where images show "
-        "some), or another that is registered; auto is shadowed",
+        "paper, printed, prefiltered, shadowed, or another that is registered; auto is shadowed",
     )
     bands: int = number(10, "bands of the lighting of prefiltered and shadowed; paper has 3", least=3, most=10)
     exponent: float | None = number(
         None,
-        "Blinn-Phong exponent; none: 5 for paper, as in the paper, and otherwise the one that explains the images best",
+        "Blinn-Phong exponent; none: 5 for paper, otherwise the one that explains the images best",
         least=1,
         most=10_000,
     )
@@ -249,8 +247,7 @@ class ReflectanceConfig:
     )
     relief: bool = flag(
         True,
-        "part from the albedo what varies more than skin does: relief and shadows that the mesh doesn't have, which "
-        "another light doesn't show; with robust alone",
+        "part from the albedo what varies more than skin does, which another light doesn't show; with robust alone",
     )
     max_iterations: int = number(30, "Gauss-Newton iterations of the lighting", least=1, most=10_000)
 
@@ -275,13 +272,13 @@ class MeshConfig:
 
     subdivisions: int = number(
         0,
-        "times that every face is split into four first: a mesh holds no detail finer than its edges",
+        "times that every face is split into four first",
         least=0,
         most=3,
     )
     detail: float = number(
         0.3,
-        "length below which shape comes from the normals and above which it comes from the positions",
+        "length below which shape comes from the normals",
         "centimetres",
         above=0,
         most=100,
@@ -294,13 +291,11 @@ class ResidualConfig:
 
     enabled: bool = flag(
         True,
-        "keep, for views of fitted timesteps in the capture's own light, what their images show beyond the model: "
-        "edges of shadows, interreflection",
+        "keep what images show beyond the model, for views of fitted timesteps in the capture's own light",
     )
     prior: float = number(
         0.5,
-        "views without any residual that count against those of a timestep: of what two views agree on, 0.5 keeps four "
-        "fifths",
+        "views without any residual that count against those of a timestep",
         above=0,
         most=1000,
     )

@@ -43,22 +43,16 @@ def make() -> type:
         $$f_s = C_s\, \big(1 + k\,(1 - h \cdot v)^5\big)\, N(m)\, \Big(\frac{1 + c}{2}\Big)^{m/2} c\;
         \frac{2}{n' \cdot l + n' \cdot v}, \qquad c = \max(r \cdot l, 0)$$
 
-        It is reciprocal: $r \cdot l$ and $h \cdot v$ are the same when $l$ and $v$ change places. At the mirror
-        direction $h \cdot v = n' \cdot v$, which is the factor that `shdirect` and mifit's own renders have. A
-        `fresnel` of 0 is the carried lobe without that factor; without the parameter the lobe is Blinn-Phong's, which
-        fades and leans towards the normal at grazing angles. Normalised, the albedo with its factor stops at $1 - C_d$,
-        so that no energy is gained.
+        It is reciprocal. At the mirror direction $h \cdot v = n' \cdot v$, the factor that `shdirect` and mifit's own
+        renders have. A `fresnel` of 0 is the carried lobe without that factor. Normalised, the albedo with its factor
+        stops at $1 - C_d$, so that no energy is gained.
 
-        The normal correction is the paper's $\delta_n$ as slopes in the tangent plane instead of spherical coordinates:
-        those have a pole where the azimuth means nothing and its derivative vanishes, and for a small correction that
-        pole is the uncorrected normal itself. Slopes are zero there, linear around it, and can't turn the normal over.
-        The shading frame's $s$ follows the UV parametrisation.
+        The normal correction is the paper's $\delta_n$ as slopes in the tangent plane instead of spherical coordinates,
+        which have a pole at the uncorrected normal. The shading frame's $s$ follows the UV parametrisation.
 
-        Reflects on the side of the normal; wrap it in Mitsuba's `twosided` for both. Where an interpolated or corrected
-        normal faces away from the view and the surface doesn't, near silhouettes, the diffuse base still reflects and
-        the lobe doesn't: a coarse mesh has no black outline. `sample` draws half vectors in proportion to
-        $(n' \cdot h)^m$, or with `fresnel` directions about $r$, and cosine-weighted
-        directions, in proportion to the albedos. All parameters are differentiable.
+        Reflects on the side of the normal; wrap it in Mitsuba's `twosided` for both. Where a corrected
+        normal faces away from the view and the surface doesn't, the diffuse base still reflects and
+        the lobe doesn't: a coarse mesh has no black outline. All parameters are differentiable.
         """
 
         def __init__(self, props: mi.Properties) -> None:

@@ -66,11 +66,9 @@ def make() -> type:
         - `shadowed`: as before with transfer vectors per vertex that hold the scene's own shadows, traced once per
           geometry, and the lobe dimmed by the part of its light that they let through. Meshes only.
 
-        Samples of a pixel lie on a fixed pattern; one sample is the pixel's centre. The same scene gives the same image
-        whatever the seed. Every parameter of `blinnphong` and `shenv`, and `ambient`, is differentiable; derivatives by
-        geometry are those of the shading, without the motion of silhouettes and shadows. Where the emitter clamps
-        negative radiance, the clamped radiance is what is shaded, projected to two more bands. `twosided` is
-        seen through.
+        Samples of a pixel lie on a fixed pattern, whatever the seed; one sample is the pixel's centre. Every parameter
+        of `blinnphong` and `shenv`, and `ambient`, is differentiable; derivatives by geometry are those of the shading,
+        without the motion of silhouettes and shadows. Clamped radiance is projected to two more bands.
         """
 
         def __init__(self, props: mi.Properties) -> None:
