@@ -45,7 +45,7 @@ def make() -> type:
         ----------------------------------------
 
         Shades the first hit of `blinnphong` surfaces under one `shenv` in closed form, without sampling noise. Compact
-        lights beside it, such as `directional` or a small `sphere` that emits, are looked at with shadows.
+        lights beside it, such as `directional` or a small `sphere` that emits, are shaded with shadows.
 
         - `model` (`paper`, `prefiltered`, `shadowed` or the name of another registered shading model, default
           `prefiltered`): how light becomes radiance, see below

@@ -75,7 +75,7 @@ def make() -> type:
         Directions are sampled from a table of the clamped luminance (64 x 128 cells of equal solid angle) mixed with
         10 % uniform ones, rebuilt whenever the parameters change. `coefficients` and `scale` are differentiable.
 
-        Why the `radius`: Mitsuba doesn't tell emitters written in Python about the scene. It only has to be large
+        The `radius` is needed because emitters written in Python don't get the scene. It only has to be large
         enough. RGB variants only.
         """
 
