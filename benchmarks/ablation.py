@@ -99,7 +99,6 @@ def _prior_alone(colour: Any, weight: Any, wrong: Any, *rest: Any) -> Any:
 PARTS = (
     Part(BASE),
     Part("surface: off", {"surface.enabled": False}),
-    Part("surface: refit of the model", {"surface.refit": False}),
     Part("surface: lids and lips closed", {"surface.close_lids": False, "surface.close_lips": False}),
     Part("stage 1: images (landmarks alone)", {"geometry.rounds": 0}),
     Part("stage 1: albedo prior of skin's contrast", {"geometry.albedo_prior": 1.0}),
