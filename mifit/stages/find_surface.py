@@ -163,7 +163,7 @@ def find_surface(
         "name": "surface",
         "outcome": rest.outcome.value,
         "moved_last_mm": rest.moved * capture.unit_mm,
-        "levels": rest.levels,
+        "levels": list(rest.levels),
         "matched": rest.matched,
         "displacement_mm": float(np.sqrt(np.mean(moved**2))),
         "epipolar_pixels": residuals,

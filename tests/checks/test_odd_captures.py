@@ -84,7 +84,7 @@ def test_a_fit_of_an_odd_capture_ends_in_words(name, shared, tmp_path, capfd, va
     rough = read(shared / "captures/soft", timesteps=1, factor=FACTOR, cameras=("left", "right"))
     change(rough)
     folder = write(rough, tmp_path / "capture")
-    (tmp_path / "fit.toml").write_text("[surface]\nrefit = false\n[reflectance]\ntexture_size = 64\n")
+    (tmp_path / "fit.toml").write_text("[reflectance]\ntexture_size = 64\n")
     out = tmp_path / "out"
     options = ("--config", str(tmp_path / "fit.toml"), "--model", "builtin:coarse", "--quiet")
     code = main(["fit", str(folder), "--out", str(out), *options])
