@@ -167,7 +167,6 @@ def gallery(size: int) -> None:
         relit = {light: head.lit(light) for light in ("city", "studio", "sunset", "apartment")}
         rows.append(row([tile(image, f"{label}") for label, image in (own | relit).items()]))
     page(rows, IMAGES / "gallery.jpg")
-    page([strip(Head(name, size)) for name in ("scan_studio", "scan_sun", "emily")], IMAGES / "gallery_maps.jpg")
 
 
 def light(size: int, frames: int = 24, height: int = 260) -> None:
