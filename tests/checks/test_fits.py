@@ -78,16 +78,12 @@ def test_doctor_examines_a_capture(name, code, verdict, shared, tmp_path, capsys
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "codes"),
-    [("landmarks shifted", ["landmarks-shifted"]), ("one turned, yaw", [])],
-)
-def test_a_cheap_fit_names_what_only_it_can_tell(name, codes, shared, tmp_path, variant):
-    """Where it names nothing, nothing is said either: no false alarm."""
+@pytest.mark.parametrize("name", ["landmarks shifted", "one turned, yaw"])
+def test_a_fit_of_what_no_image_tells_says_nothing_wrong(name, shared, tmp_path, variant):
+    """docs/limits.md has both: no other fault is named in their place."""
     capture = Capture.load(make(name, shared / "captures/soft", tmp_path, timesteps=2))
     found = mifit.fit(capture, MorphableModel.load("builtin:coarse"), PAIR, until="geometry")
-    assert [one.code for one in found.diagnostics if one.severity != "note"] == codes
-    assert found.geometry.report.outcome == (INCONSISTENT if codes else "converged")
+    assert not [one.code for one in found.diagnostics if one.severity != "note"]
 
 
 @pytest.mark.slow
