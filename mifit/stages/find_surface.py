@@ -59,7 +59,7 @@ LARGEST_MAP = 1024
 SETTLED = 0.15
 """Part of a sweep's step below which a level is at rest (root mean square over what is measured)."""
 MOST_SWEEPS, SWEEPS_OF_LIDS = 5, 2
-"""Of a level, and of the finest one once more where lids have been closed."""
+"""Of a level, and of the two finest ones once more where lids have been closed."""
 ROBUST_STEPS = 0.7
 """Distance from the surface, in steps of the sweep, where an offset counts as an outlier."""
 JAW = 17
@@ -134,7 +134,8 @@ def find_surface(
         CONTACT_MM / model.unit_mm,
     )
     scenes = Scenes(skin.faces, np.unique(model.faces[model.face_mask]), SLACK * resolution.pixel)
-    sight = Sight(capture, model, tuple(cameras), scenes, resolution.pixel, config.reach / capture.unit_mm)
+    reach = config.reach / capture.unit_mm
+    sight = Sight(capture, model, tuple(cameras), scenes, resolution.pixel, reach, config.finest)
     landmarks = Landmarks.of(capture, model, cameras, geometry)
     search = Search(geometry, model, pairs, skin, prior, landmarks, sight, level_step, config.stiffness, progress)
 
@@ -322,7 +323,11 @@ class State:
 
 @dataclass(frozen=True)
 class Sight:
-    """The views of the surface at one level of the image pyramid."""
+    """The views of the surface at the levels of the image pyramid.
+
+    ``pixel`` is the world length of a pixel of level 0 at the face, ``reach`` how far borders are looked for, world
+    length, at all levels but the finest.
+    """
 
     capture: Capture
     model: MorphableModel
@@ -330,6 +335,7 @@ class Sight:
     scenes: Scenes
     pixel: float
     reach: float
+    finest: int
 
     def texels(self, vertices: NDArray, level: int) -> TexelMap:
         """Texels of a surface (V, 3) that are about as large as a level's pixels."""
@@ -345,11 +351,11 @@ class Sight:
 
     def borders(self, timestep: int, vertices: NDArray, level: int) -> Borders:
         """Outlines of one timestep's surface in all views."""
-        finer = min(2.0 * 0.5**level, 1.0)  # where a pixel mixes skin and background the border is doubtful
-        if level:
-            finer = min(REACH * self.pixel / self.reach, 1.0)
+        factor = 2.0 * 0.5**level  # where a pixel mixes skin and background the border is doubtful
+        if level > self.finest:
+            factor = REACH * self.pixel / self.reach
         scene = self.scenes.at(timestep, vertices)
-        return find_borders(self.capture, scene, self.cameras, timestep, finer)
+        return find_borders(self.capture, scene, self.cameras, timestep, min(factor, 1.0))
 
     def epipolar_residuals(
         self,
@@ -430,9 +436,11 @@ class Search:
             if skin.weights is not None:
                 rows = replace(rows, points=rows.points @ skin.weights)
             mean = state.expression.mean(axis=0)
-            start = state.displacement[: skin.count], np.concatenate([state.identity, mean])
+            coefficients = np.concatenate([state.identity, mean])
+            surface = self.prior.move(coefficients) + state.displacement[: skin.count]
             factor = factor or self.prior.factor(rows, self.stiffness)
-            moved_by, coefficients = solve_surface(self.prior, rows, *start, self.stiffness, factor)
+            solved = self.prior, rows, surface, self._bounds(state), self.stiffness, factor
+            moved_by, coefficients = solve_surface(*solved)
             identity, changed = np.split(coefficients, [len(state.identity)])
             expression = state.expression + (changed - mean)
             state = replace(state, identity=identity, expression=expression, displacement=skin.spread(moved_by))
@@ -445,6 +453,14 @@ class Search:
             if outcome is Outcome.CONVERGED and number >= 2:
                 break
         return rest
+
+    def _bounds(self, state: State) -> NDArray[np.float64]:
+        """(K, 2) bounds of identity and mean expression: the expression of no timestep leaves the model's."""
+        low, high = self.model.expression_bounds.T.astype(np.float64)
+        mean = state.expression.mean(axis=0)
+        low, high = (low - state.expression).max(axis=0), (high - state.expression).min(axis=0)
+        of_mean = np.stack([mean + np.minimum(low, 0.0), mean + np.maximum(high, 0.0)], axis=1)
+        return np.concatenate([np.tile([-np.inf, np.inf], (len(state.identity), 1)), of_mean])
 
 
 def measurements(

@@ -203,9 +203,11 @@ def test_the_solution_is_the_minimum(model):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     offsets, precision = rng.normal(size=80), rng.uniform(0.5, 2.0, 80)
     displacement, coefficients, moved = np.zeros((36, 3)), np.zeros(5), np.zeros(80)
+    free = np.tile([-np.inf, np.inf], (5, 1))
     for _ in range(60):  # conjugate gradients go on from where they ended
         measured = Measurements(points, normals, offsets - moved, precision, np.full(80, 1e9))
-        displacement, coefficients = solve_surface(prior, measured, displacement, coefficients, 0.5)
+        surface = prior.move(coefficients) + displacement
+        displacement, coefficients = solve_surface(prior, measured, surface, free, 0.5)
         moved = ((points @ (prior.move(coefficients) + displacement)) * normals).sum(1)
     rows = np.einsum("nv,nc->nvc", points.toarray(), normals).reshape(80, -1)
     plate = np.kron(0.5 * prior.plate.toarray(), np.eye(3))
@@ -230,20 +232,32 @@ def test_what_the_modes_explain_is_left_to_them():
     prior = SurfacePrior.of(grid, faces, modes, longest=200.0)
     normals, points = np.tile([0.0, 0.0, 1.0], (len(grid), 1)), sp.identity(len(grid), format="csr")
     height = np.stack(bumps, axis=1) @ (1.5, -1.0, 0.5, 1.0)
-    displacement, coefficients = np.zeros((len(grid), 3)), np.zeros(3)
-    for _ in range(5):  # sweeps
-        now = (prior.move(coefficients) + displacement)[:, 2]
-        measured = Measurements(points, normals, height - now, np.full(len(grid), 100.0), np.full(len(grid), 1e9))
-        displacement, coefficients = solve_surface(prior, measured, displacement, coefficients, 8.0)
     true = np.zeros((len(grid), 3))
     true[:, 2] = height
-    best = np.linalg.solve(
-        8.0 * prior.gram + np.eye(3), 8.0 * prior.bent.T @ true.ravel()
-    )  # unit deviation shrinks them
+
+    def swept(bounds):
+        now = np.zeros((len(grid), 3))
+        for _ in range(5):
+            far = np.full(len(grid), 1e9)
+            measured = Measurements(points, normals, height - now[:, 2], np.full(len(grid), 100.0), far)
+            displacement, coefficients = solve_surface(prior, measured, now, bounds, 8.0)
+            now = prior.move(coefficients) + displacement
+        return displacement, coefficients, now
+
+    bounds = np.tile([-np.inf, np.inf], (3, 1))
+    displacement, coefficients, _ = swept(bounds)
+    # The prior of unit deviation shrinks them.
+    best = np.linalg.solve(8.0 * prior.gram + np.eye(3), 8.0 * prior.bent.T @ true.ravel())
     np.testing.assert_allclose(coefficients, best, atol=0.02)
     assert (np.abs(best - (1.5, -1.0, 0.5)) < 0.2).all()
     beyond = true[:, 2] - prior.move(best)[:, 2]
     np.testing.assert_allclose(displacement[:, 2], beyond, atol=0.05)
+
+    # A mode that would leave its bounds stays at them, and the displacement takes the rest.
+    bounds[0, 1] = 1.0
+    displacement, coefficients, now = swept(bounds)
+    assert coefficients[0] == 1.0 and displacement[:, 2] @ bumps[0] > 0.3 * bumps[0] @ bumps[0]
+    np.testing.assert_allclose(now[:, 2], height, atol=0.1)
 
 
 def test_a_highlight_that_one_view_shows_counts_little_and_exposure_nothing():
@@ -269,7 +283,7 @@ def test_an_outlier_counts_little():
             prior,
             Measurements(points, up, offsets, np.ones(36), np.full(36, turn)),
             np.zeros((36, 3)),
-            np.zeros(1),
+            np.array([[-np.inf, np.inf]]),
             1.0,
         )[0][14, 2]
         for turn in (1e9, 1.0)
@@ -309,6 +323,12 @@ def test_the_width_of_the_face_is_that_in_the_images(model, bumpy, start):
     ends = bumpy.vertices[0][model.landmarks[[0, 16]]]
     width = np.mean([np.ptp(bumpy.camera(name).project(ends)[:, 0]) for name in BOTH])  # turned by 20 degrees
     assert 1.0 < start.face_width / width < 1.2
+
+
+def test_expressions_stay_within_their_bounds(model, found):
+    low, high = model.expression_bounds.T
+    assert np.isfinite(low).any()
+    assert (found.expression >= low - 1e-6).all() and (found.expression <= high + 1e-6).all()
 
 
 def test_each_level_is_swept_until_the_surface_rests(model, bumpy, start, found, monkeypatch):

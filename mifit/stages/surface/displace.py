@@ -10,7 +10,8 @@ with the measured points W (barycentric), their normals n, offsets o and precisi
 areas a of the rest mesh. Only the normal component of U is measured: a point that slides on the surface costs nothing,
 so that what the views show decides where the surface lies and the prior decides how the mesh lies on it.
 
-The coefficients are eliminated: with the plate's matrix K and the stiffness s, the best ones for a surface are
+Coefficients stay within the model's bounds: one that would leave them is held there for a solution. The others are
+eliminated: with the plate's matrix K and the stiffness s, the best ones for a surface are
 ``m = G^-1 s M'K U`` with ``G = s M'KM + 1``. What remains is solved for U by conjugate gradients, with the
 plate and the measurements, axes decoupled, as preconditioner: one sparse factorisation serves all axes.
 """
@@ -135,6 +136,23 @@ class SurfacePrior:
         moved: NDArray = self.modes @ np.asarray(coefficients, np.float32)
         return moved.astype(np.float64).reshape(-1, 3)
 
+    def coefficients(
+        self, surface: NDArray, stiffness: float, bounds: NDArray
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """(K,) coefficients of least energy for a surface (V, 3) within bounds (K, 2), and which lie between them."""
+        matrix = stiffness * self.gram + np.eye(len(self.gram))
+        right = stiffness * (self.bent.T @ surface.ravel().astype(np.float32)).astype(np.float64)
+        found, free = np.zeros(len(right)), np.ones(len(right), bool)
+        while free.any():
+            held = matrix[np.ix_(free, ~free)] @ found[~free]
+            found[free] = la.solve(matrix[np.ix_(free, free)], right[free] - held, assume_a="pos")
+            within = np.clip(found, *bounds.T)
+            beyond = within != found
+            if not beyond.any():
+                break
+            found, free = within, free & ~beyond
+        return found, free
+
 
 def _contacts(vertices: NDArray, faces: NDArray, distance: float) -> sp.csr_matrix:
     """(V, V) sum of |d_i - d_j|^2 over vertices of different sheets that nearly touch.
@@ -160,8 +178,8 @@ def _contacts(vertices: NDArray, faces: NDArray, distance: float) -> sp.csr_matr
 def solve_surface(
     prior: SurfacePrior,
     measured: Measurements,
-    displacement: NDArray,
-    coefficients: NDArray,
+    surface: NDArray,
+    bounds: NDArray,
     stiffness: float,
     factor: spl.SuperLU | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -172,8 +190,10 @@ def solve_surface(
     prior : SurfacePrior
     measured : Measurements
         Relative to the current surface.
-    displacement, coefficients : (V, 3), (K,)
-        The current surface.
+    surface : (V, 3)
+        The current surface: what modes and displacement together add to the mean.
+    bounds : (K, 2)
+        Of the coefficients.
     stiffness : float
         Weight of the plate.
     factor : SuperLU, optional
@@ -183,7 +203,10 @@ def solve_surface(
     measured = measured.where(measured.precision > 0)
     points, normals, precision = measured.points, measured.normals, measured.precision
     transposed = points.T.tocsr()
-    start = prior.move(coefficients) + displacement
+    now, free = prior.coefficients(surface, stiffness, bounds)
+    held_modes = prior.move(np.where(free, 0.0, now))
+    bent, gram = prior.bent[:, free], prior.gram[np.ix_(free, free)]
+    start = surface - held_modes
     at_start = points @ start
     along_start = (at_start * normals).sum(1)
     target = along_start + measured.offsets
@@ -192,12 +215,12 @@ def solve_surface(
     def precondition(r: NDArray) -> NDArray:
         return np.asarray(factor.solve(r.reshape(-1, 3).astype(np.float32)).ravel(), np.float64)
 
-    inner = la.cho_factor(stiffness * prior.gram + np.eye(len(coefficients)))
+    inner = la.cho_factor(stiffness * gram + np.eye(len(gram)))
 
-    def modes_of(surface: NDArray) -> NDArray[np.float64]:
-        """(K,) best coefficients for a surface."""
-        along_modes = prior.bent.T @ surface.ravel().astype(np.float32)
-        return np.asarray(la.cho_solve(inner, stiffness * along_modes.astype(np.float64)))
+    def without_modes(x: NDArray) -> NDArray[np.float64]:
+        """What the free modes take from the plate's pull on a surface (V, 3), flat."""
+        along_modes = stiffness * (bent.T @ x.ravel().astype(np.float32)).astype(np.float64)
+        return np.asarray(bent @ la.cho_solve(inner, along_modes).astype(np.float32), np.float64)
 
     # Geman and McClure's weights at the current surface; the sweeps that follow weight anew.
     weight = precision / (1.0 + (measured.offsets / measured.robust) ** 2) ** 2
@@ -209,7 +232,7 @@ def solve_surface(
         at = points @ x
         normal = (at * normals).sum(1, keepdims=True) * normals
         out = (stiffness * (prior.plate @ x) + transposed @ (across * normal + along * at)).ravel()
-        return np.asarray(out - stiffness * (prior.bent @ modes_of(x).astype(np.float32)))
+        return np.asarray(out - stiffness * without_modes(x))
 
     right = transposed @ ((weight * target)[:, None] * normals + along * held)
     size = (start.size, start.size)
@@ -220,6 +243,6 @@ def solve_surface(
         maxiter=MOST_ITERATIONS,
         M=spl.LinearOperator(size, matvec=precondition),
     )
-    surface = start + change.reshape(-1, 3)
-    coefficients = modes_of(surface)
+    surface = start + change.reshape(-1, 3) + held_modes
+    coefficients, _ = prior.coefficients(surface, stiffness, bounds)
     return surface - prior.move(coefficients), coefficients
