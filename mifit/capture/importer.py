@@ -35,7 +35,7 @@ class Material:
 
 
 class Selection(TypedDict, total=False):
-    """Which frames are kept, see `import_capture`, and who is told how far it is."""
+    """Which frames are kept, see `import_capture`, and who hears of its progress."""
 
     every: int
     start: int

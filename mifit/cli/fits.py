@@ -101,7 +101,7 @@ def fit(arguments: Namespace) -> int:
 
     timesteps = arguments.timesteps
     if timesteps is None and folder not in arguments.capture:
-        timesteps = 4  # of clips the moments that tell most
+        timesteps = 4  # of clips, the most informative moments
     if isinstance(timesteps, int):
         timesteps = _chosen(arguments, capture, timesteps)
     progress, view = console_progress(arguments.quiet), None
@@ -144,7 +144,7 @@ def fit(arguments: Namespace) -> int:
 
 
 def _chosen(arguments: Namespace, capture: Capture, count: int) -> FrameChoice:
-    """The frames that tell most, said on standard error."""
+    """The most informative frames, named on standard error."""
     from mifit.capture.choose_frames import choose_frames
     from mifit.fitting import choose
 

@@ -141,7 +141,7 @@ fit  fits.fit  fit geometry, reflectance and normals to a capture, or to clips o
     --model        text=auto   morphable model: a path, builtin, or auto (default): the one that mifit model fetch has
         fetched, else builtin
     --cameras      names       cameras to use, e.g. left,right; default: the first two
-    --timesteps    auto_steps  e.g. 0,1,2,3 or 0-3, or auto (auto:6): the four (six) that tell most; default: the first
+    --timesteps    auto_steps  e.g. 0,1,2,3 or 0-3, or auto (auto:6): the four (six) best ones; default: the first
         four, of clips auto
     --until        geometry|reflectance|normals=normals  last stage (default: normals, everything)
     --resume       flag        go on with a run that was stopped
@@ -318,7 +318,7 @@ def _add(parser: argparse.ArgumentParser, lines: str) -> None:
 
 
 def _reader(kind: str) -> Document:
-    """What argparse is told of a kind of argument."""
+    """Keywords for argparse of a kind of argument."""
     if kind == "flag":
         return {"action": "store_true"}
     if kind in READERS:

@@ -2,7 +2,7 @@
 
 8- and 16-bit files hold sRGB-coded values, or those of a PNG's own gamma, and are decoded to linear Rec. 709, 0..1;
 floating-point files (EXR, HDR) are linear already. Their primaries and the exposure of a Radiance file are heeded;
-files of luminance and chroma or XYZ are refused. The kind of a file is told by its first bytes, not by its name. Sizes
+files of luminance and chroma or XYZ are refused. The first bytes give the kind of a file, not its name. Sizes
 are read from the header and checked before a pixel is decoded, so a small file can't claim gigabytes. An orientation
 tag is not applied: pixel coordinates of a calibration refer to the pixels as stored.
 """

@@ -37,7 +37,7 @@ class BoardSettings:
         Edges wider than this, pixels, or than this many times those of a camera's sharper frames, are blurred.
     outlier, least_outlier, out_of_step : float
         Frames whose error is this many times the median are left out: from so many pixels on for a camera alone, and
-        for what other cameras show (a tilted board that is found a little off still tells more than it harms).
+        for what other cameras show (a tilted board that is found a little off still helps more than it harms).
     cells : int
         Cells across and down of the picture of coverage.
     most_focal_deviation, most_error : float

@@ -1,4 +1,4 @@
-"""Nonlinear least squares by Levenberg and Marquardt's method; knows nothing of faces or rendering.
+"""Nonlinear least squares by Levenberg and Marquardt's method, independent of faces and rendering.
 
 A *problem* linearises itself into a *system* (normal equations with their structure); `minimize` takes damped steps and
 returns a `Solution` that says in an enumerated `Outcome` how it ended.

@@ -201,7 +201,7 @@ def compare(
         area = face_area(vertices, model.faces, model.face_mask, view)
     elif region == "skin":
         true = None
-        with suppress(InputError):  # a truth whose faces nobody knows
+        with suppress(InputError):  # a truth of unknown faces
             true = true_mesh(capture, timestep, model)
         points, moved = vertices, moments
         faces: NDArray = model.faces

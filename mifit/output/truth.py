@@ -74,7 +74,7 @@ def true_mesh(capture: Capture, timestep: int, model: MorphableModel | None = No
     Raises
     ------
     InputError
-        A damaged file, or vertices whose faces nobody knows.
+        A damaged file, or vertices of unknown faces.
     """
     folder = Path(capture.path) / "truth"
     for path in (folder / f"{timestep:04d}.ply", folder / "head.ply"):

@@ -265,7 +265,7 @@ class Reconstruction:
         rotate : float or (3, 3)
             Turns the light about the vertical (+y) by degrees, or by a rotation R: what came from d comes from R d.
         exposure : float or "auto"
-            Factor on the radiance. A capture doesn't tell how its exposure relates to that of an environment file:
+            Factor on the radiance. The exposure of a capture has no known relation to that of an environment file:
             ``"auto"`` keeps the mean luminance of the recovered lighting.
         rotations : sequence, optional
             Several values of ``rotate``, for which the environment is read and projected once; a list is returned.

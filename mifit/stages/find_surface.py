@@ -495,7 +495,7 @@ def thinned(texels: TexelMap) -> NDArray[np.intp]:
 
 
 def moved_with(model: MorphableModel, texels: TexelMap, posed: Sequence[Posed], moved: NDArray) -> list[Posed]:
-    """Texels of a surface whose vertices have moved by (T, V, 3), a pixel or so: what is seen of them stays."""
+    """Texels of a surface whose vertices have moved by (T, V, 3), a pixel or so: their visibility stays."""
     by = [interpolate(way, model.faces, texels.face, texels.weights) for way in moved]
     return [replace(one, position=one.position + way) for one, way in zip(posed, by, strict=True)]
 

@@ -1,4 +1,4 @@
-"""Frames that tell most: spread in pose, sharp, eyes open, views that agree; and cameras that are late."""
+"""The most informative frames: spread in pose, sharp, eyes open, views that agree; and cameras that are late."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ def test_doctor_examines_a_capture(name, code, verdict, shared, tmp_path, capsys
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["landmarks shifted", "one turned, yaw"])
-def test_a_fit_of_what_no_image_tells_says_nothing_wrong(name, shared, tmp_path, variant):
+def test_faults_that_no_image_shows_are_not_taken_for_others(name, shared, tmp_path, variant):
     """docs/limits.md has both: no other fault is named in their place."""
     capture = Capture.load(make(name, shared / "captures/soft", tmp_path, timesteps=2))
     found = mifit.fit(capture, MorphableModel.load("builtin:coarse"), PAIR, until="geometry")

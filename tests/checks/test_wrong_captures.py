@@ -48,7 +48,7 @@ UNKNOWABLE = {
     "both mirrored, swapped", "focal 1.15", "baseline", "one turned, yaw", "linear in PNG", "tone curve",
     "lens left out", "two people", "landmarks shifted",
 }  # fmt: skip
-"""What no image tells; docs/limits.md says why, and what it costs."""
+"""What no image shows; docs/limits.md says why, and what it costs."""
 SAID = {
     "inches": "lengths of the cameras are in inches, the capture says one is 10 mm; multiply the translations by 2.54",
     "feet": "multiply the translations by 30.48",

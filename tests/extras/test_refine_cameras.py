@@ -1,4 +1,4 @@
-"""Calibrated cameras that matches adjust: what images tell is undone, what they don't tell stays."""
+"""Calibrated cameras that matches adjust: what images determine is undone, the rest stays."""
 
 from __future__ import annotations
 

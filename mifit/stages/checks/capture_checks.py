@@ -28,7 +28,7 @@ BETTER = 0.65
 """Part of the cost that undoing a mistake must leave at most. The 51 landmarks of two
 views are then less likely as they are by a factor of e^20 or more; errors are correlated, so that a fifth counts."""
 ALIKE = 1.15
-"""Costs, over the least, of mistakes that landmarks don't tell apart: all are named."""
+"""Costs, over the least, of mistakes that landmarks leave open: all are named."""
 LARGEST_FACE = 1.6
 """Size of a face over the model's, and its inverse, beyond which nobody's is: outer corners of adults' eyes lie
 91 +- 5 mm apart, an infant's 60 mm (Farkas 1994)."""
@@ -127,7 +127,7 @@ def landmark_diagnostics(shots: Sequence[Shot], later: Sequence[Shot], face: Fac
         return [_unexplained(given)] if given.cost > DOUBTFUL else _size_diagnostics(given, face.unit_mm)
 
     def odd(pair: tuple[Hypothesis, Explanation]) -> tuple[bool, ...]:
-        """What landmarks don't tell apart: but people stand upright, are of human size, and lenses are centred.
+        """What landmarks leave open: but people stand upright, are of human size, and lenses are centred.
 
         A shift has two unknowns more than other mistakes, so that it comes last.
         """

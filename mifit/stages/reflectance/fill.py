@@ -43,7 +43,9 @@ class Filled:
     specular_confidence: NDArray[np.float32]
 
 
-def blend_unseen(model: MorphableModel, texels: TexelMap, maps: NDArray, confidence: NDArray, told: NDArray) -> Filled:
+def blend_unseen(
+    model: MorphableModel, texels: TexelMap, maps: NDArray, confidence: NDArray, observability: NDArray
+) -> Filled:
     """Replace texels that were hardly seen by the mean face's albedo times a factor that continues the seen ones.
 
     The factor's logarithm, like the specular albedo itself, is first taken from the opposite half of the face, where
@@ -57,9 +59,9 @@ def blend_unseen(model: MorphableModel, texels: TexelMap, maps: NDArray, confide
         Diffuse and specular albedo from the images.
     confidence : (N,)
         How often and how well each texel was seen, 0..1.
-    told : (N,)
-        Share of what images tell of the specular albedo, 0..1: a texel that was well seen may tell nothing of it, in
-        deep shade or where no lobe points at a light.
+    observability : (N,)
+        How far images determine the specular albedo, 0..1: not at all for a well visible texel in deep shade, or where
+        no lobe points at a light.
     """
     expected = np.maximum(interpolate(model.mean_albedo, model.faces, texels.face, texels.weights), DARKEST)
     found = texels.from_map(maps).astype(np.float64)
@@ -82,8 +84,8 @@ def blend_unseen(model: MorphableModel, texels: TexelMap, maps: NDArray, confide
     blended = share * found + (1.0 - share) * smooth
     blended[:, :3] = expected * np.exp(blended[:, :3])
     image = texels.to_map(np.clip(blended, 0.0, 1.0).astype(np.float32))
-    trusted, glossy = (texels.to_map(np.asarray(x, np.float32)) for x in (confidence, confidence * told))
-    return Filled(image[..., :3], image[..., 3], trusted, glossy)
+    both = (texels.to_map(np.asarray(x, np.float32)) for x in (confidence, confidence * observability))
+    return Filled(image[..., :3], image[..., 3], *both)
 
 
 def light_known(level: NDArray[np.float32], dark: float) -> NDArray[np.float32]:
