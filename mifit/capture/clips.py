@@ -181,7 +181,9 @@ class Moments:
         return self.source.files([self.numbers[i] for i in numbers])
 
 
-def aligned(sources: Sequence[Source], starts: Sequence[float] = ()) -> list[Moments]:
+def aligned(
+    sources: Sequence[Source], starts: Sequence[float] = (), trim: tuple[float, float] | None = None
+) -> list[Moments]:
     """The moments that all sources show, one for each frame of the slowest clip.
 
     Parameters
@@ -190,6 +192,8 @@ def aligned(sources: Sequence[Source], starts: Sequence[float] = ()) -> list[Mom
         Clips may differ in length, rate and size. Lists of images are in step, one moment an image.
     starts : sequence of float
         Seconds by which each clip began later than the first one; default: all at once.
+    trim : (float, float), optional
+        Seconds of the first clip from which, and up to which, moments are taken.
 
     Raises
     ------
@@ -200,6 +204,8 @@ def aligned(sources: Sequence[Source], starts: Sequence[float] = ()) -> list[Mom
     if starts and len(starts) != len(clips):
         raise InputError(f"found {len(starts)} starts, expected one for each of {len(clips)} videos")
     if not clips:
+        if trim is not None:
+            raise InputError("trim: found with images, expected it with videos")
         for other in sources[1:]:
             if other.length != sources[0].length:
                 raise InputError(
@@ -218,6 +224,14 @@ def aligned(sources: Sequence[Source], starts: Sequence[float] = ()) -> list[Mom
             f"{', '.join(str(clip.path) for clip in clips)}: show no moment in common when they begin at "
             f"{', '.join(f'{s:.2f}' for s in begun)} s; give --offset"
         )
+    if trim is not None:
+        common = times[shown]
+        shown &= (times >= trim[0]) & (times <= trim[1])
+        if not shown.any():
+            raise InputError(
+                f"trim: found {trim[0]:g} to {trim[1]:g} s, expected a part of {common[0]:.2f} to {common[-1]:.2f} s "
+                f"of {clips[0].path} that all clips show"
+            )
     off = np.abs(exact - numbers)[:, shown].mean(axis=1)
     return [
         Moments(clip, tuple(row[shown].tolist()), float(o)) for clip, row, o in zip(clips, numbers, off, strict=True)

@@ -41,6 +41,7 @@ class Selection(TypedDict, total=False):
     start: int
     count: int | None
     starts: Sequence[float]
+    trim: tuple[float, float] | None
     progress: Progress
 
 
@@ -79,6 +80,8 @@ def import_capture(
         its own keeps it.
     starts : sequence of float
         Seconds by which each video began later than the first one (`capture.clips`); default: all at once.
+    trim : (float, float), optional
+        Seconds of the first video from which, and up to which, frames are taken.
     progress : Progress
 
     Returns
@@ -118,6 +121,7 @@ def import_material(
     start: int = 0,
     count: int | None = None,
     starts: Sequence[float] = (),
+    trim: tuple[float, float] | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Make a capture folder of what ``gather`` finds; else as `import_capture`."""
@@ -129,7 +133,7 @@ def import_material(
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: is there already and not empty; name another folder")
     material = gather()
-    sources = aligned(material.sources, starts)
+    sources = aligned(material.sources, starts, trim)
     if start >= sources[0].length:
         raise InputError(f"start: found {start}, expected less than the {sources[0].length} frames there are")
     numbers = range(start, sources[0].length, every)[:count]

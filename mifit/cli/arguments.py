@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import functools
+import math
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Collection, Iterable
@@ -198,6 +199,15 @@ def offsets(text: str) -> list[float] | str:
     return text if text == "auto" else [real(part) for part in listed(text)]
 
 
+def span(text: str) -> tuple[float, float]:
+    """``1.5:8`` -> (1.5, 8.0); an end that is left out is open."""
+    begin, colon, end = text.partition(":")
+    found = (real(begin) if begin else -math.inf, real(end) if end else math.inf)
+    if not colon or not found[0] < found[1]:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected BEGIN:END in seconds, such as 1.5:8")
+    return found
+
+
 READERS: dict[str, Callable[[str], Any]] = {
     "text": str,
     "path": path,
@@ -209,6 +219,7 @@ READERS: dict[str, Callable[[str], Any]] = {
     "rate": rate,
     "exposure": exposure,
     "offsets": offsets,
+    "span": span,
     "pixels": whole(16, MAX_RENDERED_PIXELS // 16),
     "samples": whole(1, MAX_SAMPLES),
     "seed": whole(0, MAX_SEED),

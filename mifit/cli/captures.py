@@ -95,12 +95,14 @@ def import_(arguments: Namespace) -> None:
         import_digital_emily(arguments.digital_emily, arguments.out)
         print(f"Capture: {arguments.out}; it has no landmarks yet: mifit landmarks {arguments.out}")
         return
-    options = {name: getattr(arguments, name) for name in ("images", "every", "start", "count", "units")} | {
+    options = {name: getattr(arguments, name) for name in ("images", "every", "start", "count", "trim", "units")} | {
         "videos": arguments.video,
         "progress": console_progress(arguments.quiet),
     }
     if arguments.video and arguments.offset:
-        options["starts"] = start_times(arguments, open_sources(arguments.video, ()), options["progress"])
+        options["starts"] = start_times(
+            arguments, open_sources(arguments.video, ()), arguments.offset, options["progress"]
+        )
     if kind in KINDS:
         import_from(kind, sources[kind], arguments.out, photos=arguments.photos, **options)
     else:
@@ -115,6 +117,7 @@ def calibrate(arguments: Namespace) -> None:
     if arguments.capture is not None:
         _calibrate_from_heads(arguments)
         return
+    from mifit.capture.clips import aligned
     from mifit.capture.sources import open_sources
     from mifit.extras.board_calibration import calibrate_boards, write_calibration
     from mifit.extras.boards import Board
@@ -130,7 +133,9 @@ def calibrate(arguments: Namespace) -> None:
         print("Print it at 100 per cent, glue it onto something flat, and measure a square.")
         return
     sources = open_sources(arguments.video, arguments.images, arguments.names)
-    calibration = calibrate_boards(sources, board, arguments.units, console_progress(arguments.quiet))
+    progress = console_progress(arguments.quiet)
+    starts = start_times(arguments, sources, arguments.offset, progress) if arguments.offset else []
+    calibration = calibrate_boards(aligned(sources, starts), board, arguments.units, progress)
     write_calibration(calibration, out, arguments.units)
     print(calibration.summary())
     print(f"Calibration: {out}")

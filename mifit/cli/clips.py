@@ -35,7 +35,7 @@ def capture_of(arguments: Namespace) -> Path:
     """
     paths: list[Path] = arguments.capture
     if len(paths) == 1 and is_capture(paths[0]):
-        for option in ("calibration", "board", "offset", "every"):
+        for option in ("calibration", "board", "offset", "trim", "every"):
             if getattr(arguments, option) is not None:
                 raise InputError(f"--{option}: found with the capture {paths[0]}, expected it with clips")
         return paths[0]
@@ -77,6 +77,7 @@ def _origin(arguments: Namespace) -> Document:
         inside = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
         known[str(path.absolute())] = [[p.name, p.stat().st_size, p.stat().st_mtime_ns] for p in inside]
     options = {name: getattr(arguments, name) for name in ("pattern", "offset", "every")}
+    options["trim"] = str(arguments.trim)
     return {"files": known, "clips": len(arguments.capture), **options}
 
 
@@ -91,30 +92,32 @@ def _make(arguments: Namespace, paths: Sequence[Path], folder: Path) -> None:
         raise InputError(f"--board: found with --calibration {arguments.calibration}, expected one of the two")
     kinds: Document = {"videos": paths} if _are_videos(paths) else {"images": paths}
     sources = open_sources(kinds.get("videos", ()), kinds.get("images", ()))
-    starts = start_times(arguments, sources, progress)
+    starts = start_times(arguments, sources, arguments.offset, progress)
     if arguments.board:
         kinds["transforms"] = _calibrated(arguments, sources, folder.with_name("calibration"), progress)
     elif arguments.calibration:
         kinds["transforms" if arguments.calibration.suffix == ".json" else "calibration"] = arguments.calibration
-    length = aligned(sources, starts)[0].length
+    length = aligned(sources, starts, arguments.trim)[0].length
     every = arguments.every or max(-(-length // 24), 1)
-    import_capture(folder, **kinds, every=every, starts=starts, progress=progress)
+    import_capture(folder, **kinds, every=every, starts=starts, trim=arguments.trim, progress=progress)
     if arguments.board:
         shutil.copytree(folder.with_name("calibration"), folder / "calibration")
         shutil.rmtree(folder.with_name("calibration"))
     say(arguments, detect_landmarks(folder, progress=progress))
 
 
-def start_times(arguments: Namespace, sources: Sequence[Source], progress: Progress) -> list[float]:
-    """Seconds by which each video begins after the first: those of ``--offset``, or found and said on stderr."""
+def start_times(
+    arguments: Namespace, sources: Sequence[Source], offset: list[float] | str | None, progress: Progress
+) -> list[float]:
+    """Seconds by which each video begins after the first: the ``offset`` given, or found and said on stderr."""
     from mifit.capture.clips import aligned, describe, synchronise
     from mifit.capture.sources import Video
 
     videos = [source for source in sources if isinstance(source, Video)]
     if len(videos) < 2:
         return []
-    if isinstance(arguments.offset, list):
-        return arguments.offset
+    if isinstance(offset, list):
+        return offset
     starts = synchronise(videos, progress)
     seconds = [start.seconds for start in starts]
     for line in describe(aligned(sources, seconds), starts):
@@ -124,8 +127,8 @@ def start_times(arguments: Namespace, sources: Sequence[Source], progress: Progr
 
 def _calibrated(arguments: Namespace, sources: Sequence[Source], folder: Path, progress: Progress) -> Path:
     """Cameras from clips of a board, one for each of the clips, as a file to import."""
-    from mifit.capture.clips import aligned, describe, synchronise
-    from mifit.capture.sources import Video, open_sources
+    from mifit.capture.clips import aligned
+    from mifit.capture.sources import open_sources
     from mifit.extras.board_calibration import calibrate_boards, write_calibration
     from mifit.extras.boards import Board
 
@@ -134,10 +137,7 @@ def _calibrated(arguments: Namespace, sources: Sequence[Source], folder: Path, p
         raise InputError(f"--board: found {len(arguments.board)} clips, expected {len(names)}, one for each camera")
     kind = {"videos": arguments.board} if _are_videos(arguments.board) else {"images": arguments.board}
     shown = open_sources(kind.get("videos", ()), kind.get("images", ()), names)
-    starts = synchronise([s for s in shown if isinstance(s, Video)], progress) if "videos" in kind else []
-    moments = aligned(shown, [start.seconds for start in starts])
-    for line in describe(moments, starts) if starts else []:
-        say(arguments, f"Board: {line}")
+    moments = aligned(shown, start_times(arguments, shown, "auto", progress))
     found = calibrate_boards(moments, Board.parse(arguments.pattern), "cm", progress)
     shutil.rmtree(folder, ignore_errors=True)
     write_calibration(found, folder, "cm")

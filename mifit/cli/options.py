@@ -25,7 +25,8 @@ STRICT = "--strict  flag  exit with 3 where a fault of the capture is named"
 FPS = "--fps  rate=12.0  timesteps per second of what moves (default: 12)"
 OFFSET = """
 --offset  offsets<S,S>  of clips: seconds by which each began after the first, such as 0,0.4; or auto, found by sound
-    or motion"""
+    or motion (of mifit fit the default)"""
+TRIM = "--trim  span<B:E>  of clips: seconds of the first one from which, and up to which, frames are taken"
 ADDRESS = """
 --host  text=127.0.0.1    of the view: address (default: this machine only)
 --port  0..65535=8080  of the view (default: 8080); 0: a free one"""
@@ -99,6 +100,7 @@ import  captures.import_  a capture from videos, image folders, photogrammetry p
     --digital-emily   path  checkout of the public Digital Emily repository
     --units           text  unit of length of the cameras: mm, cm, dm or m (default: as the source has it, or cm)
     {OFFSET}
+    {TRIM}
     --every           1..=1  keep every N-th frame (default: 1)
     --start           0..=0  first frame (default: 0)
     --count           1..    number of frames to keep
@@ -108,6 +110,7 @@ calibrate  captures.calibrate  cameras from a calibration board, or of a capture
     capture?     path       the cameras are written into it
     --video*     path       one camera's video of the board; repeat
     --images*    path       one camera's folder of images; repeat
+    {OFFSET}
     --board      text       charuco:9x6:30:22, chessboard:10x7:25 or apriltag:6x4:34:9: columns, rows and lengths in
         millimetres; without videos and images it is written for printing
     --names      names      of a board: names of the cameras; default: those of the files
@@ -135,6 +138,7 @@ fit  fits.fit  fit geometry, reflectance and normals to a capture, or to clips o
     --board+       path        of clips: a clip of a calibration board by each camera
     --pattern      text=charuco:9x6:30:22  of --board: as mifit calibrate --board takes it
     {OFFSET}
+    {TRIM}
     --every        1..   of clips: keep every N-th frame; default: 24 in all
     --config       path        TOML file with tables geometry, surface, photometry, reflectance, normals, mesh, residual
     --preset       default|paper  paper: the paper as written

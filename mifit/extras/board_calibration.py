@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from mifit.capture.clips import aligned
 from mifit.capture.sources import Source
 from mifit.capture.stereo import write_stereo
 from mifit.capture.transforms import UNITS_MM, Shot, View, write_transforms
@@ -25,7 +24,7 @@ from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.core.files import file_name, write_bytes, write_text
 from mifit.core.image import decode_image, encode_png, to_8_bit
 from mifit.errors import InputError
-from mifit.extras.board_camera import CONTRADICTS, SETTINGS, Watched, calibrate_one, covered_cells, look
+from mifit.extras.board_camera import ALIKE, CONTRADICTS, SETTINGS, Watched, calibrate_one, covered_cells, look
 from mifit.extras.boards import Board
 from mifit.progress import Progress, silent
 
@@ -53,9 +52,8 @@ class BoardCalibration:
                 f"{camera.cx:.2f}, cy {camera.cy:.2f}, distortion {k}; error {seen.error:.3f} pixels in "
                 f"{len(seen.used)} frames, {100 * seen.coverage:.0f} % of the image covered"
             )
-            lines += [f"  frame {i} left out: {reason}" for i, reason in list(seen.left_out.items())[:12]]
-            if len(seen.left_out) > 12:
-                lines.append(f"  and {len(seen.left_out) - 12} more, all in calibration.json")
+            bad = [f"  frame {i} left out: {reason}" for i, reason in seen.left_out.items() if reason != ALIKE]
+            lines += [*bad[:12], *([f"  and {len(bad) - 12} more, all in calibration.json"] if len(bad) > 12 else [])]
         lines += [f"{pair}: error {error:.3f} pixels" for pair, error in self.pair_errors.items()]
         return "\n".join([*lines, *(f"warning: {text}" for text in self.warnings)])
 
@@ -80,7 +78,6 @@ def calibrate_boards(
         The board is seen sharply in too few frames (the message says why the others don't count), cameras don't see it
         together, or the solution is too uncertain to be used.
     """
-    sources = aligned(sources)
     if len({file_name(source.name) for source in sources}) != len(sources):
         raise InputError("found cameras of one name, expected different names of videos or folders")
     if len(sources) > 1 and board.turns_into_itself:

@@ -18,6 +18,7 @@ from mifit.errors import InputError
 from mifit.extras.boards import Board, BoardPoints, edge_width
 from mifit.progress import Progress
 
+ALIKE = "like other frames"
 CONTRADICTS = "contradicts the others: error {:.2f} pixels, {:.2f} is the limit"
 
 
@@ -156,7 +157,7 @@ def calibrate_one(
                 del found[i]
     used = {i: seen for i, (seen, _) in found.items()}
     chosen = _varied(used, source.size)
-    spare = {i: "like other frames" for i in used if i not in chosen}
+    spare = {i: ALIKE for i in used if i not in chosen}
     while True:
         if len(chosen) < SETTINGS.least_frames:
             raise InputError(_too_few(source, board, len(chosen), left_out))

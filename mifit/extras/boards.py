@@ -117,7 +117,9 @@ class Board:
         else:
             what = f"a {self.kind} board of {self.columns} x {self.rows} squares of {self.size:g} mm"
             what += f" with markers of {self.other:g} mm" if self.kind == "charuco" else ""
-        return what + (f", dictionary {self.dictionary}" if self.dictionary else "")
+        what += f", dictionary {self.dictionary}" if self.dictionary else ""
+        others = ", ".join(name for name in (DICTIONARIES["charuco"], *COMMON) if name != self.dictionary)
+        return what + (f" (tried too: {others})" if self.kind == "charuco" and not self.named else "")
 
     @cached_property
     def _aruco(self) -> Any:

@@ -53,7 +53,7 @@ def import_from(
     units : str, optional
         Default: cm for ``colmap``, else metres.
     **options
-        ``every``, ``start``, ``count``, ``starts`` and ``progress``.
+        ``every``, ``start``, ``count``, ``starts``, ``trim`` and ``progress``.
 
     Raises
     ------

@@ -111,6 +111,16 @@ def test_clips_need_a_moment_in_common_and_a_start_each(tmp_path: Path) -> None:
     assert aligned(clips, [0.0, 0.2])[0].numbers[0] == 5
 
 
+def test_a_part_of_the_clips_is_taken(tmp_path: Path) -> None:
+    clips = [film(tmp_path / f"{name}.avi", 0.0, 2.0) for name in "ab"]
+    first, second = aligned(clips, [0.0, 0.2], (0.5, 1.0))
+    assert (first.numbers[0], first.numbers[-1]) == (13, 25) and (second.numbers[0], second.numbers[-1]) == (8, 20)
+    with pytest.raises(InputError, match=r"trim: found 3 to inf s, expected a part of 0.20 to 1.96 s of .*a.avi"):
+        aligned(clips, [0.0, 0.2], (3.0, np.inf))
+    kept = Capture.load(import_capture(tmp_path / "out", [clip.path for clip in clips], trim=(1.5, np.inf), every=4))
+    assert kept.timesteps == (0, 1, 2)
+
+
 def test_clips_of_unequal_length_and_size_become_a_capture(tmp_path: Path) -> None:
     clips = [film(tmp_path / "a.avi", 0.0, 1.0), film(tmp_path / "b.avi", 0.2, 0.6, size=(64, 48))]
     capture = Capture.load(import_capture(tmp_path / "out", [clip.path for clip in clips], starts=[0.0, 0.2], every=3))
