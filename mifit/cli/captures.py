@@ -12,8 +12,7 @@ from mifit.cli.console import console_progress
 from mifit.errors import InputError
 
 if TYPE_CHECKING:
-    from mifit.capture import Capture
-    from mifit.morphable import MorphableModel
+    pass
 
 
 def synth(arguments: Namespace) -> None:
@@ -148,16 +147,12 @@ def _calibrate_from_heads(arguments: Namespace) -> None:
     from mifit.fitting import choose, choose_timesteps
 
     capture = mifit.Capture.load(arguments.capture)
-    if capture.calibrated != arguments.refine:
-        state = "calibrated already; --refine adjusts it" if capture.calibrated else "uncalibrated; leave out --refine"
-        raise InputError(f"{arguments.capture}: is {state}")
+    if capture.calibrated:
+        raise InputError(f"{arguments.capture}: is calibrated already, expected a capture without cameras")
     cameras = choose("camera", capture.cameras, arguments.cameras, 2)
     timesteps = choose_timesteps(capture, arguments.timesteps)
     use_variant(arguments)
     model = mifit.MorphableModel.load(arguments.model)
-    if arguments.refine:
-        _refine_calibration(arguments, capture, model, cameras, timesteps)
-        return
     dense = calibrate_capture(capture, model, cameras, timesteps, console_progress(arguments.quiet))
     capture = dense.capture
     found = calibrate_others(capture, cameras, timesteps)
@@ -167,38 +162,3 @@ def _calibrate_from_heads(arguments: Namespace) -> None:
         print(f"{name}: {role}, focal length {camera.fx:.0f} pixels, landmarks {error:.1f} pixels beside the others'")
     print(dense.note[0].upper() + dense.note[1:])
     print(f"Capture: {arguments.capture}; its scale is the model's, its cameras are estimates")
-
-
-def _refine_calibration(
-    arguments: Namespace,
-    capture: Capture,
-    model: MorphableModel,
-    cameras: tuple[str, ...],
-    timesteps: tuple[int, ...],
-) -> None:
-    """Fit the geometry with the calibration as it is, and adjust that where dense matches agree better then."""
-    import mifit
-    from mifit.core.files import write_bytes
-    from mifit.extras.calibrate_heads import write_cameras
-    from mifit.extras.refine_cameras import refine_cameras
-
-    folder: Path = arguments.capture
-    file = folder if folder.is_file() else folder / "transforms.json"
-    before = file.with_name("transforms_before.json")
-    if before.exists():
-        raise InputError(f"{before}: is there already, from an adjustment before; move it away first")
-    progress = console_progress(arguments.quiet)
-    geometry = mifit.fit(capture, model, cameras, timesteps, until="geometry", progress=progress).geometry
-    found = refine_cameras(capture, model, geometry, cameras, progress)
-    print(found.finding[0].upper() + found.finding[1:])
-    if found.cameras:
-        write_bytes(before, file.read_bytes())
-        write_cameras(file, capture, found.cameras)
-        print(f"Capture: {file}; the calibration as it was: {before}")
-
-
-def landmarks(arguments: Namespace) -> None:
-    """Detect landmarks and write them into the capture."""
-    from mifit.capture import detect_landmarks
-
-    print(detect_landmarks(arguments.capture, arguments.detector, progress=console_progress(arguments.quiet)))

@@ -44,7 +44,6 @@ doctor  setup.doctor  what of the set-up, or of a capture, is wrong, and what me
     --model      text=auto  of a capture: a path, builtin or auto (default)
     --cameras    names      of a capture: cameras to examine; default: the first two
     --timesteps  steps      of a capture: default: the first four
-    --quick      flag       of a capture: no fit, landmarks and colours alone
     {STRICT}
     --json       flag       print JSON
     --install    landmarks  fetch the networks that find landmarks, then check
@@ -92,7 +91,7 @@ import  captures.import_  a capture from videos, image folders, photogrammetry p
     --calibration     path  OpenCV stereo calibration, YAML or XML
     --colmap          path  folder of a COLMAP model, text or binary
     --metashape       path  cameras exported by Metashape as XML
-    --realitycapture  path  folder of RealityCapture's XMP files, or its CSV of cameras
+    --realitycapture  path  folder of RealityCapture's XMP files
     --photos          path  folder of the photographs of these three (default: beside them)
     --vhap            path  folder exported by VHAP
     --nersemble       path  folder of one sequence of NeRSemble
@@ -118,8 +117,6 @@ calibrate  captures.calibrate  cameras from a calibration board, or of a capture
     --model      text=auto  of a capture: a path, builtin or auto (default)
     --cameras    names      of a capture: cameras that decide; default: the first two
     --timesteps  steps      of a capture: timesteps to use; default: the first four
-    --refine     flag       of a calibrated capture: adjust poses and focal lengths to dense matches between the views,
-        where these agree better then; the calibration as it was is kept beside it
     --out        path       of a board: folder to write
     --force      flag       of a board: write into a folder that holds something already
 

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from mifit.cli.arguments import tell, use_variant, writes
+from mifit.cli.arguments import tell, writes
 from mifit.cli.console import console_progress
-from mifit.core.diagnostics import Diagnostic
 from mifit.core.files import Document
 
 if TYPE_CHECKING:
-    from mifit.capture import Capture
-    from mifit.morphable import MorphableModel
+    pass
 
 
 def doctor(arguments: Namespace) -> int:
@@ -51,12 +48,9 @@ def _examine(arguments: Namespace) -> int:
     cameras = choose("camera", capture.cameras, arguments.cameras, 2)
     timesteps = choose_timesteps(capture, arguments.timesteps)
     found = check_capture(capture, model, cameras, timesteps)
-    faults = [one for one in found if one.severity == "fault"]
     figures: Document = {"cameras": {}}
     if capture.calibrated:
         figures["cameras"] = landmark_offsets(capture, model, cameras, timesteps)
-        if not faults and not arguments.quick and len(cameras) > 1:
-            figures["matches"] = _dense(arguments, capture, model, cameras, timesteps, found)
     if arguments.json:
         print(json.dumps({"findings": [one.document() for one in found], **figures}, indent=2))
     else:
@@ -66,32 +60,7 @@ def _examine(arguments: Namespace) -> int:
             pixels = figures["cameras"].get(name)
             text = "landmarks not judged" if pixels is None else f"landmarks {pixels:.1f} pixels from a face"
             print(f"camera {name}: {verdict}, {text}")
-        if "matches" in figures:
-            print(f"dense matches: {figures['matches']['finding']}")
     return tell(arguments, found)
-
-
-def _dense(
-    arguments: Namespace,
-    capture: Capture,
-    model: MorphableModel,
-    cameras: Sequence[str],
-    timesteps: Sequence[int],
-    found: list[Diagnostic],
-) -> Document:
-    """What dense matches between the views of a fitted face say of the calibration; findings are added to ``found``."""
-    import mifit
-    from mifit.extras.refine_cameras import refine_cameras
-
-    use_variant(arguments)
-    progress = console_progress(arguments.quiet)
-    result = mifit.fit(capture, model, cameras, timesteps, until="geometry", progress=progress)
-    found += [one for one in result.diagnostics if one not in found]
-    refined = refine_cameras(capture, model, result.geometry, cameras, progress)
-    if refined.doubtful or refined.cameras:
-        remedy = "`mifit calibrate CAPTURE --refine` adjusts it" if refined.cameras else "calibrate again"
-        found.append(Diagnostic("calibration-off", f"{refined.finding}; {remedy}"))
-    return {"finding": refined.finding, **refined.figures}
 
 
 @writes("preview", "out")

@@ -55,16 +55,6 @@ class Freedom:
     focals: int = 0
 
     @classmethod
-    def none(cls, cameras: int) -> Freedom:
-        """Cameras that stay."""
-        return cls(np.zeros((7 * cameras, 0)), np.zeros(0), np.zeros((0, 0)))
-
-    @classmethod
-    def of_prior(cls, precision: NDArray) -> Freedom:
-        """Cameras that may move in every way, at this inverse covariance (7 C, 7 C)."""
-        return cls(np.eye(len(precision)), np.zeros(len(precision)), precision)
-
-    @classmethod
     def of_focals(cls, group: NDArray, focal: NDArray, expected: NDArray, deviation: float) -> Freedom:
         """Free poses but the first, and focal lengths (C,) that cameras of a ``group`` share; -1: a known one.
 
@@ -112,8 +102,6 @@ class AdjustedBundle:
     Attributes
     ----------
     bundle : Bundle
-    moved : (R,)
-        How far cameras have moved, `Freedom`'s z.
     deviation : float
         Largest standard deviation of the logarithm of an unknown focal length, from the normal equations with all else
         eliminated, scaled by the residuals. Errors that matches share aren't in it. 0 where a calibration holds them.
@@ -123,7 +111,6 @@ class AdjustedBundle:
     """
 
     bundle: Bundle
-    moved: NDArray[np.float64]
     deviation: float
     residual: float
     settled: bool
@@ -151,7 +138,6 @@ def adjust_bundle(start: Bundle, seen: Sightings, freedom: Freedom, modes: NDArr
         deviation = float(np.sqrt(variance.max() * scale)) if variance.min() > 0 else np.inf
     return AdjustedBundle(
         problem.bundle(solution.value),
-        solution.value[: freedom.design.shape[1]],
         deviation,
         float(np.median(np.linalg.norm(residual, axis=1))),
         solution.outcome in (Outcome.CONVERGED, Outcome.STALLED),

@@ -40,8 +40,8 @@ def import_from(
     Parameters
     ----------
     kind : str
-        ``colmap`` (a folder with a text or binary model), ``metashape`` (cameras exported as XML), ``realitycapture``
-        (a folder of XMP files, or the CSV of internal and external camera parameters), ``vhap`` (a folder that VHAP
+        ``colmap`` (a folder with a text model), ``metashape`` (cameras exported as XML), ``realitycapture``
+        (a folder of XMP files), ``vhap`` (a folder that VHAP
         exports) or ``nersemble`` (one sequence, as released or as VHAP lays it out).
     where : path
     out : path

@@ -66,7 +66,7 @@ def test_landmarks_beside_the_fitted_face_are_named(shift, shared, monkeypatch):
 )
 def test_doctor_examines_a_capture(name, code, verdict, shared, tmp_path, capsys):
     folder = str(make(name, shared / "captures/soft", tmp_path, timesteps=2))
-    options = ["--model", "builtin:coarse", "--quick", "--quiet", "--strict"]
+    options = ["--model", "builtin:coarse", "--quiet", "--strict"]
     assert main(["doctor", folder, *options]) == code
     out, err = capsys.readouterr()
     assert verdict in out and "camera left: sound" in out

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import struct
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -88,20 +87,7 @@ def write_xmp(folder: Path, photos: Photos) -> Path:
     return folder
 
 
-def write_csv(path: Path, photos: Photos) -> Path:
-    rows = ["#cameras 2", "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
-    for camera, name in photos:
-        focal, u, v = film(camera)
-        k1, k2, k3, t1, t2 = brown(camera)
-        pose = camera.camera_to_world_opengl
-        heading, pitch, roll = Rotation.from_matrix(pose[:3, :3]).as_euler("ZXY", degrees=True)
-        values = (*pose[:3, 3], -heading, pitch, roll, focal, u, v, k1, k2, k3, 0.0, t1, t2)
-        rows.append(f"{name}," + ",".join(repr(float(value)) for value in values))
-    path.write_text("\n".join(rows) + "\n")
-    return path
-
-
-def write_colmap(folder: str | Path, cameras: Photos) -> None:
+def write_colmap(folder: str | Path, cameras: Photos) -> Path:
     """Write a text model of cameras with the names of their images; one COLMAP camera per image."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -119,23 +105,6 @@ def write_colmap(folder: str | Path, cameras: Photos) -> None:
     header = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
     (folder / "images.txt").write_text(header + "\n".join(poses) + "\n")
     (folder / "points3D.txt").write_text("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n")
-
-
-def write_colmap_binary(folder: Path, photos: Photos, points: int = 3) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    photos = list(photos)
-    cameras, images = struct.pack("<Q", len(photos)), struct.pack("<Q", len(photos))
-    for i, (camera, name) in enumerate(photos, start=1):
-        full = len(camera.distortion) > 4
-        lens = (*camera.distortion, *(0.0,) * 8)[: 8 if full else 4]
-        parameters = (camera.fx, camera.fy, camera.cx, camera.cy, *lens)
-        cameras += struct.pack("<iiQQ", i, 6 if full else 4, camera.width, camera.height)
-        cameras += struct.pack(f"<{len(parameters)}d", *parameters)
-        x, y, z, w = Rotation.from_matrix(camera.rotation).as_quat()
-        images += struct.pack("<i7di", i, w, x, y, z, *camera.translation, i) + name.encode() + b"\0"
-        images += struct.pack("<Q", points) + struct.pack("<ddq", 1.5, 2.5, -1) * points
-    (folder / "cameras.bin").write_bytes(cameras)
-    (folder / "images.bin").write_bytes(images)
     return folder
 
 

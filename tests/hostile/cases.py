@@ -616,19 +616,17 @@ def photogrammetry(base: Path) -> Iterator[Case]:
         shutil.copy(base / "pictures" / name / "0000.png", folder / "photos" / f"{name}.png")
         shutil.copytree(base / "pictures" / name, images / f"cam_{name}")
     exports.write_metashape(folder / "cameras.xml", photos)
-    exports.write_csv(folder / "cameras.csv", photos)
     exports.write_xmp(folder / "photos", photos)
-    exports.write_colmap_binary(folder / "model", photos)
+    exports.write_colmap(folder / "model", photos)
     (folder / "074" / "calibration").mkdir()
     parameters = exports.nersemble_parameters(cameras, 1.0)
     (folder / "074" / "calibration" / "camera_params.json").write_text(json.dumps(parameters))
     pictures = ("--images", "programs/photos")
     kinds = {
         "cameras.xml": ("--metashape", "programs/cameras.xml", *pictures),
-        "cameras.csv": ("--realitycapture", "programs/cameras.csv", *pictures),
         "photos/left.xmp": ("--realitycapture", "programs/photos", *pictures),
-        "model/cameras.bin": ("--colmap", "programs/model", *pictures),
-        "model/images.bin": ("--colmap", "programs/model", *pictures),
+        "model/cameras.txt": ("--colmap", "programs/model", *pictures),
+        "model/images.txt": ("--colmap", "programs/model", *pictures),
         "074/calibration/camera_params.json": ("--nersemble", "programs/074/sequences/EMO-1"),
     }
     rng = np.random.default_rng(3)
