@@ -21,10 +21,10 @@ from mifit.capture.sources import Source
 from mifit.capture.stereo import write_stereo
 from mifit.capture.transforms import UNITS_MM, Shot, View, write_transforms
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
-from mifit.core.files import file_name, write_bytes, write_text
-from mifit.core.image import decode_image, encode_png, to_8_bit
+from mifit.core.files import file_name, write_text
+from mifit.core.image import decode_image, to_8_bit
 from mifit.errors import InputError
-from mifit.extras.board_camera import ALIKE, CONTRADICTS, SETTINGS, Watched, calibrate_one, covered_cells, look
+from mifit.extras.board_camera import ALIKE, CONTRADICTS, SETTINGS, Watched, calibrate_one, look
 from mifit.extras.boards import Board
 from mifit.progress import Progress, silent
 
@@ -123,12 +123,9 @@ def write_calibration(calibration: BoardCalibration, folder: str | Path, units: 
     """Write what `calibrate_boards` found.
 
     ``transforms.json`` holds all cameras for ``mifit import --transforms``; ``stereo.yml`` two of them in OpenCV's
-    layout; ``calibration.json`` the error of every frame and why others were left out; ``coverage_CAMERA.png`` where in
-    the image the board was seen.
+    layout; ``calibration.json`` the error of every frame and why others were left out.
     """
     folder = Path(folder)
-    for seen in calibration.watched:
-        write_bytes(folder / f"coverage_{file_name(seen.name)}.png", encode_png(coverage_picture(seen)))
     document = {
         "units": units,
         "cameras": {
@@ -149,24 +146,6 @@ def write_calibration(calibration: BoardCalibration, folder: str | Path, units: 
         write_stereo(folder / "stereo.yml", *calibration.cameras)
     shots = [Shot(c.name, 0, folder / "images" / file_name(c.name) / "0000.png") for c in calibration.cameras]
     write_transforms(folder / "transforms.json", map(View.of, calibration.cameras), shots, units)
-
-
-def coverage_picture(seen: Watched) -> NDArray[np.uint8]:
-    """(H, W, 3) sRGB: cells where the board was seen, its points, and frames' errors ten times enlarged as circles."""
-    width, height = seen.size
-    picture = np.full((height, width, 3), 40, dtype=np.uint8)
-    for (row, column), covered in np.ndenumerate(covered_cells(seen)):
-        low, high = (
-            (column * width // SETTINGS.cells, row * height // SETTINGS.cells),
-            ((column + 1) * width // SETTINGS.cells, (row + 1) * height // SETTINGS.cells),
-        )
-        cv2.rectangle(picture, low, high, (60, 100, 60) if covered else (90, 50, 50), -1)
-        cv2.rectangle(picture, low, high, (30, 30, 30), 1)
-    for i, found in seen.used.items():
-        radius = max(1, round(10 * seen.errors[i]))
-        for x, y in np.round(found.pixels - 0.5).astype(int):
-            cv2.circle(picture, (int(x), int(y)), radius, (230, 230, 120), 1, cv2.LINE_AA)
-    return picture
 
 
 def _relative_poses(watched: Sequence[Watched], board: Board) -> tuple[list[NDArray[np.float64]], dict[str, float]]:

@@ -40,7 +40,7 @@ class BoardSettings:
         Frames whose error is this many times the median are left out: from so many pixels on for a camera alone, and
         for what other cameras show (a tilted board that is found a little off still helps more than it harms).
     cells : int
-        Cells across and down of the picture of coverage.
+        Cells across and down in which coverage is counted.
     most_focal_deviation, most_error : float
         Refused beyond: relative deviation of the focal length, error in pixels.
     weak_coverage, weak_focal : float
@@ -108,16 +108,12 @@ class Watched:
     @property
     def coverage(self) -> float:
         """Part of the cells of a grid over the image in which the board was seen."""
-        return float(covered_cells(self).mean())
-
-
-def covered_cells(seen: Watched) -> NDArray[np.bool_]:
-    """(SETTINGS.cells, SETTINGS.cells) cells of the image in which the board was seen."""
-    covered = np.zeros((SETTINGS.cells, SETTINGS.cells), dtype=bool)
-    for found in seen.used.values():
-        cell = np.clip((found.pixels / seen.size * SETTINGS.cells).astype(int), 0, SETTINGS.cells - 1)
-        covered[cell[:, 1], cell[:, 0]] = True
-    return covered
+        cells = SETTINGS.cells
+        covered = np.zeros((cells, cells), dtype=bool)
+        for found in self.used.values():
+            cell = np.clip((found.pixels / self.size * cells).astype(int), 0, cells - 1)
+            covered[cell[:, 1], cell[:, 0]] = True
+        return float(covered.mean())
 
 
 def look(

@@ -1,11 +1,10 @@
-"""Calibration boards: ChArUco, chessboard and AprilTag grid, printed and found in images."""
+"""Calibration boards: ChArUco and chessboard, printed and found in images."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,8 +13,8 @@ from numpy.typing import NDArray
 from mifit.core.files import replacing
 from mifit.errors import InputError
 
-FORMS = "charuco:COLUMNSxROWS:SQUARE:MARKER, chessboard:COLUMNSxROWS:SQUARE or apriltag:COLUMNSxROWS:TAG:GAP"
-DICTIONARIES = {"charuco": "DICT_5X5_250", "apriltag": "DICT_APRILTAG_36h11"}
+FORMS = "charuco:COLUMNSxROWS:SQUARE:MARKER or chessboard:COLUMNSxROWS:SQUARE"
+DICTIONARY = "DICT_5X5_250"
 COMMON = ("DICT_5X5_1000", "DICT_4X4_50", "DICT_4X4_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL")
 """Dictionaries of ChArUco boards to try where none was named; smaller ones of a size begin as these do."""
 PRINT_DPI = 300
@@ -47,11 +46,11 @@ class Board:
     Attributes
     ----------
     kind : str
-        ``charuco``, ``chessboard`` or ``apriltag``.
+        ``charuco`` or ``chessboard``.
     columns, rows : int
-        Squares of the first two, tags of the third.
+        Squares.
     size, other : float
-        Millimetres: side of a square and of the marker in it; side of a tag and the gap between two.
+        Millimetres: side of a square and of the marker in it.
     dictionary : str
         OpenCV's name of the set of markers; empty for a chessboard.
     named : bool
@@ -68,7 +67,7 @@ class Board:
 
     @classmethod
     def parse(cls, text: str) -> Board:
-        """Read ``charuco:9x6:30:22``, ``chessboard:10x7:25``, ``apriltag:6x6:24:7``, a dictionary's name behind it.
+        """Read ``charuco:9x6:30:22``, a dictionary's name behind it or not, or ``chessboard:10x7:25``.
 
         Raises
         ------
@@ -76,7 +75,7 @@ class Board:
             Another form, or sizes that no board has.
         """
         kind, *rest = text.split(":")
-        counts = {"charuco": 2, "chessboard": 1, "apriltag": 2}
+        counts = {"charuco": 2, "chessboard": 1}
         form = f"--board: found {text[:80]!r}, expected {FORMS}, lengths in millimetres"
         if kind not in counts or not counts[kind] < len(rest) + (kind == "chessboard") - 0 <= counts[kind] + 2:
             raise InputError(form)
@@ -87,19 +86,19 @@ class Board:
             raise InputError(form) from None
         other = others[0] if others else 0.0
         names = rest[1 + counts[kind] :]
-        name = names[0] if names else DICTIONARIES.get(kind, "")
-        least = 1 if kind == "apriltag" else 3
-        if not (least <= columns <= 50 and least <= rows <= 50 and 0.1 <= size <= 10_000):
-            raise InputError(f"{form}; {least} to 50 columns and rows")
-        if (kind == "charuco" and not 0 < other < size) or (kind == "apriltag" and not 0 < other <= 10 * size):
-            raise InputError(f"{form}; a marker smaller than its square, a gap above 0")
+        name = names[0] if names else DICTIONARY if kind == "charuco" else ""
+        if not (3 <= columns <= 50 and 3 <= rows <= 50 and 0.1 <= size <= 10_000):
+            raise InputError(f"{form}; 3 to 50 columns and rows")
+        if kind == "charuco" and not 0 < other < size:
+            raise InputError(f"{form}; a marker smaller than its square")
         if name and (kind == "chessboard" or not (name.startswith("DICT_") and hasattr(cv2.aruco, name))):
             raise InputError(
                 f"--board: found dictionary {name[:40]!r}, expected a name of OpenCV's such as DICT_5X5_250"
             )
         board = cls(kind, columns, rows, size, other, name, bool(names))
         try:
-            board._aruco  # noqa: B018 - OpenCV refuses what doesn't go together
+            if kind == "charuco":
+                board._aruco  # noqa: B018 - OpenCV refuses what doesn't go together
         except cv2.error:
             raise InputError(f"--board {text}: needs more markers than dictionary {name} has") from None
         return board
@@ -112,43 +111,32 @@ class Board:
 
     def describe(self) -> str:
         """What is looked for, in words."""
-        if self.kind == "apriltag":
-            what = f"an AprilTag grid of {self.columns} x {self.rows} tags of {self.size:g} mm, {self.other:g} mm apart"
-        else:
-            what = f"a {self.kind} board of {self.columns} x {self.rows} squares of {self.size:g} mm"
-            what += f" with markers of {self.other:g} mm" if self.kind == "charuco" else ""
-        what += f", dictionary {self.dictionary}" if self.dictionary else ""
-        others = ", ".join(name for name in (DICTIONARIES["charuco"], *COMMON) if name != self.dictionary)
-        return what + (f" (tried too: {others})" if self.kind == "charuco" and not self.named else "")
+        what = f"a {self.kind} board of {self.columns} x {self.rows} squares of {self.size:g} mm"
+        if self.kind == "chessboard":
+            return what
+        others = ", ".join(name for name in (DICTIONARY, *COMMON) if name != self.dictionary)
+        what += f" with markers of {self.other:g} mm, dictionary {self.dictionary}"
+        return what + ("" if self.named else f" (tried too: {others})")
 
     @cached_property
-    def _aruco(self) -> Any:
-        if self.kind == "chessboard":
-            return None
+    def _aruco(self) -> cv2.aruco.CharucoBoard:
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-        needed = self.columns * self.rows if self.kind == "apriltag" else self.columns * self.rows // 2
+        needed = self.columns * self.rows // 2
         if needed > len(markers.bytesList):
             raise cv2.error(f"{needed} markers")
-        shape = (self.columns, self.rows)
-        if self.kind == "apriltag":
-            return cv2.aruco.GridBoard(shape, self.size, self.other, markers)
-        return cv2.aruco.CharucoBoard(shape, self.size, self.other, markers)
+        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.size, self.other, markers)
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
         """(P, 3) points in millimetres by their ids, z = 0."""
         if self.kind == "charuco":
             return np.asarray(self._aruco.getChessboardCorners(), dtype=np.float64)
-        if self.kind == "apriltag":
-            return np.concatenate([np.asarray(p, dtype=np.float64) for p in self._aruco.getObjPoints()])
         x, y = np.meshgrid(np.arange(1.0, self.columns), np.arange(1.0, self.rows))
         return np.asarray(self.size * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1), dtype=np.float64)
 
     @property
     def extent(self) -> tuple[float, float]:
         """Width and height of the pattern in millimetres."""
-        if self.kind == "apriltag":
-            return tuple(n * self.size + (n - 1) * self.other for n in (self.columns, self.rows))  # type: ignore[return-value]
         return self.columns * self.size, self.rows * self.size
 
     @property
@@ -180,8 +168,7 @@ class Board:
 
     def find(self, grey: NDArray[np.uint8]) -> BoardPoints:
         """Points of the board in an 8-bit grey image (H, W); none when it isn't seen."""
-        find = {"charuco": self._find_charuco, "apriltag": self._find_tags, "chessboard": self._find_chessboard}
-        ids, pixels = find[self.kind](grey)
+        ids, pixels = self._find_charuco(grey) if self.kind == "charuco" else self._find_chessboard(grey)
         order = np.argsort(ids)
         return BoardPoints(ids[order], pixels[order] + 0.5)
 
@@ -196,21 +183,6 @@ class Board:
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
         pixels = cv2.cornerSubPix(grey, pixels, (window, window), (-1, -1), criteria)
         return ids.ravel().astype(np.int64), pixels.reshape(-1, 2).astype(np.float64)
-
-    def _find_tags(self, grey: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        corners, tags, _ = cv2.aruco.ArucoDetector(self._aruco.getDictionary(), parameters).detectMarkers(grey)
-        known = {int(tag): i for i, tag in enumerate(self._aruco.getIds())}
-        seen = [
-            (known[int(t)], c.reshape(4, 2))
-            for c, t in zip(corners, () if tags is None else tags.ravel(), strict=True)
-            if int(t) in known
-        ]
-        if not seen:
-            return _NONE
-        ids = np.concatenate([4 * i + np.arange(4) for i, _ in seen])
-        return ids, np.concatenate([c for _, c in seen]).astype(np.float64)
 
     def _find_chessboard(self, grey: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
         shape = (self.columns - 1, self.rows - 1)

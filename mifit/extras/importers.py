@@ -42,7 +42,7 @@ def import_from(
     kind : str
         ``colmap`` (a folder with a text model), ``metashape`` (cameras exported as XML), ``realitycapture``
         (a folder of XMP files), ``vhap`` (a folder that VHAP
-        exports) or ``nersemble`` (one sequence, as released or as VHAP lays it out).
+        exports) or ``nersemble`` (one sequence, as released).
     where : path
     out : path
         Folder to make; it must be missing or empty.
@@ -73,7 +73,7 @@ def import_from(
             return scene_material(where, [], unit)
         if kind == "nersemble":
             sequence = read_nersemble(where)
-            return Material(sequence.sources, sequence.views, sequence.annotated, unit)
+            return Material(sequence.sources, sequence.views, {}, unit)
         return _registered(kind, where, sources_of(videos, images), photos, unit)
 
     return import_material(out, gather, units, **options)

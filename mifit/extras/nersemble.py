@@ -1,8 +1,7 @@
-"""Folders of the NeRSemble data set, as released and as VHAP lays them out.
+"""Folders of the NeRSemble data set, as released.
 
-Released: ``PERSON/calibration/camera_params.json`` and ``PERSON/sequences/SEQUENCE/images/cam_SERIAL.mp4``. VHAP:
-``camera_params/PERSON/camera_params.json`` and ``PERSON/SEQUENCE/images/cam_SERIAL_TIMESTEP.jpg`` with
-``alpha_maps/cam_SERIAL_TIMESTEP.png``. ``camera_params.json`` has one intrinsic matrix for all cameras, in pixels of
+``PERSON/calibration/camera_params.json`` and ``PERSON/sequences/SEQUENCE/images/cam_SERIAL.mp4`` (or a folder of frames
+``cam_SERIAL``). ``camera_params.json`` has one intrinsic matrix for all cameras, in pixels of
 ``width`` x ``height`` (2200 x 3208 where it doesn't say), and a pose per camera from the world, in metres, to OpenCV's
 axes.
 """
@@ -10,16 +9,14 @@ axes.
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mifit.capture.sources import ImageFiles, Source, Video
-from mifit.capture.transforms import Shot, View, nearest_rotation
+from mifit.capture.transforms import View, nearest_rotation
 from mifit.core.files import read_text
-from mifit.core.image import SUFFIXES
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 
@@ -28,11 +25,10 @@ VIDEOS = (".mp4", ".avi", ".mov", ".mkv")
 
 @dataclass(frozen=True)
 class Sequence:
-    """One sequence: its cameras' images, their calibration, and their masks by camera."""
+    """One sequence: its cameras' images and their calibration."""
 
     sources: tuple[Source, ...]
     views: tuple[View, ...]
-    annotated: dict[str, list[Shot]]
 
 
 def read_nersemble(folder: str | Path) -> Sequence:
@@ -45,14 +41,11 @@ def read_nersemble(folder: str | Path) -> Sequence:
     """
     folder = Path(folder)
     sources = _sources(folder)
-    parents = folder.absolute().parents
-    places = [folder, *parents[:2]]
-    choices = [place / "calibration" / "camera_params.json" for place in places]
-    choices += [place / "camera_params" / folder.absolute().parent.name / "camera_params.json" for place in parents[:2]]
-    choices += [place / "camera_params.json" for place in places]
+    places = [folder, *folder.absolute().parents[:2]]
+    choices = [place / part / "camera_params.json" for part in ("calibration", "") for place in places]
     file = next((choice for choice in choices if choice.is_file()), None)
     if file is None:
-        raise InputError(f"{folder}: found no camera_params.json, expected {choices[1]} or {choices[-4]}")
+        raise InputError(f"{folder}: found no camera_params.json, expected {choices[2]}")
     poses, matrix, size = _parameters(file)
     views = []
     for source in sources:
@@ -70,48 +63,20 @@ def read_nersemble(folder: str | Path) -> Sequence:
             float(v) for v in np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]) * [*zoom, *zoom]
         )
         views.append(View(source.name, *source.size, (fx, fy, cx, cy), (), poses[source.name]))
-    return Sequence(tuple(sources), tuple(views), _masks(folder / "alpha_maps", sources))
-
-
-def _masks(folder: Path, sources: list[Source]) -> dict[str, list[Shot]]:
-    """The alpha maps of each camera that has one per image."""
-    masks = _by_camera(folder)
-    found = {}
-    for source in sources:
-        files = masks.get(source.name, [])
-        if len(files) == source.length:
-            found[source.name] = [Shot(source.name, i, file, mask=file) for i, file in enumerate(files)]
-        elif files:
-            raise InputError(f"{folder}: found {len(files)} masks of camera {source.name}, expected {source.length}")
-    return found
+    return Sequence(tuple(sources), tuple(views))
 
 
 def _sources(folder: Path) -> list[Source]:
     images = folder / "images"
     if not images.is_dir():
-        raise InputError(
-            f"{images}: no such folder, expected cam_SERIAL.mp4, cam_SERIAL_TIMESTEP.jpg or folders cam_SERIAL"
-        )
+        raise InputError(f"{images}: no such folder, expected cam_SERIAL.mp4 or folders cam_SERIAL in it")
     videos = sorted(p for p in images.iterdir() if p.suffix.lower() in VIDEOS and p.stem.startswith("cam_"))
     if videos:
         return [Video.open(path, path.stem.removeprefix("cam_")) for path in videos]
     folders = sorted(p for p in images.iterdir() if p.is_dir() and p.name.startswith("cam_"))
     if folders:
         return [ImageFiles.folder(path, path.name.removeprefix("cam_")) for path in folders]
-    found = _by_camera(images)
-    if not found:
-        raise InputError(f"{images}: found no cam_SERIAL.mp4, cam_SERIAL_TIMESTEP.jpg or folder cam_SERIAL")
-    return [ImageFiles.of(name, files) for name, files in found.items()]
-
-
-def _by_camera(folder: Path) -> dict[str, list[Path]]:
-    """Files ``cam_SERIAL_TIMESTEP`` of a folder, which may be missing, by serial number in the order of timesteps."""
-    found: dict[str, list[tuple[int, Path]]] = {}
-    for path in folder.iterdir() if folder.is_dir() else ():
-        match = re.fullmatch(r"cam_(\w+?)_(\d{1,9})", path.stem, re.ASCII)
-        if match and path.suffix.lower() in SUFFIXES:
-            found.setdefault(match[1], []).append((int(match[2]), path))
-    return {name: [path for _, path in sorted(files)] for name, files in sorted(found.items())}
+    raise InputError(f"{images}: found no cam_SERIAL.mp4 and no folder cam_SERIAL")
 
 
 def _parameters(file: Path) -> tuple[dict[str, np.ndarray], np.ndarray, tuple[int, int]]:

@@ -126,13 +126,13 @@ def _detail(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.
     return np.where(mask, np.clip(128.0 + 45.0 * beside / (contrast + 0.01), 0, 255), 128.0).astype(np.uint8)
 
 
-def follow_points(images: Sequence[Unwrapped], fewest: int = FEWEST_IMAGES, most: int = 2000) -> Tracks:
-    """Points that at least ``fewest`` images show; about ``most`` starts from 8 images, at most `MOST_SIGHTINGS`."""
+def follow_points(images: Sequence[Unwrapped]) -> Tracks:
+    """Points that `FEWEST_IMAGES` or more show; about 2000 starts from 8 images, at most `MOST_SIGHTINGS`."""
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setFinestScale(0)
     starts = np.unique(np.linspace(0, len(images) - 1, min(len(images), 8)).round().astype(int))
     covered = sum(int(images[a].seen.sum()) for a in starts)
-    stride = max(1, int(np.sqrt(covered / most)))
+    stride = max(1, int(np.sqrt(covered / 2000)))
     texel, sightings, count = [], [], 0
     for a in starts:
         one = images[a]
@@ -148,7 +148,7 @@ def follow_points(images: Sequence[Unwrapped], fewest: int = FEWEST_IMAGES, most
                 x, y = column[matched] + moved[:, 0], row[matched] + moved[:, 1]
                 found.append((b, matched, bilinear(other.pixels, x, y)))
         times = np.bincount(np.concatenate([which for _, which, _ in found]), minlength=len(row))
-        kept = times >= fewest
+        kept = times >= FEWEST_IMAGES
         number = np.cumsum(kept) - 1 + count
         for b, which, pixels in found:
             use = kept[which]

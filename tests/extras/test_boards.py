@@ -74,8 +74,7 @@ def test_charuco_pictures_give_the_cameras(calibrated, tmp_path: Path) -> None:
     check_cameras([view.camera() for view in views])
     document = json.loads((tmp_path / "calibration.json").read_text())
     assert len(document["cameras"]["a"]["frames"]) == len(found.watched[0].used)
-    for name in ("coverage_a.png", "coverage_b.png"):
-        assert cv2.imread(str(tmp_path / name)).shape == (480, 640, 3)
+    assert document["cameras"]["a"]["coverage"] > 0.4
 
 
 @pytest.mark.slow
@@ -95,10 +94,9 @@ def test_the_capture_calibration_is_taken_by_an_import(charuco, calibrated, tmp_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("text", "count"), [("chessboard:10x7:27", 24), ("apriltag:6x4:34:9", 16)])
-def test_other_boards(tmp_path: Path, text: str, count: int) -> None:
-    board = Board.parse(text)
-    places = poses(count, board, 470.0, seed=3)
+def test_a_chessboard(tmp_path: Path) -> None:
+    board = Board.parse("chessboard:10x7:27")
+    places = poses(24, board, 470.0, seed=3)
     sources = [
         write(tmp_path / c.name, [Studio(board, c).render(p, 100 * k + i) for i, p in enumerate(places)])
         for k, c in enumerate(pair())

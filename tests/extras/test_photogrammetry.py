@@ -133,24 +133,19 @@ def test_vhap(tmp_path: Path, folder: Path) -> None:
     assert not ours.valid[:, :third].any() and ours.valid[:, third:].all()  # its masks come along
 
 
-@pytest.mark.parametrize("layout", ["released", "vhap", "folders"])
+@pytest.mark.parametrize("layout", ["released", "folders"])
 def test_nersemble(tmp_path: Path, layout: str) -> None:
     cameras = [Camera(f"2222{c.name[1:]}", *SIZE, 141.25, 139.5, 31.3, 25.9, c.world_to_camera) for c in make_cameras()]
     person = tmp_path / "074"
-    sequence = person / "EMO-1" if layout == "vhap" else person / "sequences" / "EMO-1"
-    parameters = tmp_path / "camera_params" / "074" if layout == "vhap" else person / "calibration"
+    sequence, parameters = person / "sequences" / "EMO-1", person / "calibration"
     parameters.mkdir(parents=True)
     (parameters / "camera_params.json").write_text(json.dumps(write.nersemble_parameters(cameras, 2.0)))
     (sequence / "images").mkdir(parents=True)
-    (sequence / "alpha_maps").mkdir()
     for camera in cameras:
         for t in (9, 12):
-            image, name = Image.new("RGB", SIZE, (20 * t, 0, 0)), f"cam_{camera.name}_{t:06d}.png"
-            if layout == "vhap":
-                image.save(sequence / "images" / name)
-                Image.new("L", SIZE, 255 if t == 9 else 0).save(sequence / "alpha_maps" / name)
-            elif layout == "folders":
+            if layout == "folders":
                 (sequence / "images" / f"cam_{camera.name}").mkdir(exist_ok=True)
+                image = Image.new("RGB", SIZE, (20 * t, 0, 0))
                 image.save(sequence / "images" / f"cam_{camera.name}" / f"frame_{t:05d}.png")
         if layout == "released":
             import cv2
@@ -163,8 +158,6 @@ def test_nersemble(tmp_path: Path, layout: str) -> None:
     capture = Capture.load(imported(tmp_path / "out", nersemble=sequence))
     assert (capture.units, capture.timesteps) == ("m", (0, 1))
     assert_same_cameras(stored(capture), cameras)
-    if layout == "vhap":
-        assert [capture.frame(cameras[0].name, t).valid.mean() for t in (0, 1)] == [1.0, 0.0]
 
 
 def test_videos_with_a_photogrammetric_calibration(tmp_path: Path) -> None:
@@ -310,7 +303,8 @@ def test_bad_data_sets(tmp_path: Path, folder: Path) -> None:
     refused(read_nersemble, tmp_path, match="images: no such folder")
     (tmp_path / "images").mkdir()
     refused(read_nersemble, tmp_path, match="found no cam_SERIAL")
-    Image.new("RGB", SIZE).save(tmp_path / "images" / "cam_1_0.png")
+    (tmp_path / "images" / "cam_1").mkdir()
+    Image.new("RGB", SIZE).save(tmp_path / "images" / "cam_1" / "0.png")
     refused(read_nersemble, tmp_path, match="found no camera_params.json")
     good = write.nersemble_parameters(make_cameras(), 1.0)
     for change, message in (
