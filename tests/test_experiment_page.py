@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from pathlib import Path
 
 import numpy as np
@@ -15,27 +14,23 @@ from tests.variant import VARIANT
 PAGE = Path(mifit.__file__).resolve().parents[1] / "docs" / "experiment.md"
 
 
-def run_page(folder: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, str]) -> tuple[dict, dict[str, float]]:
-    """Execute the page's blocks in one namespace; returns it, and the seconds of each block by its first heading."""
+def run_page(folder: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, str]) -> dict:
+    """Execute the page's blocks in one namespace, and return it."""
     monkeypatch.chdir(folder)
     names: dict = {}
-    seconds: dict[str, float] = {}
-    for section in PAGE.read_text(encoding="utf-8").split("\n## ")[1:]:
-        for block in re.findall(r"^```python\n(.*?)^```", section, flags=re.S | re.M):
-            for before, after in changes.items():
-                block = block.replace(before, after)
-            started = time.perf_counter()
-            exec(compile(block, str(PAGE), "exec"), names)
-            seconds[section.splitlines()[0]] = time.perf_counter() - started
-    return names, seconds
+    for block in re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), flags=re.S | re.M):
+        for before, after in changes.items():
+            block = block.replace(before, after)
+        exec(compile(block, str(PAGE), "exec"), names)
+    return names
 
 
-def check(names: dict, frames: int = 36) -> None:
+def check(names: dict) -> None:
     result, losses = names["result"], names["losses"]
     assert mifit.Reconstruction.load("out/gloss") == result
     assert names["tanned"] != result and names["image"].shape[2] == 4
-    assert len(names["frames"]) == frames
-    assert len({frame[frame[..., 3] == 1][:, 0].mean().round(5) for frame in names["frames"]}) > 0.8 * frames
+    assert len(names["frames"]) == 36
+    assert len({frame[frame[..., 3] == 1][:, 0].mean().round(5) for frame in names["frames"]}) > 28
     assert len(losses) == 30 and losses[-1] < losses[0]
     assert names["better"] != result
     fitted, tanned, found = (names[n].reflectance.diffuse for n in ("result", "tanned", "better"))
@@ -67,26 +62,9 @@ def test_the_page_runs(variant, tiny_capture, tmp_path, monkeypatch):
     (tmp_path / "captures" / "gloss").symlink_to(tiny_capture)
     small = {
         '"builtin"': '"builtin:coarse"', '"auto"': f'"{VARIANT}"',
-        "texture_size=256": "texture_size=64, bands=4, exponent=100",  # the exponent is chosen on gloss, below
+        "texture_size=256": "texture_size=64, bands=4, exponent=100",
     }  # fmt: skip
-    names, _ = run_page(tmp_path, monkeypatch, small)
+    names = run_page(tmp_path, monkeypatch, small)
     check(names)
     tanned, found, fitted = names["losses"][0], names["losses"][-1], page_loss(names, names["result"])
     assert found - fitted < 0.25 * (tanned - fitted)  # 0.18; what the fitted face leaves is the pictures' noise
-
-
-@pytest.mark.slow
-def test_the_page_runs_on_gloss(variant, shared, tmp_path, monkeypatch):
-    (tmp_path / "captures").mkdir()
-    (tmp_path / "captures" / "gloss").symlink_to(shared / "captures" / "gloss")
-    # The 36 rotations are tested on the small capture; here three show that they work on full-size photographs.
-    changes = {
-        '"builtin"': '"builtin:coarse"',
-        '"auto"': f'"{VARIANT}"',
-        "range(0, 360, 10)": "range(0, 360, 120)",
-        "texture_size=256": "texture_size=128, bands=6",
-    }
-    names, seconds = run_page(tmp_path, monkeypatch, changes)
-    check(names, 3)
-    assert names["losses"][-1] < 0.6 * names["losses"][0]
-    print({name: round(value, 1) for name, value in seconds.items()}, names["losses"][0], names["losses"][-1])

@@ -16,7 +16,7 @@ from mifit.core.estimate import Report
 from mifit.morphable import MorphableModel
 from mifit.stages.checks.fit_checks import INCONSISTENT, check_fit, judged
 from mifit.stages.checks.landmark_model import noise_of
-from tests.checks.wrong_captures import make
+from tests.checks.wrong_captures import make, read, write
 from tests.output.conftest import ball_result
 
 PAIR = ("left", "right")
@@ -40,7 +40,7 @@ def test_a_fit_whose_images_contradict_one_another_has_not_converged(found, outc
     assert {one.report.outcome for one in judged({**parts, "geometry": mine}, []).values()} == {outcome}
 
 
-@pytest.mark.parametrize("shift", [0.0, 0.6, 1.0])
+@pytest.mark.parametrize("shift", [0.0, 1.2, 1.8])
 def test_landmarks_beside_the_fitted_face_are_named(shift, shared, monkeypatch):
     """Of the true face of a capture, whose landmarks are moved by parts of a detector's deviation."""
     from mifit.stages.checks import fit_checks
@@ -56,8 +56,8 @@ def test_landmarks_beside_the_fitted_face_are_named(shift, shared, monkeypatch):
     moved = [dataclasses.replace(shot, pixels=shot.pixels + np.array([0.0, by])) for shot in shots]
     monkeypatch.setattr(fit_checks, "landmark_shots", lambda *_: moved)
     found = check_fit(capture, model, geometry, PAIR)
-    assert [one.code for one in found] == (["landmarks-shifted"] if shift > 0.8 else [])
-    assert not found or "in all cameras alike, expected within 5.5" in found[0].text
+    assert [one.code for one in found] == (["landmarks-shifted"] if shift > 1.5 else [])
+    assert not found or "in all cameras alike, expected within 10.3" in found[0].text
 
 
 @pytest.mark.parametrize(
@@ -77,28 +77,28 @@ def test_doctor_examines_a_capture(name, code, verdict, shared, tmp_path, capsys
     assert [one["code"] for one in document["findings"]] == (["channels-exchanged"] if code else [])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["landmarks shifted", "one turned, yaw"])
-def test_faults_that_no_image_shows_are_not_taken_for_others(name, shared, tmp_path, variant):
-    """docs/limits.md has both: no other fault is named in their place."""
-    capture = Capture.load(make(name, shared / "captures/soft", tmp_path, timesteps=2))
-    found = mifit.fit(capture, MorphableModel.load("builtin:coarse"), PAIR, until="geometry")
-    assert not [one.code for one in found.diagnostics if one.severity != "note"]
+def said_of(folder, cameras):
+    """What is said of a fit of a capture's first timestep, besides notes."""
+    model = MorphableModel.load("builtin:coarse")
+    found = mifit.fit(Capture.load(folder), model, cameras, (0,), until="geometry")
+    return [(one.code, one.text) for one in found.diagnostics if one.severity != "note"]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "cameras"),
-    [
-        ("gloss", PAIR),
-        ("hard", PAIR),
-        ("emily", ("c3", "c4")),
-        ("scan_city", PAIR),
-        ("scan_studio", PAIR),
-        ("scan_sun", PAIR),
-    ],
-)
-def test_cheap_fits_of_good_captures_say_nothing(name, cameras, shared, variant):
-    capture = Capture.load(shared / "captures" / name)
-    found = mifit.fit(capture, MorphableModel.load("builtin:coarse"), cameras, (0,), until="geometry")
-    assert [one.text for one in found.diagnostics if one.severity != "note"] == []
+def test_a_fault_that_no_image_shows_is_not_taken_for_another(shared, tmp_path, variant):
+    """docs/limits.md has it: no other fault is named in its place."""
+    assert said_of(make("one turned, yaw", shared / "captures/soft", tmp_path, 1), PAIR) == []
+
+
+@pytest.mark.slow
+def test_landmarks_that_lie_beside_the_face_are_named_after_a_fit(shared, tmp_path, variant):
+    found = said_of(make("landmarks shifted", shared / "captures/scan_city", tmp_path, 1), PAIR)
+    assert {code for code, _ in found} == {"landmarks-shifted"}
+    assert any("in all cameras alike" in text for _, text in found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "cameras"), [("gloss", PAIR), ("emily", ("c3", "c4")), ("scan_city", PAIR)])
+def test_fits_of_good_captures_say_nothing(name, cameras, shared, tmp_path, variant):
+    folder = write(read(shared / "captures" / name, 1, cameras=cameras), tmp_path)
+    assert said_of(folder, cameras) == []

@@ -13,6 +13,12 @@ from mifit.cli import main
 from tests.checks.wrong_captures import Change, Rough, both, lengths, read, scale, write
 
 FACTOR = 0.2
+QUICK = """
+geometry.rounds = 1
+surface.finest = 1
+normals.max_iterations = 3
+reflectance = {texture_size = 32, bands = 4, shading = "prefiltered", exponent = 50, max_iterations = 3}
+"""
 rng = np.random.default_rng(0)
 
 
@@ -84,7 +90,7 @@ def test_a_fit_of_an_odd_capture_ends_in_words(name, shared, tmp_path, capfd, va
     rough = read(shared / "captures/soft", timesteps=1, factor=FACTOR, cameras=("left", "right"))
     change(rough)
     folder = write(rough, tmp_path / "capture")
-    (tmp_path / "fit.toml").write_text("[reflectance]\ntexture_size = 64\n")
+    (tmp_path / "fit.toml").write_text(QUICK)
     out = tmp_path / "out"
     options = ("--config", str(tmp_path / "fit.toml"), "--model", "builtin:coarse", "--quiet")
     code = main(["fit", str(folder), "--out", str(out), *options])

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 import json
 import sys
 from collections.abc import Callable
@@ -40,6 +42,11 @@ class Rough:
 
 def read(folder: Path, timesteps: int = 3, factor: float = 0.5, cameras: tuple[str, ...] = CAMERAS) -> Rough:
     """The first timesteps of a good capture; images (h, w, 3) as stored codes, BGR."""
+    return copy.deepcopy(_read(folder, timesteps, factor, cameras))
+
+
+@functools.cache
+def _read(folder: Path, timesteps: int, factor: float, cameras: tuple[str, ...]) -> Rough:
     document = json.loads((folder / "transforms.json").read_text())
     frames = {}
     for entry in document["frames"]:
@@ -55,7 +62,7 @@ def read(folder: Path, timesteps: int = 3, factor: float = 0.5, cameras: tuple[s
             "visible": np.array(landmarks["visible"]),
             "deviation": factor * landmarks.get("deviation", 0.0),
             "pose": np.array(entry["transform_matrix"]),
-            "lens": {key: entry[key] for key in ("k1", "k2", "p1", "p2")},
+            "lens": {key: entry.get(key, 0.0) for key in ("k1", "k2", "p1", "p2")},
             **{key: factor * entry[key] for key in ("fl_x", "fl_y", "cx", "cy")},
         }
     return Rough(frames, document["units"], folder)
@@ -71,7 +78,7 @@ def write(rough: Rough, out: Path) -> Path:
         for path in (file, landmarks):
             (out / path).parent.mkdir(parents=True, exist_ok=True)
         if image.dtype == np.uint8:
-            cv2.imwrite(str(out / file), image)
+            cv2.imwrite(str(out / file), image, (cv2.IMWRITE_PNG_COMPRESSION, 1))
         else:
             write_image(out / file, image[..., ::-1])
         points = {"convention": "ibug68", "points": frame["points"].tolist(), "visible": frame["visible"].tolist()}
@@ -301,9 +308,9 @@ WRONG: dict[str, Change] = {
 }
 
 
-def make(name: str, good: Path, out: Path, timesteps: int = 3) -> Path:
+def make(name: str, good: Path, out: Path, timesteps: int = 3, cameras: tuple[str, ...] = CAMERAS) -> Path:
     """Write one wrong capture."""
-    rough = read(good, timesteps)
+    rough = read(good, timesteps, cameras=cameras)
     WRONG[name](rough)
     return write(rough, out)
 

@@ -29,6 +29,9 @@ texture_size = 32
 shading = "prefiltered"
 bands = 4
 exponent = 40
+max_iterations = 3
+[normals]
+max_iterations = 3
 """
 SIZE = ("--timesteps", "3", "--width", "120", "--height", "90", "--spp", "4")
 

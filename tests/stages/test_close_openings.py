@@ -312,6 +312,6 @@ def test_lips_and_lids_are_left_alone_on_request(model, start, monkeypatch):
     asked = []
     monkeypatch.setattr(stage, "close_openings", lambda *given: asked.append(given[4]) or (given[2], {}))
     for lips in (False, True):
-        config = SurfaceConfig(finest=2, close_lips=lips, close_lids=not lips)
+        config = SurfaceConfig(finest=4, close_lips=lips, close_lids=not lips)
         stage.find_surface(capture, model, start, BOTH, config)
         assert asked[-2:] == ([(), LIPS] if lips else [LIDS, ()])

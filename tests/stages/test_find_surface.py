@@ -30,6 +30,8 @@ from tests.morphable.intersections import intersections
 from tests.test_pipeline import without_eyes
 
 QUICK = GeometryConfig(rounds=1, surface_points=800, pixels=400, max_iterations=15)
+COARSE = SurfaceConfig(finest=1)
+"""A quarter of the pixels, where a tenth of a millimetre doesn't matter."""
 BOTH = ("left", "right")
 STEPS = (0, 1)
 
@@ -107,7 +109,7 @@ def test_added_eyes_go_along_with_the_skin_and_leave_it_alone(model, bumpy, foun
     monkeypatch.setattr(
         "mifit.stages.find_surface.Scenes", lambda faces, *rest: met.append(faces) or Scenes(faces, *rest)
     )
-    eyed = find_surface(bumpy, whole, fitted_to(whole, bumpy), BOTH)
+    eyed = find_surface(bumpy, whole, fitted_to(whole, bumpy), BOTH, COARSE)
     assert met[0].max() < model.n_vertices  # what balls mirror isn't matched at the lids
     moved, n = eyed.displacement, model.n_vertices
     for ball in eyeballs(whole):
@@ -138,9 +140,9 @@ def test_outlines_follow_the_images(model, bumpy, start, monkeypatch):
     narrow = replace(model, mean=(model.mean + inwards).astype(np.float32))
     vertices = start.vertices + inwards @ start.rotation.transpose(0, 2, 1)
     fitted = replace(start, vertices=vertices.astype(np.float32))
-    outlined = covered_wrongly(model, bumpy, find_surface(bumpy, narrow, fitted, BOTH))
+    outlined = covered_wrongly(model, bumpy, find_surface(bumpy, narrow, fitted, BOTH, COARSE))
     monkeypatch.setattr("mifit.stages.find_surface.find_borders", lambda *_: joined([]))
-    matched = covered_wrongly(model, bumpy, find_surface(bumpy, narrow, fitted, BOTH))
+    matched = covered_wrongly(model, bumpy, find_surface(bumpy, narrow, fitted, BOTH, COARSE))
     assert outlined < 0.85 * matched and matched < covered_wrongly(model, bumpy, fitted)
 
 
@@ -154,7 +156,7 @@ def test_the_estimate_is_consistent_in_itself(model, found):
 
 def test_the_skin_does_not_intersect_itself(model, bumpy, start):
     """Of the search alone: lips that are closed may fold behind their corners, where nothing shows."""
-    found = find_surface(bumpy, model, start, BOTH, SurfaceConfig(close_lips=False))
+    found = find_surface(bumpy, model, start, BOTH, replace(COARSE, close_lips=False))
     eyes = np.concatenate(eyeballs(model))
     skin = model.faces[~np.isin(model.faces, eyes).any(1)]
     before, after = (intersections(10.0 * g.vertices[0], skin) for g in (start, found))
@@ -364,6 +366,6 @@ def test_a_camera_off_its_calibration_is_told_by_the_epipolar_lines(model, bumpy
     turn[:3, :3] = exponential(np.array([3.0 / right.fy, 0.0, 0.0]))
     turned = replace(right, world_to_camera=turn @ right.world_to_camera)
     off = replace(bumpy, cameras_by_name={**bumpy.cameras_by_name, "right": turned})
-    told = find_surface(off, model, start, BOTH)
+    told = find_surface(off, model, start, BOTH, COARSE)
     assert 2.5 < told.report.details["phases"][-1]["epipolar_pixels"]["left, right"] < 3.5
     assert any("epipolar" in one.text for one in told.report.warnings)

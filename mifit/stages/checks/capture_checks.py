@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.capture import Capture
+from mifit.capture.detect import available, open_detector
 from mifit.capture.transforms import UNITS_MM as FILE_UNITS_MM
 from mifit.core.camera import Camera
 from mifit.core.diagnostics import Diagnostic, worst_first
+from mifit.core.image import to_8_bit
+from mifit.core.process import one_blas_thread
 from mifit.morphable import MorphableModel
 from mifit.stages.checks.hypotheses import UNITS_MM, Hypothesis, hypotheses
-from mifit.stages.checks.landmark_model import INNER, Explanation, FaceStatistics, Shot, explain
+from mifit.stages.checks.landmark_model import INNER, Explanation, FaceStatistics, Shot, explain, noise_of
 
 TIMESTEPS, DELAY_TIMESTEPS = 2, 6
 """Timesteps whose landmarks are judged, and among which delays are looked for."""
@@ -29,6 +32,9 @@ BETTER = 0.65
 views are then less likely as they are by a factor of e^20 or more; errors are correlated, so that a fifth counts."""
 ALIKE = 1.15
 """Costs, over the least, of mistakes that landmarks leave open: all are named."""
+SHIFTED = 1.5
+"""Shift of an image's landmarks from a detector's, in deviations of one landmark, beyond which no two detectors differ,
+and how far single ones may then lie off at the median; on development heads 0.7 and 1.2 at most."""
 LARGEST_FACE = 1.6
 """Size of a face over the model's, and its inverse, beyond which nobody's is: outer corners of adults' eyes lie
 91 +- 5 mm apart, an infant's 60 mm (Farkas 1994)."""
@@ -51,6 +57,7 @@ CODE_ROUNDING = 0.02
 """Mean distance from whole 8-bit codes, in codes, below which a float image holds such codes; 0.25 for light."""
 
 
+@one_blas_thread()
 def check_capture(
     capture: Capture, model: MorphableModel, cameras: Sequence[str], timesteps: Sequence[int]
 ) -> list[Diagnostic]:
@@ -76,7 +83,7 @@ def check_capture(
         first = capture.timesteps.index(timesteps[0])
         later = landmark_shots(capture, cameras, capture.timesteps[first : first + DELAY_TIMESTEPS])
         found = landmark_diagnostics(shots, later, FaceStatistics.of(model, capture.unit_mm))
-        found = found or intrinsics_diagnostics(capture, cameras)
+        found = found or intrinsics_diagnostics(capture, cameras) or shift_diagnostics(capture, cameras, timesteps[0])
     if all(one.severity != "fault" for one in found):  # where landmarks are off, so is the skin between them
         found += colour_diagnostics(capture, cameras, timesteps)
     return worst_first(found)
@@ -148,6 +155,27 @@ def landmark_diagnostics(shots: Sequence[Shot], later: Sequence[Shot], face: Fac
     camera = first.camera if len({one.camera for one, _ in mistakes if one.shifted}) < 2 else None
     named = Diagnostic(first.code, f"{text}: {figures}; {remedy}", "fault", camera)
     return [named, *_size_diagnostics(right, face.unit_mm)]
+
+
+def shift_diagnostics(capture: Capture, cameras: Sequence[str], timestep: int) -> list[Diagnostic]:
+    """Landmarks that lie beside the face by the same pixels, by a detector where its networks are installed."""
+    if not available()["mediapipe"]:
+        return []
+    detector, said = open_detector("mediapipe"), []
+    for shot in landmark_shots(capture, cameras, [timestep]):
+        seen = detector.detect(to_8_bit(capture.frame(shot.camera.name, timestep).image))
+        if seen is None:
+            continue
+        off, noise = (shot.pixels - seen)[INNER], noise_of([shot])
+        x, y = shift = np.nanmedian(off, axis=0)
+        single = float(np.nanmedian(np.linalg.norm(off - shift, axis=1)))
+        if np.hypot(x, y) > SHIFTED * noise and single < SHIFTED * noise:
+            text = (
+                f"camera {shot.camera.name}: landmarks lie ({x:.0f}, {y:.0f}) pixels from where a detector sees them, "
+                f"expected within {SHIFTED * noise:.0f}; run `mifit landmarks`, or check where pixel coordinates begin"
+            )
+            said.append(Diagnostic("landmarks-shifted", text, "fault", shot.camera.name))
+    return said
 
 
 def _upright(shots: Sequence[Shot]) -> bool:

@@ -15,9 +15,9 @@ from mifit.morphable import MorphableModel
 from mifit.stages.checks.capture_checks import landmark_shots
 from mifit.stages.checks.landmark_model import INNER, noise_of
 
-SHIFT = 0.8
+SHIFT = 1.5
 """Shift that the landmarks of all cameras share from the face that the images show, in deviations of one landmark,
-beyond which it is no detector's: the fit gives way to two thirds of it."""
+beyond which it is no detector's: a detector's is up to 0.9 on development heads."""
 CONTRADICTIONS = ("views-disagree", "landmarks-shifted", "landmarks-unexplained", "landmarks-scatter")
 """Codes of what a fit that explains its images doesn't have."""
 INCONSISTENT = "inconsistent"
