@@ -16,7 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.arrays import on_device, stored
 from mifit.appearance.illumination import DistantLight, Illumination
+from mifit.appearance.kernels import diffuse_transfer, radiance
 from mifit.appearance.occlusion import MeshPoints
 from mifit.appearance.reception import reception
 from mifit.core.mesh import interpolate
@@ -30,7 +32,7 @@ LAMPS = 32
 BRIGHT = 8.0
 """Radiance over its mean from which light counts as bright."""
 SKY_ROWS = 64
-"""Rows of the environment from which the smooth part lights the mesh."""
+"""Rows of the environment from which the smooth part is projected, and lights the mesh."""
 BOUNCES = 2
 
 
@@ -40,7 +42,14 @@ def illumination_of(image: NDArray[np.float32], order: int) -> Illumination:
     bright = image - soft
     lamps = zip(*cut(bright), strict=True) if bright.any() else ()
     lights = tuple(DistantLight(toward, 0.0, power) for toward, power in lamps)
-    return Illumination(SHLighting.from_envmap(soft, order).coefficients, lights)
+    return Illumination(SHLighting.from_envmap(_reduced(soft), order).coefficients, lights)
+
+
+def _reduced(image: NDArray) -> NDArray[np.float32]:
+    """A lat-long environment of at most `SKY_ROWS` rows."""
+    if len(image) <= SKY_ROWS:
+        return image
+    return np.asarray(cv2.resize(image, (2 * SKY_ROWS, SKY_ROWS), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def smooth_part(image: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -137,18 +146,30 @@ def diffuse_light(
         Of the mesh's vertices.
     """
     mesh, soft = reception(scene), smooth_part(image)
-    small = cv2.resize(soft, (2 * SKY_ROWS, SKY_ROWS), interpolation=cv2.INTER_AREA).astype(np.float64)
-    power = small * np.reshape(latlong_solid_angles(SKY_ROWS, 2 * SKY_ROWS), (SKY_ROWS, -1))[..., None]
-    toward = latlong_directions(SKY_ROWS, 2 * SKY_ROWS).reshape(-1, 3)
+    small = _reduced(soft)
+    power = small * latlong_solid_angles(*small.shape[:2])[:, None, None]
+    toward = latlong_directions(*small.shape[:2]).reshape(-1, 3)
     shaded = mesh.from_sky(toward @ rotation.T, power.reshape(-1, 3))
     direct = shaded + _from_lamps(lamps, scene, mesh.normals)
     bounced = np.zeros_like(direct)
     for _ in range(BOUNCES):
         bounced = mesh.from_mesh((direct + bounced) * albedo / np.float32(np.pi))
-    received = interpolate(shaded + bounced, scene.faces, points.face, points.barycentric) / np.float32(np.pi)
-    open_sky = SHLighting.from_envmap(soft, 3).rotate(rotation)
-    bent = open_sky.irradiance(normals) / np.maximum(open_sky.irradiance(points.normal), 1e-12)
-    return (received * bent).astype(np.float32)
+    received = interpolate((shaded + bounced) / np.float32(np.pi), scene.faces, points.face, points.barycentric)
+    open_sky = SHLighting.from_envmap(small, 3).rotate(rotation)
+    received *= _bend(open_sky, normals, points.normal)
+    return received
+
+
+def _bend(light: SHLighting, normals: NDArray, base: NDArray) -> NDArray[np.float32]:
+    """(N, 3) irradiance at bent normals over that at the mesh's."""
+    import drjit as dr
+    import mitsuba as mi
+
+    rows = [mi.Color3f(*map(float, row)) for row in light.coefficients]
+    dr.make_opaque(rows)
+    bent, open_sky = (radiance(diffuse_transfer(on_device(mi.Vector3f, n), 3), rows) for n in (normals, base))
+    ratio = bent / dr.maximum(open_sky, 1e-12)
+    return stored([ratio.x, ratio.y, ratio.z], len(normals))
 
 
 def _from_lamps(lamps: Sequence[DistantLight], scene: SurfaceScene, normals: NDArray) -> NDArray[np.float32]:

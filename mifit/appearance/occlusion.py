@@ -144,8 +144,23 @@ class Occlusion:
         if smooth:
             at_vertices = mesh.transfer(illumination.order, seed)
             transfer = VertexTransfer(at_vertices, mesh.scene.faces[points.face], points.barycentric)
-        place = points.position, points.normal
-        return cls(transfer, tuple(mesh.scene.open_towards(*place, light.samples()) for light in illumination.lights))
+        return cls(transfer, tuple(_visible(mesh.scene, points, [light.samples() for light in illumination.lights])))
+
+
+def _visible(scene: SurfaceScene, points: MeshPoints, samples: Sequence[NDArray]) -> list[NDArray[np.uint32]]:
+    """Per light, which of its samples (D, 3) each point sees; rays towards 32 directions are sent at once."""
+    groups: list[list[NDArray]] = []
+    for directions in samples:
+        if not groups or sum(map(len, groups[-1])) + len(directions) > 32:
+            groups.append([])
+        groups[-1].append(directions)
+    found = []
+    for group in groups:
+        bits = scene.open_towards(points.position, points.normal, np.concatenate(group))
+        for directions in group:
+            found.append(bits & np.uint32((1 << len(directions)) - 1))
+            bits = bits >> np.uint32(len(directions) % 32)
+    return found
 
 
 def trace_transfer(

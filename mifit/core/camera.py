@@ -216,18 +216,6 @@ class Camera:
         length = np.sqrt(x * x + y * y + 1.0)
         return np.stack([x / length, y / length, 1.0 / length], axis=-1) @ self.rotation
 
-    def box_rays(self, rows: slice, columns: slice) -> NDArray[np.float64]:
-        """`pixel_rays` through the centres of a box of pixels, coordinates first: (3, pixels), row by row.
-
-        Row and column of each pixel are all that it takes, which is several times as fast as from all the centres.
-        """
-        x = (np.arange(self.width)[columns] + 0.5 - self.cx) / self.fx
-        y = ((np.arange(self.height)[rows] + 0.5 - self.cy) / self.fy)[:, None]
-        length = np.sqrt(x * x + y * y + 1.0)
-        directions = np.empty((3, *length.shape))
-        directions[0], directions[1], directions[2] = x / length, y / length, 1.0 / length
-        return self.rotation.T @ directions.reshape(3, -1)
-
     def pixel_centres(self) -> NDArray[np.float64]:
         """(H, W, 2) coordinates of all pixel centres."""
         y, x = np.mgrid[0 : self.height, 0 : self.width]

@@ -6,7 +6,7 @@ optimisers share.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,9 +29,23 @@ if TYPE_CHECKING:
 
 
 def visible_surface(result: Reconstruction, camera: Camera, timestep: int, oversampling: int = 2) -> VisibleSurface:
-    """Find the front-facing surface under every sample of a camera's pixels."""
-    i = result.index(timestep)
-    return trace_mesh(result.geometry.vertices[i], result.model.faces, camera, oversampling)
+    """Find the front-facing surface under every sample of a camera's pixels.
+
+    Where pixels are no wider than texels the samples of one face in a pixel are one: nothing varies between them.
+    """
+    model, vertices = result.model, result.geometry.vertices[result.index(timestep)]
+    joined = np.ones(len(model.faces), dtype=bool)
+    if result.reflectance is not None:
+        side = len(result.reflectance.diffuse)
+        texels = np.where(mapped_faces(result), _areas(model.uv[model.faces_uv]) * side**2, 0.0)
+        joined = texels <= _areas(camera.project(vertices)[model.faces])
+    return trace_mesh(vertices, model.faces, camera, oversampling, joined=joined)
+
+
+def _areas(corners: NDArray) -> NDArray:
+    """(F,) twice the areas of triangles (F, 3, 2) in a plane."""
+    (ax, ay), (bx, by) = ((corners[:, k] - corners[:, 0]).T for k in (1, 2))
+    return np.abs(ax * by - ay * bx)
 
 
 @dataclass(frozen=True)
@@ -104,14 +118,12 @@ def shade_methods(
         points = MeshPoints(surface.points, base, surface.face, surface.weights)
         mesh = occluding_mesh(vertices, model.faces)
         given = material.normal, base, surface.view, appearance.trace(mesh, points)
-        diffuse, specular_light = appearance.shade_bent(*given)
-        if result.environment is not None and appearance.lobe.fresnel is not None:
-            lights = appearance.illumination
-            lamps = replace(lights, radiance=np.zeros_like(lights.radiance))
-            diffuse, _ = replace(appearance, illumination=lamps).shade_bent(*given)
+        measured = result.environment if appearance.lobe.fresnel is not None else None
+        diffuse, specular_light = appearance.shade_bent(*given, smooth_diffuse=measured is None)
+        if measured is not None:
             turn = np.eye(3) if result.environment_rotation is None else result.environment_rotation
             place = mesh.scene, points, material.normal, vertex_materials(result)[:, :3]
-            diffuse = diffuse + diffuse_light(result.environment, turn, lights.lights, *place)
+            diffuse += diffuse_light(measured, turn, appearance.illumination.lights, *place)
         ambient = np.float32(reflectance.illumination.ambient)
         for method in finer:
             specular = material.specular[:, None] if method == "full" else np.float32(0.0)

@@ -258,6 +258,6 @@ def face_area(vertices: NDArray, faces: NDArray, face_mask: NDArray, camera: Cam
     """(H, W) pixels whose centre sees the front of a face-area triangle, eroded by 2 pixels."""
     surface = trace_mesh(vertices, faces, camera, 1)
     area = np.zeros(camera.height * camera.width, dtype=bool)
-    area[surface.index] = face_mask[surface.face]
+    area[surface.pixel] = face_mask[surface.face]
     # The image's border is no border of the face.
     return binary_erosion(area.reshape(camera.height, camera.width), np.ones((5, 5)), border_value=1)

@@ -164,7 +164,7 @@ def write_relit(
     timestep, views = lits[0].timesteps[0], list(cameras) or list(result.cameras)
     if not views:
         raise InputError("this result has no cameras to show it from; give one")
-    level = _level(SHLighting.from_envmap(image, result.lighting.order))
+    level = _level(SHLighting.from_envmap(image, 1))
     capture_exposure = _level(result.lighting) / level
     used = capture_exposure if exposure == "auto" else float(exposure)
     shared: list[tuple[VisibleSurface, SampledMaterial]] = []

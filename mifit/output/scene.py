@@ -123,7 +123,7 @@ def render_path(
     # the inside of the head, seen through the eye openings, so coverage is that of local rendering.
     hit = image[..., 3:]
     surface = visible_surface(result, camera, timestep)
-    alpha = surface.image(np.zeros((len(surface.index), 3)))[..., 3:]
+    alpha = surface.image(np.zeros((len(surface.pixel), 3)))[..., 3:]
     colour = np.where(alpha > 0, image[..., :3] / np.maximum(hit, 1e-3), 0.0)
     return np.concatenate([colour, alpha], axis=-1).astype(np.float32)
 

@@ -155,17 +155,17 @@ class SurfaceScene:
         if not all(part):
             nothing = np.zeros(part, np.float32)
             return box, np.full(part, -1, np.int32), nothing, nothing, nothing
-        directions = camera.box_rays(*box)
-        ray = mi.Ray3f(mi.Point3f(camera.position), on_device(mi.Vector3f, directions.T))
+        directions, along = _box_rays(camera, box)
+        ray = mi.Ray3f(mi.Point3f(camera.position), directions)
         hit = self.rays.ray_intersect_preliminary(ray, coherent=True)
-        dr.eval(hit.t, hit.prim_uv, hit.prim_index)  # one kernel: each array read would trace the rays again
+        z = hit.t * along
+        dr.eval(hit.t, z, hit.prim_uv, hit.prim_index)  # one kernel: each array read would trace the rays again
         t = np.array(hit.t, dtype=np.float32)
         valid = np.isfinite(t)
         face = np.where(valid, np.array(hit.prim_index).astype(np.int32), -1)
         # Rays that hit nothing hold any bits in their coordinates: zeros, so that no sum of them warns.
         u, v = (np.where(valid, np.array(x, dtype=np.float32), np.float32(0)) for x in hit.prim_uv)
-        depth = np.full(t.shape, np.inf, np.float32)
-        np.multiply(t, camera.rotation[2] @ directions, out=depth, where=valid, casting="same_kind")
+        depth = np.where(valid, np.array(z, dtype=np.float32), np.float32(np.inf))
         return box, face.reshape(part), u.reshape(part), v.reshape(part), depth.reshape(part)
 
     def _box(self, camera: Camera) -> tuple[slice, slice]:
@@ -230,6 +230,26 @@ class SurfaceScene:
         start = (mi.UInt(0), dr.zeros(mi.UInt, len(points)))
         _, bits = dr.while_loop(state=start, cond=lambda i, bits: i < dr.opaque(mi.UInt, len(directions)), body=body)
         return np.array(bits, dtype=np.uint32)
+
+
+def _box_rays(camera: Camera, box: tuple[slice, slice]) -> tuple[Any, Any]:
+    """Unit directions through the centres of a box of pixels, row by row, and their parts along the camera's axis."""
+    import drjit as dr
+    import mitsuba as mi
+
+    rows, columns = (range(size)[side] for side, size in zip(box, (camera.height, camera.width), strict=True))
+    number = dr.arange(mi.UInt32, len(rows) * len(columns))
+    width = dr.opaque(mi.UInt32, len(columns))
+    row = number // width
+    first, focal = ((rows.start + 0.5 - camera.cy, columns.start + 0.5 - camera.cx), (camera.fy, camera.fx))
+    y, x = (
+        (mi.Float64(i) + dr.opaque(mi.Float64, start)) / dr.opaque(mi.Float64, f)
+        for i, start, f in zip((row, number - row * width), first, focal, strict=True)
+    )
+    along = dr.rcp(dr.sqrt(x * x + y * y + 1.0))
+    turn = [[dr.opaque(mi.Float64, float(value)) for value in line] for line in camera.rotation]
+    world = [mi.Float(along * (x * turn[0][k] + y * turn[1][k] + turn[2][k])) for k in range(3)]
+    return mi.Vector3f(*world), mi.Float(along)
 
 
 def _diagonal(vertices: NDArray) -> float:

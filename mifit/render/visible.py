@@ -18,51 +18,74 @@ from mifit.render.gbuffer import SurfaceScene
 class VisibleSurface:
     """What a camera sees of a mesh in an image of ``shape`` with ``oversampling`` samples along each side of a pixel.
 
-    ``index`` (N,) is the flat number (row * width * oversampling + column) of every covered sample, ``face`` (N,) and
-    ``weights`` (N, 3) where on the mesh it lies, ``points`` (N, 3) its world position and ``view`` (N, 3) the unit
-    vector towards the camera.
+    ``pixel`` (N,) is the flat number of the pixel that a sample is in, ``face`` (N,) and ``weights`` (N, 3) where on
+    the mesh it lies, ``points`` (N, 3) its world position and ``view`` (N, 3) the unit vector towards the camera.
+    ``count`` (N,) is the number of a pixel's samples that it stands for.
     """
 
     shape: tuple[int, int]
     oversampling: int
-    index: NDArray[np.int64]
+    pixel: NDArray[np.int64]
     face: NDArray[np.int32]
     weights: NDArray[np.float32]
     points: NDArray[np.float32]
     view: NDArray[np.float32]
-
-    @property
-    def pixel(self) -> NDArray[np.int64]:
-        """(N,) flat number of the pixel that each sample is in."""
-        k, width = self.oversampling, self.shape[1]
-        return self.index // (width * k) // k * width + self.index % (width * k) // k
+    count: NDArray[np.float32]
 
     def image(self, values: NDArray) -> NDArray[np.float32]:
         """Mean of sample values (N, C) in each pixel, 0 where none is, and coverage: (H, W, C + 1)."""
         pixel, size = self.pixel, self.shape[0] * self.shape[1]
-        count = np.bincount(pixel, minlength=size)
-        sums = [np.bincount(pixel, channel, minlength=size) / np.maximum(count, 1) for channel in values.T]
-        return np.stack([*sums, count / self.oversampling**2], axis=-1).astype(np.float32).reshape(*self.shape, -1)
+        total = np.bincount(pixel, self.count, minlength=size)
+        sums = [np.bincount(pixel, c * self.count, minlength=size) / np.maximum(total, 1) for c in values.T]
+        return np.stack([*sums, total / self.oversampling**2], axis=-1).astype(np.float32).reshape(*self.shape, -1)
 
 
 def trace_mesh(
-    vertices: NDArray, faces: NDArray, camera: Camera, oversampling: int, scene: SurfaceScene | None = None
+    vertices: NDArray,
+    faces: NDArray,
+    camera: Camera,
+    oversampling: int,
+    scene: SurfaceScene | None = None,
+    joined: NDArray[np.bool_] | None = None,
 ) -> VisibleSurface:
     """The front-facing surface of a mesh under a camera's samples.
 
     A sample whose nearest surface shows its back (the inside of the head through an eye opening) is not covered.
-    ``scene`` is one of this mesh, where there is one.
+    ``scene`` is one of this mesh, where there is one. A pixel's samples on one of the faces ``joined`` (F,) become one
+    in their middle.
     """
-    k = oversampling
+    k, shape = oversampling, (camera.height, camera.width)
     buffer = (scene or occluding_mesh(vertices, faces).scene).gbuffer(camera if k == 1 else camera.resized(k))
-    index = np.flatnonzero(buffer.face.ravel() >= 0)
-    face = buffer.face.ravel()[index]
-    weights = buffer.weights.reshape(-1, 3)[index]
+    by_pixel = buffer.face.reshape(shape[0], k, shape[1], k).transpose(0, 2, 1, 3).reshape(-1, k * k)
+    covered = np.flatnonzero((by_pixel >= 0).any(axis=1))
+    face = by_pixel[covered]
+    row, column = np.divmod(covered, shape[1])
+    first = row * (k * k * shape[1]) + column * k  # of a pixel's samples in the buffer
+    within = np.add.outer(np.arange(k) * (k * shape[1]), np.arange(k)).ravel()
+    weights = buffer.weights.reshape(-1, 3).take(first[:, None] + within, axis=0)
+    count = (face >= 0).astype(np.float32)
+    if joined is not None:
+        _join(face, weights, count, joined)
+    used = count > 0
+    pixel, face, weights, count = np.repeat(covered, used.sum(axis=1)), face[used], weights[used], count[used]
     points = interpolate(vertices, faces, face, weights)
     view = normalize(camera.position - points)
     front = np.sum(face_cross(vertices, faces)[face] * view, axis=1) > 0
-    single = (x[front].astype(np.float32) for x in (weights, points, view))
-    return VisibleSurface((camera.height, camera.width), k, index[front], face[front], *single)
+    single = (x[front].astype(np.float32) for x in (weights, points, view, count))
+    return VisibleSurface(shape, k, pixel[front], face[front], *single)
+
+
+def _join(face: NDArray, weights: NDArray, count: NDArray, joined: NDArray[np.bool_]) -> None:
+    """Make samples (P, S) of a pixel on one face one, whose ``count`` is their number; that of the others becomes 0."""
+    samples = face.shape[1]
+    for i in range(samples - 1):
+        may = (count[:, i] > 0) & joined[face[:, i]]
+        for j in range(i + 1, samples):
+            same = np.flatnonzero(may & (face[:, i] == face[:, j]))
+            weights[same, i] += weights[same, j]
+            count[same, i] += 1
+            count[same, j] = 0
+        weights[:, i] /= np.maximum(count[:, i], 1)[:, None]
 
 
 _meshes = Recent[OccludingMesh](8)  # the timesteps of a result whose views are drawn one after the other

@@ -22,13 +22,6 @@ def test_rays_go_through_the_points_that_project_to_their_pixels() -> None:
     np.testing.assert_allclose(camera.project(points), pixels, atol=1e-9)
 
 
-def test_rays_of_a_box_are_those_of_its_pixels_centres() -> None:
-    camera = _camera()
-    for rows, columns in ((slice(None), slice(None)), (slice(3, 40), slice(10, 11)), (slice(5, 5), slice(0, 7))):
-        expected = camera.pixel_rays(camera.pixel_centres()[rows, columns]).reshape(-1, 3)
-        np.testing.assert_allclose(camera.box_rays(rows, columns).T, expected, rtol=0, atol=1e-15)
-
-
 def test_points_behind_the_camera_have_no_projection() -> None:
     camera = _camera()
     behind = camera.position - 5.0 * camera.pixel_rays(np.array([[31.0, 25.0]]))

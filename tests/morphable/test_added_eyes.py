@@ -137,7 +137,7 @@ def test_no_gap_is_left_between_lids_and_corners(skin, whole, variant) -> None:
         camera = look_at_head("a", degrees, 700, 700, distance=60.0)
         surface = trace_mesh(vertices, whole.faces, camera, 1)
         seen = np.zeros(camera.height * camera.width, bool)
-        seen[surface.index] = True
+        seen[surface.pixel] = True
         marks = camera.project(vertices[whole.landmarks]).astype(np.int32)
         for eye in (slice(36, 42), slice(42, 48)):
             inside = np.zeros((camera.height, camera.width), np.uint8)

@@ -48,7 +48,7 @@ def test_it_adds_its_cosine_to_a_render(keyed, variant):
     cosine = np.maximum(normal @ TOWARDS, 0.0)
     expected = surface_material(keyed, surface, 0).diffuse * cosine[:, None] / np.pi * POWER
     clear = cosine > 0.3  # nearer the terminator facets shadow themselves, and on a ball nothing else does
-    got = added.reshape(-1, 3)[surface.index]
+    got = added.reshape(-1, 3)[surface.pixel]
     assert clear.sum() > 500
     np.testing.assert_allclose(got[clear], expected[clear], atol=5e-3)
     np.testing.assert_allclose(got[normal @ TOWARDS < -0.05], 0.0, atol=1e-6)

@@ -58,18 +58,29 @@ class FakeCapture:
         return FakeFrame(image, valid)
 
 
+def test_samples_of_a_face_in_a_pixel_become_one_in_their_middle(ball, variant):
+    vertices, faces, camera = ball.geometry.vertices[0], ball.model.faces, ball_camera().resized(4)
+    every = trace_mesh(vertices, faces, camera, 2)
+    some = trace_mesh(vertices, faces, camera, 2, joined=np.ones(len(faces), dtype=bool))
+    assert len(some.face) < 0.5 * len(every.face)
+    assert some.count.sum() == len(every.face)
+    np.testing.assert_allclose(some.weights.sum(axis=1), 1.0, atol=1e-6)
+    # What varies linearly over faces has the same mean in every pixel.
+    np.testing.assert_allclose(some.image(some.points), every.image(every.points), atol=1e-5)
+
+
 def test_pca_is_the_papers_equation(ball, variant):
     camera = ball_camera()
     surface = visible_surface(ball, camera, 3, 1)
     image = ball.render(camera, 3, method="pca", samples=1)
     # The paper's equation at one sample in the middle of the ball, from scratch.
-    k = np.argmin(np.abs(surface.index - (32 * 64 + 32)))
+    k = np.argmin(np.abs(surface.pixel - (32 * 64 + 32)))
     face = ball.model.faces[surface.face[k]]
     w = surface.weights[k]
     n = w @ vertex_normals(ball.geometry.vertices[1], ball.model.faces)[face]
     n /= np.linalg.norm(n)
     expected = 0.01 + (w @ ball.geometry.vertex_albedo[face]) * (sh.basis(n, 3) @ ball.geometry.shading)
-    np.testing.assert_allclose(image.reshape(-1, 4)[surface.index[k], :3], expected, rtol=1e-4)
+    np.testing.assert_allclose(image.reshape(-1, 4)[surface.pixel[k], :3], expected, rtol=1e-4)
 
 
 def test_diffuse_is_albedo_times_irradiance_with_refined_normals(ball, variant):
@@ -79,7 +90,7 @@ def test_diffuse_is_albedo_times_irradiance_with_refined_normals(ball, variant):
     inside = ball.model.face_mask[surface.face]
     irradiance = ball.lighting.irradiance(material.normal.astype(np.float64))
     expected = material.diffuse * irradiance / np.pi + 0.02
-    image = ball.render(camera, 0, method="diffuse", samples=1).reshape(-1, 4)[surface.index, :3]
+    image = ball.render(camera, 0, method="diffuse", samples=1).reshape(-1, 4)[surface.pixel, :3]
     np.testing.assert_allclose(image, expected, atol=2e-4)
     # Outside the face area: albedo and gloss that continue the maps, the mesh's normals.
     np.testing.assert_allclose(material.specular, 0.15, atol=1e-4)
@@ -113,8 +124,8 @@ def test_alpha_is_coverage(ball, variant):
 def test_back_faces_are_not_covered(variant):
     """A single triangle seen from behind."""
     vertices, faces = np.array([[-3, -3, 0], [3, -3, 0], [0, 3, 0.0]]), np.array([[0, 1, 2]])
-    assert len(trace_mesh(vertices, faces, ball_camera(angle=0), 1).index) > 100
-    assert len(trace_mesh(vertices, faces, ball_camera(angle=180), 1).index) == 0
+    assert len(trace_mesh(vertices, faces, ball_camera(angle=0), 1).pixel) > 100
+    assert len(trace_mesh(vertices, faces, ball_camera(angle=180), 1).pixel) == 0
 
 
 def test_evaluation_of_a_perfect_photograph_and_of_a_known_error(ball, variant):
@@ -155,7 +166,7 @@ def test_region_is_the_face_area_eroded_and_valid(ball, variant):
     area = face_area(ball.geometry.vertices[0], ball.model.faces, ball.model.face_mask, camera)
     surface = trace_mesh(ball.geometry.vertices[0], ball.model.faces, camera, 1)
     whole = np.zeros(64 * 64, bool)
-    whole[surface.index] = ball.model.face_mask[surface.face]
+    whole[surface.pixel] = ball.model.face_mask[surface.face]
     whole = whole.reshape(64, 64)
     rows, columns = np.nonzero(area)
     for dr in range(-2, 3):

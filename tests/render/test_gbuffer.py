@@ -9,6 +9,7 @@ import trimesh
 from mifit.core.camera import Camera
 from mifit.core.mesh import interpolate
 from mifit.errors import InputError
+from mifit.render import gbuffer
 from mifit.render.gbuffer import SurfaceScene
 
 
@@ -104,12 +105,20 @@ def test_bad_meshes_are_refused(variant: str, ball, camera: Camera) -> None:
         scene.gbuffer(bent)
 
 
+def test_rays_of_a_box_are_those_of_its_pixels_centres(variant: str, camera: Camera) -> None:
+    for rows, columns in ((slice(None), slice(None)), (slice(3, 40), slice(10, 11))):
+        expected = camera.pixel_rays(camera.pixel_centres()[rows, columns]).reshape(-1, 3)
+        directions, along = gbuffer._box_rays(camera, (rows, columns))
+        np.testing.assert_allclose(np.array(directions).T, expected, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(np.array(along), expected @ camera.rotation[2], rtol=0, atol=1e-7)
+
+
 def test_what_a_camera_saw_is_kept_until_the_mesh_moves(variant: str, ball, camera: Camera, monkeypatch) -> None:
     vertices, faces = ball
     scene = SurfaceScene(vertices, faces)
     first = scene.gbuffer(camera)
     first.face[:] = 7  # the caller's own
-    monkeypatch.setattr(Camera, "box_rays", lambda *_: pytest.fail("rays were sent again"))
+    monkeypatch.setattr(gbuffer, "_box_rays", lambda *_: pytest.fail("rays were sent again"))
     again = scene.gbuffer(camera)
     monkeypatch.undo()
     fresh = SurfaceScene(vertices, faces).gbuffer(camera)
