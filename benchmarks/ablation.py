@@ -118,7 +118,7 @@ PARTS = (
         step="reflectance",
     ),
     Part("stage 2: robust weights and what needs them", {"reflectance.robust": False}),
-    Part("stage 2: relief in the light", {"reflectance.relief": False}),
+    Part("stage 2: residual shading", {"reflectance.residual_shading": False}),
     Part("stage 2: difference term", {"reflectance.specular_difference_weight": 0.0}),
     Part("stage 3: off", without=("normals", "mesh", "residual")),
     Part("residual", {"residual.enabled": False}),

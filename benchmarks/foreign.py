@@ -90,7 +90,7 @@ def constant_albedo(full: Reconstruction) -> Reconstruction:
     diffuse, specular = full.reflectance.diffuse.copy(), full.reflectance.specular.copy()
     painted = diffuse.any(-1)
     diffuse[painted], specular[painted] = diffuse[seen].mean(0), specular[seen].mean()
-    flat = replace(full.reflectance, diffuse=diffuse, specular=specular, relief=None)
+    flat = replace(full.reflectance, diffuse=diffuse, specular=specular, residual_shading=None)
     return replace(full, reflectance=flat, residual=None)
 
 

@@ -245,7 +245,7 @@ class ReflectanceConfig:
     segment: bool = flag(
         True, "leave out what hides the face in an image: hair, cloth, glasses, a hand; with robust alone"
     )
-    relief: bool = flag(
+    residual_shading: bool = flag(
         True,
         "part from the albedo what varies more than skin does, which another light doesn't show; with robust alone",
     )

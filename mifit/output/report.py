@@ -293,7 +293,7 @@ def picture_maps(result: Reconstruction, timestep: int) -> str:
         ("Specular albedo", reflectance.specular, None),
         ("Confidence: how often and how well each texel was seen", reflectance.confidence, 1.0),
         ("Confidence of the specular albedo: how far images determine it", reflectance.specular_confidence, 1.0),
-        ("Light that mesh and lighting don't explain, parted from the albedo", reflectance.relief, 2.0),
+        ("Light that mesh and lighting don't explain, parted from the albedo", reflectance.residual_shading, 2.0),
     ]
     figures = [_figure(to_8_bit(reflectance.diffuse), "Diffuse albedo", "diffuse albedo map")]
     for caption, values, peak in grey:

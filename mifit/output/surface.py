@@ -85,7 +85,7 @@ def surface_maps(result: Reconstruction, timestep: int, skin: bool = False) -> S
     Texels that belong to no face repeat the nearest texel inside, so bilinear look-ups at a seam see no gap.
     Without stage 2 the albedo is the fitted model's at 512 texels; without stage 3, or for a timestep that it
     did not refine, the normals are the mesh's. ``skin`` asks for the albedo alone, for files without a light of their
-    own: what the capture's light leaves unexplained (``relief``) is part of the diffuse map otherwise.
+    own: what the capture's light leaves unexplained (``residual_shading``) is part of the diffuse map otherwise.
     """
     model, geometry = result.model, result.geometry
     reflectance = result.reflectance

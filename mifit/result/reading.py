@@ -280,9 +280,9 @@ def _reflectance(folder: Path, document: Document) -> ReflectanceEstimate | None
     diffuse = _read_map(folder / "maps" / "diffuse.exr", 3)
     labels = _labels(folder, document)
 
-    def optional(name: str) -> NDArray[np.float32] | None:
-        path = folder / "maps" / f"{name}.exr"
-        return _read_map(path, 1, len(diffuse)) if path.exists() else None
+    def optional(*names: str) -> NDArray[np.float32] | None:
+        paths = [path for name in names if (path := folder / "maps" / f"{name}.exr").exists()]
+        return _read_map(paths[0], 1, len(diffuse)) if paths else None
 
     return ReflectanceEstimate(
         diffuse=diffuse,
@@ -294,7 +294,7 @@ def _reflectance(folder: Path, document: Document) -> ReflectanceEstimate | None
         report=_report(document, "reflectance"),
         labels=tuple(labels.values()),
         labelled=tuple(labels),
-        relief=optional("relief"),
+        residual_shading=optional("residual_shading", "relief"),
         specular_confidence=optional("specular_confidence"),
     )
 

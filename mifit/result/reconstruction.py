@@ -310,12 +310,12 @@ class Reconstruction:
     def with_illumination(self, illumination: Illumination) -> Reconstruction:
         """The same face in another light, taken as it is; see `relight` for environment maps.
 
-        What the capture's own light left unexplained (``reflectance.relief``, ``residual``) is gone with it.
+        What the capture's own light left unexplained (``reflectance.residual_shading``, ``residual``) is gone with it.
         InputError for a result without reflectance.
         """
         if self.reflectance is None:
             raise InputError("illumination: this result has no reflectance; fit with --until reflectance")
-        reflectance = replace(self.reflectance, illumination=illumination, relief=None)
+        reflectance = replace(self.reflectance, illumination=illumination, residual_shading=None)
         return replace(self, reflectance=reflectance, residual=None, environment=None, environment_rotation=None)
 
     @property

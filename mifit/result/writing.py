@@ -43,7 +43,7 @@ def save(result: Reconstruction, folder: Path, write_scene: Callable[[Path], Non
         surfaces = _surfaces(result)
         files = [partial(_write_timestep, result, new, timestep, surfaces) for timestep in result.timesteps]
         if result.reflectance is not None:
-            for name in ("diffuse", "specular", "confidence", "relief", "specular_confidence"):
+            for name in ("diffuse", "specular", "confidence", "residual_shading", "specular_confidence"):
                 found = getattr(result.reflectance, name)
                 if found is not None:
                     files.append(partial(write_image, new / "maps" / f"{name}.exr", found))

@@ -125,8 +125,8 @@ def infer_reflectance(
         light = illumination.unknowns, illumination.ambient
         terms = energies(surface, forward, *light, solved.maps, albedo, config)
         details["objective"] = {**terms, "total": sum(terms.values())}
-    diffuse, relief = filled.diffuse, None
-    if first is not None and config.relief:
+    diffuse, residual_shading = filled.diffuse, None
+    if first is not None and config.residual_shading:
         # What no light reached is as dark as it was seen under the capture's own light, and skin under any other. Where
         # the lighting's error changes an albedo by as much as skin varies, skin is the better guess.
         level = surface.texels.to_map(surface.brightness())
@@ -134,11 +134,14 @@ def infer_reflectance(
         filled = blend_unseen(model, surface.texels, solved.maps, quality, solved.observability)
         parted = separate_shading(model, surface.texels, filled.diffuse, filled.confidence)
         shade = (shown.diffuse @ LUMINANCE) / np.maximum(filled.diffuse @ LUMINANCE, 1e-3)
-        diffuse, relief = parted.skin, parted.relief * np.where(surface.texels.mask, np.clip(shade, 0.0, 1.0), 1.0)
+        diffuse = parted.skin
+        residual_shading = (
+            parted.residual_shading * np.where(surface.texels.mask, np.clip(shade, 0.0, 1.0), 1.0)
+        ).astype(np.float32)
         details["spread"] = {"symmetric": parted.symmetric, "sided": parted.sided}
     return ReflectanceEstimate(
         diffuse=diffuse,
-        relief=None if relief is None else relief.astype(np.float32),
+        residual_shading=residual_shading,
         specular=filled.specular,
         confidence=filled.confidence,
         specular_confidence=filled.specular_confidence,

@@ -61,7 +61,7 @@ def test_skin_as_it_is_stays(head):
     parted = separate_shading(*head, albedo, np.ones((SIZE, SIZE), np.float32))
     assert parted.symmetric == pytest.approx(0.15, abs=0.02) and parted.sided < 0.02
     np.testing.assert_allclose(parted.skin, albedo, atol=1e-5)
-    np.testing.assert_allclose(parted.relief, 1.0, atol=1e-4)
+    np.testing.assert_allclose(parted.residual_shading, 1.0, atol=1e-4)
 
 
 @pytest.mark.parametrize("strength", [0.3, 0.6])
@@ -77,7 +77,7 @@ def test_light_from_one_side_is_parted(head, strength):
 
     assert error(parted.skin) < 0.5 * error(found)
     assert spreads(head, parted.skin)[1] < 1.2 * SIDED_SPREAD < spreads(head, found)[1]
-    np.testing.assert_allclose(parted.skin * parted.relief[..., None], found, atol=1e-5)
+    np.testing.assert_allclose(parted.skin * parted.residual_shading[..., None], found, atol=1e-5)
     assert parted.skin[inside].mean() == pytest.approx(found[inside].mean(), rel=0.02)  # its level stays
     assert parted.skin.max() <= 1.0
 
@@ -94,7 +94,7 @@ def test_more_contrast_than_skin_has_is_parted(head):
 def test_a_face_that_was_hardly_seen_is_left_alone(head):
     found = skin(head, 0.6)
     parted = separate_shading(*head, found, np.zeros((SIZE, SIZE), np.float32))
-    assert parted.symmetric is None and parted.skin is found and (parted.relief == 1.0).all()
+    assert parted.symmetric is None and parted.skin is found and (parted.residual_shading == 1.0).all()
 
 
 def test_without_a_symmetry_all_contrast_is_judged_as_one(head):

@@ -46,14 +46,14 @@ class Decomposition:
     ----------
     skin : (S, S, 3) float32
         Diffuse albedo.
-    relief : (S, S) float32
-        Factor of the diffuse light; ``skin * relief[..., None]`` is the map that was found.
+    residual_shading : (S, S) float32
+        Factor of the diffuse light; ``skin * residual_shading[..., None]`` is the map that was found.
     symmetric, sided : float or None
         Measured spreads of log luminance; None where too little of the face was seen.
     """
 
     skin: NDArray[np.float32]
-    relief: NDArray[np.float32]
+    residual_shading: NDArray[np.float32]
     symmetric: float | None
     sided: float | None
 
@@ -92,10 +92,10 @@ def separate_shading(
     # The level stays where the split between albedo and light put it.
     change -= np.log((found[observed] * np.exp(change[observed])[:, None]).mean() / found[observed].mean())
     change = np.minimum(change * share, -np.log(np.maximum(found.max(axis=1), DARKEST)))  # no albedo above 1
-    skin, relief = texels.from_map(diffuse) * np.exp(change)[:, None], np.exp(-change)
+    skin, factor = texels.from_map(diffuse) * np.exp(change)[:, None], np.exp(-change)
     return Decomposition(
         texels.to_map(skin.astype(np.float32)),
-        np.where(texels.mask, texels.to_map(relief.astype(np.float32)), np.float32(1.0)),
+        np.where(texels.mask, texels.to_map(factor.astype(np.float32)), np.float32(1.0)),
         symmetric,
         sided,
     )

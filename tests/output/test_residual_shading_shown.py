@@ -15,11 +15,11 @@ from tests.output.conftest import ball_camera, ball_result
 
 @pytest.fixture(scope="module")
 def parted(variant):
-    """A result whose diffuse map was parted into a smooth skin and relief, and the one that it was parted from."""
+    """A result with smooth skin and residual shading, and one with their product as albedo."""
     whole = ball_result()
     found = whole.reflectance.diffuse
-    relief = np.linspace(0.6, 1.2, len(found), dtype=np.float32)[:, None].repeat(len(found), axis=1)
-    skin = replace(whole.reflectance, diffuse=found / relief[..., None], relief=relief)
+    residual_shading = np.linspace(0.6, 1.2, len(found), dtype=np.float32)[:, None].repeat(len(found), axis=1)
+    skin = replace(whole.reflectance, diffuse=found / residual_shading[..., None], residual_shading=residual_shading)
     return replace(whole, reflectance=skin), whole
 
 
@@ -35,9 +35,9 @@ def test_its_own_light_shows_the_product(parted):
 def test_another_light_shows_skin_alone(parted):
     result, whole = parted
     light = Illumination(np.float64([[0.9, 0.8, 0.7]]))
-    bare = replace(whole, reflectance=replace(result.reflectance, relief=None))
+    bare = replace(whole, reflectance=replace(result.reflectance, residual_shading=None))
     shown = result.relight(light)
-    assert shown.reflectance.relief is None
+    assert shown.reflectance.residual_shading is None
     np.testing.assert_array_equal(shown.render(ball_camera(), 0), bare.relight(light).render(ball_camera(), 0))
     assert np.abs(shown.render(ball_camera(), 0) - whole.relight(light).render(ball_camera(), 0)).max() > 0.02
 
@@ -53,7 +53,7 @@ def test_it_is_kept_in_the_folder(parted, tmp_path):
     result, whole = parted
     result.save(tmp_path / "result")
     loaded = Reconstruction.load(tmp_path / "result", model=result.model)
-    np.testing.assert_array_equal(loaded.reflectance.relief, result.reflectance.relief)
+    np.testing.assert_array_equal(loaded.reflectance.residual_shading, result.reflectance.residual_shading)
     np.testing.assert_array_equal(loaded.reflectance.diffuse, result.reflectance.diffuse)
     whole.save(tmp_path / "result", force=True)
-    assert Reconstruction.load(tmp_path / "result", model=result.model).reflectance.relief is None
+    assert Reconstruction.load(tmp_path / "result", model=result.model).reflectance.residual_shading is None
