@@ -33,7 +33,7 @@ from mifit.stages.geometry.scenes import Scenes
 from mifit.stages.surface.align_timesteps import align_timesteps
 from mifit.stages.surface.close_openings import LIDS, LIPS, close_again, close_openings
 from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surface
-from mifit.stages.surface.epipolar import epipolar_residual
+from mifit.stages.surface.epipolar import epipolar_residual, likeness
 from mifit.stages.surface.outline import REACH, Borders, find_borders, joined
 from mifit.stages.surface.sweep import Found, Posed, across_time, sweep
 from mifit.stages.surface.thin_walls import keep_walls
@@ -78,6 +78,8 @@ SLACK = 0.01
 """Pixels that the surface may move by before what rays meet is built anew."""
 OFF_PIXELS = 1.0
 """Median distance from epipolar lines that deserves a warning."""
+ALIKE = 0.35
+"""Correlation of two views of one face: 0.6 to 0.9 on development heads, 0.1 of two persons."""
 
 
 @checked
@@ -158,6 +160,7 @@ def find_surface(
     result, crossed = keep_walls(model, result)
     world = result.vertices.astype(np.float64)
     residuals = sight.epipolar_residuals(views, pairs, result.timesteps, world, config.finest)
+    likenesses = sight.likenesses(pairs, result.timesteps[0], world[0], config.finest + 1)
     seconds = time.perf_counter() - began
     moved = np.linalg.norm(rest.state.displacement, axis=1)[np.unique(model.faces[model.face_mask])] * model.unit_mm
     phase = {
@@ -168,11 +171,13 @@ def find_surface(
         "matched": rest.matched,
         "displacement_mm": float(np.sqrt(np.mean(moved**2))),
         "epipolar_pixels": residuals,
+        "likeness": likenesses,
         "openings": closed | closed_lips,
         "walls_crossed": crossed,
         "seconds": seconds,
     }
-    return replace(result, report=_extended(geometry.report, seconds, phase, epipolar_warnings(residuals)))
+    warnings = epipolar_warnings(residuals) + likeness_warnings(likenesses)
+    return replace(result, report=_extended(geometry.report, seconds, phase, warnings))
 
 
 def neighbours(cameras: Sequence[Camera], centre: NDArray) -> list[tuple[int, int]]:
@@ -374,6 +379,11 @@ class Sight:
             found[f"{self.cameras[a]}, {self.cameras[b]}"] = None if residual is None else residual * 2.0**level
         return found
 
+    def likenesses(self, pairs: Sequence, timestep: int, vertices: NDArray, level: int) -> dict[str, float | None]:
+        """Correlation of what each pair of views shows on one timestep's surface (V, 3)."""
+        posed = self.posed(timestep, vertices, self.texels(vertices, level), level)
+        return {f"{self.cameras[a]}, {self.cameras[b]}": likeness(posed, (a, b)) for a, b in pairs}
+
 
 @dataclass(frozen=True)
 class Rest:
@@ -532,4 +542,17 @@ def epipolar_warnings(residuals: Mapping[str, float | None]) -> list[Diagnostic]
         )
         for names, pixels in residuals.items()
         if pixels is not None and pixels > OFF_PIXELS
+    ]
+
+
+def likeness_warnings(likenesses: Mapping[str, float | None]) -> list[Diagnostic]:
+    """What to say of views, such as ``"left, right"``, that show different skin in the same places."""
+    return [
+        Diagnostic(
+            "skin-differs",
+            f"cameras {names}: what they show on the fitted face correlates by {value:.2f}, expected at least "
+            f"{ALIKE:g}; they show two people, or two moments, or the calibration is off",
+        )
+        for names, value in likenesses.items()
+        if value is not None and value < ALIKE
     ]

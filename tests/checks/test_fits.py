@@ -16,7 +16,7 @@ from mifit.core.estimate import Report
 from mifit.morphable import MorphableModel
 from mifit.stages.checks.fit_checks import INCONSISTENT, check_fit, judged
 from mifit.stages.checks.landmark_model import noise_of
-from tests.checks.wrong_captures import make, read, write
+from tests.checks.wrong_captures import another_person, make, read, write
 from tests.output.conftest import ball_result
 
 PAIR = ("left", "right")
@@ -95,6 +95,13 @@ def test_landmarks_that_lie_beside_the_face_are_named_after_a_fit(shared, tmp_pa
     found = said_of(make("landmarks shifted", shared / "captures/scan_city", tmp_path, 1), PAIR)
     assert {code for code, _ in found} == {"landmarks-shifted"}
     assert any("in all cameras alike" in text for _, text in found)
+
+
+@pytest.mark.slow
+def test_two_people_are_told_by_their_skin(shared, tmp_path, variant):
+    rough = read(shared / "captures/soft", 1)
+    another_person(rough, "right", "hard")
+    assert "skin-differs" in {code for code, _ in said_of(write(rough, tmp_path), PAIR)}
 
 
 @pytest.mark.slow

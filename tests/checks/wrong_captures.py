@@ -227,9 +227,9 @@ def s_curve(value: NDArray) -> NDArray:
     return value**2 * (3 - 2 * value)
 
 
-def another_person(rough: Rough, name: str) -> None:
-    """A camera shows another head, which stands where the first one does."""
-    other = read(rough.good.parent / "gloss", len(rough.steps))
+def another_person(rough: Rough, name: str, who: str = "gloss") -> None:
+    """A camera shows another head, which stands where the first one does; skin of ``gloss`` is that of ``soft``."""
+    other = read(rough.good.parent / who, len(rough.steps))
     for step in rough.steps:
         rough.frames[name, step].update({key: other.frames[name, step][key] for key in SHOT})
 

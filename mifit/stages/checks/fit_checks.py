@@ -18,7 +18,7 @@ from mifit.stages.checks.landmark_model import INNER, noise_of
 SHIFT = 1.5
 """Shift that the landmarks of all cameras share from the face that the images show, in deviations of one landmark,
 beyond which it is no detector's: a detector's is up to 0.9 on development heads."""
-CONTRADICTIONS = ("views-disagree", "landmarks-shifted", "landmarks-unexplained", "landmarks-scatter")
+CONTRADICTIONS = ("views-disagree", "skin-differs", "landmarks-shifted", "landmarks-unexplained", "landmarks-scatter")
 """Codes of what a fit that explains its images doesn't have."""
 INCONSISTENT = "inconsistent"
 """Outcome of a stage whose search has ended where the views, or images and landmarks, contradict one another."""

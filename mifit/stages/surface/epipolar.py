@@ -1,4 +1,4 @@
-"""How far what two views show lies off one another's epipolar lines: calibration and synchrony, measured densely.
+"""Whether two views show one surface: how far off one another's epipolar lines it lies, and how alike it looks.
 
 Along its normal a texel is moved until the views agree; across the plane through it and both cameras no depth moves
 it, so that a shift which remains there is no matter of the surface.
@@ -20,6 +20,8 @@ FARTHEST = 4
 """Pixels that are searched to either side."""
 FEWEST = 200
 """Texels that must match for a residual to be told."""
+FACING = 0.4
+"""Cosine of the angle of view above which views are compared as they are."""
 
 
 def epipolar_residual(
@@ -65,3 +67,13 @@ def epipolar_residual(
     order = np.argsort(distance)
     total = np.cumsum(weight[order])
     return float(distance[order][np.searchsorted(total, 0.5 * total[-1])])
+
+
+def likeness(step: Posed, pair: tuple[int, int]) -> float | None:
+    """Correlation of the features that a pair of views shows on a surface; None where few texels face both."""
+    first, second = (step.images[view].sample(step.position, step.normal, np.zeros(1))[0] for view in pair)
+    used = (first[:, 1] > 0.99) & (second[:, 1] > 0.99) & (step.seen[list(pair)].min(axis=0) > FACING)
+    both = np.stack([first[used, 0], second[used, 0]])
+    if used.sum() < FEWEST or not both.std(axis=1).all():
+        return None
+    return float(np.corrcoef(both)[0, 1])
