@@ -1,8 +1,10 @@
 """The command line: exit codes, one-line errors, the whole path from a capture to a figure."""
 
 import argparse
+import importlib
 import json
 import math
+import re
 import shutil
 from argparse import Namespace
 
@@ -12,6 +14,7 @@ import pytest
 
 from mifit.cli import build_parser, main
 from mifit.cli.arguments import tell
+from mifit.cli.options import COMMANDS as TABLE
 from mifit.core.diagnostics import Diagnostic
 
 COMMANDS = (
@@ -43,6 +46,12 @@ def test_help(capsys, command):
     code, out, _ = run(capsys, command, "--help")
     assert code == 0
     assert "usage: mifit" in out
+
+
+def test_every_command_has_its_function():
+    for paragraph in TABLE.strip().split("\n\n"):
+        module, name = re.split("  +", paragraph, maxsplit=2)[1].split(".")
+        assert callable(getattr(importlib.import_module(f"mifit.cli.{module}"), name)), name
 
 
 @pytest.mark.parametrize(

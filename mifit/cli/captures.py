@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from argparse import Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mifit.cli.arguments import check_empty, use_variant
 from mifit.cli.clips import start_times
 from mifit.cli.console import console_progress
 from mifit.errors import InputError
-
-if TYPE_CHECKING:
-    pass
 
 
 def synth(arguments: Namespace) -> None:
@@ -162,3 +158,10 @@ def _calibrate_from_heads(arguments: Namespace) -> None:
         print(f"{name}: {role}, focal length {camera.fx:.0f} pixels, landmarks {error:.1f} pixels beside the others'")
     print(dense.note[0].upper() + dense.note[1:])
     print(f"Capture: {arguments.capture}; its scale is the model's, its cameras are estimates")
+
+
+def landmarks(arguments: Namespace) -> None:
+    """Detect landmarks and write them into the capture."""
+    from mifit.capture import detect_landmarks
+
+    print(detect_landmarks(arguments.capture, arguments.detector, progress=console_progress(arguments.quiet)))

@@ -44,6 +44,7 @@ doctor  setup.doctor  what of the set-up, or of a capture, is wrong, and what me
     --model      text=auto  of a capture: a path, builtin or auto (default)
     --cameras    names      of a capture: cameras to examine; default: the first two
     --timesteps  steps      of a capture: default: the first four
+    --dense      flag       of a capture: fit the first timestep and compare the views on its surface too
     {STRICT}
     --json       flag       print JSON
     --install    landmarks  fetch the networks that find landmarks, then check

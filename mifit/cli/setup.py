@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
-from typing import TYPE_CHECKING
 
-from mifit.cli.arguments import tell, writes
+from mifit.cli.arguments import tell, use_variant, writes
 from mifit.cli.console import console_progress
+from mifit.core.diagnostics import worst_first
 from mifit.core.files import Document
-
-if TYPE_CHECKING:
-    pass
 
 
 def doctor(arguments: Namespace) -> int:
@@ -51,6 +48,13 @@ def _examine(arguments: Namespace) -> int:
     figures: Document = {"cameras": {}}
     if capture.calibrated:
         figures["cameras"] = landmark_offsets(capture, model, cameras, timesteps)
+    if arguments.dense:
+        use_variant(arguments)
+        progress = console_progress(arguments.quiet)
+        fitted = mifit.fit(capture, model, cameras, timesteps[:1], until="geometry", progress=progress)
+        found = worst_first([*found, *fitted.diagnostics])
+        (surface,) = (one for one in fitted.geometry.report.details["phases"] if one["name"] == "surface")
+        figures |= {key: surface.get(key, {}) for key in ("epipolar_pixels", "likeness")}
     if arguments.json:
         print(json.dumps({"findings": [one.document() for one in found], **figures}, indent=2))
     else:
@@ -60,6 +64,10 @@ def _examine(arguments: Namespace) -> int:
             pixels = figures["cameras"].get(name)
             text = "landmarks not judged" if pixels is None else f"landmarks {pixels:.1f} pixels from a face"
             print(f"camera {name}: {verdict}, {text}")
+        for names, value in figures.get("epipolar_pixels", {}).items():
+            alike = figures["likeness"][names]
+            if value is not None and alike is not None:
+                print(f"cameras {names}: {value:.2f} pixels off epipolar lines, images correlate by {alike:.2f}")
     return tell(arguments, found)
 
 
