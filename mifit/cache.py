@@ -16,7 +16,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import filelock
 import numpy as np
@@ -29,16 +29,18 @@ from mifit.core.estimate import Report
 from mifit.core.files import replacing
 from mifit.core.photometry import Photometry
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
 RECORDS: dict[str, type] = {cls.__name__: cls for cls in (Report, Diagnostic, Illumination, DistantLight, Lobe)}
 """Dataclasses that an estimate may hold."""
 ARRAY, RECORD, PHOTOMETRY = "$array", "$record", "$photometry"
 
 
-def digest(value: Any) -> str:
+def digest(value: object) -> str:
     """Hex digest of a JSON value or a dataclass of JSON values."""
-    record = dataclasses.is_dataclass(value) and not isinstance(value, type)
-    plain = dataclasses.asdict(value) if record else value
+    plain = dataclasses.asdict(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else value
     return hashlib.sha256(json.dumps(plain, sort_keys=True, default=str).encode()).hexdigest()
 
 
@@ -78,7 +80,7 @@ class Cache:
         return filelock.FileLock(self.folder / f"{name}.lock")
 
 
-def save(folder: Path, stage: str, estimate: Any, key: str) -> None:
+def save(folder: Path, stage: str, estimate: DataclassInstance, key: str) -> None:
     """Write one stage's estimate (a dataclass of arrays, scalars and the records of `RECORDS`)."""
     arrays: dict[str, np.ndarray] = {}
     fields = {f.name: _plain(getattr(estimate, f.name), f.name, arrays) for f in dataclasses.fields(estimate)}
@@ -102,7 +104,7 @@ def load(folder: Path, stage: str, cls: type[T], key: str) -> T | None:
         return None
 
 
-def _plain(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
+def _plain(value: object, name: str, arrays: dict[str, np.ndarray]) -> object:
     """A value as JSON, its arrays put aside under names made of ``name``."""
     if isinstance(value, np.ndarray):
         arrays[name] = value
@@ -119,7 +121,7 @@ def _plain(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _restored(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+def _restored(value: object, arrays: Mapping[str, np.ndarray]) -> object:
     """The value that `_plain` made JSON of; lists come back as tuples, but for those inside dictionaries."""
     if isinstance(value, list):
         return tuple(_restored(item, arrays) for item in value)
@@ -134,7 +136,7 @@ def _restored(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     return value
 
 
-def _content(arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> str:
+def _content(arrays: Mapping[str, np.ndarray], values: Mapping[str, object]) -> str:
     """Digest of what an estimate holds, so that a changed value or shape is noticed."""
     state = hashlib.sha256(json.dumps(values, sort_keys=True).encode())
     for name in sorted(arrays):

@@ -17,10 +17,10 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, TypeVar, cast, get_type_hints
 
 import numpy as np
 
@@ -65,6 +65,8 @@ from mifit.stages.normals.refine_normals import refine_normals
 from mifit.stages.photometry import find_photometry
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
@@ -74,14 +76,20 @@ ONE_COLOUR = 1e-3
 Stage = Literal["geometry", "reflectance", "normals"]
 STAGES: tuple[Stage, ...] = ("geometry", "reflectance", "normals")
 Part = Literal["geometry", "reflectance", "normals", "mesh", "residual"]
-PARTS: dict[Part, type] = {
-    "geometry": GeometryEstimate,
-    "reflectance": ReflectanceEstimate,
-    "normals": NormalsEstimate,
-    "mesh": MeshEstimate,
-    "residual": ResidualEstimate,
-}
-Inputs = Mapping[Part, Any]
+Estimate = GeometryEstimate | ReflectanceEstimate | NormalsEstimate | MeshEstimate | ResidualEstimate
+
+
+class Estimates(TypedDict, total=False):
+    """Estimates by part, as the last step of each left them."""
+
+    geometry: GeometryEstimate
+    reflectance: ReflectanceEstimate
+    normals: NormalsEstimate
+    mesh: MeshEstimate
+    residual: ResidualEstimate
+
+
+PARTS: dict[str, type[Estimate]] = get_type_hints(Estimates)
 
 
 @dataclass(frozen=True)
@@ -112,7 +120,7 @@ class Source:
             "seed": self.seed,
         }
 
-    def seen(self, inputs: Inputs) -> Source:
+    def seen(self, inputs: Estimates) -> Source:
         """The source with the gains and exposures that its geometry holds divided out of the images."""
         if "geometry" not in inputs or not inputs["geometry"].photometry:
             return self
@@ -130,8 +138,8 @@ class Step:
     name: str
     part: Part
     inputs: tuple[Part, ...]
-    settings: tuple[Any, ...]
-    run: Callable[..., Any]
+    settings: tuple[DataclassInstance, ...]
+    run: Callable[..., Estimate]
 
 
 @checked
@@ -220,7 +228,7 @@ def fit(
         capture, estimated = dense.capture, (Diagnostic("uncalibrated", text), note)
     source = Source(capture, capture_digest, model, cameras, timesteps, seed)
 
-    def result(estimates: Mapping[Part, Any], seconds: float = 0.0) -> Reconstruction:
+    def result(estimates: Estimates, seconds: float = 0.0) -> Reconstruction:
         geometry = estimates["geometry"]
         found = [*checked, *check_fit(capture, model, geometry, cameras)]
         return Reconstruction(
@@ -387,17 +395,17 @@ def run_steps(
     source: Source,
     progress: Progress,
     cache: Cache,
-    watch: Callable[[Mapping[Part, Any]], None] | None = None,
-) -> tuple[dict[Part, Any], float]:
+    watch: Callable[[Estimates], None] | None = None,
+) -> tuple[Estimates, float]:
     """Estimates by part, as the last step of each left it, and the wall time of all steps, those kept included."""
-    estimates: dict[Part, Any] = {}
+    estimates: Estimates = {}
     before = 0.0
     made = keys(listed, source)
     for step in listed:
-        inputs = {part: estimates[part] for part in step.inputs}
+        inputs = cast("Estimates", {part: estimates[part] for part in step.inputs})
         run = functools.partial(step.run, source.seen(inputs), inputs, progress, *step.settings)
         try:
-            done = cache.get(step.name, PARTS[step.part], made[step.name], run)
+            done: Estimate = cache.get(step.name, PARTS[step.part], made[step.name], run)
         except np.linalg.LinAlgError as error:
             raise InputError(
                 f"{step.name}: equations without a solution ({error}), expected images of one face that all cameras "
@@ -408,21 +416,23 @@ def run_steps(
         estimates[step.part] = done
         if watch:
             watch(estimates)
-    return estimates, before + sum(estimate.report.seconds for estimate in estimates.values())
+    return estimates, before + sum(part.report.seconds for part in cast("dict[str, Estimate]", estimates).values())
 
 
-def _fit_geometry(source: Source, inputs: Inputs, progress: Progress, config: GeometryConfig) -> GeometryEstimate:
+def _fit_geometry(source: Source, inputs: Estimates, progress: Progress, config: GeometryConfig) -> GeometryEstimate:
     capture, model, cameras = source.images
     found = fit_geometry(capture, model, cameras, source.timesteps, config, seed=source.seed, progress=progress)
     return behind_lids(model, found)
 
 
-def _find_surface(source: Source, inputs: Inputs, progress: Progress, config: SurfaceConfig) -> GeometryEstimate:
+def _find_surface(source: Source, inputs: Estimates, progress: Progress, config: SurfaceConfig) -> GeometryEstimate:
     capture, model, cameras = source.images
     return behind_lids(model, find_surface(capture, model, inputs["geometry"], cameras, config, progress))
 
 
-def _find_photometry(source: Source, inputs: Inputs, progress: Progress, config: PhotometryConfig) -> GeometryEstimate:
+def _find_photometry(
+    source: Source, inputs: Estimates, progress: Progress, config: PhotometryConfig
+) -> GeometryEstimate:
     (capture, model, cameras), geometry = source.images, inputs["geometry"]
     began = time.perf_counter()
     found = find_photometry(capture, model, geometry, cameras, config, source.seed, progress)
@@ -431,23 +441,23 @@ def _find_photometry(source: Source, inputs: Inputs, progress: Progress, config:
 
 
 def _infer_reflectance(
-    source: Source, inputs: Inputs, progress: Progress, config: ReflectanceConfig
+    source: Source, inputs: Estimates, progress: Progress, config: ReflectanceConfig
 ) -> ReflectanceEstimate:
     capture, model, cameras = source.images
     return infer_reflectance(capture, model, inputs["geometry"], cameras, config, seed=source.seed, progress=progress)
 
 
-def _refine_normals(source: Source, inputs: Inputs, progress: Progress, config: NormalsConfig) -> NormalsEstimate:
+def _refine_normals(source: Source, inputs: Estimates, progress: Progress, config: NormalsConfig) -> NormalsEstimate:
     capture, model, cameras = source.images
     given = inputs["geometry"], inputs["reflectance"]
     return refine_normals(capture, model, *given, cameras, config, seed=source.seed, progress=progress)
 
 
-def _refine_mesh(source: Source, inputs: Inputs, progress: Progress, config: MeshConfig) -> MeshEstimate:
+def _refine_mesh(source: Source, inputs: Estimates, progress: Progress, config: MeshConfig) -> MeshEstimate:
     return refine_mesh(source.model, inputs["geometry"], inputs["normals"], config, progress)
 
 
-def _find_residual(source: Source, inputs: Inputs, progress: Progress, config: ResidualConfig) -> ResidualEstimate:
+def _find_residual(source: Source, inputs: Estimates, progress: Progress, config: ResidualConfig) -> ResidualEstimate:
     capture, model, cameras = source.images
     given = inputs["geometry"], inputs["reflectance"], inputs["normals"]
     return find_residual(capture, model, *given, cameras, config, seed=source.seed, progress=progress)

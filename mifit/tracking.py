@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, from_mapping
 from mifit.core.arrays import Rows
 from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
-from mifit.core.estimate import GeometryEstimate, NormalsEstimate, Report
+from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, Report
 from mifit.core.files import Document
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.process import one_blas_thread
@@ -45,6 +45,8 @@ from mifit.stages.surface.kept_texture import KeptTexture
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
+
+Moments = TypeVar("Moments", GeometryEstimate, NormalsEstimate, MeshEstimate)
 
 MEMORY = 4
 """Frames whose corrections make the prior of the next."""
@@ -370,9 +372,9 @@ def extend(
     return replace(result, **parts)
 
 
-def _longer(estimate: Any, part: str, timestep: int, rows: Mapping[str, NDArray], room: Room | None) -> Any:
+def _longer(estimate: Moments, part: str, timestep: int, rows: Mapping[str, NDArray], room: Room | None) -> Moments:
     """An estimate with a row of each of its arrays for one more timestep."""
-    arrays = {
+    arrays: Document = {
         name: np.concatenate([getattr(estimate, name), row[None]]) if room is None else room[part, name].add(row)
         for name, row in rows.items()
     }

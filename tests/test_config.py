@@ -126,6 +126,15 @@ def test_every_setting_is_within_its_bounds_and_explained():
         assert from_mapping(cls, dataclasses.asdict(made), "defaults") == made
 
 
+def test_every_number_of_a_fit_says_where_it_comes_from():
+    for key, _, expected, meaning in list_settings(FitConfig):
+        if "number" in expected:
+            source = re.search(
+                r"\((paper|cost|limit|set by hand|estimated|measured|chosen on|units|all|the most)[^()]*\)$", meaning
+            )
+            assert source, key
+
+
 def test_an_experiment_has_every_setting_of_a_fit():
     keys = {key for key, *_ in list_settings(FitRun)}
     assert {key for key, *_ in list_settings(FitConfig)} < keys

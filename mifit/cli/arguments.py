@@ -9,7 +9,7 @@ import sys
 from argparse import Namespace
 from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from mifit.core.diagnostics import Diagnostic, worst_first
 from mifit.core.files import check_overwriting, overwriting
@@ -208,7 +208,7 @@ def span(text: str) -> tuple[float, float]:
     return found
 
 
-READERS: dict[str, Callable[[str], Any]] = {
+READERS: dict[str, Callable[[str], object]] = {
     "text": str,
     "path": path,
     "names": listed,

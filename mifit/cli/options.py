@@ -6,7 +6,6 @@ import argparse
 import importlib
 import re
 from argparse import Namespace
-from typing import Any
 
 import mifit
 from mifit.cli.arguments import READERS, Parser, whole
@@ -267,7 +266,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     common = Parser(add_help=False)
     _add(common, COMMON)
-    actions: Any = None
+    actions: argparse._SubParsersAction[Parser] | None = None
     for paragraph in COMMANDS.strip().split("\n\n"):
         head, _, lines = paragraph.partition("\n")
         name, function, text = re.split("  +", head, maxsplit=2)
@@ -276,7 +275,7 @@ def build_parser() -> argparse.ArgumentParser:
             text_of_group = "inspect, convert and fetch morphable models"
             p = _command(commands, group, text_of_group, common)
             actions = p.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=Parser)
-        p = _command(actions, action, text, common) if action else _command(commands, name, text, common)
+        p = _command(actions, action, text, common) if action and actions else _command(commands, name, text, common)
         p.set_defaults(run=_Run(function))
         _add(p, lines)
     return parser
@@ -292,7 +291,9 @@ class _Run:
         return getattr(importlib.import_module(f"mifit.cli.{self._module}"), self._name)(arguments)
 
 
-def _command(commands: Any, name: str, text: str, common: Parser) -> argparse.ArgumentParser:
+def _command(
+    commands: argparse._SubParsersAction[Parser], name: str, text: str, common: Parser
+) -> argparse.ArgumentParser:
     return commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".", parents=[common])
 
 

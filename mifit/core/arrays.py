@@ -20,7 +20,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.lib import format as npy
@@ -127,7 +127,7 @@ class Rows:
     """
 
     def __init__(self, count: int, shape: tuple[int, ...], dtype: DTypeLike) -> None:
-        self._array: NDArray[Any] = _reserved((count, *shape), np.dtype(dtype))
+        self._array: NDArray = _reserved((count, *shape), np.dtype(dtype))
         self._used = 0
 
     def add(self, row: NDArray) -> NDArray:
@@ -250,7 +250,7 @@ class Recent(Generic[T]):
         self._kept.clear()
 
 
-def content_key(*values: Any) -> bytes:
+def content_key(*values: object) -> bytes:
     """Digest of arrays, by shape, type and content, and of plain values."""
     digest = hashlib.blake2b()
     for value in values:
@@ -262,7 +262,7 @@ def content_key(*values: Any) -> bytes:
     return digest.digest()
 
 
-def same(a: Any, b: Any) -> bool:
+def same(a: object, b: object) -> bool:
     """Whether two values are equal to the last bit: plain ones, arrays, and records, mappings and sequences of both."""
     if a is b:
         return True
@@ -271,9 +271,9 @@ def same(a: Any, b: Any) -> bool:
         return x.shape == y.shape and x.dtype == y.dtype and bool(np.array_equal(x, y, equal_nan=x.dtype.kind == "f"))
     if type(a) is not type(b):
         return False
-    if isinstance(a, Mapping):
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
         return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, (list, tuple)):
+    if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)):
         return len(a) == len(b) and all(map(same, a, b))
     if dataclasses.is_dataclass(a):
         return all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a) if f.compare)

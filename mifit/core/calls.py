@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,7 +29,7 @@ def finite(values: ArrayLike, shape: tuple[int, ...], name: str) -> NDArray[np.f
     return array
 
 
-def whole(value: Any, low: int, name: str, high: int = 2**31 - 1) -> int:
+def whole(value: object, low: int, name: str, high: int = 2**31 - 1) -> int:
     """A whole number from ``low`` to ``high``; InputError for another."""
     if not isinstance(value, (int, np.integer)) or not low <= value <= high:
         raise InputError(f"{name}: found {value!r}, expected a whole number from {low} to {high}")

@@ -14,7 +14,7 @@ import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -24,6 +24,9 @@ from mifit.core.files import read_bytes, write_bytes
 from mifit.core.limits import MAX_DECODED_BYTES, MAX_IMAGE_BYTES, MAX_PIXELS
 from mifit.core.process import decoding
 from mifit.errors import InputError
+
+if TYPE_CHECKING:
+    import PIL.Image
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".hdr")
 """Names that image folders are searched for."""
@@ -126,7 +129,7 @@ def _check_size(size: tuple[int, int], path: str | Path) -> None:
         )
 
 
-def _open_raster(data: bytes) -> Any:
+def _open_raster(data: bytes) -> PIL.Image.Image:
     from PIL import Image as Pillow
     from PIL import UnidentifiedImageError
 
@@ -167,10 +170,12 @@ def _table(bits: int, gamma: float | None, path: str | Path) -> NDArray[np.float
     return (codes ** (1.0 / gamma)).astype(np.float32)
 
 
-def _bits(image: Any, data: bytes) -> int:
+def _bits(image: PIL.Image.Image, data: bytes) -> int:
+    from PIL.TiffImagePlugin import TiffImageFile
+
     if image.format == "PNG":
         return data[24]
-    if image.format == "TIFF":
+    if isinstance(image, TiffImageFile):
         return max(image.tag_v2.get(258, (8,)))
     return 8
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +41,7 @@ class Photometry:
         return {"gain": {name: list(map(float, rgb)) for name, rgb in self.gain.items()}, "exposure": exposure}
 
     @classmethod
-    def from_document(cls, document: Mapping[str, Any]) -> Photometry:
+    def from_document(cls, document: Document) -> Photometry:
         """What `document` wrote.
 
         Raises

@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import mifit
 from mifit import cache
@@ -33,6 +33,11 @@ from mifit.config import (
 from mifit.core.files import Document, check_file, file_digest, file_name
 from mifit.core.limits import MAX_IMAGE_BYTES, MAX_RUNS, MAX_SAMPLES, MAX_SEED, MAX_SETTINGS_BYTES
 from mifit.errors import InputError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Part = TypeVar("Part", bound="DataclassInstance")
 
 
 @settings
@@ -149,7 +154,7 @@ class Run:
         return "_".join([file_name("_".join(words)), self.digest[:10]] if words else [self.digest[:10]])
 
 
-def _plain(value: Any) -> str:
+def _plain(value: object) -> str:
     text = "-".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
     return "".join(c if c.isalnum() or c in ".-+" else "-" for c in Path(text).name)
 
@@ -206,14 +211,14 @@ def load_plan(path: str | Path, overrides: Sequence[str] = (), seed: int = 0) ->
     return Plan(runs[0].experiment.name, tuple(runs), jobs)
 
 
-def _toml_value(text: str) -> Any:
+def _toml_value(text: str) -> object:
     try:
         return parse_toml(f"x = {text}")["x"]
     except (ValueError, RecursionError):
         return text
 
 
-def _assign(table: dict, key: str, value: Any, where: str) -> None:
+def _assign(table: dict, key: str, value: object, where: str) -> None:
     """Set a dotted key in nested tables, which are made as needed; a capture takes the place of a synthetic one."""
     *parents, last = key.split(".")
     for name in parents:
@@ -226,11 +231,11 @@ def _assign(table: dict, key: str, value: Any, where: str) -> None:
         table.pop(other, None)
 
 
-def _points(sweep: Any, where: str) -> Iterator[Document]:
+def _points(sweep: object, where: str) -> Iterator[Document]:
     """The points of a sweep: the product of ``grid``'s lists, or the tables of ``list``; one point without a sweep."""
     if not isinstance(sweep, dict) or set(sweep) - {"grid", "list"} or len(sweep) > 1:
         raise InputError(f"{where}: sweep: found {sweep!r}, expected one table 'grid' or one list 'list'")
-    points: list[Any] = sweep.get("list", [{}])
+    points = sweep.get("list", [{}])
     grid = sweep.get("grid", {})
     if not isinstance(grid, dict):
         raise InputError(f"{where}: sweep.grid: found {grid!r}, expected a table of lists")
@@ -247,14 +252,14 @@ def _points(sweep: Any, where: str) -> Iterator[Document]:
         yield dict(_flatten(point)) | dict(zip(grid, values, strict=True))
 
 
-def _with_captures(sweep: Any, path: Path) -> Any:
+def _with_captures(sweep: object, path: Path) -> object:
     """A sweep in whose grid a folder of captures stands for the list of them."""
     if not isinstance(sweep, dict) or not isinstance(sweep.get("grid"), dict):
         return sweep
     grid = dict(_flatten(sweep["grid"]))
     for key in ("fit.capture", "relight.capture"):
-        if isinstance(grid.get(key), str):
-            folder = grid[key]
+        folder = grid.get(key)
+        if isinstance(folder, str):
             found = sorted(p.parent.name for p in (path.parent / folder).glob("*/transforms.json"))
             if not found:
                 raise InputError(f"{path}: sweep.grid: {key}: found no capture in {folder!r}, expected folders of them")
@@ -262,7 +267,7 @@ def _with_captures(sweep: Any, path: Path) -> Any:
     return {**sweep, "grid": grid}
 
 
-def _flatten(table: dict, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _flatten(table: dict, prefix: str = "") -> Iterator[tuple[str, object]]:
     """Nested tables -> dotted keys, so that both ``a.b = [1]`` and ``"a.b" = [1]`` work in TOML."""
     for key, value in table.items():
         if isinstance(value, dict):
@@ -304,7 +309,7 @@ def _resolved(e: Experiment, folder: Path, where: str) -> Experiment:
     return e
 
 
-def _absolute(settings: Any, folder: Path) -> Any:
+def _absolute(settings: Part, folder: Path) -> Part:
     """Settings whose paths are absolute, in their parts too."""
     changed: Document = {}
     for field in dataclasses.fields(settings):
@@ -317,9 +322,9 @@ def _absolute(settings: Any, folder: Path) -> Any:
     return dataclasses.replace(settings, **changed)
 
 
-def _inputs(e: Experiment) -> dict[str, tuple[Any, ...]]:
+def _inputs(e: Experiment) -> dict[str, tuple]:
     """What a run reads: the arguments of `_digest` for each input."""
-    found: dict[str, tuple[Any, ...]] = {}
+    found: dict[str, tuple] = {}
     if e.render:
         found["scene"] = ("file", e.render.scene)
     if e.relight:

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -233,7 +233,7 @@ def compare(
     return Comparison(timestep, photograph, area, renders, blended, area & base.seen, off)
 
 
-def held_out(result: Reconstruction, found: Mapping[str, Any]) -> bool:
+def held_out(result: Reconstruction, found: Document) -> bool:
     """Whether nothing that an evaluation compared with was fitted: another camera, or timesteps without a fit."""
     fitted = found["camera"] in [c.name for c in result.cameras]
     return not fitted or not set(found["timesteps"]) & set(result.timesteps)

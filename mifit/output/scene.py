@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from mifit.result import Method, Reconstruction
 
 SAMPLES = Parameter("spp", 64)
-Skin = Callable[[Mapping[str, Document]], Mapping[str, Any]]
+Skin = Callable[[Mapping[str, Document]], Mapping[str, object]]
 """Makes a BSDF's dictionary of those of the maps' textures."""
 
 
@@ -181,7 +181,7 @@ def _slopes(result: Reconstruction, timestep: int, normal_object: NDArray, shape
 def load_result_scene(
     result: Reconstruction,
     timestep: int,
-    integrator: str | Mapping[str, Any],
+    integrator: str | Mapping[str, object],
     cameras: Sequence[Camera],
     method: Method,
     samples: int,
@@ -195,7 +195,7 @@ def load_result_scene(
     whole(samples, 1, "samples", MAX_SAMPLES)
     if not all(isinstance(camera, Camera) for camera in cameras):
         raise TypeError("scene: cameras: found other objects, expected Camera")
-    chosen = {"type": integrator} if isinstance(integrator, str) else dict(integrator)
+    chosen: Document = {"type": integrator} if isinstance(integrator, str) else dict(integrator)
     if chosen.get("type") == "shdirect":
         if result.environment is not None:  # what it shades is smooth light
             smooth = replace(result.illumination, radiance=result.lighting.coefficients, lights=())
@@ -220,7 +220,7 @@ def scene_description(
     method: Method,
     stock: bool,
     files: str,
-    integrator: Mapping[str, Any] | None = None,
+    integrator: Mapping[str, object] | None = None,
     samples: int | Parameter = SAMPLES,
 ) -> Document:
     """The scene of `write_scene` as a plain dictionary (`render.description`), its files in the folder ``files``.

@@ -21,7 +21,7 @@ import re
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,7 +146,7 @@ class _Files:
             group[key] = path
         return found
 
-    def _place(self, path: Path, capture: Capture) -> tuple[dict[Any, Path], Any] | None:
+    def _place(self, path: Path, capture: Capture) -> tuple[dict, object] | None:
         stem, suffix = path.stem, path.suffix.lower()
         if suffix in MESHES:
             known = stem.isdigit() and int(stem) in capture.timesteps

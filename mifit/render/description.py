@@ -10,7 +10,6 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -48,11 +47,11 @@ class Parameter:
     default: int | float | str
 
 
-def to_mitsuba(description: Mapping[str, Any]) -> Document:
+def to_mitsuba(description: Mapping[str, object]) -> Document:
     """The description for ``mi.load_dict``: transforms as Mitsuba's, parameters as their defaults."""
     import mitsuba as mi
 
-    def convert(value: Any) -> Any:
+    def convert(value: object) -> object:
         if isinstance(value, Mapping):
             return {key: convert(item) for key, item in value.items()}
         if isinstance(value, Parameter):
@@ -61,10 +60,10 @@ def to_mitsuba(description: Mapping[str, Any]) -> Document:
             return mi.ScalarTransform4f(value)
         return value
 
-    return convert(description)
+    return {key: convert(item) for key, item in description.items()}
 
 
-def to_xml(description: Mapping[str, Any], comment: str = "") -> str:
+def to_xml(description: Mapping[str, object], comment: str = "") -> str:
     """The description of a whole scene as Mitsuba XML; KeyError for a plugin that `KINDS` doesn't list."""
     root = ET.Element("scene", version="3.0.0")
     if comment:
@@ -78,7 +77,7 @@ def to_xml(description: Mapping[str, Any], comment: str = "") -> str:
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
-def _parameters(description: Mapping[str, Any]) -> dict[str, Parameter]:
+def _parameters(description: Mapping[str, object]) -> dict[str, Parameter]:
     found: dict[str, Parameter] = {}
     for value in description.values():
         if isinstance(value, Parameter):
@@ -88,7 +87,7 @@ def _parameters(description: Mapping[str, Any]) -> dict[str, Parameter]:
     return found
 
 
-def _add(parent: ET.Element, name: str, value: Any, label: str = "name") -> None:
+def _add(parent: ET.Element, name: str, value: object, label: str = "name") -> None:
     """Add a property or object; floats with all their digits, so that the file says what was described."""
     if isinstance(value, Parameter):
         ET.SubElement(parent, _tag(value.default), name=name, value=f"${value.name}")
@@ -111,14 +110,14 @@ def _add(parent: ET.Element, name: str, value: Any, label: str = "name") -> None
                 _add(added, key, item)
 
 
-def _tag(value: Any) -> str:
+def _tag(value: object) -> str:
     for kind, tag in ((bool, "boolean"), (int, "integer"), (float, "float"), (str, "string")):
         if isinstance(value, kind):
             return tag
     raise TypeError(f"scene description: found a value of type {type(value).__name__}")
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return repr(float(value)) if isinstance(value, float) else str(value)  # NumPy's floats call themselves so

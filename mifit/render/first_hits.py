@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,7 +18,7 @@ KEPT_BYTES, RAY_BYTES = 2**30, 260
 """Of first hits at most, and of one of them with its ray and its point: a dozen views of 680 x 480."""
 
 
-def _buffers_of(mesh: mi.Mesh) -> list[Any]:
+def _buffers_of(mesh: mi.Mesh) -> list[mi.Float]:
     """What a point on a mesh is made of: positions, faces, normals and UVs, as far as there are any."""
     import mitsuba as mi
 
@@ -26,7 +26,7 @@ def _buffers_of(mesh: mi.Mesh) -> list[Any]:
     return [parameters[key] for key in MESH_BUFFERS if key in parameters]
 
 
-def _number_of(pointer: Any) -> int:
+def _number_of(pointer: mi.ShapePtr) -> int:
     """The number by which kernels know a shape or a sensor."""
     import drjit as dr
     import mitsuba as mi
@@ -41,7 +41,7 @@ def recording() -> bool:
     return bool(dr.flag(dr.JitFlag.SymbolicScope) or dr.flag(dr.JitFlag.FreezingScope))
 
 
-def _by_tile(uv: mi.Point2f) -> Any:
+def _by_tile(uv: mi.Point2f) -> mi.UInt32:
     """The order of points in which those that share a tile of texels follow one another."""
     import mitsuba as mi
 
@@ -62,7 +62,7 @@ class FirstHits:
         self.sensor: mi.Sensor = None
         self.kept: dict[tuple[int, int], Document] = {}
 
-    def find(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> tuple[Any, Any]:
+    def find(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.UInt32 | None, mi.SurfaceInteraction3f]:
         """The points that a sensor's rays meet, and the numbers of their rays; None where each ray has an entry."""
         import drjit as dr
         import mitsuba as mi
@@ -102,7 +102,7 @@ class FirstHits:
             return index, kept["hits"].compute_surface_interaction(dr.gather(mi.Ray3f, mi.Ray3f(ray), index))
         return index, mi.SurfaceInteraction3f(kept["si"])
 
-    def hit(self, index: mi.UInt32, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> Any:
+    def hit(self, index: mi.UInt32 | None, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Bool:
         """Which rays meet something, given what `find` found."""
         import drjit as dr
         import mitsuba as mi

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from mifit.core.arrays import Recent
 from mifit.core.camera import Camera
 from mifit.core.mesh import lengths
 from mifit.errors import InputError
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 MESH_POSITIONS = "vertex_positions"
 MESH_FACES = "faces"
@@ -46,8 +49,12 @@ class GBuffer:
 
 
 def make_mesh(
-    vertices: NDArray, faces: NDArray, uv: NDArray | None = None, normals: NDArray | None = None, bsdf: Any = None
-) -> Any:
+    vertices: NDArray,
+    faces: NDArray,
+    uv: NDArray | None = None,
+    normals: NDArray | None = None,
+    bsdf: mi.BSDF | None = None,
+) -> mi.Mesh:
     """An ``mi.Mesh`` from arrays, with one UV pair and normal per vertex where given; without normals it is shaded
     flat.
 
@@ -221,7 +228,7 @@ class SurfaceScene:
         origin = on_device(mi.Vector3f, points) + dr.opaque(mi.Float, SHADOW_EPSILON * self._diagonal) * n
         toward = mi.Float(aligned(directions).ravel())
 
-        def body(i: Any, bits: Any) -> tuple[Any, Any]:
+        def body(i: mi.UInt, bits: mi.UInt) -> tuple[mi.UInt, mi.UInt]:
             d = mi.Vector3f(*(dr.gather(mi.Float, toward, 3 * i + k) for k in range(3)))
             above = dr.dot(n, d) > 0.0
             seen = above & ~self.rays.ray_test(mi.Ray3f(mi.Point3f(origin), d), active=above)
@@ -232,7 +239,7 @@ class SurfaceScene:
         return np.array(bits, dtype=np.uint32)
 
 
-def _box_rays(camera: Camera, box: tuple[slice, slice]) -> tuple[Any, Any]:
+def _box_rays(camera: Camera, box: tuple[slice, slice]) -> tuple[mi.Vector3f, mi.Float]:
     """Unit directions through the centres of a box of pixels, row by row, and their parts along the camera's axis."""
     import drjit as dr
     import mitsuba as mi

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 
-def load_scene(source: str | Path | Mapping[str, Any], **parameters: Any) -> Any:
+def load_scene(source: str | Path | Mapping[str, object], **parameters: object) -> mi.Scene:
     """A Mitsuba scene from an XML file or a dictionary, with mifit's plugins registered.
 
     Equal objects are not merged, so parameters keep the names that the scene gives them. The ``radius`` of each
@@ -75,15 +75,13 @@ def _one_line(message: str) -> str:
 
 
 def render_scene(
-    path: str | Path, parameters: Mapping[str, Any], spp: int, seed: int = 0, sensor: int = 0
+    path: str | Path, parameters: Mapping[str, object], spp: int, seed: int = 0, sensor: int = 0
 ) -> NDArray[np.float32]:
     """What a scene file's film holds, (H, W, C): linear radiance on black, and coverage where it has alpha.
 
     ``parameters`` are values of the file's ``<default>`` names, ``sensor`` says which of the scene's sensors.
     """
     import mitsuba as mi
-
-    from mifit.render.scene import load_scene
 
     scene = load_scene(path, **parameters)
     image = mi.render(scene, sensor=sensor, spp=spp, seed=seed)  # type: ignore[arg-type]

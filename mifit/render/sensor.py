@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +11,9 @@ from mifit.core.camera import Camera
 from mifit.core.files import Document
 from mifit.errors import InputError
 from mifit.render.description import Parameter, to_mitsuba
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 MITSUBA_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
 """OpenCV's camera axes (x right, y down) to Mitsuba's (x left, y up); both look along +z."""
@@ -52,7 +55,7 @@ def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str =
     }
 
 
-def make_sensor(camera: Camera, spp: int = 16, sampler: str = "multijitter") -> Any:
+def make_sensor(camera: Camera, spp: int = 16, sampler: str = "multijitter") -> mi.Sensor:
     """The loaded ``mi.Sensor`` of `sensor_description`; InputError as there."""
     import mitsuba as mi
 

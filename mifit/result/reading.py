@@ -8,10 +8,9 @@ import warnings
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mifit.appearance import models
 from mifit.appearance.illumination import Illumination, light_from
@@ -147,11 +146,11 @@ def _report(document: Document, stage: str) -> Report:
     return Report(entry["status"], energies, float(entry["seconds"]), _diagnostics(entry["warnings"]), entry["details"])
 
 
-def _diagnostics(entries: Any) -> tuple[Diagnostic, ...]:
+def _diagnostics(entries: Sequence[Document]) -> tuple[Diagnostic, ...]:
     return tuple(Diagnostic.of(entry) for entry in entries)
 
 
-def _array(value: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float64]:
+def _array(value: ArrayLike, shape: tuple[int, ...], name: str) -> NDArray[np.float64]:
     """A float64 array of a given shape, all finite and within bounds."""
     out = np.array(value, dtype=np.float64)
     if out.shape != shape or not (np.abs(out) <= MAX_NUMBER).all():
@@ -159,15 +158,15 @@ def _array(value: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float64]
     return out
 
 
-def _positive(value: Any, name: str) -> float:
+def _positive(value: ArrayLike, name: str) -> float:
     """A number from 1e-9 to 1e9."""
-    number = float(value)
+    number = float(_array(value, (), name))
     if not 1.0 / MAX_NUMBER <= number <= MAX_NUMBER:
         raise ValueError(f"{name}: found {number:g}, expected a number from {1.0 / MAX_NUMBER:g} to {MAX_NUMBER:g}")
     return number
 
 
-def _rotations(value: Any, count: int) -> NDArray[np.float64]:
+def _rotations(value: ArrayLike, count: int) -> NDArray[np.float64]:
     """(N, 3, 3) rotations."""
     out = _array(value, (count, 3, 3), "rotation")
     if not (np.allclose(out @ out.transpose(0, 2, 1), np.eye(3), atol=1e-3) and (np.linalg.det(out) > 0).all()):

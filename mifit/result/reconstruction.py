@@ -187,7 +187,7 @@ class Reconstruction:
 
     def scene(
         self,
-        integrator: str | Mapping[str, Any] = "path",
+        integrator: str | Mapping[str, object] = "path",
         timestep: int | None = None,
         cameras: Sequence[Camera] | None = None,
         method: Method = "full",

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,50 +135,49 @@ def _document(result: Reconstruction) -> Document:
             "shading_model": reflectance.shading_model,
             **reflectance.lobe.parameters(),
         }
-    return _finite(
-        {
-            "format_version": FORMAT_VERSION,
-            "mifit_version": mifit.__version__,
-            "config": result.config,
-            "capture": {
-                "digest": result.capture_digest,
-                "units": result.units,
-                "unit_mm": result.unit_mm,
-                "cameras": [{k: getattr(c, k) for k in CAMERA} for c in result.cameras],
-                "photometry": geometry.photometry.document(),
-                "landmark_noise": float(geometry.landmark_noise),
-                "face_width": float(geometry.face_width),
-            },
-            "model": {
-                "source": _source(result.model_source),
-                "name": result.model.name,
-                "digest": result.model.digest,
-                "identity": geometry.identity.tolist(),
-                "albedo": geometry.albedo.tolist(),
-                "scale": float(geometry.scale),
-                "displaced": geometry.displacement is not None,
-                "subdivisions": 0 if result.mesh is None else result.mesh.subdivisions,
-            },
-            "lighting": lighting,
-            "timesteps": [
-                {
-                    "timestep": t,
-                    "rotation": geometry.rotation[i].tolist(),
-                    "translation": geometry.translation[i].tolist(),
-                    "expression": geometry.expression[i].tolist(),
-                    "tracked": result.tracked.get(t),
-                    "refined_normals": result.refined_normal(t) is not None,
-                    "refined_mesh": result.mesh is not None and t in result.mesh.timesteps,
-                    "residual": result.residual is not None and t in result.residual.timesteps,
-                }
-                for i, t in enumerate(result.timesteps)
-            ],
-            "stages": {name: _report_document(report) for name, report in result.reports.items()},
-            "seconds": result.seconds,
-            "peak_memory": int(result.peak_memory),
-            "warnings": [found.document() for found in result.warnings],
-        }
-    )
+    found = {
+        "format_version": FORMAT_VERSION,
+        "mifit_version": mifit.__version__,
+        "config": result.config,
+        "capture": {
+            "digest": result.capture_digest,
+            "units": result.units,
+            "unit_mm": result.unit_mm,
+            "cameras": [{k: getattr(c, k) for k in CAMERA} for c in result.cameras],
+            "photometry": geometry.photometry.document(),
+            "landmark_noise": float(geometry.landmark_noise),
+            "face_width": float(geometry.face_width),
+        },
+        "model": {
+            "source": _source(result.model_source),
+            "name": result.model.name,
+            "digest": result.model.digest,
+            "identity": geometry.identity.tolist(),
+            "albedo": geometry.albedo.tolist(),
+            "scale": float(geometry.scale),
+            "displaced": geometry.displacement is not None,
+            "subdivisions": 0 if result.mesh is None else result.mesh.subdivisions,
+        },
+        "lighting": lighting,
+        "timesteps": [
+            {
+                "timestep": t,
+                "rotation": geometry.rotation[i].tolist(),
+                "translation": geometry.translation[i].tolist(),
+                "expression": geometry.expression[i].tolist(),
+                "tracked": result.tracked.get(t),
+                "refined_normals": result.refined_normal(t) is not None,
+                "refined_mesh": result.mesh is not None and t in result.mesh.timesteps,
+                "residual": result.residual is not None and t in result.residual.timesteps,
+            }
+            for i, t in enumerate(result.timesteps)
+        ],
+        "stages": {name: _report_document(report) for name, report in result.reports.items()},
+        "seconds": result.seconds,
+        "peak_memory": int(result.peak_memory),
+        "warnings": [found.document() for found in result.warnings],
+    }
+    return {key: _finite(value) for key, value in found.items()}
 
 
 def _source(source: str) -> str:
@@ -198,7 +196,7 @@ def _report_document(report: Report) -> Document:
     }
 
 
-def _finite(value: Any) -> Any:
+def _finite(value: object) -> object:
     """The value with plain Python numbers, and null for what JSON can't hold."""
     if isinstance(value, dict):
         return {str(k): _finite(v) for k, v in value.items()}

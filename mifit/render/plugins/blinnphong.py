@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from mifit.appearance.lobe import EXPONENT_MAX, EXPONENT_MIN
 
 
@@ -88,7 +86,7 @@ def make() -> type:
         def parameters_changed(self, keys: list[str]) -> None:
             self._set_flags()
 
-        def parameters(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> tuple[Any, Any, Any, Any, Any]:
+        def parameters(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> tuple[mi.Color3f, ...]:
             """Both albedos, exponent, Fresnel factor (or None) and corrected local normal at a surface point."""
             diffuse = self.diffuse.eval(si, active)
             specular = self.specular.eval(si, active)
@@ -103,20 +101,20 @@ def make() -> type:
             n = mi.Normal3f(dr.normalize(mi.Vector3f(slopes.x, slopes.y, 1.0)))
             return diffuse, specular, exponent, fresnel, n
 
-        def at_angle(self, diffuse: mi.Color3f, specular: mi.Float, fresnel: mi.Float, cosine: mi.Float) -> Any:
+        def at_angle(self, diffuse: mi.Color3f, specular: mi.Float, fresnel: mi.Float, cosine: mi.Float) -> mi.Color3f:
             """Specular albedo with its Fresnel factor at a cosine, stopped where it would gain energy."""
             if fresnel is None:
                 return specular
             value = specular * fresnel_factor(cosine, fresnel)
             return dr.minimum(value, dr.maximum(1.0 - diffuse, 0.0)) if self.normalized else value
 
-        def _half(self, wi: mi.Vector3f, wo: mi.Vector3f) -> Any:
+        def _half(self, wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Vector3f:
             h = wi + wo
             return h * dr.rsqrt(dr.maximum(dr.squared_norm(h), 1e-12))
 
         def _lobe(
             self, wi: mi.Vector3f, wo: mi.Vector3f, n: mi.Vector3f, exponent: mi.Float, fresnel: mi.Float
-        ) -> tuple[Any, Any]:
+        ) -> tuple[mi.Float, mi.Float]:
             """The lobe without albedo and N(m), and the density of wo when it is sampled."""
             if fresnel is not None:
                 return carried_lobe(wi, wo, n, exponent)
@@ -127,7 +125,9 @@ def make() -> type:
             density = (exponent + 1.0) * dr.inv_two_pi * power / dr.maximum(4.0 * wi_h, 1e-8)
             return power, dr.select(wi_h > 0.0, density, 0.0)
 
-        def _specular_probability(self, ctx: mi.BSDFContext, wi: mi.Vector3f, parameters: Any) -> Any:
+        def _specular_probability(
+            self, ctx: mi.BSDFContext, wi: mi.Vector3f, parameters: tuple[mi.Color3f, ...]
+        ) -> mi.Float:
             """Probability of sampling the lobe: the share of its albedo; none where the normal faces away."""
             has_specular = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
             has_diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1)
@@ -141,7 +141,7 @@ def make() -> type:
             facing = (cosine > 0.0) & (mi.Frame3f.cos_theta(wi) > 0.0)
             return dr.select(facing, dr.select(s + d > 0.0, s / dr.maximum(s + d, 1e-12), 0.5), 0.0)
 
-        def _reflects(self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, n: mi.Vector3f) -> tuple[Any, Any, Any]:
+        def _reflects(self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, n: mi.Vector3f) -> tuple[mi.Bool, ...]:
             """Where the base reflects, where the lobe does as well, and the corrected cosine of wo."""
             cosine, facing = dr.dot(wo, n), mi.Frame3f.cos_theta(si.wi) > 0.0
             front = facing | (dr.dot(si.n, si.to_world(si.wi)) > 0.0)
@@ -149,8 +149,13 @@ def make() -> type:
             return above, above & facing & (dr.dot(si.wi, n) > 0.0), cosine
 
         def _value(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, parameters: Any, active: mi.Bool
-        ) -> Any:
+            self,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            wo: mi.Vector3f,
+            parameters: tuple[mi.Color3f, ...],
+            active: mi.Bool,
+        ) -> mi.Spectrum:
             diffuse, specular, exponent, fresnel, n = parameters
             wi = si.wi
             reflects, shines, cosine = self._reflects(si, wo, n)
@@ -165,8 +170,13 @@ def make() -> type:
             return dr.select(active & reflects, value * cosine, 0.0)
 
         def _density(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, parameters: Any, active: mi.Bool
-        ) -> Any:
+            self,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            wo: mi.Vector3f,
+            parameters: tuple[mi.Color3f, ...],
+            active: mi.Bool,
+        ) -> mi.Float:
             _, _, exponent, fresnel, n = parameters
             reflects, shines, cosine = self._reflects(si, wo, n)
             p = self._specular_probability(ctx, si.wi, parameters)
@@ -175,15 +185,17 @@ def make() -> type:
 
         def eval(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> Any:
+        ) -> mi.Spectrum:
             return self._value(ctx, si, wo, self.parameters(si, active), active)
 
-        def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True) -> Any:
+        def pdf(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> mi.Float:
             return self._density(ctx, si, wo, self.parameters(si, active), active)
 
         def eval_pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> tuple[Any, Any]:
+        ) -> tuple[mi.Spectrum, mi.Float]:
             parameters = self.parameters(si, active)
             return (
                 self._value(ctx, si, wo, parameters, active),
@@ -197,7 +209,7 @@ def make() -> type:
             sample1: mi.Float,
             sample2: mi.Point2f,
             active: mi.Bool = True,
-        ) -> tuple[Any, Any]:
+        ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
             parameters = self.parameters(si, active)
             _, _, exponent, fresnel, n = dr.detach(parameters)
             p = self._specular_probability(ctx, si.wi, parameters)
@@ -232,7 +244,7 @@ def make() -> type:
             valid = active & (bs.pdf > 0.0)
             return bs, dr.select(valid, value / dr.select(valid, bs.pdf, 1.0), 0.0)
 
-        def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> Any:
+        def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
             return self.parameters(si, active)[0]
 
         def to_string(self) -> str:

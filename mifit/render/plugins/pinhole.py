@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from mifit.errors import InputError
 
 
@@ -55,7 +53,7 @@ def make() -> type:
 
         def sample_ray(
             self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
-        ) -> tuple[Any, Any]:
+        ) -> tuple[mi.Ray3f, mi.Color3f]:
             film = self.film()
             pixel = sample2 * mi.Vector2f(film.crop_size()) + mi.Vector2f(film.crop_offset())
             local = dr.normalize(mi.Vector3f((self.cx - pixel.x) / self.fx, (self.cy - pixel.y) / self.fy, 1.0))
@@ -67,7 +65,7 @@ def make() -> type:
 
         def sample_ray_differential(
             self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
-        ) -> tuple[Any, Any]:
+        ) -> tuple[mi.RayDifferential3f, mi.Color3f]:
             ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
             differential = mi.RayDifferential3f(ray)
             size = mi.Vector2f(self.film().crop_size())
@@ -78,7 +76,7 @@ def make() -> type:
             differential.has_differentials = True
             return differential, weight
 
-        def bbox(self) -> Any:
+        def bbox(self) -> mi.ScalarBoundingBox3f:
             return mi.ScalarBoundingBox3f()  # a point that no scene has to hold
 
         def to_string(self) -> str:

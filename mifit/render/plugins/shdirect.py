@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -30,12 +29,12 @@ def make() -> type:
 
         def __init__(self) -> None:
             super().__init__()
-            self.found: list[Any] = []
+            self.found: list[object] = []
 
-        def put(self, name: str, value: Any, flags: Any) -> None:
+        def put(self, name: str, value: object, flags: object) -> None:
             self.found.append(value)
 
-    def at(values: Any, index: mi.UInt32) -> Any:
+    def at(values: mi.Float, index: mi.UInt32) -> mi.Float:
         """The entries of an array, whose only one may be that of all."""
         return values if dr.width(values) == 1 else dr.gather(type(values), values, index)
 
@@ -86,7 +85,9 @@ def make() -> type:
             if dr.is_jit_v(mi.Float):
                 callback.put("ambient", self.ambient, mi.ParamFlags.Differentiable)
 
-        def sample_rays(self, scene: mi.Scene, sensor: mi.Sensor, sampler: mi.Sampler) -> tuple[Any, Any, Any]:
+        def sample_rays(
+            self, scene: mi.Scene, sensor: mi.Sensor, sampler: mi.Sampler
+        ) -> tuple[mi.Ray3f, mi.Color3f, mi.Vector2f]:
             """Rays on a fixed pattern inside each pixel, the same for every pixel and seed."""
             film = sensor.film()
             size = film.crop_size()
@@ -115,7 +116,7 @@ def make() -> type:
             spp: int = 0,
             develop: bool = True,
             evaluate: bool = True,
-        ) -> Any:
+        ) -> mi.TensorXf:
             """Image (H, W, 3), or with alpha (H, W, 4).
 
             One sample per pixel under a box filter is the pixel: it is written to its place, where Mitsuba's way adds
@@ -174,7 +175,7 @@ def make() -> type:
                 ray, weight, _ = self.sample_rays(scene, sensor, sampler)
                 share = dr.opaque(mi.Float, 1.0 / spp)
 
-                def given(samples: mi.UInt32) -> Any:
+                def given(samples: mi.UInt32) -> mi.Color3f:
                     """Gradients of samples."""
                     first = samples // dr.opaque(mi.UInt32, spp) * grad_in.shape[2]
                     entries = (dr.gather(mi.Float, grad_in.array, first + k) for k in range(3))
@@ -195,8 +196,14 @@ def make() -> type:
                 dr.eval()
 
         def sample(
-            self, mode: Any, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool = True, **_: Any
-        ) -> tuple[Any, Any, list[Any], Any]:
+            self,
+            mode: dr.ADMode,
+            scene: mi.Scene,
+            sampler: mi.Sampler,
+            ray: mi.Ray3f,
+            active: mi.Bool = True,
+            **_: object,
+        ) -> tuple[mi.Color3f, mi.Bool, list[mi.Float], None]:
             """Radiance along primary rays; plain automatic differentiation in every mode."""
             index, value, behind, hit = self._seen(scene, ray, active)
             return self._everywhere(index, value, behind, hit), hit | (not self.hide), [], None
@@ -206,13 +213,17 @@ def make() -> type:
             special = dr.all(mi.has_flag(film.flags(), mi.FilmFlags.Special))
             return not special and film.rfilter().is_box_filter()
 
-        def _seen(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> tuple[Any, Any, Any, Any]:
+        def _seen(
+            self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool
+        ) -> tuple[mi.UInt32 | None, mi.Color3f, mi.Color3f | None, mi.Bool]:
             """Numbers of the rays that meet something (None: one entry per ray), radiance there, behind, and which."""
             index, si = self._hits.find(scene, ray, active)
             behind = None if self.hide else self._emitters(scene)[0].radiance(ray.d)
             return index, self._shade(scene, si), behind, self._hits.hit(index, si, ray)
 
-        def _everywhere(self, index: mi.UInt32, value: Any, behind: mi.Color3f, hit: mi.Bool) -> Any:
+        def _everywhere(
+            self, index: mi.UInt32 | None, value: mi.Color3f, behind: mi.Color3f | None, hit: mi.Bool
+        ) -> mi.Color3f:
             """Radiance along every ray, of what `_seen` found."""
             if index is not None:
                 radiance = dr.zeros(mi.Color3f, dr.width(hit))
@@ -220,7 +231,7 @@ def make() -> type:
                 value = radiance
             return value if behind is None else dr.select(hit, value, behind)
 
-        def _shade(self, scene: mi.Scene, si: mi.SurfaceInteraction3f) -> Any:
+        def _shade(self, scene: mi.Scene, si: mi.SurfaceInteraction3f) -> mi.Color3f:
             """Radiance that leaves points of surfaces towards the camera; nothing where there is none."""
             emitter, compact = self._emitters(scene)
             flat = emitter.project()
@@ -262,7 +273,7 @@ def make() -> type:
             lobe = self._lobes.get(key, lambda: kernels.prepare_exponent(exponent, order, normalized))
             return replace(lobe, fresnel=fresnel)
 
-        def _emitters(self, scene: mi.Scene) -> tuple[Any, list[Any]]:
+        def _emitters(self, scene: mi.Scene) -> tuple[mi.Emitter, list[mi.Emitter]]:
             """The scene's `shenv`, of which there is one, and its other emitters, none of them an environment."""
             emitters = scene.emitters()
             smooth = [e for e in emitters if type(e).__name__ == "SHEnvironment"]
@@ -274,7 +285,9 @@ def make() -> type:
                 )
             return smooth[0], others
 
-        def _direct(self, scene: mi.Scene, light: mi.Emitter, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Any:
+        def _direct(
+            self, scene: mi.Scene, light: mi.Emitter, si: mi.SurfaceInteraction3f, active: mi.Bool
+        ) -> mi.Color3f:
             """What the points reflect of a compact light that they see, averaged over a fixed pattern on it."""
             context, bsdf = mi.BSDFContext(), si.bsdf()
             count = 1 if mi.has_flag(light.flags(), mi.EmitterFlags.Delta) else 16
@@ -287,9 +300,9 @@ def make() -> type:
                 total += dr.select(lit, bsdf.eval(context, si, si.to_local(ds.d), lit) * weight, 0.0)
             return total / count
 
-        def _bsdfs(self, scene: mi.Scene) -> list[tuple[Any, Any, bool]]:
+        def _bsdfs(self, scene: mi.Scene) -> list[tuple[mi.BSDF, mi.BSDFPtr, bool]]:
             """The scene's `blinnphong` objects, the pointers that surfaces carry, and whether they are two-sided."""
-            result: dict[int, tuple[Any, Any, bool]] = {}
+            result: dict[int, tuple[mi.BSDF, mi.BSDFPtr, bool]] = {}
             for shape in scene.shapes():
                 outer = shape.bsdf()
                 bsdf, two_sided = outer, False
@@ -305,7 +318,9 @@ def make() -> type:
                 result[id(outer)] = (bsdf, mi.BSDFPtr(outer), two_sided)
             return list(result.values())
 
-        def _transfer(self, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: mi.Bool, order: int) -> list[Any]:
+        def _transfer(
+            self, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: mi.Bool, order: int
+        ) -> list[mi.Float]:
             """Traced transfer vectors at the hits, interpolated between vertices."""
             size = order * order
             values = [mi.Float(0.0) for _ in range(size)]
@@ -322,7 +337,7 @@ def make() -> type:
 
         def _barycentric(
             self, shape: mi.Shape, si: mi.SurfaceInteraction3f, corners: mi.Vector3u, active: mi.Bool
-        ) -> tuple[Any, Any]:
+        ) -> tuple[mi.Float, mi.Float]:
             with dr.suspend_grad():
                 p0, p1, p2 = (shape.vertex_position(corner, active) for corner in corners)
                 e1, e2, q = p1 - p0, p2 - p0, si.p - p0
@@ -331,7 +346,7 @@ def make() -> type:
                 area = dr.maximum(a * c - b * b, 1e-30)
                 return (c * d - b * e) / area, (a * e - b * d) / area
 
-        def _tables(self, shapes: list[mi.Shape], order: int) -> list[Any]:
+        def _tables(self, shapes: list[mi.Shape], order: int) -> list[mi.Float]:
             """Transfer vectors per vertex of every shape; traced again only when positions changed."""
             if any(not shape.is_mesh() for shape in shapes):
                 raise InputError("shdirect: model 'shadowed': found a shape that isn't a mesh, expected meshes only")

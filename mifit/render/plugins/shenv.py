@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mifit.core.sh import LUMINANCE, basis, order_of, quadrature
 from mifit.errors import InputError
@@ -22,7 +21,7 @@ CLAMPED_BANDS = 2
 """Bands to add when clamped radiance, which is no longer band limited, is projected for closed-form shading."""
 
 
-def read_coefficients(value: Any) -> np.ndarray:
+def read_coefficients(value: ArrayLike) -> np.ndarray:
     """Coefficients (B*B, 3) from an array, or from text with all numbers in rows; InputError for another count."""
     if isinstance(value, str):
         try:
@@ -104,7 +103,7 @@ def make() -> type:
             height = np.broadcast_to(z[:, None], (ROWS, COLUMNS))
             cells = np.stack([np.outer(r, np.cos(phi)), np.outer(r, np.sin(phi)), height], axis=-1)
             self._cell_basis = basis(cells.reshape(-1, 3), order_of(array))
-            self._projections: dict[int, tuple[Any, Any]] = {}
+            self._projections: dict[int, tuple[mi.Vector3f, mi.Float]] = {}
             self._rebuild()
 
         def _rebuild(self) -> None:
@@ -140,7 +139,7 @@ def make() -> type:
             if not keys or "coefficients" in keys:
                 self._rebuild()
 
-        def radiance(self, direction: mi.Vector3f) -> Any:
+        def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
             """Clamped radiance from world directions."""
             local = self._to_local(direction)
             flat = self.coefficients.array
@@ -149,10 +148,10 @@ def make() -> type:
                 total += y * mi.Color3f(*(_entry(flat, 3 * k + c) for c in range(3)))
             return mi.Color3f(dr.maximum(total * self.scale, 0.0))
 
-        def _to_local(self, direction: mi.Vector3f) -> Any:
+        def _to_local(self, direction: mi.Vector3f) -> mi.Vector3f:
             return self.to_world.inverse() @ mi.Vector3f(direction)
 
-        def project(self) -> Any:
+        def project(self) -> mi.Float:
             """Coefficients of the clamped radiance in world axes, flat (K*K*3), differentiable.
 
             They are the emitter's own where nothing is clamped, rotated to the world; otherwise the projection of the
@@ -179,7 +178,7 @@ def make() -> type:
                 dr.scatter(flat, sums[c], 3 * dr.arange(mi.UInt32, order * order) + c)
             return flat
 
-        def _sample(self, sample: mi.Point2f, active: mi.Bool) -> tuple[Any, Any]:
+        def _sample(self, sample: mi.Point2f, active: mi.Bool) -> tuple[mi.Vector3f, mi.Float]:
             """A world direction and its density."""
             index, x = self._table.sample_reuse(sample.x, active)
             z = -1.0 + (2.0 / ROWS) * (mi.Float(index // COLUMNS) + x)
@@ -190,7 +189,7 @@ def make() -> type:
             # Looked up again, so that rounding at a cell's edge can't make it differ from pdf_direction.
             return d, self._density(d, active)
 
-        def _density(self, direction: mi.Vector3f, active: mi.Bool) -> Any:
+        def _density(self, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
             d = self._to_local(direction)
             row = dr.clip(mi.Int32(dr.floor((d.z + 1.0) * (0.5 * ROWS))), 0, ROWS - 1)
             turn = dr.atan2(d.y, d.x) * (0.5 / np.pi)
@@ -198,10 +197,12 @@ def make() -> type:
             pmf = self._table.eval_pmf_normalized(mi.UInt32(row * COLUMNS + column), active)
             return dr.select(active, pmf * (ROWS * COLUMNS / (4.0 * np.pi)), 0.0)
 
-        def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> Any:
+        def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
             return dr.select(active, self.radiance(-si.wi), 0.0)
 
-        def sample_direction(self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True) -> tuple[Any, Any]:
+        def sample_direction(
+            self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
+        ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
             d, pdf = self._sample(sample, active)
             reach = 2.0 * dr.maximum(self.radius, dr.norm(mi.Vector3f(it.p)))
             ds = mi.DirectionSample3f()
@@ -216,22 +217,22 @@ def make() -> type:
             ds.dist = reach
             return ds, dr.select(active, self.radiance(d) / pdf, 0.0)
 
-        def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> Any:
+        def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
             return self._density(ds.d, active)
 
-        def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> Any:
+        def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Spectrum:
             return dr.select(active, self.radiance(ds.d), 0.0)
 
         def sample_ray(
             self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
-        ) -> tuple[Any, Any]:
+        ) -> tuple[mi.Ray3f, mi.Spectrum]:
             d, pdf = self._sample(sample3, active)
             disk = mi.warp.square_to_uniform_disk_concentric(sample2)
             origin = self.radius * (mi.Frame3f(d).to_world(mi.Vector3f(disk.x, disk.y, 0.0)) + d)
             ray = mi.Ray3f(mi.Point3f(origin), -d, time, [])
             return ray, dr.select(active, self.radiance(d) * (np.pi * dr.square(self.radius)) / pdf, 0.0)
 
-        def bbox(self) -> Any:
+        def bbox(self) -> mi.ScalarBoundingBox3f:
             return mi.ScalarBoundingBox3f()  # an environment has no extent
 
         def to_string(self) -> str:
@@ -241,7 +242,7 @@ def make() -> type:
                 f"  rotation = {self._rotation.tolist()}\n]"
             )
 
-    def _entry(flat: mi.Float, index: int) -> Any:
+    def _entry(flat: mi.Float, index: int) -> mi.Float:
         if not dr.is_jit_v(mi.Float):
             return flat[index]
         # All points add to these few gradients: in copies per thread, or they would wait for one another.
