@@ -1,8 +1,7 @@
 """Reading FLAME's pickles without running them.
 
-A pickle is a program for a stack machine that may call anything. Here Python's own machine runs with what could do
-harm replaced: a name stays a name, arrays are built from their bytes by NumPy's recipes as they are written down here,
-and only text may be a key. Nothing of the file is ever called, hashed or imported.
+A pickle is a program for a stack machine that may call anything. Here every name that it mentions stands for one of the
+few recipes below, which build arrays from their bytes as NumPy pickles them; all other names are refused.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import pickletools
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,95 +21,69 @@ from mifit.core.files import opened, read_bytes
 from mifit.core.limits import MAX_MODEL_BYTES
 from mifit.errors import InputError
 
-MAX_STEPS = 10**6
-"""Instructions of one pickle; FLAME's have a few thousand."""
-
-
-class Name(NamedTuple):
-    """A module's name in a pickle: a word and nothing more."""
-
-    module: str
-    name: str
+MAX_STEPS = 20_000
+"""Instructions of one pickle, and its largest memo index; FLAME's have a few thousand."""
 
 
 class Instance:
-    """Stands in for an object that isn't an array: its class's name and its state."""
+    """Stands in for an object that isn't an array, such as chumpy's: its state alone."""
 
-    def __init__(self, kind: Name) -> None:
-        self.kind, self.state = kind, object()
+    state: object = None
 
-    def build(self, state: object) -> None:
-        """Take the state as it is."""
+    def __setstate__(self, state: object) -> None:
         self.state = state
 
 
-class Dtype:
+class _Dtype:
     """A type of plain numbers, its byte order set by its state as NumPy pickles it."""
 
-    def __init__(self, text: object) -> None:
+    def __init__(self, code: object, *_: object) -> None:
+        text = code.decode("latin1") if isinstance(code, bytes) else code
         if not isinstance(text, str) or not re.fullmatch(r"[<>|=]?[biuf][1248]", text):
             raise InputError(f"an array has type {_short(text)}, expected plain numbers")
         self.dtype = np.dtype(text)
 
-    def build(self, state: object) -> None:
+    def __setstate__(self, state: object) -> None:
         """State: (version, byte order, subarray, names, fields, size, alignment, flags[, metadata])."""
-        known = isinstance(state, tuple) and len(state) >= 5 and state[2:5] == (None, None, None)
-        if not isinstance(state, tuple) or not known or state[1] not in ("<", ">", "|", "="):
+        if not isinstance(state, tuple) or state[2:5] != (None, None, None) or state[1] not in ("<", ">", "|", "="):
             raise InputError("an array's type has fields or no byte order, expected plain numbers")
         self.dtype = self.dtype.newbyteorder(state[1])
 
 
-class Array:
-    """An array in the making: empty until its state or buffer is there."""
+class _Array:
+    """An array in the making: empty until its state is there."""
 
-    def __init__(self) -> None:
-        self.value: np.ndarray | None = None
+    value: np.ndarray | None = None
 
-    def build(self, state: object) -> None:
-        """State: (version, shape, dtype, whether Fortran order, bytes)."""
+    def __init__(self, kind: object = None, shape: object = (0,), code: object = None) -> None:
+        if shape != (0,):
+            raise InputError(f"an array is built with shape {_short(shape)}, expected (0,)")
+
+    def __setstate__(self, state: object) -> None:
+        """State: (version, shape, dtype, whether Fortran order, bytes); every size is checked against the bytes."""
         if not isinstance(state, tuple) or len(state) not in (4, 5):
             raise InputError(f"an array has a state of type {type(state).__name__}, expected 5 values")
         shape, dtype, fortran, data = state[-4:]
-        self.fill(data, dtype, shape, "F" if fortran else "C")
-
-    def fill(self, data: object, dtype: object, shape: object, order: object) -> None:
-        """Set the values from bytes; every size is checked against them."""
         if isinstance(data, str):
             data = data.encode("latin1")
-        if not isinstance(dtype, Dtype) or not isinstance(data, (bytes, bytearray)) or order not in ("C", "F"):
+        if not isinstance(dtype, _Dtype) or not isinstance(data, (bytes, bytearray)):
             raise InputError("an array isn't built of bytes and a type of plain numbers")
         if not isinstance(shape, tuple) or len(shape) > 8 or any(type(n) is not int or n < 0 for n in shape):
             raise InputError(f"an array has shape {_short(shape)}, expected whole numbers")
         if math.prod(shape) * dtype.dtype.itemsize != len(data):
             raise InputError(f"an array claims shape {shape} of {dtype.dtype}, but holds {len(data)} bytes")
-        self.value = np.frombuffer(data, dtype.dtype).reshape(shape, order=order)
+        self.value = np.frombuffer(data, dtype.dtype).reshape(shape, order="F" if fortran else "C")
 
 
-def _reconstruct(kind: object, shape: object, code: object) -> Array:
-    if type(kind) is not Name or kind not in _ARRAY_TYPES or shape != (0,):
-        raise InputError(f"an array is built with shape {_short(shape)}, expected (0,)")
-    return Array()
-
-
-def _frombuffer(data: object, dtype: object, shape: object, order: object, axes: object = None) -> Array:
-    made = Array()
-    made.fill(data, dtype, shape, "C" if order == "K" else order)
+def _frombuffer(data: object, dtype: object, shape: object, order: object, axes: object = None) -> _Array:
+    made = _Array()
+    made.__setstate__((shape, dtype, order == "F", data))
+    assert made.value is not None
     if axes is not None:
-        assert made.value is not None
         every = list(range(made.value.ndim))
         if not isinstance(axes, tuple) or any(type(n) is not int for n in axes) or sorted(axes) != every:
             raise InputError(f"an array has its axes in the order {_short(axes)}, expected each once")
         made.value = made.value.transpose(axes)
-    return made
-
-
-def _dtype(code: object, *_: object) -> Dtype:
-    return Dtype(code.decode("latin1") if isinstance(code, bytes) else code)
-
-
-def _scalar(dtype: object, data: object) -> Array:
-    made = Array()
-    made.fill(data, dtype, (), "C")
     return made
 
 
@@ -120,56 +93,90 @@ def _encode(text: object, encoding: object = "latin1") -> bytes:
     return text.encode("latin1")
 
 
-def _empty() -> bytes:
-    return b""
+class _Recipe:
+    """What a name stands for: it may be called, and nothing else can be done to it."""
+
+    __slots__ = ("make",)
+
+    def __init__(self, make: Callable[..., object]) -> None:
+        self.make = make
+
+    def __call__(self, *arguments: object) -> object:
+        return self.make(*arguments)
+
+    def __setstate__(self, state: object) -> None:
+        raise InputError("sets the state of a function, which is refused; expected arrays only")
 
 
-def _object(kind: object, *_: object) -> Instance:
-    if type(kind) is not Name or kind not in _INSTANCES:
-        raise InputError(f"an object of type {_short(kind)} is built, expected an array")
-    return Instance(kind)
+def _refuse(*_: object) -> object:
+    raise InputError("an object is built that is no array, which is refused")
 
 
-_ARRAY_TYPES = {Name("numpy", "ndarray")}
-_INSTANCES = {
-    Name("scipy.sparse.csc", "csc_matrix"),
-    Name("scipy.sparse._csc", "csc_matrix"),
-    Name("chumpy.ch", "Ch"),
+_RECIPES: dict[str, object] = {
+    "numpy.dtype": _Recipe(_Dtype),
+    "numpy.ndarray": _Recipe(_refuse),
+    "numpy.core.multiarray._reconstruct": _Recipe(_Array),
+    "numpy.core.multiarray.scalar": _Recipe(lambda dtype, data: _frombuffer(data, dtype, (), "C")),
+    "numpy.core.numeric._frombuffer": _Recipe(_frombuffer),
+    "copyreg._reconstructor": _Recipe(lambda kind, *_: Instance() if kind is Instance else _refuse()),
+    "_codecs.encode": _Recipe(_encode),
+    "builtins.bytes": _Recipe(lambda: b""),
+    "builtins.object": _Recipe(_refuse),
+    "scipy.sparse._csc.csc_matrix": Instance,
+    "chumpy.ch.Ch": Instance,
 }
-_RECIPES: dict[Name, Callable[..., Any]] = {
-    Name("numpy", "dtype"): _dtype,
-    Name("numpy.core.multiarray", "_reconstruct"): _reconstruct,
-    Name("numpy._core.multiarray", "_reconstruct"): _reconstruct,
-    Name("numpy.core.multiarray", "scalar"): _scalar,
-    Name("numpy._core.multiarray", "scalar"): _scalar,
-    Name("numpy.core.numeric", "_frombuffer"): _frombuffer,
-    Name("numpy._core.numeric", "_frombuffer"): _frombuffer,
-    Name("copy_reg", "_reconstructor"): _object,
-    Name("copyreg", "_reconstructor"): _object,
-    Name("_codecs", "encode"): _encode,
-    Name("__builtin__", "bytes"): _empty,
-    Name("builtins", "bytes"): _empty,
+"""By module and name as of today; only what is here may be mentioned, and its meaning is given here."""
+_RENAMED = {
+    "numpy._core": "numpy.core",
+    "copy_reg": "copyreg",
+    "__builtin__": "builtins",
+    "scipy.sparse.csc": "scipy.sparse._csc",
 }
-_ADMITTED = {*_RECIPES, *_ARRAY_TYPES, *_INSTANCES, Name("__builtin__", "object"), Name("builtins", "object")}
-"""Names that a pickle may mention; only the recipes have a meaning, and it is given here."""
+
+
+class _Unpickler(pickle._Unpickler):  # type: ignore[name-defined, misc]
+    """Python's own machine, in which only text may be a key: anything else could be made to hash for ever."""
+
+    stack: list[object]
+    pop_mark: Callable[[], list[object]]
+    dispatch: ClassVar[dict[int, Callable[..., None]]] = dict(pickle._Unpickler.dispatch)  # type: ignore[attr-defined]
+
+    def load_setitem(self) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        self._set([key, value])
+
+    def load_setitems(self) -> None:
+        self._set(self.pop_mark())
+
+    def load_dict(self) -> None:
+        items = self.pop_mark()
+        self.stack.append({})
+        self._set(items)
+
+    def _set(self, values: list[object]) -> None:
+        target = self.stack[-1]
+        for key, value in zip(values[::2], values[1::2], strict=True):
+            key = key.decode("latin1") if isinstance(key, bytes) else key
+            if type(key) is not str or type(target) is not dict:
+                raise InputError(f"sets an item {_short(key)} of a {type(target).__name__}, expected names of arrays")
+            target[key] = value
+
+    dispatch.update({pickle.SETITEM[0]: load_setitem, pickle.SETITEMS[0]: load_setitems, pickle.DICT[0]: load_dict})
+
+    def find_class(self, module: str, name: str) -> object:
+        known = next((new + module[len(old) :] for old, new in _RENAMED.items() if module.startswith(old)), module)
+        if f"{known}.{name}" not in _RECIPES:
+            raise InputError(f"wants to run {module}.{name}, which is refused; expected arrays only")
+        return _RECIPES[f"{known}.{name}"]
 
 
 def _short(value: object) -> str:
     """A value for a message; containers by their type, as they may hold themselves a million times."""
-    if isinstance(value, Name):
-        return f"{value.module}.{value.name}"[:80]
     if type(value) is tuple and len(value) <= 8 and all(type(n) is int and abs(n) < 2**64 for n in value):
         return repr(value)
     if type(value) in (str, bytes) or (type(value) is int and abs(value) < 2**64):
         return repr(value[:40] if isinstance(value, (str, bytes)) else value)
     return f"a {type(value).__name__}"
-
-
-_REFUSED = {
-    "INST", "OBJ", "EXT1", "EXT2", "EXT4", "PERSID", "BINPERSID", "NEWOBJ_EX", "EMPTY_SET", "ADDITEMS", "FROZENSET",
-    "NEXT_BUFFER", "READONLY_BUFFER",
-}  # fmt: skip
-"""Instructions that make objects in other ways. Sizes are checked where the instructions are counted."""
 
 
 def is_pickle(path: Path) -> bool:
@@ -193,13 +200,12 @@ def read_pickle(path: Path) -> dict[str, object]:
     """
     data = read_bytes(path, MAX_MODEL_BYTES, "pickle")
     try:
+        # A first pass checks every length; the second one could be told to reserve what isn't there.
         for step, (op, argument, _) in enumerate(pickletools.genops(data)):
-            if step > MAX_STEPS:
+            if step > MAX_STEPS or ("PUT" in op.name and (argument or 0) > MAX_STEPS):
                 raise InputError(f"found more than {MAX_STEPS} instructions, expected a dictionary of arrays")
-            if op.name in _REFUSED or op.proto > 5:
+            if op.name in ("EMPTY_SET", "ADDITEMS", "FROZENSET"):  # they hash what they are given
                 raise InputError(f"uses {op.name}, which is refused; expected arrays only")
-            if "PUT" in op.name and (argument or 0) > 2**32:  # larger ones could be chosen to collide
-                raise InputError(f"memo index {_short(argument)}, expected at most {2**32}")
         out = _Unpickler(io.BytesIO(data), encoding="latin1").load()
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -214,66 +220,8 @@ def plain_array(value: object, where: str) -> np.ndarray:
     """Array of a pickled value, out of chumpy if need be; raises InputError for anything else."""
     if isinstance(value, Instance) and isinstance(value.state, dict):  # chumpy keeps the array in its attribute x
         value = value.state.get("x")
-    if isinstance(value, Array):
+    if isinstance(value, _Array):
         value = value.value
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
-        kind = value.kind.name if isinstance(value, Instance) else type(value).__name__
-        raise InputError(f"{where}: found {kind}, expected a numeric array")
+        raise InputError(f"{where}: found {type(value).__name__}, expected a numeric array")
     return value
-
-
-class _Unpickler(pickle._Unpickler):  # type: ignore[name-defined, misc]
-    """Python's machine; a name is a `Name`, which can't be called."""
-
-    stack: list[object]
-    pop_mark: Callable[[], list[object]]
-    dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)  # type: ignore[attr-defined]
-
-    def find_class(self, module: str, name: str) -> Name:
-        if Name(module, name) not in _ADMITTED:
-            raise InputError(f"wants to run {module}.{name}, which is refused; expected arrays only")
-        return Name(module, name)
-
-    def load_reduce(self) -> None:
-        arguments, function = self.stack.pop(), self.stack.pop()
-        if type(function) is not Name or function not in _RECIPES or type(arguments) is not tuple:
-            raise InputError(f"wants to run {_short(function)}, which is refused; expected arrays only")
-        self.stack.append(_RECIPES[function](*arguments))
-
-    def load_newobj(self) -> None:
-        _, kind = self.stack.pop(), self.stack.pop()
-        self.stack.append(_object(kind))
-
-    def load_build(self) -> None:
-        state, target = self.stack.pop(), self.stack[-1]
-        if not isinstance(target, (Array, Dtype, Instance)):
-            kind = type(target).__name__
-            raise InputError(f"sets the state of a {kind}, which is refused; expected arrays only")
-        target.build(state)
-
-    def load_setitem(self) -> None:
-        value, key = self.stack.pop(), self.stack.pop()
-        self._set([key, value])
-
-    def load_setitems(self) -> None:
-        self._set(self.pop_mark())
-
-    def load_dict(self) -> None:
-        items = self.pop_mark()
-        self.stack.append({})
-        self._set(items)
-
-    def _set(self, values: list[object]) -> None:
-        target = self.stack[-1]
-        if type(target) is not dict or len(values) % 2:
-            raise ValueError("items without a dictionary")
-        for key, value in zip(values[::2], values[1::2], strict=True):
-            if isinstance(key, (bytes, bytearray)):
-                key = key.decode("latin1")
-            if type(key) is not str:
-                raise InputError(f"a key is a {type(key).__name__}, expected text")
-            target[key] = value
-
-
-for _op in ("REDUCE", "NEWOBJ", "BUILD", "SETITEM", "SETITEMS", "DICT"):
-    _Unpickler.dispatch[getattr(pickle, _op)[0]] = getattr(_Unpickler, f"load_{_op.lower()}")
