@@ -99,7 +99,6 @@ add(
     identity=("x", -1, 1.5),
     region=("x", np.zeros(3, bool), 3),
 )
-add("MorphableModel.from_template", lambda m, v: mifit.MorphableModel.from_template(v), None, "x", 3)
 add("MorphableModel.save", lambda m, v: m.coarse.save(v), None, 3, "/proc/none/x.npz", "x.txt", "", "a\0b")
 add(
     "Camera",
@@ -330,10 +329,8 @@ add(
     height=(-1,),
     spp=(0, "x"),
     tone=(5.0, "x"),
-    motion=("x", None),
     outside=(NAN, "x", -1),
     landmark_bias=(NAN,),
-    lamp=(3, [1, 2], ["x"] * 3),
     seed=(-1, "x"),
 )
 add("linear_to_srgb", lambda m, v: mifit.linear_to_srgb(v), "x", {}, [[1], [2, 3]], object())

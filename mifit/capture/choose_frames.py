@@ -58,21 +58,17 @@ class FrameChoice:
         Of the chosen ones.
     left_out : dict of int to str
         Frames that could not be chosen, with the reason.
-    offsets : dict of str to float
-        Time by which each camera but the first is late, in frames; of cameras whose views tell.
     """
 
     timesteps: tuple[int, ...]
     why: dict[int, str]
     left_out: dict[int, str] = field(default_factory=dict)
-    offsets: dict[str, float] = field(default_factory=dict)
 
     def document(self) -> dict:
         """JSON values for a report."""
         return {
             "why": {str(t): text for t, text in self.why.items()},
             "left_out": {str(t): text for t, text in self.left_out.items()},
-            "camera_offsets_frames": self.offsets,
         }
 
 
@@ -137,37 +133,7 @@ def choose_frames(
     taken = [k for k, i in enumerate(good) if steps[i] in beside]
     chosen, why = _spread(poses, sharp[good] / np.nanmedian(sharp), count, taken)
     found = {int(steps[good[k]]): text for k, text in zip(chosen, why, strict=True)}
-    every = bool((np.diff(steps) == 1).all())
-    offsets = camera_offsets(capture, cameras, points) if every else {}
-    return FrameChoice(tuple(sorted(found)), dict(sorted(found.items())), left_out, offsets)
-
-
-def camera_offsets(capture: Capture, cameras: Sequence[str], points: NDArray) -> dict[str, float]:
-    """Frames by which cameras are later than the first one, from how landmarks leave their epipolar lines as they move.
-
-    A point that moves at v pixels a frame, seen d frames late, lies d v.n off its line of normal n. That is one
-    equation per landmark and frame. ``points`` (C, T, 68, 2) are undistorted, of consecutive frames.
-    """
-    found: dict[str, float] = {}
-    if not capture.calibrated or points.shape[1] < 5:
-        return found
-    for k in range(1, len(cameras)):
-        normal, distance = _epipolar(capture, cameras[0], cameras[k], points[0], points[k])
-        speed = np.gradient(points[k], axis=0)
-        across = (speed * normal).sum(-1)
-        # A detector's bias per landmark is no motion.
-        across, distance = (v - np.nanmedian(v, axis=0) for v in (across, distance))
-        ok = np.isfinite(across) & np.isfinite(distance)
-        if ok.sum() < 100 or np.sqrt(np.mean(across[ok] ** 2)) < 0.3:
-            continue
-        offset, weight = 0.0, ok.astype(np.float64)
-        for _ in range(10):
-            residual = np.where(ok, distance - offset * across, 0.0)
-            scale = 1.4826 * np.median(np.abs(residual[ok])) + 1e-6
-            weight = ok / (1.0 + (residual / (2.0 * scale)) ** 2)
-            offset = float(np.nansum(weight * across * distance) / max(np.nansum(weight * across**2), 1e-12))
-        found[cameras[k]] = round(-offset, 3)
-    return found
+    return FrameChoice(tuple(sorted(found)), dict(sorted(found.items())), left_out)
 
 
 def _landmarks(capture: Capture, camera: str, steps: NDArray) -> NDArray[np.float64]:

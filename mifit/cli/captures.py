@@ -34,7 +34,6 @@ def synth(arguments: Namespace) -> None:
         height=arguments.height,
         spp=arguments.spp,
         tone=arguments.tone,
-        motion=arguments.motion,
         outside=arguments.outside,
         landmark_bias=arguments.landmark_bias,
         progress=console_progress(arguments.quiet),
@@ -44,7 +43,7 @@ def synth(arguments: Namespace) -> None:
 
 def _synth_scan(arguments: Namespace) -> None:
     """A capture of a scanned head."""
-    for name, default in (("subjects", 1), ("motion", "poses"), ("tone", None), ("landmark_bias", 0.0)):
+    for name, default in (("subjects", 1), ("tone", None), ("landmark_bias", 0.0)):
         if getattr(arguments, name) != default:
             option = name.replace("_", "-")
             raise InputError(f"--{option}: found with --head, whose shape and skin are the scan's; leave it out")

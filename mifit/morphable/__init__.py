@@ -1,9 +1,9 @@
 """Morphable face models: the built-in one and every format that users own."""
 
-from mifit.morphable import from_template, recognise
+from mifit.morphable import recognise
 from mifit.morphable.model import MorphableModel
 
-PROVIDERS = (from_template, recognise)
+PROVIDERS = (recognise,)
 """Modules that enter themselves as what the methods of `MorphableModel` call (``model.provides``)."""
 
 __all__ = ["MorphableModel"]

@@ -330,33 +330,6 @@ class MorphableModel:
         """What `load` read the model from, an absolute path or ``"builtin"``; empty for a model made otherwise."""
         return str(self.__dict__.get("_source", ""))
 
-    @classmethod
-    def from_template(
-        cls,
-        mesh: object,
-        landmarks: ArrayLike | None = None,
-        kernels: tuple | None = None,
-        unit_mm: float = 10.0,
-        modes: int = 60,
-        name: str = "template",
-    ) -> MorphableModel:
-        """Make a model of any face mesh: Gaussian-process identity and expression modes, pigment albedo.
-
-        Parameters
-        ----------
-        mesh : (vertices, faces) or an object with these attributes, such as a trimesh
-            Upright (y up), nose along +z, counter-clockwise outwards.
-        landmarks : (68,) int, optional
-            iBUG vertices; found by registering the built-in head when not given.
-        kernels : tuple of (scale, inducing points, (sx, sy, sz)), optional
-            Correlation lengths and deviations of the identity's Gaussian process in mm.
-        unit_mm : float
-            Millimetres per unit of the mesh.
-        modes : int
-            Identity modes.
-        """
-        return _PROVIDED["from_template"](mesh, landmarks, kernels, unit_mm, modes, name)
-
     # -- files --------------------------------------------------------------------------------------------
 
     @classmethod

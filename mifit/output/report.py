@@ -276,8 +276,6 @@ def _frames(result: Reconstruction) -> str:
     refined = {} if result.reflectance is None else result.reflectance.report.details.get("refined", {})
     lines = [f"Timestep {t} was fitted: {why}." for t, why in chosen.get("why", {}).items()]
     lines += [f"Timestep {t} was not to be chosen: {why}." for t, why in chosen.get("left_out", {}).items()]
-    for camera, offset in chosen.get("camera_offsets_frames", {}).items():
-        lines.append(f"Camera {camera} is {offset:+.2f} frames later than the first one, by its epipolar lines.")
     if refined:
         lines.append(f"Maps and lighting are from {len(refined['timesteps'])} frames.")
         lines += [f"Timestep {t} was left out of them: {why}." for t, why in refined["left_out"].items()]

@@ -51,8 +51,6 @@ class PathTracer:
     ----------
     environment : (H, W, 3)
         Lat-long radiance in Mitsuba's ``envmap`` layout: row 0 up, u = 0 along -z, u = 1/4 along +x.
-    lamps : sequence of dict
-        Emitters beside the environment, as Mitsuba's dictionaries.
     specular : bool
         Whether the lobes reflect; without them the diffuse base alone is left.
     """
@@ -61,7 +59,6 @@ class PathTracer:
         self,
         materials: dict[str, Material],
         environment: NDArray,
-        lamps: Sequence[Document] = (),
         specular: bool = True,
     ) -> None:
         import mitsuba as mi
@@ -69,7 +66,6 @@ class PathTracer:
         self._bsdfs = {name: mi.load_dict(_bsdf(material, float(specular))) for name, material in materials.items()}
         bitmap = mi.Bitmap(np.ascontiguousarray(environment, dtype=np.float32))
         self._emitter = mi.load_dict({"type": "envmap", "bitmap": bitmap})
-        self._lamps = {f"lamp{i}": mi.load_dict(lamp) for i, lamp in enumerate(lamps)}
         self._integrator = mi.load_dict({"type": "path", "max_depth": 4, "hide_emitters": True})  # two bounces
 
     def render(
@@ -83,7 +79,7 @@ class PathTracer:
         import mitsuba as mi
 
         spp = _stratified_count(spp)
-        content: Document = {"type": "scene", "environment": self._emitter, **self._lamps}
+        content: Document = {"type": "scene", "environment": self._emitter}
         for i, surface in enumerate(surfaces):
             content[f"surface{i}"] = make_mesh(
                 surface.vertices,

@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +43,6 @@ DISTANCE = 72.0
 """Centimetres from the cameras to the head."""
 MOST_MM = 20.0
 """Of what moves a head or a landmark away from the model."""
-LAMP, LEAST_LAMP = 6.0, 20.0
-"""Irradiance of a lamp at the origin, where the procedural studio's is about 1, and its least distance in cm."""
 FULL_WELL = 12000.0
 """Electrons of a pixel at linear value 1: shot noise."""
 READ_NOISE = 0.0012
@@ -63,10 +60,8 @@ def synthesize(  # noqa: PLR0913
     height: int = 480,
     spp: int = 64,
     tone: float | None = None,
-    motion: head.Motion = "poses",
     outside: float = head.OUTSIDE,
     landmark_bias: float = 0.0,
-    lamp: Sequence[float] | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Render a capture of an unseen subject, with ground truth beside it.
@@ -93,15 +88,11 @@ def synthesize(  # noqa: PLR0913
         Samples per pixel.
     tone : float, optional
         Skin from 0, fair, to 1, deep; drawn for each subject by default.
-    motion : {"poses", "talk", "turn"}
-        How the head moves, see `head.draw_motion`.
     outside : float
         Millimetres by which heads leave what the model spans, see `head.neutral_shape`.
     landmark_bias : float
         Millimetres, standard deviation of each coordinate of a landmark's bias, see `detector.draw_bias`; by default
         landmarks are true but for noise.
-    lamp : (3,), optional
-        Place of a bare bulb beside the environment, centimetres from the origin, where heads are.
     progress : Progress
 
     Returns
@@ -125,16 +116,12 @@ def synthesize(  # noqa: PLR0913
         ("seed", seed, 0, MAX_SEED),
     ):
         check_range(name, value, low, high)
-    if motion not in get_args(head.Motion):
-        raise InputError(f"motion: found {motion!r}, expected one of {', '.join(get_args(head.Motion))}")
     check_active_variant()
     for name, length in (("outside", outside), ("landmark_bias", landmark_bias)):
         if not 0 <= length <= MOST_MM:
             raise InputError(f"{name}: found {length}, expected 0 to {MOST_MM:g} mm")
     if tone is not None and not 0 <= tone <= 1:
         raise InputError(f"tone: found {tone}, expected 0 (fair) to 1 (deep)")
-    if lamp is not None and not (np.shape(lamp) == (3,) and LEAST_LAMP <= np.linalg.norm(lamp) < math.inf):
-        raise InputError(f"lamp: found {lamp}, expected x, y, z at {LEAST_LAMP:g} cm or more from the origin")
     shape = MorphableModel.load(model)
     radiance = None if env is None else read_environment(env)
     out.mkdir(parents=True, exist_ok=True)  # a place that can't be written is refused now, not after the first render
@@ -143,12 +130,12 @@ def synthesize(  # noqa: PLR0913
     map_size = 1024 if min(width / 680, height / 480) > 0.6 else 512
     for i in range(subjects):
         folder = out if subjects == 1 else out / f"subject_{i:02d}"
-        subject = _draw_subject(shape, SkinStyle.draw(seed + i, tone), timesteps, map_size, motion, outside)
+        subject = _draw_subject(shape, SkinStyle.draw(seed + i, tone), timesteps, map_size, outside)
         subject = dataclasses.replace(subject, landmark_bias=landmark_bias)
         light = studio_environment(seed + i) if radiance is None else radiance
         start = i * (timesteps + 1)
         advance = partial(_advance, progress, start, total)
-        _write_capture(folder, subject, cameras, light, lamp, spp, advance)
+        _write_capture(folder, subject, cameras, light, spp, advance)
     return out
 
 
@@ -188,9 +175,7 @@ class _Subject:
     landmark_bias: float
 
 
-def _draw_subject(
-    model: MorphableModel, style: SkinStyle, timesteps: int, map_size: int, motion: head.Motion, outside: float
-) -> _Subject:
+def _draw_subject(model: MorphableModel, style: SkinStyle, timesteps: int, map_size: int, outside: float) -> _Subject:
     seed = style.seed
     scale = model.unit_mm / 10.0  # the world is in centimetres
     mean_mm = model.mean.astype(np.float64) * model.unit_mm
@@ -214,7 +199,7 @@ def _draw_subject(
     centre = neutral[model.landmarks[27:48]].mean(axis=0) - np.array([0.0, 0.0, 55.0 / model.unit_mm])
     rims = [] if "eye0" in parts else openings(model)[0]
     eyes = [head.eye_centre(neutral[rim] * model.unit_mm) / model.unit_mm for rim in rims]
-    poses = head.draw_motion(model, timesteps, seed, scale, centre, motion)
+    poses = head.draw_motion(model, timesteps, seed, scale, centre)
     return _Subject(model, seed, neutral, poses, scale, skin, parts, eyes, 0.0)
 
 
@@ -223,17 +208,12 @@ def _write_capture(
     subject: _Subject,
     cameras: list[Camera],
     environment: NDArray[np.float32],
-    lamp: Sequence[float] | None,
     spp: int,
     advance: Callable[[int], None],
 ) -> None:
     """Render and write one capture; ``transforms.json`` comes last, so a broken-off folder isn't taken for whole."""
     advance(0)
-    lamps: list[dict[str, object]] = []
-    if lamp is not None:
-        intensity = {"type": "rgb", "value": LAMP * float(np.sum(np.square(lamp)))}
-        lamps = [{"type": "point", "position": [float(x) for x in lamp], "intensity": intensity}]
-    tracer = PathTracer(_materials(subject), environment, lamps=lamps)
+    tracer = PathTracer(_materials(subject), environment)
     exposure = _exposure(tracer, subject, cameras[0])
     _write_maps(folder / "truth" / "maps.npz", subject.skin["face"])
     with replacing(folder / "truth" / "mesh.npz") as temporary:
@@ -272,8 +252,6 @@ def _write_capture(
             )
         advance(t + 2)
     note: dict[str, object] = {"seed": subject.seed, "exposure": exposure, "spp": spp, "model": subject.model.name}
-    if lamp is not None:
-        note["lamp"] = [float(x) for x in lamp]
     write_text(folder / "truth" / "scene.json", json.dumps(note, indent=1) + "\n")
     write_image(folder / "truth" / "environment.exr", environment)
     write_transforms(folder / "transforms.json", [View.of(camera) for camera in cameras], shots, "cm")

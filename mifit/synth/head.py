@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,16 +43,8 @@ def neutral_shape(model: MorphableModel, seed: int, outside: float = OUTSIDE) ->
     return shape + (outside / model.unit_mm) * noise[:, None] * vertex_normals(shape, model.faces)
 
 
-Motion = Literal["poses", "talk", "turn"]
-
-
-def draw_motion(
-    model: MorphableModel, timesteps: int, seed: int, scale: float, centre: NDArray, motion: Motion = "poses"
-) -> list[HeadPose]:
-    """A pose and an expression per timestep, smooth in time.
-
-    ``poses`` differ widely from timestep to timestep, as photographs do; ``talk`` and ``turn`` are sequences at 30
-    frames a second: syllables, four to five a second, with a head that sways, and a slow turn from side to side.
+def draw_motion(model: MorphableModel, timesteps: int, seed: int, scale: float, centre: NDArray) -> list[HeadPose]:
+    """A pose and an expression per timestep, which differ as widely as in photographs; the first one is neutral.
 
     Parameters
     ----------
@@ -65,8 +56,6 @@ def draw_motion(
     centre : (3,)
         Object-space point that the head turns about and that stays near the world's origin.
     """
-    if motion != "poses":
-        return _sequence(model, timesteps, seed, scale, centre, motion)
     rng = np.random.default_rng([seed, 12])
     phase, speed = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.5, 1.1, 6)
     swing = np.array([9.0, 5.0, 3.0, 0.8, 0.5, 0.5])  # degrees of yaw, pitch, roll; centimetres
@@ -78,49 +67,12 @@ def draw_motion(
     expression = np.zeros((timesteps, model.n_expression))
     wave = 0.5 - 0.5 * np.cos(0.9 * seconds[:, None] + np.arange(len(active)))
     expression[1:, active] = (strength * wave)[1:]  # the first timestep is neutral
-    return _poses(swing * np.sin(phase + speed * seconds[:, None]), np.clip(expression, *bounds.T), scale, centre)
-
-
-def _poses(swing: NDArray, expression: NDArray, scale: float, centre: NDArray) -> list[HeadPose]:
-    """Of angles and shifts (T, 6), degrees of yaw, pitch, roll and centimetres, and expressions (T, K)."""
+    swing = swing * np.sin(phase + speed * seconds[:, None])
     rotations = Rotation.from_euler("yxz", swing[:, :3], degrees=True).as_matrix()
     return [
         HeadPose(weights.astype(np.float32), rotation, shift - scale * rotation @ centre)
-        for weights, rotation, shift in zip(expression, rotations, swing[:, 3:], strict=True)
+        for weights, rotation, shift in zip(np.clip(expression, *bounds.T), rotations, swing[:, 3:], strict=True)
     ]
-
-
-def _sequence(
-    model: MorphableModel, timesteps: int, seed: int, scale: float, centre: NDArray, motion: Motion
-) -> list[HeadPose]:
-    """A head that talks or turns, frame by frame."""
-    rng = np.random.default_rng([seed, 14])
-    seconds = np.arange(timesteps) / 30.0
-    phase = rng.uniform(0, 2 * np.pi, (2, 6))
-    slow = np.sin(phase[0] + 2 * np.pi * np.outer(seconds, rng.uniform(0.15, 0.4, 6)))
-    swing = slow * (4.0, 2.5, 1.5, 0.3, 0.3, 0.2)
-    expression = np.zeros((timesteps, model.n_expression))
-    if motion == "turn":
-        swing[:, 0] = 35.0 * np.sin(2 * np.pi * seconds / 4.0)
-    else:
-        talking = talking_modes(model)
-        rate = rng.uniform(3.8, 5.0, len(talking)) * np.where(np.arange(len(talking)) % 2, 0.5, 1.0)
-        wave = 0.5 - 0.5 * np.cos(phase[1, : len(talking)] + 2 * np.pi * np.outer(seconds, rate))
-        breath = np.clip(1.5 * np.sin(2 * np.pi * seconds / 1.7 + phase[1, 0]) + 0.9, 0.0, 1.0)  # words and pauses
-        bounds = np.asarray(model.expression_bounds, dtype=np.float64)
-        free = np.isinf(bounds).max(axis=1)[talking]
-        strength = np.where(free, rng.choice([-1.0, 1.0], len(talking)) * 0.9, rng.uniform(0.2, 0.5, len(talking)))
-        expression[:, talking] = strength * wave * breath[:, None]
-        expression = np.clip(expression, *bounds.T)
-    return _poses(swing, expression, scale, centre)
-
-
-def talking_modes(model: MorphableModel) -> NDArray[np.int64]:
-    """The six expressions that move the mouth's landmarks most, relative to the brows' and eyes'."""
-    moved = np.linalg.norm(model.expression[model.landmarks].astype(np.float64), axis=1)  # (68, Ke)
-    mouth, rest = moved[48:68].mean(axis=0), moved[17:48].mean(axis=0)
-    score = mouth**2 / (mouth + 3.0 * rest + 1e-12)
-    return np.argsort(-score, kind="stable")[: min(6, model.n_expression)]
 
 
 def wrap_uv(uv: NDArray, faces_uv: NDArray) -> tuple[NDArray[np.float32], NDArray[np.int32]]:

@@ -1,4 +1,4 @@
-"""The most informative frames: spread in pose, sharp, eyes open, views that agree; and cameras that are late."""
+"""The most informative frames: spread in pose, sharp, eyes open, views that agree."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from mifit.capture.capture import Frame
-from mifit.capture.choose_frames import camera_offsets, choose_frames
+from mifit.capture.choose_frames import choose_frames
 from mifit.core.camera import Camera
 from mifit.errors import InputError
 
@@ -31,13 +31,13 @@ class Head:
 
     calibrated, path = True, "head"
 
-    def __init__(self, yaw, late=0.0, seed=0):
+    def __init__(self, yaw, seed=0):
         rng = np.random.default_rng(seed)
         self.points = rng.uniform(-5.0, 5.0, (68, 3)) * [1.0, 1.0, 0.7]
         for eye, x in ((36, -3.0), (42, 3.0)):
             for k, (dx, dy) in enumerate(((-1, 0), (-0.4, 0.4), (0.4, 0.4), (1, 0), (0.4, -0.4), (-0.4, -0.4))):
                 self.points[eye + k] = (x + dx, 2.0 + dy, 3.0)
-        self.yaw, self.late = yaw, late
+        self.yaw = yaw
         self.timesteps = tuple(range(len(yaw)))
         self.cameras = ("left", "right")
         texture = rng.uniform(0.1, 0.9, (SIDE, SIDE, 1)).repeat(3, axis=2)
@@ -50,14 +50,13 @@ class Head:
     def landmarks(self, name, timestep):
         if timestep in self.lost:
             return None
-        time = timestep - (self.late if name == "right" else 0.0)
-        yaw = np.interp(time, self.timesteps, self.yaw)
+        yaw = np.interp(timestep, self.timesteps, self.yaw)
         points = self.points.copy()
         if timestep in self.closed:
             for eye in (36, 42):
                 points[eye : eye + 6, 1] = points[eye, 1]
         turn = Rotation.from_euler("yx", [yaw, 0.5 * yaw], degrees=True).as_matrix()
-        shift = [0.0, 0.08 * time, 0.0]
+        shift = [0.0, 0.08 * timestep, 0.0]
         return SimpleNamespace(points=self.camera(name).project(points @ turn.T + shift), visible=np.ones(68, bool))
 
     def frame(self, name, timestep):
@@ -106,13 +105,6 @@ def test_views_that_disagree_are_left_out():
     assert list(found.left_out) == [4] and "views disagree" in found.left_out[4]
 
 
-@pytest.mark.parametrize("late", [0.0, 0.4, -0.7])
-def test_a_late_camera_is_measured(late):
-    head = Head(swing(), late)
-    points = np.stack([np.stack([head.landmarks(c, t).points for t in head.timesteps]) for c in head.cameras])
-    assert camera_offsets(head, head.cameras, points[:, 1:-1])["right"] == pytest.approx(late, abs=0.1)
-
-
 def test_only_named_cameras_are_read():
     head = Head(swing())
     choose_frames(head, ("left",), 2)
@@ -134,4 +126,3 @@ def test_further_frames_lie_far_from_those_taken_and_come_from_those_named():
     assert set(found.timesteps) == {5, STEPS - 3} and found.why.keys() == set(found.timesteps)
     every = choose_frames(head, head.cameras, STEPS, beside=(0, 1))
     assert set(every.timesteps) == set(range(2, STEPS))
-    assert not choose_frames(head, head.cameras, 2, timesteps=(0, 2, 5, 9, 11)).offsets  # a speed needs the next frame

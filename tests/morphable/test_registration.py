@@ -68,23 +68,6 @@ def test_landmarks_are_found_on_a_mesh_without_any(ict):
         assert error[list(ring)].mean() < 8.0
 
 
-def test_template_becomes_a_model(coarse):
-    m = MorphableModel.from_template((coarse.mean, coarse.faces), landmarks=coarse.landmarks, modes=20)
-    assert (m.n_identity, m.n_expression, m.n_albedo) == (20, 30, 60)
-    np.testing.assert_array_equal(m.mean, coarse.mean)
-    assert m.symmetry is not None
-    v = 10 * (m.shape(m.sample(0)[0]) - m.mean)
-    assert 1.0 < np.linalg.norm(v, axis=1).mean() < 20.0
-    assert (m.albedo() > 0).all()
-    with pytest.raises(InputError, match=r"mesh is a str, expected \(vertices, faces\)"):
-        MorphableModel.from_template("x")
-    with pytest.raises(InputError, match="68 indices"):
-        MorphableModel.from_template((coarse.mean, coarse.faces), landmarks=np.arange(5))
-    kernels = ((60.0, 20, (3.0, 3.0, 3.0)),)
-    smooth = MorphableModel.from_template((coarse.mean, coarse.faces), coarse.landmarks, kernels, modes=10)
-    assert smooth.n_identity == 10
-
-
 def test_unwrapping_is_one_to_one(coarse):
     uv, corners = unwrap(coarse.mean.astype(float), coarse.faces, coarse.face_mask)
     t = uv[corners[coarse.face_mask]].astype(float)

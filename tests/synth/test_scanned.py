@@ -1,4 +1,4 @@
-"""Captures of scanned heads, heads that talk and turn, and the public Digital Emily scenes."""
+"""Captures of scanned heads and the public Digital Emily scenes."""
 
 import json
 import math
@@ -123,32 +123,14 @@ def test_options_of_scans_and_of_models_do_not_mix(files, capsys):
     common = ["synth", "--out", str(folder / "x"), "--quiet"]
     assert main([*common, "--maps", "albedo=a.png"]) == 2
     assert main([*common, "--head", str(mesh), "--maps", "albedo"]) == 2
-    assert main([*common, "--head", str(mesh), "--maps", "albedo=a.png", "--motion", "talk"]) == 2
+    assert main([*common, "--head", str(mesh), "--maps", "albedo=a.png", "--tone", "1"]) == 2
     said = capsys.readouterr().err
-    assert "belong to --head" in said and "NAME=FILE" in said and "--motion: found with --head" in said
+    assert "belong to --head" in said and "NAME=FILE" in said and "--tone: found with --head" in said
 
 
 @pytest.fixture(scope="module")
 def coarse():
     return MorphableModel.load("builtin:coarse")
-
-
-def test_a_talking_head_moves_its_mouth_and_keeps_its_brows(coarse):
-    poses = heads.draw_motion(coarse, 60, 4, 0.1, np.zeros(3), "talk")
-    shapes = np.stack([coarse.expression[coarse.landmarks] @ p.expression for p in poses]) * coarse.unit_mm
-    mouth, brows = (np.ptp(shapes[:, part], axis=0).max() for part in (slice(48, 68), slice(17, 27)))
-    assert mouth > 4 and mouth > 3 * brows
-    steps = np.abs(np.diff(shapes, axis=0)).max()
-    assert 0.2 < steps < 4  # millimetres a frame: neither still nor jumping
-    angles = [np.degrees(np.arccos(min(1.0, (np.trace(p.rotation) - 1) / 2))) for p in poses]
-    assert max(angles) < 15
-
-
-def test_a_turning_head_goes_from_side_to_side_without_expression(coarse):
-    poses = heads.draw_motion(coarse, 121, 4, 0.1, np.zeros(3), "turn")
-    yaw = np.degrees([np.arctan2(p.rotation[0, 2], p.rotation[2, 2]) for p in poses])
-    assert yaw.max() > 30 and yaw.min() < -30 and np.abs(np.diff(yaw)).max() < 4
-    assert not any(p.expression.any() for p in poses)
 
 
 PBRT = """Film "image"
