@@ -7,7 +7,7 @@ import itertools
 import os
 import shutil
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +88,7 @@ class FaceAlignment:
             ) from None
         try:
             kind = getattr(face_alignment.LandmarksType, "TWO_D", None) or face_alignment.LandmarksType._2D
-            self._aligner: Any = face_alignment.FaceAlignment(kind, device="cpu")
+            self._aligner = face_alignment.FaceAlignment(kind, device="cpu")
         except Exception as error:  # its weights come over the network on first use
             raise MifitError(f"detector face-alignment: doesn't start ({error}); its weights may be missing") from None
 

@@ -13,7 +13,6 @@ import sys
 import tempfile
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,7 +118,7 @@ class Network:
         with decoding():
             from ai_edge_litert.interpreter import Interpreter
 
-            self._interpreter: Any = Interpreter(model_content=data, num_threads=threads())
+            self._interpreter = Interpreter(model_content=data, num_threads=threads())
             self._interpreter.allocate_tensors()
         self._input = self._interpreter.get_input_details()[0]
         self._outputs = self._interpreter.get_output_details()

@@ -14,13 +14,12 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
-from mifit.core.files import read_text, write_text
+from mifit.core.files import Document, read_text, write_text
 from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_NUMBER, MAX_PIXELS, MAX_TIMESTEP
 from mifit.errors import InputError
 
@@ -206,7 +205,7 @@ def _camera_to_world(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64
     return inverse @ OPENGL_FROM_OPENCV
 
 
-def _load(path: Path) -> dict[str, Any]:
+def _load(path: Path) -> Document:
     try:
         document = json.loads(read_text(path, MAX_DOCUMENT_BYTES, "file of a capture"))
     except InputError:
@@ -226,7 +225,7 @@ def _short(value: object) -> str:
 class _Entry:
     """Checked access to one frame's keys; messages name the frame and the key."""
 
-    def __init__(self, values: Mapping[str, Any], where: str):
+    def __init__(self, values: Document, where: str):
         self.values, self.where = values, where
 
     def __contains__(self, key: str) -> bool:

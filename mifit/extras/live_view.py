@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -178,10 +178,10 @@ def _guarded(host: str) -> Iterator[None]:
     """Make servers that viser starts in the block answer their own pages alone, and `MAX_CLIENTS` at once."""
     from websockets.asyncio import server as websockets
 
-    serve_any = websockets.serve
+    serve_any: Callable[..., object] = websockets.serve
     sockets: weakref.WeakSet[ServerConnection] = weakref.WeakSet()
 
-    def serve(*arguments: Any, process_request: Any, **options: Any) -> Any:
+    def serve(*arguments: object, process_request: Callable[..., Response | None], **options: object) -> object:
         def answer(connection: ServerConnection, request: Request) -> Response | None:
             hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
             try:
@@ -203,7 +203,7 @@ def _guarded(host: str) -> Iterator[None]:
     try:
         yield
     finally:
-        websockets.serve = serve_any  # type: ignore[misc]
+        websockets.serve = serve_any  # type: ignore[assignment, misc]
 
 
 class LiveView:
@@ -236,7 +236,7 @@ class LiveView:
         self._picture = Picture(result)
         self._shown = Shown(result.methods[-1], self._steps[0])
         self._newest = result.methods[-1]
-        self._played = self._rested = time.monotonic()
+        self._rested = time.monotonic()
         self._changed: dict[int, float] = {}  # client -> when its picture went out of date
         self._coarse: set[int] = set()  # clients whose last picture was a small one
         self._woken = threading.Event()
@@ -264,10 +264,6 @@ class LiveView:
     def poll(self) -> None:
         """Answer the requests that are waiting; from the thread that set the variant."""
         self._woken.clear()
-        if self._play is not None and self._play.value and time.monotonic() - self._played > 0.15:
-            self._played = time.monotonic()
-            steps = self._steps
-            self._step.value = steps[(steps.index(self._shown.timestep) + 1) % len(steps)]
         now = time.monotonic()
         for client, handle in self._server.get_clients().items():
             if client in self._changed:
@@ -287,7 +283,7 @@ class LiveView:
         self._newest = result.methods[-1]
         self._picture = Picture(result)
         self._parts.options = tuple(LABELS[m] for m in METHODS if m in result.methods)
-        self._parts.value = LABELS[new]
+        self._parts.value = LABELS[new]  # type: ignore[misc]  # it has a setter
         self._show(method=new)
 
     def say(self, text: str) -> None:
@@ -306,15 +302,10 @@ class LiveView:
             "Show", tuple(LABELS[m] for m in METHODS if m in result.methods), initial_value=LABELS[self._shown.method]
         )
         shown.on_update(lambda _: self._show(method=parts[shown.value]))
-        self._parts: Any = shown
-        self._play: Any = None
-        self._step: Any = None
+        self._parts = shown
         if len(self._steps) > 1:
-            self._step = gui.add_slider("Timestep", self._steps[0], self._steps[-1], 1, self._steps[0])
-            self._step.on_update(
-                lambda _: self._show(timestep=min(self._steps, key=lambda t: abs(t - int(self._step.value))))
-            )
-            self._play = gui.add_checkbox("Play", False)
+            step = gui.add_slider("Timestep", self._steps[0], self._steps[-1], 1, self._steps[0])
+            step.on_update(lambda _: self._move_to(int(step.value)))
         if result.reflectance is not None:
             self._light_controls()
         front = gui.add_button("Look from the front")
@@ -329,8 +320,12 @@ class LiveView:
         load.on_upload(lambda _: self._upload(load.value.name, load.value.content))
         gui.add_button("Recovered light").on_click(lambda _: self._show(environment=None))
 
-    def _show(self, **changes: Any) -> None:
-        self._shown = replace(self._shown, **changes)
+    def _move_to(self, timestep: int) -> None:
+        nearest = min(self._steps, key=lambda t: abs(t - timestep))
+        self._show(timestep=nearest)
+
+    def _show(self, **changes: Method | int | float | Path | None) -> None:
+        self._shown = replace(self._shown, **changes)  # type: ignore[arg-type]
         self._ask(*self._server.get_clients())
 
     def _ask(self, *clients: int) -> None:

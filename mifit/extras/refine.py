@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -153,10 +153,16 @@ def _followed(
         else:
             found.append(one)
     progress("follow frames", len(further), len(further))
-    names_of = ("expression", "rotation", "translation", "vertices")
-    rows: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in found]) for name in names_of}
     timesteps = tuple(t for one in found for t in one.timesteps)
-    return replace(home, timesteps=timesteps, **rows).at(sorted(timesteps)), failed
+    together = replace(
+        home,
+        timesteps=timesteps,
+        expression=np.concatenate([one.expression for one in found]),
+        rotation=np.concatenate([one.rotation for one in found]),
+        translation=np.concatenate([one.translation for one in found]),
+        vertices=np.concatenate([one.vertices for one in found]),
+    )
+    return together.at(sorted(timesteps)), failed
 
 
 def _difference(result: Reconstruction, capture: Capture, geometry: GeometryEstimate) -> float:

@@ -1,9 +1,11 @@
 """Morphable face models: the built-in one and every format that users own."""
 
-from mifit.morphable import recognise
-from mifit.morphable.model import MorphableModel
+from mifit.morphable.formats.own import save_model
+from mifit.morphable.model import MorphableModel, provide
+from mifit.morphable.recognise import automatic_model, load_model
 
-PROVIDERS = (recognise,)
-"""Modules that enter themselves as what the methods of `MorphableModel` call (``model.provides``)."""
+provide("automatic", automatic_model)
+provide("load", load_model)
+provide("save", save_model)
 
 __all__ = ["MorphableModel"]

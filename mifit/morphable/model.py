@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,22 +18,16 @@ from mifit.core.mesh import face_cross
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 
-_PROVIDED: dict[str, Callable[..., Any]] = {}
-F = TypeVar("F", bound=Callable[..., Any])
+_PROVIDED: dict[str, Callable[..., object]] = {}
 
 
-def provides(method: str) -> Callable[[F], F]:
+def provide(method: str, function: Callable[..., object]) -> None:
     """Make a function what a method of `MorphableModel` calls.
 
-    Formats, templates and the built-in model are made of models, so they import this module and it imports none of
-    them; they enter themselves here when ``mifit.morphable`` is imported.
+    Formats and the built-in model are made of models, so they import this module and it imports none of them; they
+    enter themselves here when ``mifit.morphable`` is imported.
     """
-
-    def enter(function: F) -> F:
-        _PROVIDED[method] = function
-        return function
-
-    return enter
+    _PROVIDED[method] = function
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,8 +344,9 @@ class MorphableModel:
             The file is missing, damaged or of no known kind; the message says what was found.
         """
         if isinstance(path, str) and path.partition("+")[0] == "auto":
-            path = path.replace("auto", _PROVIDED["automatic"](), 1)
+            path = path.replace("auto", str(_PROVIDED["automatic"]()), 1)
         model = _PROVIDED["load"](path, kind)
+        assert isinstance(model, MorphableModel)
         # Not a field: a model that is made from this one by `replace` is no longer the file's.
         named = isinstance(path, str) and path.partition(":")[0] == "builtin"
         model._set("_source", str(path) if named else str(Path(path).resolve()))

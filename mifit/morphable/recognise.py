@@ -24,7 +24,7 @@ from mifit.morphable.formats.ict import is_ict_folder, is_ict_npz, load_ict_fold
 from mifit.morphable.formats.mat5 import is_mat5, mat_names
 from mifit.morphable.formats.own import FORMAT_KEY, load_own
 from mifit.morphable.formats.pickles import is_pickle
-from mifit.morphable.model import MorphableModel, provides
+from mifit.morphable.model import MorphableModel
 from mifit.morphable.openings import SUFFIX, with_eyes
 
 BUILTIN = ("builtin", "builtin:coarse")
@@ -50,14 +50,12 @@ def fetched_model(name: str) -> Path:
     return cache_folder() / "models" / f"{name}.npz"
 
 
-@provides("automatic")
 def automatic_model() -> str:
     """What ``auto`` stands for: the fetched ICT-FaceKit where it is there, else ``builtin``."""
     path = fetched_model("ict")
     return str(path) if path.is_file() else "builtin"
 
 
-@provides("load")
 def load_model(path: str | Path, kind: str | None = None) -> MorphableModel:
     """Load ``"builtin"``, ``"builtin:coarse"``, or a file or folder of a known kind; see `MorphableModel.load`.
 

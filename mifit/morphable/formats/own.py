@@ -10,13 +10,12 @@ import numpy as np
 from mifit.core.arrays import read_npz
 from mifit.core.files import replacing
 from mifit.errors import InputError
-from mifit.morphable.model import MorphableModel, provides
+from mifit.morphable.model import MorphableModel
 
 FORMAT_KEY = "mifit_model"
 _VERSION = 1
 
 
-@provides("save")
 def save_model(model: MorphableModel, path: str | Path) -> None:
     """Write a model; loading it gives back every array bit for bit.
 
