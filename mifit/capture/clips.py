@@ -14,7 +14,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import correlate
 
 from mifit.capture.sources import Source, Video, opened_video
 from mifit.core.process import decoding
@@ -73,6 +72,8 @@ def lag(first: NDArray, second: NDArray, rate: float) -> tuple[float, float]:
 
     The signals share a second at the least, or half of the shorter one.
     """
+    from scipy.signal import correlate  # slow to load, and every command loads this module
+
     a, b = (np.asarray(x, dtype=np.float64) - np.mean(x) for x in (first, second))
     ones = np.ones(len(a)), np.ones(len(b))
     product = correlate(b, a, method="fft")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.core.files import Document, read_text, write_text
-from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_NUMBER, MAX_PIXELS, MAX_TIMESTEP
+from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_NUMBER, MAX_PIXELS
 from mifit.errors import InputError
 
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0}
@@ -253,7 +253,7 @@ class _Entry:
             raise self.fail(key, expected)
         return value
 
-    def whole(self, key: str, low: int, high: int = MAX_TIMESTEP) -> int:
+    def whole(self, key: str, low: int, high: int = int(MAX_NUMBER)) -> int:
         expected = f"a whole number of at least {low} and at most {high}"
         value = self.number(key, expected)
         if value != int(value) or not low <= value <= high:

@@ -34,8 +34,6 @@ MAX_UNPACKING, UNPACKING_SLACK = 100, 16 * 2**20
 """A packed file may hold at most this many times its size, and this much more: arrays of floats pack far less."""
 MAX_TIMESTEPS = 10**5
 """Timesteps of one capture or one option."""
-MAX_TIMESTEP = 10**9
-"""Largest number of a timestep."""
 MAX_RUNS = 10**4
 """Runs of one experiment's sweep."""
 MAX_SAMPLES = 2**20

@@ -20,7 +20,8 @@ def rmse(image: Image, reference: Image, mask: Mask = None) -> float:
 
     InputError where shapes differ, or the region is empty.
     """
-    return math.sqrt(mean_squared_error(image, reference, mask))
+    a, b, mask = _checked(image, reference, mask)
+    return math.sqrt(float(np.mean((a[mask] - b[mask]) ** 2)))
 
 
 def psnr(image: Image, reference: Image, mask: Mask = None, peak: float = 255.0) -> float:
@@ -31,12 +32,6 @@ def psnr(image: Image, reference: Image, mask: Mask = None, peak: float = 255.0)
 def psnr_from_rmse(error: float, peak: float = 255.0) -> float:
     """Peak signal-to-noise ratio in dB of a root-mean-square error."""
     return math.inf if error == 0 else 20.0 * math.log10(peak / error)
-
-
-def mean_squared_error(image: Image, reference: Image, mask: Mask = None) -> float:
-    """Mean squared difference over a region; parameters and errors as for `rmse`."""
-    a, b, mask = _checked(image, reference, mask)
-    return float(np.mean((a[mask] - b[mask]) ** 2))
 
 
 def ssim(image: Image, reference: Image, mask: Mask = None, peak: float = 255.0) -> float:
