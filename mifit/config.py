@@ -129,16 +129,22 @@ WEIGHT = 1e9  # above any weight that makes sense, below what overflows in float
 class GeometryConfig:
     """Stage 1, morphable-model fitting (paper, section 4).
 
-    ``objective = "consistency"`` weights its terms by their noise and lets every surface point have its own albedo;
-    ``"paper"`` is the paper's objective, whose weights are for colours of 0..255 and for pixels.
+    ``objective = "landmarks"`` weights landmarks by their noise and leaves the images to the surface; ``"paper"`` is
+    the paper's objective as written, whose weights are for colours of 0..255 and for pixels.
     """
 
-    objective: Literal["consistency", "paper"] = one_of("consistency", "what is minimised")
+    objective: Literal["landmarks", "paper"] = one_of("landmarks", "what is minimised")
     eyes: bool = flag(
         True,
         "give a model whose eyes are holes simple eyes and the inside of a mouth",
     )
-    rounds: int = number(2, "outer steps: visibility is found anew in each", source="cost", least=0, most=100)
+    rounds: int = number(
+        2,
+        "objective paper: outer steps, in each of which visibility is found anew",
+        source="cost",
+        least=0,
+        most=100,
+    )
     landmark_noise: float = number(
         1.0,
         "least standard deviation of a landmark coordinate; residuals may raise it",
@@ -162,14 +168,14 @@ class GeometryConfig:
     )
     pixels: int = number(
         2000,
-        "objective paper: facial pixels per image, chosen at random",
+        "facial pixels per image, chosen at random",
         source="set by hand",
         least=1,
         most=1_000_000,
     )
     robust_colour: float = number(
         30.0,
-        "objective paper: residual from which a pixel counts as an outlier",
+        "albedo and lighting: residual from which a pixel counts as an outlier",
         "of 255",
         source="set by hand",
         above=0,
@@ -182,36 +188,7 @@ class GeometryConfig:
         least=0,
         most=WEIGHT,
     )
-    as_written: bool = flag(
-        False,
-        "objective paper: the paper's terms and no others",
-    )
-    surface_points: int = number(
-        3000, "points of the surface that are compared between images", source="cost", least=1, most=200_000
-    )
-    texture_weight: float = number(
-        0.03,
-        "independent measurements per surface point and image: neighbours share pixels",
-        source="set by hand",
-        above=0,
-        most=WEIGHT,
-    )
-    texture_sigma: float = number(
-        1.0,
-        "fine blur; its difference from the wide one is the texture",
-        "pixels",
-        source="set by hand",
-        least=0,
-        most=1000,
-    )
-    texture_window: float = number(6.0, "wide blur", "pixels", source="set by hand", above=0, most=1000)
     max_iterations: int = number(30, "Gauss-Newton iterations of a round", source="limit", least=1, most=10_000)
-
-    def __post_init__(self) -> None:
-        if not self.texture_sigma < self.texture_window:
-            raise ValueError(
-                f"texture_sigma: found {self.texture_sigma}, expected below texture_window, {self.texture_window}"
-            )
 
 
 SHADINGS = ["auto", "paper", "printed", "prefiltered", "shadowed"]
@@ -380,7 +357,6 @@ class FitConfig:
         return cls(
             geometry=GeometryConfig(
                 objective="paper",
-                as_written=True,
                 eyes=False,
             ),
             surface=SurfaceConfig(enabled=False),

@@ -1,9 +1,9 @@
 """Further timesteps with reflectance and lighting fixed: pose and expression, then normals (paper, section 6).
 
-Each new timestep starts where the last one ended. Its surface texture is compared with that of the fitted timesteps,
-so that nothing drifts: at spread points by stage 1's terms, then finely where landmarks are biased
-(`surface.kept_texture`). Its normals are drawn to the mean correction of the last frames, carried along in the tangent
-planes of the moving face: where the images say little the detail stays, where they say much it follows at once.
+Each new timestep starts where the last one ended, and at its landmarks. Its surface texture is then aligned to that of
+the fitted timesteps, so that nothing drifts (`surface.kept_texture`). Its normals are drawn to the mean correction of
+the last frames, carried along in the tangent planes of the moving face: where the images say little the detail stays,
+where they say much it follows at once.
 
 `track` follows a face; `track_into` also writes each frame into a result folder as it finishes, so that a killed run
 goes on.
@@ -36,8 +36,6 @@ from mifit.result.ownership import locked
 from mifit.result.writing import add_timestep
 from mifit.sampling.observations import Surface
 from mifit.stages.fit_geometry import fit_pose_expression
-from mifit.stages.geometry.refine import texture_reference
-from mifit.stages.geometry.summary import landmarks_are_biased
 from mifit.stages.normals.refine_mesh import MeshRefiner
 from mifit.stages.normals.refine_normals import check_maps, refine_frame
 from mifit.stages.surface.kept_texture import KeptTexture
@@ -115,7 +113,7 @@ def track(
             raise InputError(f"timestep {timestep}: the result has it already; name timesteps that weren't fitted")
     cameras = [camera.name for camera in result.cameras]
     texels = rasterize_uv(model.uv, model.faces_uv, check_maps(reflectance), model.face_mask)
-    follower = Follower(capture, model, geometry, cameras, geometry_config, result.fitted, seed)
+    follower = Follower(capture, model, geometry, cameras, geometry_config, result.fitted)
     memory = _Memory(model, texels)
     if normals is not None:
         for timestep in [t for t in geometry.timesteps if t in normals.timesteps][-MEMORY:]:
@@ -151,15 +149,11 @@ class Follower:
         cameras: Sequence[str],
         geometry_config: GeometryConfig,
         fitted: Sequence[int] | None = None,
-        seed: int = 0,
     ) -> None:
         self._capture, self._model, self._cameras = capture, model, tuple(cameras)
-        self._config, self._seed = geometry_config, seed
+        self._config = geometry_config
         self._home = geometry.at(geometry.timesteps if fitted is None else fitted)
-        self._reference = texture_reference(capture, model, self._home, cameras, geometry_config, seed)
-        # Landmarks without a bias place a face better than skin does, whose shading turns with the light.
-        biased = landmarks_are_biased(self._home)
-        self._texture = KeptTexture(capture, model, self._home, cameras) if biased else None
+        self._texture = KeptTexture(capture, model, self._home, cameras)
         self._last = geometry.at(geometry.timesteps[-1:])
 
     @one_blas_thread()
@@ -173,22 +167,13 @@ class Follower:
         """
 
         def fit(start: GeometryEstimate) -> GeometryEstimate:
-            return fit_pose_expression(
-                self._capture,
-                self._model,
-                start,
-                self._cameras,
-                timestep,
-                self._config,
-                seed=self._seed,
-                reference=self._reference,
-            )
+            return fit_pose_expression(self._capture, self._model, start, self._cameras, timestep, self._config)
 
         def error(found: GeometryEstimate) -> float:
             return landmark_error(self._capture, self._model, found, self._cameras)
 
         found, refound = _follow(fit, error, self._last, self._home)
-        found = found if self._texture is None else self._texture.aligned(found)
+        found = self._texture.aligned(found)
         warnings = list(found.report.warnings)
         if refound:
             text = f"timestep {timestep}: lost the face and found it again by its landmarks"

@@ -12,12 +12,11 @@ from mifit.appearance import models
 from mifit.cli import main
 from mifit.config import PRESETS, FitConfig, GeometryConfig, NormalsConfig, ReflectanceConfig
 from mifit.core.uv import TexelMap, bend, tangent_plane
-from mifit.stages.geometry.landmarks import LandmarkTerm, LandmarkView
+from mifit.stages.geometry.images import PixelView
+from mifit.stages.geometry.landmarks import LandmarkTerm, LandmarkView, State
 from mifit.stages.geometry.parameters import Frames, Layout
 from mifit.stages.geometry.points import PointBasis
-from mifit.stages.geometry.refine import paper_problem
-from mifit.stages.geometry.rendering import PixelView, RenderingProblem
-from mifit.stages.geometry.start import State
+from mifit.stages.geometry.rendering import RenderingProblem, paper_problem
 from mifit.stages.reflectance.maps import Smoothness, TexelSystems, laplacian, solve_maps
 from mifit.stages.reflectance.paper_energy import energies, lighting_equations
 from tests.output.conftest import ball_camera, ball_model
@@ -29,7 +28,7 @@ RNG = np.random.default_rng(8)
 def test_the_preset_has_the_papers_settings():
     paper, default = FitConfig.paper(), FitConfig()
     g, r, n = paper.geometry, paper.reflectance, paper.normals
-    assert (g.objective, g.as_written, g.landmark_weight, g.prior_weight) == ("paper", True, 10.0, 5e-5)
+    assert (g.objective, g.landmark_weight, g.prior_weight) == ("paper", 10.0, 5e-5)
     assert (r.shading, r.robust, r.specular_difference_weight) == ("printed", False, 0.1)
     # lambda_H = 0.001 for maps and images of 0..255, the same for both maps
     assert r.smoothness_weight == pytest.approx(0.001 * 255 / 255**2) and r.specular_smoothness == 1.0
@@ -61,9 +60,7 @@ def test_the_photometric_term_is_a_mean_over_each_views_pixels_of_values_to_255(
         albedo = np.einsum("nk,nkc->nc", weights, scene.model.mean_albedo[scene.model.faces[face]])
         residual = 255.0 * (0.05 + albedo * 2.0 / np.sqrt(4 * np.pi) - 0.3)
         expected += (residual**2).sum() / count
-    problem = RenderingProblem(
-        scene.model, scene.layout, scene.frames, tuple(views), LandmarkTerm((), np.inf), np.inf, {}
-    )
+    problem = RenderingProblem(scene.model, scene.layout, scene.frames, tuple(views), LandmarkTerm((), np.inf), {})
     assert problem.energies(x)["photo"] == pytest.approx(expected, rel=1e-6)
     d = np.zeros(len(x))
     d[at("ambient")] = 1e-5
@@ -71,30 +68,23 @@ def test_the_photometric_term_is_a_mean_over_each_views_pixels_of_values_to_255(
     assert 2.0 * problem.linearize(x).gradient[at("ambient")][0] == pytest.approx(slope, rel=1e-5)
 
 
-@pytest.mark.parametrize("as_written", [True, False])
-def test_the_papers_weights_of_landmarks_and_prior(as_written):
+def test_the_papers_weights_of_landmarks_and_prior():
     model, camera = ball_model(), ball_camera()
-    config = GeometryConfig(objective="paper", as_written=as_written)
     layout = Layout(1, model.n_identity, model.n_expression)
     state = State(layout, Frames(np.eye(3)[None], 1.0), np.zeros(layout.size))
     pixels = camera.project(model.mean[model.landmarks[:20]].astype(float)) + np.array((3.0, -4.0))
     basis = PointBasis.at_vertices(model, model.landmarks[:20])
     view = LandmarkView(0, camera, np.arange(20), model.landmarks[:20], pixels, 1.0, basis)
-    asked = []
-    looked = SimpleNamespace(pixels=lambda state, count, blur, seed: asked.append((count, blur)) or ())
-    problem, x = paper_problem(model, state, np.zeros(model.n_albedo + 28), (view,), looked, config, 0)
-    assert asked == [(config.pixels, 0.0 if as_written else 1.0)]
+    config = GeometryConfig(objective="paper")
+    problem, x = paper_problem(model, state, np.zeros(model.n_albedo + 28), (view,), (), config)
     x[problem.layout.at("identity")], x[problem.layout.at("ambient")] = 0.0, 0.1
-    found = problem.energies(x)
-    if as_written:  # every landmark is five pixels off: w_l times the mean square
-        assert found["landmarks"] == pytest.approx(10.0 * 25.0, rel=1e-4)
-        assert found["prior"] == 0
-        x[problem.layout.at("identity")], x[problem.layout.at("albedo")] = 2.0, 3.0
-        x[problem.layout.at("expression", 0)] = 1.0
-        sizes = model.n_identity * 4 + model.n_albedo * 9 + model.n_expression
-        assert problem.energies(x)["prior"] == pytest.approx(5e-5 * sizes)
-    else:  # bounded penalty, ambient pulled to zero
-        assert found["landmarks"] < 0.7 * 10.0 * 25.0 and found["prior"] > 1
+    found = problem.energies(x)  # every landmark is five pixels off: w_l times the mean square
+    assert found["landmarks"] == pytest.approx(10.0 * 25.0, rel=1e-4)
+    assert found["prior"] == 0
+    x[problem.layout.at("identity")], x[problem.layout.at("albedo")] = 2.0, 3.0
+    x[problem.layout.at("expression", 0)] = 1.0
+    sizes = model.n_identity * 4 + model.n_albedo * 9 + model.n_expression
+    assert problem.energies(x)["prior"] == pytest.approx(5e-5 * sizes)
 
 
 # Stage 2 --------------------------------------------------------------------------------------------------------------

@@ -65,8 +65,6 @@ class GeometryEstimate:
         (`displaced`). None where the surface is the model's.
     landmark_noise : float
         Standard deviation of a landmark coordinate, pixels: of the detector as set, or of residuals where that is more.
-    face_width : float
-        Mean width of the face in the images, pixels, as a view from the front would have it; 0 where not known.
     """
 
     timesteps: tuple[int, ...]
@@ -84,7 +82,6 @@ class GeometryEstimate:
     photometry: Photometry = field(default_factory=Photometry)
     displacement: NDArray | None = None
     landmark_noise: float = 0.0
-    face_width: float = 0.0
 
     def index(self, timestep: int) -> int:
         """Position of a timestep in the per-timestep arrays; KeyError when it was not fitted."""

@@ -378,3 +378,14 @@ def _encode_exr(pixels: NDArray[np.float32]) -> bytes:
     with OpenEXR.File(header, channels) as file:
         file.write(stream)
     return stream.getvalue()
+
+
+def box(mask: NDArray[np.bool_], margin: int = 0) -> tuple[slice, slice]:
+    """Rows and columns around the pixels of a mask (H, W), with a margin; all of them around an empty mask."""
+    ends = []
+    for axis, size in enumerate(mask.shape):
+        inside = np.flatnonzero(mask.any(axis=1 - axis))
+        ends.append(
+            slice(max(inside[0] - margin, 0), min(inside[-1] + margin + 1, size)) if len(inside) else slice(size)
+        )
+    return ends[0], ends[1]

@@ -273,9 +273,6 @@ class _System:
         shared = np.linalg.solve(schur, right[:p] - product @ right[p:])
         return np.concatenate([shared, inverse @ (right[p:] - mixed.T @ shared)])
 
-    def covariance_diagonal(self) -> NDArray[np.float64]:
-        return np.diag(self.inverse(np.eye(len(self.gradient))))
-
 
 def _by_pose(slope: NDArray, turned: NDArray, move: NDArray) -> NDArray[np.float64]:
     """(M, 2, 6) derivative of pixels by a pose's turn and shift, from that by places (M, 2, 3)."""

@@ -142,7 +142,7 @@ def _followed(
             if timestep in result.timesteps:
                 one = result.geometry.at((timestep,))
             else:
-                follower = follower or Follower(capture, result.model, home, names, config.geometry, None, seed)
+                follower = follower or Follower(capture, result.model, home, names, config.geometry)
                 one = follower.next(timestep)[0]
         except ConvergenceError:
             failed[timestep] = "the face isn't found in it"

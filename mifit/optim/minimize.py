@@ -1,8 +1,11 @@
-"""Nonlinear least squares by Gauss-Newton or Levenberg-Marquardt: linearise, propose, evaluate, judge, repeat.
+"""Nonlinear least squares by Levenberg and Marquardt's method: linearise, propose, evaluate, judge, repeat.
 
-A *problem* linearises itself into a *system* (normal equations with their structure, `optim.systems`); a *descent*
-turns a system into a step; an *acceptance* judges the step and sets the size of the next one; `minimize` drives the
-three and returns a `Solution` that says in an enumerated `Outcome` how it ended.
+A *problem* linearises itself into a *system* (normal equations with their structure); `minimize` takes damped steps and
+returns a `Solution` that says in an enumerated `Outcome` how it ended.
+
+The energy is E = sum r^2 (no half), so the model of a step d is E + 2 g.d + d.H d with g = J^T r and H = J^T J.
+A damped step solves (H + lambda D) d = -g, D = diag(H): Marquardt's scaling, which makes it independent of the
+parameters' units. Frozen parameters (at a bound, pushed outwards) keep d = 0.
 """
 
 from __future__ import annotations
@@ -15,8 +18,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-
-from mifit.optim.systems import System
+from scipy import linalg
 
 
 class Outcome(Enum):
@@ -39,15 +41,12 @@ class Solution:
     """What `minimize` returns.
 
     ``value`` (n,) are the best parameters found; ``energies`` per term at the start and after each accepted step;
-    ``system`` the linearisation at ``value`` when the run converged, else at the last linearised point, None if it
-    diverged at the start; its ``covariance_diagonal`` gives the uncertainty of the parameters. ``iterations`` count
-    linearisations, ``evaluations`` energies and ``rejected`` steps.
+    ``iterations`` count linearisations, ``evaluations`` energies and ``rejected`` steps.
     """
 
     value: NDArray
     outcome: Outcome
     energies: dict[str, list[float]] = field(default_factory=dict)
-    system: System | None = None
     iterations: int = 0
     evaluations: int = 0
     rejected: int = 0
@@ -62,6 +61,50 @@ class Solution:
     def usable(self) -> bool:
         """Whether ``value`` is a minimum, or on the way to one, rather than the wreck of a failed run."""
         return self.outcome not in (Outcome.DIVERGED, Outcome.SINGULAR)
+
+
+class System(Protocol):
+    """What `minimize` needs to know of a linearisation."""
+
+    @property
+    def gradient(self) -> NDArray[np.float64]:
+        """(n,) g = J^T r, half the gradient of the energy."""
+        ...
+
+    def product(self, step: NDArray) -> NDArray[np.float64]:
+        """H times a vector."""
+        ...
+
+    def solve(self, damping: float, frozen: NDArray[np.bool_], gradient: NDArray | None = None) -> NDArray[np.float64]:
+        """Damped step with the frozen parameters held, for another right-hand side if given.
+
+        Raises numpy's LinAlgError when singular.
+        """
+        ...
+
+
+class DenseSystem:
+    """Normal equations in one dense matrix: ``hessian`` (n, n) = J^T J and ``gradient`` (n,) = J^T r."""
+
+    def __init__(self, hessian: NDArray, gradient: NDArray) -> None:
+        self.hessian = np.asarray(hessian, dtype=np.float64)
+        self.gradient = np.asarray(gradient, dtype=np.float64)
+
+    def product(self, step: NDArray) -> NDArray[np.float64]:
+        """H d."""
+        return self.hessian @ step
+
+    def solve(self, damping: float, frozen: NDArray[np.bool_], gradient: NDArray | None = None) -> NDArray[np.float64]:
+        """Cholesky of the damped matrix over the free parameters."""
+        free = np.flatnonzero(~frozen)
+        h = self.hessian[np.ix_(free, free)]
+        diagonal = np.diag(h)
+        # D is kept away from zero, so that a parameter without data is still held by damping.
+        h[np.diag_indices(len(free))] += damping * np.maximum(diagonal, 1e-12 * diagonal.max(initial=0.0) or 1.0)
+        step = np.zeros(len(frozen))
+        g = self.gradient if gradient is None else gradient
+        step[free] = linalg.cho_solve(linalg.cho_factor(h), -g[free])
+        return step
 
 
 class Problem(Protocol):
@@ -113,7 +156,7 @@ def minimize(
     history = {name: [value] for name, value in terms.items()}
     energy = sum(terms.values())
     evaluations, rejected, iterations = 1, 0, 0
-    size, system, outcome = 1e3, None, Outcome.MAX_ITERATIONS
+    size, outcome = 1e3, Outcome.MAX_ITERATIONS
     if not np.isfinite(energy):
         outcome, max_iterations = Outcome.DIVERGED, 0
     while iterations < max_iterations:
@@ -157,7 +200,7 @@ def minimize(
                 break
         if done:
             break
-    return Solution(x, outcome, history, system, iterations, evaluations, rejected, time.perf_counter() - began)
+    return Solution(x, outcome, history, iterations, evaluations, rejected, time.perf_counter() - began)
 
 
 def trust(predicted: float, actual: float, size: float, rejections: int) -> tuple[bool, float]:
@@ -196,3 +239,19 @@ def _bounded_step(system: System, size: float, frozen: NDArray, low: NDArray, hi
         held = held | below | above
         gradient = system.gradient + system.product(fixed)
     return step
+
+
+def geman_mcclure(squared: NDArray, scale: float) -> tuple[NDArray, NDArray]:
+    """Geman and McClure's penalty s^2 r^2 / (s^2 + r^2): bounded, so that a gross outlier has no pull.
+
+    It equals r^2 to second order at zero; the weight rho'(r) / 2r is that of iteratively reweighted least squares.
+
+    Returns
+    -------
+    rho, weight : arrays like ``squared``
+        An infinite ``scale`` gives least squares.
+    """
+    if np.isinf(scale):
+        return squared, np.ones_like(squared)
+    q = scale * scale / (scale * scale + squared)
+    return squared * q, q * q

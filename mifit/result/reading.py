@@ -212,7 +212,6 @@ def _geometry(folder: Path, document: Document, model: MorphableModel) -> Geomet
         photometry=Photometry.from_document(document["capture"].get("photometry", {})),
         displacement=_displacement(folder, len(model.mean)) if entry.get("displaced") else None,
         landmark_noise=float(document["capture"]["landmark_noise"]),
-        face_width=float(document["capture"]["face_width"]),
     )
 
 

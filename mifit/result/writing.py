@@ -146,7 +146,6 @@ def _document(result: Reconstruction) -> Document:
             "cameras": [{k: getattr(c, k) for k in CAMERA} for c in result.cameras],
             "photometry": geometry.photometry.document(),
             "landmark_noise": float(geometry.landmark_noise),
-            "face_width": float(geometry.face_width),
         },
         "model": {
             "source": _source(result.model_source),

@@ -29,7 +29,7 @@ from mifit.morphable.openings import leading_faces, skin_weights
 from mifit.optim import Outcome
 from mifit.progress import Progress, silent
 from mifit.stages.geometry.points import corner_matrix
-from mifit.stages.geometry.scenes import Scenes
+from mifit.stages.geometry.surfaces import Scenes
 from mifit.stages.surface.align_timesteps import align_timesteps
 from mifit.stages.surface.close_openings import LIDS, LIPS, close_again, close_openings
 from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surface

@@ -19,15 +19,25 @@ from mifit.morphable import MorphableModel
 from mifit.optim import Solution
 from mifit.progress import Progress, silent
 from mifit.stages.geometry.appearance import fit_appearance, gather
-from mifit.stages.geometry.displaced import displaced
-from mifit.stages.geometry.landmarks import LandmarkView
+from mifit.stages.geometry.images import blind_warnings, facial_pixels
+from mifit.stages.geometry.landmarks import (
+    FEWEST_LANDMARKS,
+    State,
+    fit_landmarks,
+    initial_state,
+    landmark_views,
+    priors_of,
+    world_vertices,
+)
 from mifit.stages.geometry.parameters import Frames, Layout
-from mifit.stages.geometry.refine import Reference, priors_of, refine_by_rendering, refine_by_texture, texture_reference
-from mifit.stages.geometry.start import FEWEST_LANDMARKS, State, fit_landmarks, initial_state, landmark_views
+from mifit.stages.geometry.rendering import refine_by_rendering
 from mifit.stages.geometry.summary import Journal, pack
-from mifit.stages.geometry.visibility import Visibility, spread_points, unseen_warnings
+from mifit.stages.geometry.surfaces import displaced
 
-__all__ = ["fit_geometry", "fit_pose_expression", "texture_reference"]
+SMOOTH = 1.0
+"""Blur of the images from which albedo and lighting are found, pixels."""
+
+__all__ = ["fit_geometry", "fit_pose_expression"]
 
 
 @checked
@@ -60,8 +70,7 @@ def fit_geometry(
     Returns
     -------
     GeometryEstimate
-        ``report.details`` holds the phases and the standard deviations of pose and shape, from the curvature at
-        the solution.
+        ``report.details`` holds the phases.
 
     Raises
     ------
@@ -79,16 +88,30 @@ def fit_geometry(
     cameras, timesteps = tuple(cameras), tuple(timesteps)
     if not cameras or not timesteps:
         raise InputError("fit_geometry: found no camera or no timestep, expected at least one of each")
-    journal = Journal("fit geometry", 2 + config.rounds, progress)
+    journal = Journal("fit geometry", 1 + (config.rounds if config.objective == "paper" else 1), progress)
     layout = Layout(len(timesteps), model.n_identity, model.n_expression, log_scale=int(config.scale_deviation > 0.0))
     config = replace(config, landmark_noise=_landmark_noise(capture, cameras, timesteps, config))
     views = landmark_views(capture, model, cameras, timesteps, config.landmark_noise)
     state = initial_state(model, views, len(timesteps), layout, model.unit_mm / capture.unit_mm)
     start = fit_landmarks(model, views, state, config.landmark_noise, priors_of(config))
     journal.phase("landmarks", _usable(start.solution, "landmarks"))
-    config = replace(config, landmark_noise=start.noise)
-    used = views if config.as_written else start.views  # the paper's landmarks are fixed vertices
-    return _refine_and_pack(capture, model, cameras, timesteps, config, seed, journal, start.state, used, None, None)
+    state, world = start.state, world_vertices(model, start.state)
+    seen = capture, model, cameras, timesteps
+    pixels = facial_pixels(*seen, world, config.pixels, SMOOTH, seed)
+    problem = gather(model, world, pixels, config.robust_colour, config.albedo_prior)
+    lit = _usable(fit_appearance(problem, config.max_iterations), "albedo and lighting")
+    appearance = lit.value
+    if config.objective == "paper":
+        for number in range(config.rounds):
+            pixels = facial_pixels(*seen, world_vertices(model, state), config.pixels, 0.0, seed + number)
+            # The paper's landmarks are fixed vertices.
+            state, solution, appearance = refine_by_rendering(model, state, appearance, views, pixels, config)
+            journal.phase("rendering", _usable(solution, "images"))
+    else:
+        journal.phase("albedo and lighting", lit, geometric=False)
+    for message in blind_warnings(pixels, cameras, timesteps, capture.unit_mm):
+        journal.warn(message)
+    return pack(model, state, appearance, timesteps, journal, start.views, start.noise)
 
 
 def fit_pose_expression(
@@ -98,23 +121,17 @@ def fit_pose_expression(
     cameras: Sequence[str],
     timestep: int,
     config: GeometryConfig,
-    seed: int = 0,
-    progress: Progress = silent,
-    reference: Reference | None = None,
 ) -> GeometryEstimate:
-    """Fit pose and expression of one further timestep; identity, albedo and lighting stay those of ``geometry``.
+    """Fit pose and expression of one further timestep to its landmarks; all else stays that of ``geometry``.
 
     Starts from the last timestep of ``geometry`` or from the landmarks, whichever reprojects better. With too few
-    landmarks the former alone is used, with a warning.
+    landmarks it is the last timestep again, with a warning.
 
     Parameters
     ----------
     geometry : GeometryEstimate
         Initial fit, or that of the timestep before.
-    reference : Reference, optional
-        Texture of the surface from timesteps already fitted (`texture_reference`): the new images are compared with
-        it as well as with one another. Its surface points are used.
-    capture, model, cameras, timestep, config, seed, progress
+    capture, model, cameras, timestep, config
         As in `fit_geometry`.
 
     Returns
@@ -132,24 +149,28 @@ def fit_pose_expression(
     cameras = tuple(cameras)
     if not cameras:
         raise InputError("fit_pose_expression: found no camera, expected at least one")
-    journal = Journal("track geometry", 2 + config.rounds, progress)
+    journal = Journal("track geometry", 1, silent)
     baked = bake_identity(displaced(model, geometry), geometry.identity)
-    warm = _state_of(geometry, geometry.timesteps[-1])
-    config = replace(config, landmark_noise=_landmark_noise(capture, cameras, (timestep,), config))
-    views = landmark_views(capture, baked, cameras, (timestep,), config.landmark_noise, fewest=0)
+    state = _state_of(geometry, geometry.timesteps[-1])
+    noise = _landmark_noise(capture, cameras, (timestep,), config)
+    views = landmark_views(capture, baked, cameras, (timestep,), noise, fewest=0)
     if sum(len(view.index) for view in views) >= FEWEST_LANDMARKS:
-        state = initial_state(baked, views, 1, warm.layout, geometry.scale, warm)
-        start = fit_landmarks(baked, views, state, config.landmark_noise, priors_of(config))
+        state = initial_state(baked, views, 1, state.layout, geometry.scale, state)
+        start = fit_landmarks(baked, views, state, noise, priors_of(config))
         journal.phase("landmarks", _usable(start.solution, "landmarks"))
-        state, views, config = start.state, start.views, replace(config, landmark_noise=start.noise)
+        state, views, noise = start.state, start.views, start.noise
     else:
-        state = warm
         text = f"timestep {timestep}: too few landmarks; started from timestep {geometry.timesteps[-1]} alone"
         journal.warn(Diagnostic("few-landmarks", text))
-    found = _refine_and_pack(
-        capture, baked, cameras, (timestep,), config, seed, journal, state, views, reference, geometry
+    appearance = np.concatenate([geometry.albedo, geometry.shading.ravel(), [geometry.ambient]])
+    found = pack(baked, state, appearance, (timestep,), journal, views, noise)
+    return replace(
+        found,
+        identity=geometry.identity,
+        vertex_albedo=geometry.vertex_albedo,
+        displacement=geometry.displacement,
+        photometry=geometry.photometry,
     )
-    return replace(found, displacement=geometry.displacement, photometry=geometry.photometry)
 
 
 def _landmark_noise(
@@ -182,73 +203,3 @@ def _usable(solution: Solution, what: str) -> Solution:
             "iterations; check the landmarks and the calibration of the cameras"
         )
     return solution
-
-
-def _refine_and_pack(
-    capture: Capture,
-    model: MorphableModel,
-    cameras: tuple[str, ...],
-    timesteps: tuple[int, ...],
-    config: GeometryConfig,
-    seed: int,
-    journal: Journal,
-    state: State,
-    views: tuple[LandmarkView, ...],
-    reference: Reference | None,
-    fixed: GeometryEstimate | None,
-) -> GeometryEstimate:
-    """Photometric rounds, then albedo and lighting unless ``fixed`` has them."""
-    visibility = Visibility(capture, model, cameras, timesteps)
-    if config.objective == "paper" and fixed is None:
-        appearance = _appearance(model, state, visibility, config, seed)
-        for number in range(config.rounds):
-            state, solution, appearance = refine_by_rendering(
-                model, state, appearance, views, visibility, config, seed + number
-            )
-            journal.phase("rendering", _usable(solution, "images"))
-    else:
-        if reference is not None:
-            points = reference.points(model)
-        else:
-            points = spread_points(model, config.surface_points, seed)
-        for _ in range(config.rounds):
-            state, solution = refine_by_texture(model, state, views, visibility, points, config, reference)
-            journal.phase("texture", _usable(solution, "images"))
-    if config.objective == "paper" and config.as_written and fixed is None:
-        coefficients = appearance
-    elif fixed is not None:
-        coefficients = np.concatenate([fixed.albedo, fixed.shading.ravel(), [fixed.ambient]])
-    else:
-        coefficients = _appearance(model, state, visibility, config, seed, journal)
-    for message in visibility.warnings:
-        journal.warn(message)
-    for message in unseen_warnings(visibility.blind, cameras, len(timesteps), capture.unit_mm):
-        journal.warn(message)
-    return pack(
-        model,
-        state,
-        coefficients,
-        timesteps,
-        visibility.world(state),
-        journal,
-        views,
-        config.landmark_noise,
-        fixed,
-    )
-
-
-def _appearance(
-    model: MorphableModel,
-    state: State,
-    visibility: Visibility,
-    config: GeometryConfig,
-    seed: int,
-    journal: Journal | None = None,
-) -> NDArray[np.float64]:
-    """Albedo coefficients, shading and ambient for a held geometry."""
-    pixels = visibility.pixels(state, config.pixels, 1.0, seed, anew=False)
-    problem = gather(model, visibility.world(state), pixels, config.robust_colour, config.albedo_prior)
-    solution = _usable(fit_appearance(problem, config.max_iterations), "albedo and lighting")
-    if journal is not None:
-        journal.phase("albedo and lighting", solution, geometric=False)
-    return solution.value

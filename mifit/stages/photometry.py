@@ -27,7 +27,7 @@ from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate
 from mifit.core.photometry import Photometry
 from mifit.core.sh import bands, basis, cosine_coefficients
-from mifit.optim.robust import geman_mcclure
+from mifit.optim import geman_mcclure
 from mifit.progress import Progress, silent
 from mifit.sampling.observations import Observations, Surface
 from mifit.sampling.visibility import GRAZING

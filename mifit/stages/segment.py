@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.estimate import Label
-from mifit.core.image import to_8_bit
+from mifit.core.image import box, to_8_bit
 from mifit.core.mesh import interpolate
 from mifit.core.process import on_all_cores
 from mifit.sampling.visibility import DARKEST
@@ -183,7 +183,7 @@ def _segment_image(
     eyes, mouth = _polygons(hit.shape, marks, EYES), _polygons(hit.shape, marks, (INNER_LIPS,))
     if facial.any() and not frame.masked:
         usable = facial & frame.valid & number & ~eyes & ~mouth
-        rows, columns = _box(facial)
+        rows, columns = box(facial)
         step = -(-max(rows.stop - rows.start, columns.stop - columns.start) // LONGEST)
         grid = slice(rows.start, rows.stop, step), slice(columns.start, columns.stop, step)
         objects = _objects(
@@ -282,16 +282,16 @@ def _outlines(
         state[cv2.erode(core, disc).astype(bool)] = cv2.GC_FGD
         state[near & clean] = cv2.GC_BGD
         state[~facial] = cv2.GC_BGD
-        box = _box(cv2.dilate(near.astype(np.uint8), around).astype(bool))
-        part = np.ascontiguousarray(state[box])
+        about = box(cv2.dilate(near.astype(np.uint8), around).astype(bool))
+        part = np.ascontiguousarray(state[about])
         if min((part == cv2.GC_FGD).sum(), (part == cv2.GC_BGD).sum()) < LEAST_SIZE:
             out |= core.astype(bool)
             continue
         cv2.setRNGSeed(0)
         behind, before = np.zeros((1, 65)), np.zeros((1, 65))
         nowhere = (0, 0, 0, 0)
-        cv2.grabCut(np.ascontiguousarray(picture[box]), part, nowhere, behind, before, 2, cv2.GC_INIT_WITH_MASK)
-        out[box] |= np.isin(part, (cv2.GC_FGD, cv2.GC_PR_FGD))
+        cv2.grabCut(np.ascontiguousarray(picture[about]), part, nowhere, behind, before, 2, cv2.GC_INIT_WITH_MASK)
+        out[about] |= np.isin(part, (cv2.GC_FGD, cv2.GC_PR_FGD))
     return out
 
 
@@ -344,8 +344,3 @@ def _polygons(shape: tuple[int, ...], marks: NDArray, parts: Sequence[slice]) ->
         if np.isfinite(marks[part]).all():
             cv2.fillPoly(area, [np.clip(np.round(marks[part]), -1e6, 1e6).astype(np.int32)], 1)
     return area > 0
-
-
-def _box(area: NDArray[np.bool_]) -> tuple[slice, slice]:
-    rows, columns = np.flatnonzero(area.any(axis=1)), np.flatnonzero(area.any(axis=0))
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)

@@ -12,8 +12,8 @@ from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.fit_geometry import fit_geometry
-from mifit.stages.geometry.displaced import moved_by
 from mifit.stages.geometry.parameters import exponential
+from mifit.stages.geometry.surfaces import moved_by
 from mifit.stages.surface.align_timesteps import align_timesteps
 from mifit.stages.surface.kept_texture import KeptTexture
 from mifit.stages.surface.sweep import BEST_APART, MOST_PAIRS, Posed, across_time

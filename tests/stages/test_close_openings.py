@@ -17,8 +17,8 @@ from mifit.core.estimate import GeometryEstimate, Report
 from mifit.core.mesh import face_cross
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs, with_eyes
-from mifit.stages.geometry.displaced import displaced, moved_by
 from mifit.stages.geometry.parameters import exponential
+from mifit.stages.geometry.surfaces import displaced, moved_by
 from mifit.stages.surface.close_openings import LIDS, LIPS, close_again, close_openings
 from mifit.stages.surface.closed_line import heights, read_strip
 from mifit.stages.surface.margins import COLUMNS, Gap, Margins

@@ -12,13 +12,12 @@ from mifit.core.camera import Camera
 from mifit.core.mesh import normalize
 from mifit.core.sh import basis
 from mifit.stages.geometry.appearance import AppearanceProblem, fit_appearance
-from mifit.stages.geometry.consistency import ConsistencyProblem, TextureView
-from mifit.stages.geometry.images import SmoothImage, blur, texture_level
+from mifit.stages.geometry.images import PixelView, SmoothImage, blur
 from mifit.stages.geometry.initial import align, pose_candidates, reprojection, triangulate
 from mifit.stages.geometry.landmarks import LandmarkProblem, LandmarkTerm, LandmarkView
 from mifit.stages.geometry.parameters import Frames, Layout, exponential, left_jacobian, rotation_angle
 from mifit.stages.geometry.points import PointBasis
-from mifit.stages.geometry.rendering import Patch, PixelView, RenderingProblem, Surface
+from mifit.stages.geometry.rendering import RenderingProblem
 
 
 def head(rng, n=9, identity=4, expression=3, albedo=2):
@@ -157,32 +156,6 @@ def test_samples_at_the_border_or_on_invalid_pixels_are_refused():
     assert image.sample(pixels)[2].tolist() == [True, False, False, False, False, False, False]
 
 
-def test_texture_ignores_exposure_and_smooth_shading():
-    rng = np.random.default_rng(2)
-    paint = np.exp(0.3 * rng.normal(size=(80, 80, 3))).astype(np.float32)
-    y, x = np.mgrid[0:80, 0:80]
-    light = np.exp(0.01 * x - 0.006 * y)[..., None]
-    valid = np.ones((80, 80), bool)
-    plain, lit = (texture_level(i.astype(np.float32), valid, 1.0, 5.0).values for i in (paint, 2.5 * paint * light))
-    inner = (slice(20, 60), slice(20, 60))
-    assert np.abs(plain[inner] - lit[inner]).max() < 0.01 < 0.05 < plain[inner].std()
-
-
-def test_a_texture_is_the_same_whatever_lies_around_its_valid_pixels():
-    rng = np.random.default_rng(4)
-    image = rng.uniform(0.1, 0.9, (90, 120, 3)).astype(np.float32)
-    valid = np.zeros((90, 120), bool)
-    valid[40:60, 0:30] = True
-    valid[50, 10] = False
-    small = texture_level(image[10:, :70], valid[10:, :70], 1.0, 5.0)
-    whole = texture_level(np.where(valid[..., None], image, 7.0).astype(np.float32), valid, 1.0, 5.0)
-    log = np.log(image + 1e-3)
-    expected = blur(log, valid, 1.0) - blur(log, valid, 5.0)
-    np.testing.assert_allclose(whole.values[valid], expected[valid], atol=1e-5)
-    np.testing.assert_allclose(small.values[valid[10:, :70]], expected[valid], atol=1e-5)
-    assert texture_level(image, np.zeros((90, 120), bool), 1.0, 5.0).valid.sum() == 0
-
-
 def test_landmark_jacobian(scene):
     layout = replace(scene.layout, albedo=0, shading=0, ambient=0)
     x = np.concatenate([scene.x[scene.layout.at("identity")], scene.x[scene.layout.at("log_scale")]])
@@ -205,23 +178,9 @@ def test_rendering_jacobian(scene):
             views.append(PixelView(step, cam, smooth_image(scene.rng), face, weights))
     priors = {"identity": 0.3, "albedo": 0.2, "expression": 0.4, "ambient": 10.0}
     problem = RenderingProblem(
-        scene.model, scene.layout, scene.frames, tuple(views), LandmarkTerm(landmark_views(scene), 50.0), 200.0, priors
+        scene.model, scene.layout, scene.frames, tuple(views), LandmarkTerm(landmark_views(scene), 50.0), priors
     )
     check_gradient(problem, scene.x, 1e-4)
-
-
-def test_held_slopes_of_the_normals_are_those_at_the_point_where_they_are_held(scene):
-    face, weights = random_points(scene.rng, scene.model, 60)
-    view = PixelView(1, scene.cameras[0], smooth_image(scene.rng), face, weights)
-    problem = RenderingProblem(
-        scene.model, scene.layout, scene.frames, (view,), LandmarkTerm((), np.inf), 200.0, {"ambient": 1.0}
-    )
-    held, away = problem.holding_slopes(scene.x), scene.x + 0.2
-    exact = problem.linearize(scene.x)
-    np.testing.assert_array_equal(held.linearize(scene.x).dense(), exact.dense())
-    assert held.energies(away) == problem.energies(away)
-    off = held.linearize(away).gradient - problem.linearize(away).gradient
-    assert 0 < np.abs(off).max() < 0.1 * np.abs(exact.gradient).max()
 
 
 def test_rendering_normals_matter(scene):
@@ -230,94 +189,10 @@ def test_rendering_normals_matter(scene):
     flat = SmoothImage(np.full((96, 96, 3), 0.3), np.ones((96, 96)))
     view = PixelView(0, scene.cameras[0], flat, face, weights)
     problem = RenderingProblem(
-        scene.model, scene.layout, scene.frames, (view,), LandmarkTerm((), np.inf), np.inf, {"ambient": 1.0}
+        scene.model, scene.layout, scene.frames, (view,), LandmarkTerm((), np.inf), {"ambient": 1.0}
     )
     shape = [*range(*scene.layout.at("identity").indices(99)), *range(*scene.layout.at("expression", 0).indices(99))]
     check_gradient(problem, scene.x, 1e-4, columns=shape)
-
-
-def test_consistency_jacobian(scene):
-    """Variable projection: the gradient is that of the energy with the free values at their best."""
-    layout = replace(scene.layout, albedo=0, shading=0, ambient=0, log_scale=0)
-    x = np.concatenate([scene.x[scene.layout.at("identity")], *(scene.x[scene.layout.local(k)] for k in range(2))])
-    face, weights = random_points(scene.rng, scene.model, 80)
-    views = []
-    for step in range(2):
-        for cam in scene.cameras:
-            seen = np.sort(scene.rng.choice(80, 60, replace=False))
-            points = basis_on(scene.model, face[seen], weights[seen])
-            views.append(TextureView(step, cam, smooth_image(scene.rng), seen, scene.rng.uniform(0.3, 1, 60), points))
-    problem = ConsistencyProblem(
-        layout,
-        scene.frames,
-        80,
-        tuple(views),
-        0.1,
-        np.inf,
-        0.5,
-        LandmarkTerm((), np.inf),
-        {"identity": 0.2, "expression": 0.3},
-    )
-    check_gradient(problem, x, 1e-4)
-    # the elimination must equal explicit unknowns: a step with the values free is the step of the full system
-    known = (scene.rng.uniform(0.1, 0.6, (80, 3)), scene.rng.uniform(0.2, 1.0, 80))
-    check_gradient(replace(problem, known=known), x, 1e-4)
-
-
-def test_images_are_looked_up_once_at_a_step_that_is_accepted(scene, monkeypatch):
-    layout, looks = Layout(1, 4, 3), []
-    x = 0.1 * scene.rng.normal(size=layout.size)
-    face, weights = random_points(scene.rng, scene.model, 10)
-    views = tuple(
-        TextureView(0, cam, smooth_image(scene.rng), np.arange(10), np.ones(10), basis_on(scene.model, face, weights))
-        for cam in scene.cameras
-    )
-    given = layout, scene.frames, 10, views, 1.0, 3.0, 1.0, LandmarkTerm((), np.inf), {"identity": 1e-3}
-    fresh = ConsistencyProblem(*given).linearize(x)
-    look = ConsistencyProblem._look
-    monkeypatch.setattr(ConsistencyProblem, "_look", lambda self, at: looks.append(at.copy()) or look(self, at))
-    problem = ConsistencyProblem(*given)
-    here = problem.energies(x)
-    elsewhere = problem.energies(x + 0.01)
-    assert len(looks) == 2 and here != elsewhere
-    assert problem.energies(x) == here
-    found = problem.linearize(x)
-    assert len(looks) == 3
-    np.testing.assert_array_equal(found.hessian, fresh.hessian)
-    np.testing.assert_array_equal(found.gradient, fresh.gradient)
-
-
-def test_elimination_equals_explicit_values(scene):
-    """H after elimination is the Schur complement of the system that keeps every point's value."""
-    layout = Layout(1, 4, 3)
-    x = 0.1 * scene.rng.normal(size=layout.size)
-    face, weights = random_points(scene.rng, scene.model, 10)
-    views = tuple(
-        TextureView(0, cam, smooth_image(scene.rng), np.arange(10), np.ones(10), basis_on(scene.model, face, weights))
-        for cam in scene.cameras
-    )
-    problem = ConsistencyProblem(
-        layout,
-        scene.frames,
-        10,
-        views,
-        1.0,
-        np.inf,
-        1.0,
-        LandmarkTerm((), np.inf),
-        {"identity": 1e-3, "expression": 1e-3},
-    )
-    rows = []
-    for i in range(layout.size):
-        d = np.zeros(layout.size)
-        d[i] = 1e-6
-        up, down = (np.stack([o[2] for o in problem._observe(x + s * d)]) for s in (1, -1))
-        rows.append((up - down) / 2e-6)
-    jacobian = np.stack(rows, -1)  # (views, points, channels, n)
-    centred = (jacobian - jacobian.mean(0)).reshape(-1, layout.size)
-    prior = np.zeros(layout.size)
-    prior[:7] = 1e-3
-    np.testing.assert_allclose(problem.linearize(x).hessian, centred.T @ centred + np.diag(prior), rtol=1e-4, atol=1e-6)
 
 
 def test_appearance_recovers_albedo_and_lighting():
@@ -388,16 +263,3 @@ def test_triangulation_and_pose_are_exact_without_noise():
         error = [reprojection(cams, 10 * points, pix, 0.1, pose) for pose in candidates]
         best = candidates[int(np.argmin(error))]
         assert rotation_angle(best[0], rotation) < 1e-3 and np.abs(best[1] - translation).max() < 1e-3
-
-
-def test_a_patch_of_the_model_has_the_same_points_normals_and_derivatives(scene):
-    face, weights = random_points(scene.rng, scene.model, 30)
-    identity, expression = (0.3 * scene.rng.normal(size=n) for n in (scene.layout.identity, scene.layout.expression))
-    patch, number = Patch.around(scene.model, face)
-    assert len(patch.mean) < len(scene.model.mean)
-    whole, part = (Surface(model, identity, expression) for model in (scene.model, patch))
-    at_whole, at_part = (s.vertices[s.model.faces[f]] for s, f in ((whole, face), (part, number)))
-    np.testing.assert_allclose(at_part, at_whole, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(part.normals(number, weights)[0], whole.normals(face, weights)[0], atol=1e-5)
-    slopes, expected = part.normal_modes(number, weights), whole.normal_modes(face, weights)
-    np.testing.assert_allclose(slopes, expected, atol=1e-4 * np.abs(expected).max())

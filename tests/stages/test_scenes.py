@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mifit.stages.geometry.scenes import Scenes
+from mifit.stages.geometry.surfaces import Scenes
 
 RIGHT = np.array([1.0, 0.0, 0.0])
 FACES = np.array([[0, 1, 2]])

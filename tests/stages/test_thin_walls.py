@@ -9,7 +9,7 @@ from mifit.core.estimate import GeometryEstimate, Report
 from mifit.core.mesh import vertex_normals
 from mifit.morphable import MorphableModel
 from mifit.optim import Outcome
-from mifit.stages.geometry.displaced import moved_by, object_shapes
+from mifit.stages.geometry.surfaces import moved_by, object_shapes
 from mifit.stages.surface.thin_walls import KEPT, Walls, keep_walls
 from tests.morphable.intersections import intersections
 

@@ -40,13 +40,19 @@ def fit_truth(monkeypatch, scene):
 
     starts = []
 
-    def fit(capture, model, geometry, cameras, timestep, config, seed=0, progress=None, reference=None):
-        assert reference == "texture"
+    class NoTexture:
+        def __init__(self, *arguments):
+            pass
+
+        def aligned(self, geometry):
+            return geometry
+
+    def fit(capture, model, geometry, cameras, timestep, config):
         starts.append((timestep, geometry.timesteps[-1]))
         return scene.geometry.at((timestep,))
 
     monkeypatch.setattr(track, "fit_pose_expression", fit)
-    monkeypatch.setattr(track, "texture_reference", lambda *arguments: "texture")
+    monkeypatch.setattr(track, "KeptTexture", NoTexture)
     return starts
 
 

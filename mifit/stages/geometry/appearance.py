@@ -12,9 +12,12 @@ from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.sh import basis
 from mifit.morphable import MorphableModel
 from mifit.optim import DenseSystem, Solution, geman_mcclure, minimize
+from mifit.sampling.visibility import DARKEST
+from mifit.stages.geometry.images import PixelView
 from mifit.stages.geometry.points import corner_matrix
-from mifit.stages.geometry.rendering import AMBIENT_PRIOR, WHITE, PixelView
+from mifit.stages.geometry.rendering import WHITE
 
+AMBIENT_PRIOR = 1e-2  # of the squared ambient term in 0..1: fixes the gauge against the constant harmonic
 SHADING_PRIOR = 1e-4  # of the squared coefficients, 0..255: decides only what the visible normals leave open
 LEVEL_PRIOR = 1.0
 """Of the squared relative change of the face's mean albedo, per channel, 0..255: fixes the gauge against the lighting.
@@ -23,8 +26,6 @@ Images show the product of albedo and light alone, so nothing tells the level; b
 skin in brighter light makes all contrasts cheap: without this it falls to half, in light far from white to nothing.
 As a prior alone, 0.28 of the logarithm as skin's luminance spreads is a hundred times too weak to hold it.
 """
-DARKEST = 1e-3
-"""Level of a face, linear reflectance, below which relative changes mean nothing."""
 
 
 @dataclass(frozen=True)
@@ -127,35 +128,29 @@ def gather(
     model: MorphableModel, world: NDArray, views: Sequence[PixelView], robust: float, albedo_prior: float
 ) -> AppearanceProblem:
     """Collect the pixels of all views; ``world`` (T, V, 3) is the held geometry."""
-    mean, modes, harmonics, observed, weight = [], [], [], [], []
     flat = model.albedo_modes.reshape(len(model.mean), -1)
     normals = [vertex_normals(vertices, model.faces) for vertices in world]
+    parts = [
+        (
+            np.zeros((0, 3), np.float32),
+            np.zeros((0, 3, model.n_albedo), np.float32),
+            np.zeros((0, 9), np.float32),
+            np.zeros((0, 3), np.float32),
+            np.zeros(0),
+        )
+    ]
     for view in views:
         corner = corner_matrix(model.faces, view.face, view.weights, len(model.mean))
         normal = normalize(interpolate(normals[view.step], model.faces, view.face, view.weights))
         position = interpolate(world[view.step], model.faces, view.face, view.weights)
         colour, _, inside = view.image.sample(view.camera.project(position), gradient=False)
-        mean.append((corner @ model.mean_albedo)[inside])
-        modes.append((corner @ flat).reshape(len(view.face), 3, -1)[inside])
-        harmonics.append(basis(normal, 3).astype(np.float32)[inside])
-        observed.append(colour[inside])
-        weight.append(np.full(inside.sum(), 1.0 / max(inside.sum(), 1)))
-    if not views:
-        empty = np.zeros((0, 3), np.float32)
-        modes, mean, harmonics = (
-            [np.zeros((0, 3, model.albedo_modes.shape[2]), np.float32)],
-            [empty],
-            [np.zeros((0, 9), np.float32)],
-        )
-        observed, weight = [empty], [np.zeros(0)]
+        modes = (corner @ flat).reshape(len(view.face), 3, -1)
+        rows = corner @ model.mean_albedo, modes, basis(normal, 3).astype(np.float32), colour
+        parts.append((*(each[inside] for each in rows), np.full(inside.sum(), 1.0 / max(inside.sum(), 1))))
     face = np.unique(model.faces[model.face_mask])
     level = model.mean_albedo[face].mean(axis=0, dtype=np.float64)
     return AppearanceProblem(
-        np.concatenate(mean),
-        np.concatenate(modes),
-        np.concatenate(harmonics),
-        np.concatenate(observed),
-        np.concatenate(weight),
+        *(np.concatenate(each) for each in zip(*parts, strict=True)),
         robust,
         albedo_prior,
         model.albedo_modes[face].mean(axis=0, dtype=np.float64) / np.maximum(level, DARKEST)[:, None],

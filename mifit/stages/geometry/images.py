@@ -1,4 +1,4 @@
-"""Images as smooth functions of position: cubic B-splines over Gaussian levels, with exact gradients.
+"""Facial pixels of the images, and images as smooth functions of position with exact gradients.
 
 An image's pixel values are taken as the spline's coefficients. The function is then the image blurred by the cubic
 B-spline (about 0.58 pixels), twice differentiable everywhere, which Gauss-Newton and finite differences both need.
@@ -6,13 +6,22 @@ B-spline (about 0.58 pixels), twice differentiable everywhere, which Gauss-Newto
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-DARKEST = 1e-3  # added before the logarithm: below the read noise of 8-bit images
+from mifit.capture import Capture
+from mifit.core.camera import Camera
+from mifit.core.diagnostics import Diagnostic
+from mifit.morphable import MorphableModel
+from mifit.render.gbuffer import SurfaceScene
+from mifit.sampling.visibility import DARKEST
+
+BORDER = 2
+"""Pixels along the outline of the model that are left out: they mix it with what lies behind."""
 
 
 @dataclass(frozen=True)
@@ -89,39 +98,98 @@ def blur(values: NDArray, valid: NDArray, sigma: float) -> NDArray:
     return out / np.maximum(total if values.ndim == 2 else total[..., None], 1e-4)
 
 
-def level(image: NDArray, valid: NDArray, sigma: float) -> SmoothImage:
+def smooth_image(image: NDArray, valid: NDArray, sigma: float) -> SmoothImage:
     """Image blurred by ``sigma`` pixels; invalid pixels ignored."""
     values = blur(image, valid, sigma) if sigma > 0 else image
     return SmoothImage(np.ascontiguousarray(values, np.float32), valid.astype(np.float32))
 
 
-def texture_level(image: NDArray, valid: NDArray, sigma: float, window: float) -> SmoothImage:
-    """Logarithm of an image between two scales: what is painted on the skin rather than how it is lit.
+@dataclass(frozen=True)
+class PixelView:
+    """Facial pixels of one image.
 
-    In the logarithm albedo and shading add; the difference of a fine and a wide blur keeps moles, brows, lips and
-    pores, and drops smooth shading, ambient level and exposure.
+    Attributes
+    ----------
+    step : int
+    camera : Camera
+    image : SmoothImage
+        Linear colours.
+    face : (n,) int, weights : (n, 3)
+        Surface point under each pixel.
+    """
+
+    step: int
+    camera: Camera
+    image: SmoothImage
+    face: NDArray
+    weights: NDArray
+
+
+def facial_pixels(
+    capture: Capture,
+    model: MorphableModel,
+    cameras: Sequence[str],
+    timesteps: Sequence[int],
+    world: NDArray,
+    count: int,
+    sigma: float,
+    seed: int,
+) -> tuple[PixelView, ...]:
+    """Up to ``count`` facial pixels of every image, chosen evenly at random; images without any are left out.
 
     Parameters
     ----------
-    sigma, window : float
-        Fine and wide blur in pixels.
+    world : (T, V, 3)
+        The surface that is looked at.
+    sigma : float
+        Blur of the images, pixels.
     """
-    # Blurs reach four deviations far, and what lies outside the valid pixels is never read.
-    part = box(valid, int(np.ceil(4.0 * window)) + 1)
-    shown = valid[part]
-    log = np.log(np.maximum(image[part], 0.0) + DARKEST).astype(np.float32)
-    fine = blur(log, shown, sigma) if sigma > 0 else log
-    values = np.zeros(image.shape, np.float32)
-    values[part] = fine - blur(log, shown, window)
-    return SmoothImage(values, valid.astype(np.float32))
+    rng = np.random.default_rng(seed)
+    out = []
+    for step, (timestep, vertices) in enumerate(zip(timesteps, world, strict=True)):
+        scene = SurfaceScene(vertices, model.faces)
+        for name in cameras:
+            camera, frame = capture.camera(name), capture.frame(name, timestep)
+            buffer = scene.gbuffer(camera)
+            on = cv2.erode((buffer.face >= 0).astype(np.uint8), np.ones((2 * BORDER + 1,) * 2, np.uint8), borderValue=0)
+            usable = (on > 0) & frame.valid & ~frame.clipped & (frame.image.max(axis=2) > DARKEST)
+            facial = np.flatnonzero(usable & model.face_mask[np.maximum(buffer.face, 0)])
+            if len(facial) > count:
+                facial = np.sort(rng.choice(facial, count, replace=False))
+            if len(facial):
+                face, weights = buffer.face.reshape(-1)[facial], buffer.weights.reshape(-1, 3)[facial]
+                out.append(PixelView(step, camera, smooth_image(frame.image, frame.valid, sigma), face, weights))
+    return tuple(out)
 
 
-def box(mask: NDArray[np.bool_], margin: int = 0) -> tuple[slice, slice]:
-    """Rows and columns around the pixels of a mask (H, W), with a margin; all of them around an empty mask."""
-    ends = []
-    for axis, size in enumerate(mask.shape):
-        inside = np.flatnonzero(mask.any(axis=1 - axis))
-        ends.append(
-            slice(max(inside[0] - margin, 0), min(inside[-1] + margin + 1, size)) if len(inside) else slice(size)
+def blind_warnings(
+    views: Sequence[PixelView], cameras: Sequence[str], timesteps: Sequence[int], unit_mm: float
+) -> list[Diagnostic]:
+    """What to say of images that show no usable pixel of the face, and of cameras that show none at any timestep.
+
+    Parameters
+    ----------
+    views : sequence of PixelView
+        Of the images that do.
+    cameras, timesteps
+        All that were fitted.
+    unit_mm : float
+        The capture's unit of length in millimetres.
+    """
+    shown = {(view.camera.name, timesteps[view.step]) for view in views}
+    blind = [(name, t) for t in timesteps for name in cameras if (name, t) not in shown]
+    unusable = "no pixel of the face can be used (out of view, masked, clipped or black); only landmarks count there"
+    found = [
+        Diagnostic("no-usable-pixels", f"camera {name}, timestep {t}: {unusable}", camera=name) for name, t in blind
+    ]
+    return found + [
+        Diagnostic(
+            "face-unseen",
+            f"camera {name} shows the front of the fitted face at no timestep. If its images do show the face: is the "
+            f"unit of length right (found one of {unit_mm:g} mm), is the order of the landmarks (left taken for right "
+            "turns a head around), are the cameras' poses?",
+            camera=name,
         )
-    return ends[0], ends[1]
+        for name in cameras
+        if all((name, t) in blind for t in timesteps)
+    ]

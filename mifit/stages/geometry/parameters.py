@@ -1,4 +1,4 @@
-"""The unknowns of stage 1 as one flat vector: shared by all timesteps first, then timestep by timestep.
+"""The unknowns of stage 1 as one flat vector, shared by all timesteps first, and their normal equations.
 
 Gauge. Scale against distance: the scale is fixed by the units of model and capture, or held by a prior on its
 logarithm. Albedo against lighting: the model's mean albedo and its prior decide. Ambient against the constant
@@ -12,6 +12,8 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mifit.optim import DenseSystem
 
 SHARED = ("identity", "albedo", "shading", "ambient", "log_scale")
 LOCAL = ("expression", "rotation", "translation")
@@ -150,3 +152,44 @@ def rotation_angle(a: NDArray, b: NDArray) -> float:
     """Angle between two rotations, in degrees."""
     cosine = (np.trace(a.T @ b) - 1.0) / 2.0
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+class NormalEquations:
+    """J^T J and J^T r of rows that each touch the shared unknowns and one timestep's."""
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        self.hessian, self.gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
+
+    def add(self, step: int, rows: NDArray) -> None:
+        """Add rows (m, S + P + 1) of one timestep: shared and local derivatives and residual, by their weights' root.
+
+        float32 rows are multiplied in float32 and accumulated in float64.
+        """
+        shared, local = slice(self.layout.shared_size), self.layout.local(step)
+        products, s = rows.T @ rows, self.layout.shared_size
+        for at, own in ((shared, slice(s)), (local, slice(s, -1))):
+            for other, part in ((shared, slice(s)), (local, slice(s, -1))):
+                self.hessian[at, other] += products[own, part]
+            self.gradient[at] += products[own, -1]
+
+    def add_priors(self, x: NDArray, priors: dict[str, float]) -> None:
+        """Add ``weight * |x[name]|^2`` per group, for every timestep if the group is local."""
+        for at, weight in _held(self.layout, priors):
+            self.hessian[at, at] += weight * np.eye(at.stop - at.start)
+            self.gradient[at] += weight * x[at]
+
+    def system(self) -> DenseSystem:
+        """The accumulated equations."""
+        return DenseSystem(self.hessian, self.gradient)
+
+
+def prior_energy(layout: Layout, x: NDArray, priors: dict[str, float]) -> float:
+    """Energy that `NormalEquations.add_priors` linearises."""
+    return sum(weight * float(x[at] @ x[at]) for at, weight in _held(layout, priors))
+
+
+def _held(layout: Layout, priors: dict[str, float]) -> list[tuple[slice, float]]:
+    """Unknowns that priors hold, and their weights."""
+    steps = {name: range(layout.timesteps) if name in LOCAL else (0,) for name in priors}
+    return [(layout.at(name, step), weight) for name, weight in priors.items() for step in steps[name]]

@@ -1,4 +1,4 @@
-"""The paper's photo-consistency term: I_ren = I_a + C_d * sum_k l_k phi_k(n) against the images, pixel by pixel.
+"""The paper's objective as written: I_ren = I_a + C_d * sum_k l_k phi_k(n) against the images, pixel by pixel.
 
 Units are the paper's: colours times 255. Each facial pixel of an image is tied to the surface point that the G-buffer
 found under it; as the parameters move, the point moves over the image and the residual follows it,
@@ -18,73 +18,24 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from mifit.core.camera import Camera
+from mifit.config import GeometryConfig
 from mifit.core.mesh import face_cross
 from mifit.core.sh import basis_gradient
 from mifit.morphable import MorphableModel
-from mifit.optim import geman_mcclure
-from mifit.optim.systems import ArrowSystem
-from mifit.stages.geometry.images import SmoothImage
-from mifit.stages.geometry.landmarks import LandmarkTerm
-from mifit.stages.geometry.normal import NormalEquations, prior_energy
-from mifit.stages.geometry.parameters import Frames, Layout, Pose, cross_matrix
+from mifit.optim import DenseSystem, Solution, minimize
+from mifit.stages.geometry.images import PixelView
+from mifit.stages.geometry.landmarks import LandmarkTerm, LandmarkView, State, bounds, priors_of
+from mifit.stages.geometry.parameters import Frames, Layout, NormalEquations, Pose, cross_matrix, prior_energy
 from mifit.stages.geometry.points import PointBasis, Projection, corner_matrix, project
 
 WHITE = 255.0
-AMBIENT_PRIOR = 1e-2  # of the squared ambient term in 0..1: fixes the gauge against the constant harmonic
-
-
-@dataclass(frozen=True)
-class PixelView:
-    """Facial pixels of one image.
-
-    Attributes
-    ----------
-    step : int
-    camera : Camera
-    image : SmoothImage
-        Linear colours.
-    face : (n,) int, weights : (n, 3)
-        Surface point under each pixel.
-    """
-
-    step: int
-    camera: Camera
-    image: SmoothImage
-    face: NDArray
-    weights: NDArray
-
-
-@dataclass(frozen=True)
-class Patch:
-    """The part of a model that decides positions and normals on some of its faces.
-
-    Attributes
-    ----------
-    mean, identity, expression, faces
-        As of the model, of these vertices and the faces around the wanted ones' corners alone.
-    """
-
-    mean: NDArray
-    identity: NDArray
-    expression: NDArray
-    faces: NDArray
-
-    @classmethod
-    def around(cls, model: MorphableModel, face: NDArray) -> tuple[Patch, NDArray]:
-        """Around faces (n,) of a model, and their numbers (n,) in the patch."""
-        corner = np.zeros(len(model.mean), bool)
-        corner[model.faces[face]] = True
-        kept = np.flatnonzero(corner[model.faces].any(axis=1))
-        vertices, faces = np.unique(model.faces[kept], return_inverse=True)
-        patch = cls(model.mean[vertices], model.identity[vertices], model.expression[vertices], faces.reshape(-1, 3))
-        return patch, np.searchsorted(kept, face)
+"""Colours of 0..1 in the paper's units."""
 
 
 class Surface:
     """The model's surface at one timestep in object space, with its vertex normals before and after normalising."""
 
-    def __init__(self, model: MorphableModel | Patch, identity: NDArray, expression: NDArray) -> None:
+    def __init__(self, model: MorphableModel, identity: NDArray, expression: NDArray) -> None:
         size = 3 * len(model.mean)
         dtype = model.mean.dtype
         flat = model.mean.reshape(-1) + model.identity.reshape(size, len(identity)) @ identity.astype(dtype)
@@ -161,8 +112,9 @@ class Surface:
 class Observation:
     """One view at one parameter value: residuals and what their derivatives are made of."""
 
+    surface: Surface
     residual: NDArray  # (n, 3), 0..255
-    ok: NDArray  # (n,) bool
+    weight: NDArray  # (n,) of its square: all alike, 0 where the image has no value
     slope: NDArray  # (n, 3, 2) of the image, by pixels
     projection: Projection
     normal: NDArray  # (n, 3) world
@@ -195,14 +147,8 @@ class RenderingProblem:
     Attributes
     ----------
     views : tuple of PixelView
-    robust : float
-        Residual (0..255, over the three channels) where Geman and McClure's penalty turns; infinite for plain
-        least squares.
     priors : dict of str to float
         Weight of the squared coefficients per group.
-    slopes : tuple of (n, 3, Ki + Ke), optional
-        Derivatives of the normals under each view's pixels by the coefficients, held; by default found anew in every
-        linearisation.
     """
 
     model: MorphableModel
@@ -210,9 +156,7 @@ class RenderingProblem:
     frames: Frames
     views: tuple[PixelView, ...]
     landmarks: LandmarkTerm
-    robust: float
     priors: dict[str, float]
-    slopes: tuple[NDArray, ...] | None = None
 
     @cached_property
     def _rows(self) -> list[PixelRows]:
@@ -237,20 +181,22 @@ class RenderingProblem:
         """Of each view."""
         key = x.tobytes()
         if key not in self._last:
-            surfaces = self._surfaces(x)
+            at = self.layout.at
+            steps = range(self.layout.timesteps)
+            surfaces = [Surface(self.model, x[at("identity")], x[at("expression", k)]) for k in steps]
             self._last.clear()
             self._last[key] = [
-                self._observe(view, rows, surfaces[view.step], face, x)
-                for view, rows, face in zip(self.views, self._rows, self._patches[1], strict=True)
+                self._observe(view, rows, surfaces[view.step], x)
+                for view, rows in zip(self.views, self._rows, strict=True)
             ]
         return self._last[key]
 
-    def _observe(self, view: PixelView, rows: PixelRows, surface: Surface, face: NDArray, x: NDArray) -> Observation:
-        """One view; ``face`` are its pixels' faces on the surface's patch."""
+    def _observe(self, view: PixelView, rows: PixelRows, surface: Surface, x: NDArray) -> Observation:
+        """One view."""
         pose: Pose = self.frames.pose(self.layout, x, view.step)
         w = view.weights.astype(np.float64)
-        points = np.einsum("nk,nkc->nc", w, surface.vertices[surface.model.faces[face]])
-        normal = surface.normals(face, w)[0] @ pose.rotation.T
+        points = np.einsum("nk,nkc->nc", w, surface.vertices[self.model.faces[view.face]])
+        normal = surface.normals(view.face, w)[0] @ pose.rotation.T
         projection = project(view.camera, pose, points)
         values, slope, inside = view.image.sample(projection.pixels)
         assert slope is not None
@@ -260,74 +206,31 @@ class RenderingProblem:
         colour = rows.albedo + modes @ x[self.layout.at("albedo")].astype(modes.dtype)
         residual = WHITE * (x[self.layout.at("ambient")] + colour * shade - values)
         ok = inside & (projection.depth > 0)
-        return Observation(residual, ok, slope, projection, normal, colour, shade, harmonics, basis_slope)
-
-    def _loss(self, observation: Observation) -> tuple[float, NDArray]:
-        """Mean robust square over the view's pixels, and each pixel's weight in it."""
-        squared = (observation.residual**2).sum(1)
-        rho, weight = geman_mcclure(squared, self.robust)
-        count = max(int(observation.ok.sum()), 1)
-        return float(rho[observation.ok].sum()) / count, np.where(observation.ok, weight, 0.0) / count
-
-    @cached_property
-    def _patches(self) -> tuple[list[Patch], list[NDArray]]:
-        """What the pixels of each timestep are on, and the numbers of their faces there, per view."""
-        patches, faces = [], [np.zeros(0, np.intp)] * len(self.views)
-        for step in range(self.layout.timesteps):
-            own = [i for i, view in enumerate(self.views) if view.step == step]
-            together = np.concatenate([np.zeros(0, np.intp), *(self.views[i].face for i in own)])
-            patch, numbers = Patch.around(self.model, together)
-            patches.append(patch)
-            ends = np.cumsum([len(self.views[i].face) for i in own])[:-1]
-            for i, part in zip(own, np.split(numbers, ends), strict=False):
-                faces[i] = part
-        return patches, faces
-
-    def _surfaces(self, x: NDArray) -> list[Surface]:
-        at = self.layout.at
-        patches = self._patches[0]
-        return [Surface(patch, x[at("identity")], x[at("expression", k)]) for k, patch in enumerate(patches)]
+        weight = ok / max(int(ok.sum()), 1)
+        return Observation(surface, residual, weight, slope, projection, normal, colour, shade, harmonics, basis_slope)
 
     def energies(self, x: NDArray) -> dict[str, float]:
-        """Energy per term."""
-        data = sum(self._loss(observation)[0] for observation in self._observations(x))
+        """Energy per term; that of the images is each view's mean over its pixels."""
+        data = sum((o.weight * (o.residual**2).sum(1)).sum() for o in self._observations(x))
         prior = prior_energy(self.layout, x, self.priors)
         landmarks = self.landmarks.energy(self.layout, self.frames, x)
         return {"photo": float(data), "landmarks": landmarks, "prior": prior}
 
-    def holding_slopes(self, x: NDArray) -> RenderingProblem:
-        """The problem with the normals' derivatives by the coefficients held as they are at x.
-
-        They are the dearest part of a linearisation, and change by as much as the surface bends. Energies stay exact.
-        """
-        surfaces = self._surfaces(x)
-        slopes = [
-            surfaces[view.step].normal_modes(face, view.weights.astype(np.float64))
-            for view, face in zip(self.views, self._patches[1], strict=True)
-        ]
-        return replace(self, slopes=tuple(slopes))
-
-    def linearize(self, x: NDArray) -> ArrowSystem:
+    def linearize(self, x: NDArray) -> DenseSystem:
         """Normal equations at x."""
         equations = NormalEquations(self.layout)
-        slopes = self.slopes if self.slopes is not None else self.holding_slopes(x).slopes
-        assert slopes is not None
-        observed = self._observations(x)
-        for view, rows, by_shape, observation in zip(self.views, self._rows, slopes, observed, strict=True):
-            equations.add_weighted(view.step, self._weighted_rows(view, rows, by_shape, observation, x))
+        for view, rows, observation in zip(self.views, self._rows, self._observations(x), strict=True):
+            equations.add(view.step, self._weighted_rows(view, rows, observation, x))
         self.landmarks.accumulate(equations, self.layout, self.frames, x)
         equations.add_priors(x, self.priors)
         return equations.system()
 
-    def _weighted_rows(self, view: PixelView, rows: PixelRows, slopes: NDArray, o: Observation, x: NDArray) -> NDArray:
-        """Jacobian and residuals by the root of their weights, as `NormalEquations.add_weighted` takes them.
-
-        Pixel by pixel, channel by channel; ``slopes`` are the derivatives of the normals by the coefficients.
-        """
+    def _weighted_rows(self, view: PixelView, rows: PixelRows, o: Observation, x: NDArray) -> NDArray:
+        """Jacobian and residuals, pixel by pixel, channel by channel, as `NormalEquations.add` takes them."""
         layout = self.layout
         dtype = rows.position.dtype
         n, shared = len(view.face), layout.shared_size
-        root = np.sqrt(self._loss(o)[1])[:, None, None]
+        root = np.sqrt(o.weight)[:, None, None]
         pose = self.frames.pose(layout, x, view.step)
         by_pixel = -WHITE * root * o.slope.astype(np.float64)
         # shading through the world normal, each channel its own lighting
@@ -337,13 +240,12 @@ class RenderingProblem:
         out = np.zeros((n, 3, shared + layout.local_size + 1), dtype=dtype)
         by_position = (by_pixel @ o.projection.by_object).astype(dtype)
         by_shape = by_position @ rows.position
+        slopes = o.surface.normal_modes(view.face, view.weights.astype(np.float64))
         by_shape += (by_normal @ pose.rotation).astype(dtype) @ slopes
         out[:, :, layout.at("identity")] = by_shape[:, :, : layout.identity]
         out[:, :, shared : shared + layout.expression] = by_shape[:, :, layout.identity :]
-        if layout.albedo:
-            out[:, :, layout.at("albedo")] = (WHITE * root[:, 0] * o.shade).astype(dtype)[
-                :, :, None
-            ] * rows.albedo_modes
+        by_albedo = (WHITE * root[:, 0] * o.shade).astype(dtype)
+        out[:, :, layout.at("albedo")] = by_albedo[:, :, None] * rows.albedo_modes
         first = layout.at("shading").start
         for c in range(3):
             out[:, c, first + c : first + 27 : 3] = WHITE * root[:, 0] * o.albedo[:, c, None] * o.basis
@@ -356,3 +258,57 @@ class RenderingProblem:
         out[:, :, shared + layout.expression : -1] = by_pose
         out[:, :, -1] = root[:, 0] * o.residual
         return out.reshape(3 * n, out.shape[2])
+
+
+def refine_by_rendering(
+    model: MorphableModel,
+    state: State,
+    appearance: NDArray,
+    views: tuple[LandmarkView, ...],
+    pixels: tuple[PixelView, ...],
+    config: GeometryConfig,
+) -> tuple[State, Solution, NDArray]:
+    """One outer step of the paper's objective, all unknowns together.
+
+    Parameters
+    ----------
+    appearance : (Ka + 28,)
+        Albedo coefficients, shading and ambient to start from.
+    pixels : tuple of PixelView
+        Those of the images, without blur, as the surface at ``state`` covers them.
+
+    Returns
+    -------
+    state (geometry alone), solution, appearance
+    """
+    problem, start = paper_problem(model, state, appearance, views, pixels, config)
+    low, high = bounds(problem.layout, model.expression_bounds)
+    solution = minimize(
+        problem, start, lower=low, upper=high, max_iterations=config.max_iterations, energy_tolerance=1e-4
+    )
+    full = State(problem.layout, problem.frames, solution.value)
+    at = problem.layout.at
+    appearance = np.concatenate([solution.value[at(name)] for name in ("albedo", "shading", "ambient")])
+    return full.with_layout(state.layout), solution, appearance
+
+
+def paper_problem(
+    model: MorphableModel,
+    state: State,
+    appearance: NDArray,
+    views: tuple[LandmarkView, ...],
+    pixels: tuple[PixelView, ...],
+    config: GeometryConfig,
+) -> tuple[RenderingProblem, NDArray]:
+    """The paper's objective, and the flat vector to start from; parameters as in `refine_by_rendering`."""
+    layout = replace(state.layout, albedo=model.n_albedo, shading=27, ambient=1)
+    full = state.with_layout(layout).recentred()
+    x = full.x
+    albedo, shading, ambient = np.split(appearance, [model.n_albedo, model.n_albedo + 27])
+    x[layout.at("albedo")], x[layout.at("shading")], x[layout.at("ambient")] = albedo, shading, ambient
+    # w_l / |F_view| per view
+    weighted = tuple(replace(view, weight=config.landmark_weight / max(len(view.index), 1)) for view in views)
+    priors = {name: config.prior_weight for name in ("identity", "albedo", "expression")}
+    if layout.log_scale:
+        priors["log_scale"] = priors_of(config)["log_scale"]
+    return RenderingProblem(model, layout, full.frames, pixels, LandmarkTerm(weighted, np.inf), priors), x

@@ -12,13 +12,9 @@ from mifit.core.estimate import GeometryEstimate, Report
 from mifit.morphable import MorphableModel
 from mifit.optim import Outcome, Solution
 from mifit.progress import Progress
-from mifit.stages.geometry.landmarks import LandmarkTerm, LandmarkView
-from mifit.stages.geometry.start import State, coordinate_deviation
+from mifit.stages.geometry.landmarks import LandmarkView, State, coordinate_deviation, world_vertices
 
 FARTHEST_IDENTITY = 8.0  # standard deviations; heads beyond a model's span reach six, wrong cameras ten
-SCATTER_OF_FACE, LEAST_SCATTER = 0.005, 1.1
-"""Deviation of a landmark between images of one head, as a part of the face's width and at least in pixels; what
-exceeds it is bias. Good detectors scatter by 0.3 per cent and about a pixel, and are off by one to four per cent."""
 SCATTER_OF_WIDTH = 0.015  # deviation of landmarks from the fit, as part of the image's width, that deserves a warning
 
 
@@ -73,11 +69,9 @@ def pack(
     state: State,
     appearance: NDArray,
     timesteps: tuple[int, ...],
-    world: NDArray,
     journal: Journal,
     views: tuple[LandmarkView, ...],
     noise: float,
-    fixed: GeometryEstimate | None,
 ) -> GeometryEstimate:
     """Turn a state into the stage's result.
 
@@ -85,28 +79,19 @@ def pack(
     ----------
     appearance : (Ka + 28,)
         Albedo coefficients, shading, ambient.
-    world : (T, V, 3)
     noise : float
         Standard deviation of a landmark coordinate that the fit used, pixels.
-    fixed : GeometryEstimate, optional
-        Where identity and albedo come from when they weren't fitted.
     """
-    layout, x = state.layout, state.x
+    layout, x, world = state.layout, state.x, world_vertices(model, state)
     poses = [state.frames.pose(layout, x, k) for k in range(len(timesteps))]
     albedo, shading, ambient = np.split(appearance, [model.n_albedo, model.n_albedo + 27])
     expression = np.stack([x[layout.at("expression", k)] for k in range(len(timesteps))])
-    details = {
-        "phases": journal.phases,
-        "landmark_rms_pixels": _landmark_rms(state, views),
-    }
-    if journal.last is not None and journal.last.system is not None:
-        details["standard_deviations"] = _deviations(state, journal.last)
     width = min((view.camera.width for view in views), default=np.inf)
     scatter = coordinate_deviation(state, views) if views else 0.0
     if scatter > SCATTER_OF_WIDTH * width:
         text = f"landmarks scatter by {scatter:.1f} pixels about the fitted face: check detector and calibration"
         journal.warn(Diagnostic("landmarks-scatter", text))
-    identity = x[layout.at("identity")].copy() if fixed is None else fixed.identity
+    identity = x[layout.at("identity")].copy()
     if len(identity) and np.abs(identity).max() > FARTHEST_IDENTITY:
         text = (
             f"an identity coefficient is {np.abs(identity).max():.1f} standard deviations from the mean: the model "
@@ -122,7 +107,7 @@ def pack(
         translation=np.stack([pose.translation for pose in poses]),
         scale=poses[0].scale,
         vertices=world.astype(np.float32),
-        vertex_albedo=model.albedo(albedo) if fixed is None else fixed.vertex_albedo,
+        vertex_albedo=model.albedo(albedo),
         shading=shading.reshape(9, 3).copy(),
         ambient=float(ambient[0]),
         report=Report(
@@ -130,57 +115,7 @@ def pack(
             journal.energies,
             time.perf_counter() - journal.began,
             tuple(journal.warnings),
-            details,
+            {"phases": journal.phases},
         ),
         landmark_noise=noise,
-        face_width=_face_width(model, world, views),
     )
-
-
-def _face_width(model: MorphableModel, world: NDArray, views: tuple[LandmarkView, ...]) -> float:
-    """Mean width of the face in the images, pixels, as a view from the front would have it; 0 without views."""
-    found = []
-    for view in views:
-        ends = world[view.step][model.landmarks[[0, 16]]].astype(np.float64)
-        depth = float(np.linalg.norm(ends.mean(axis=0) - view.camera.position))
-        found.append(float(np.linalg.norm(ends[1] - ends[0])) * np.sqrt(view.camera.fx * view.camera.fy) / depth)
-    return float(np.mean(found)) if found else 0.0
-
-
-def _landmark_rms(state: State, views: tuple[LandmarkView, ...]) -> dict[str, float]:
-    """Root-mean-square landmark distance in pixels per camera."""
-    term = LandmarkTerm(views, np.inf)
-    squares: dict[str, list[NDArray]] = {}
-    for view in views:
-        distance = term.distances(view, state.layout, state.frames, state.x)
-        squares.setdefault(view.camera.name, []).append((distance**2).sum(1))
-    return {name: float(np.sqrt(np.mean(np.concatenate(values)))) for name, values in squares.items()}
-
-
-def _deviations(state: State, solution: Solution) -> dict[str, list]:
-    """Standard deviations of pose and shape from the inverse curvature; None where the data leave them open."""
-    assert solution.system is not None
-    layout = state.layout
-    variance = solution.system.covariance_diagonal()
-    deviation = np.sqrt(np.maximum(variance, 0.0))
-
-    def listed(values: NDArray) -> list:
-        return [float(v) if np.isfinite(v) else None for v in values]
-
-    steps = range(layout.timesteps)
-    return {
-        "identity": listed(deviation[layout.at("identity")]),
-        "expression": [listed(deviation[layout.at("expression", k)]) for k in steps],
-        "rotation_degrees": [listed(np.degrees(deviation[layout.at("rotation", k)])) for k in steps],
-        "translation": [listed(deviation[layout.at("translation", k)]) for k in steps],
-    }
-
-
-def scatter_pixels(geometry: GeometryEstimate) -> float:
-    """Deviation of a landmark coordinate that a good detector has between images of this face, pixels."""
-    return max(LEAST_SCATTER, SCATTER_OF_FACE * geometry.face_width)
-
-
-def landmarks_are_biased(geometry: GeometryEstimate) -> bool:
-    """Whether the landmarks lie farther from the fit than a good detector scatters."""
-    return geometry.landmark_noise > scatter_pixels(geometry)

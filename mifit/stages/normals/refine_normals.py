@@ -368,10 +368,6 @@ class NormalSystem:
         matrix, near = (ssl.LinearOperator((size, size), each) for each in (apply, precondition))
         return np.asarray(ssl.cg(matrix, right, rtol=SOLVED, maxiter=60, M=near)[0])
 
-    def covariance_diagonal(self) -> NDArray[np.float64]:
-        """Diagonal of the inverse of the texels' own blocks: with the neighbours held."""
-        return np.einsum("naa->na", np.linalg.inv(self.blocks + 1e-12 * np.eye(2))).ravel()
-
 
 def graph_laplacian(values: NDArray, neighbours: NDArray) -> NDArray:
     """Degree times values (N, 3) less the neighbours' (N, 4): symmetric."""

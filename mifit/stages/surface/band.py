@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
-from mifit.stages.geometry.images import box
+from mifit.core.image import box
 
 DARKEST = 4e-3
 """Added before the logarithm, in linear image units: below it the noise of 8-bit images outweighs the signal."""

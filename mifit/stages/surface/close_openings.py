@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mifit.core.estimate import GeometryEstimate
 from mifit.morphable.openings import EYES
 from mifit.render.gbuffer import SurfaceScene
-from mifit.stages.geometry.displaced import moved_by, object_shapes
+from mifit.stages.geometry.surfaces import moved_by, object_shapes
 from mifit.stages.surface.closed_line import Strip, heights, read_strip, sample, shows_an_eye, shows_teeth
 from mifit.stages.surface.margins import UP, Gap, Margins, Region
 

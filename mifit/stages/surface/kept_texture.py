@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
 
 
+LEVELS = (2, 1, 0)
+"""Of the image pyramid, one after the other: landmarks that share a bias leave a face pixels from where its skin is."""
+
+
 class KeptTexture:
     """What the views of fitted timesteps show of the surface.
 
@@ -41,11 +45,12 @@ class KeptTexture:
         views = [capture.camera(name) for name in cameras]
         vertices = geometry.vertices.astype(np.float64)
         self._texels, self._factor, _ = texels_of_pixels(model, vertices[0], views)
-        posed = [self._posed(*one) for one in zip(geometry.timesteps, vertices, strict=True)]
-        self._looks = looks_at(self._texels, posed)
-        weight = np.stack([look.weight for look in self._looks])
+        steps = list(zip(geometry.timesteps, vertices, strict=True))
+        self._looks = {level: looks_at(self._texels, [self._posed(*one, level) for one in steps]) for level in LEVELS}
+        finest = self._looks[LEVELS[-1]]
+        weight = np.stack([look.weight for look in finest])
         self._known = weight.sum(axis=0) > 0
-        value = np.stack([look.value for look in self._looks])
+        value = np.stack([look.value for look in finest])
         self._mean = (weight * value).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-6)
 
     def aligned(self, geometry: GeometryEstimate) -> GeometryEstimate:
@@ -53,9 +58,12 @@ class KeptTexture:
 
         ``geometry`` itself where they agree no better elsewhere, as when something hides most of the face.
         """
-        model, texels = self._model, self._texels
-        posed = self._posed(geometry.timesteps[0], geometry.vertices[0].astype(np.float64))
-        moved = align_timesteps(model, geometry, texels, [posed], self._looks)
+        model, texels, moved = self._model, self._texels, geometry
+        timestep = geometry.timesteps[0]
+        for level, looks in self._looks.items():
+            posed = self._posed(timestep, moved.vertices[0].astype(np.float64), level)
+            moved = align_timesteps(model, moved, texels, [posed], looks)
+        posed = self._posed(timestep, geometry.vertices[0].astype(np.float64), LEVELS[-1])
         by = interpolate(moved.vertices[0] - geometry.vertices[0], model.faces, texels.face, texels.weights)
         if not self._apart(replace(posed, position=posed.position + by)) < self._apart(posed):
             return geometry
@@ -75,7 +83,7 @@ class KeptTexture:
         every = np.concatenate(apart)
         return float(np.median(every)) if len(every) else np.inf
 
-    def _posed(self, timestep: int, vertices: NDArray) -> Posed:
+    def _posed(self, timestep: int, vertices: NDArray, level: int) -> Posed:
         scene = SurfaceScene(vertices, self._model.faces)
-        given = scene, vertices, self._model.faces, self._texels, self._cameras, timestep, self._factor
+        given = scene, vertices, self._model.faces, self._texels, self._cameras, timestep, 0.5**level * self._factor
         return pose_texels(self._capture, *given)

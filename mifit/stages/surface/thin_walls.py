@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import edges, normalize, vertex_normals
 from mifit.morphable import MorphableModel
-from mifit.stages.geometry.displaced import moved_by, object_shapes
+from mifit.stages.geometry.surfaces import moved_by, object_shapes
 
 THICKEST_MM, CAVITY_MM = 6.0, 15.0
 """Distance between the sides of a wall, and between the sides of a cavity, at the most."""
