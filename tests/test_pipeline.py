@@ -139,7 +139,7 @@ def another(section, name, value):
     elif isinstance(value, bool):
         changed = not value
     else:
-        changed = type(value)(2 * value + 1) if name != "texture_sigma" else 2.0
+        changed = type(value)(2 * value + 1)
     return dataclasses.replace(section, **{name: changed})
 
 

@@ -210,17 +210,11 @@ class Label(IntEnum):
 
     BACKGROUND = 0
     OCCLUDER = 32
-    CLOTH = 64
-    HAIR = 96
     MOUTH = 160
     EYES = 208
     SKIN = 255
 
 
-HIDDEN = (Label.OCCLUDER, Label.CLOTH, Label.HAIR)
-"""What hides the face."""
-
-
 def hidden(labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Pixels (H, W) at which something hides the face."""
-    return np.isin(labels, HIDDEN)
+    return np.asarray(labels == Label.OCCLUDER)

@@ -22,6 +22,16 @@ VARIABLES = (OURS, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS",
 """Read by libraries when they are loaded, and by processes that this one starts."""
 
 
+BLOCK = 1 << 20
+"""Numbers that are worked on at a time: they stay in a core's cache, and bound what is held beside the result."""
+
+
+def blocks(count: int, width: int = 1) -> list[slice]:
+    """Slices that cut ``count`` rows of ``width`` numbers into `BLOCK` numbers each."""
+    step = max(BLOCK // max(width, 1), 1)
+    return [slice(at, min(at + step, count)) for at in range(0, count, step)]
+
+
 def set_threads(count: int) -> None:
     """Use so many threads, at least 1; before ``set_variant``, which gives Dr.Jit its number.
 

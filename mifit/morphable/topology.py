@@ -21,6 +21,9 @@ from mifit.errors import InputError
 EYES_AND_MOUTH = (range(36, 42), range(42, 48), range(60, 68))
 """iBUG landmarks around the three openings of a face."""
 
+INNER = np.arange(17, 68)
+"""Those inside the face: the first ones lie on its contour, and slide over it as the head turns."""
+
 IBUG_MIRROR = np.array(
     [
         *range(16, -1, -1),

@@ -21,8 +21,6 @@ HEAT_LIMIT = 40.0
 
 CLIPPED_TINT = (214, 39, 160)
 LABEL_TINTS = (
-    (Label.HAIR, (0, 160, 60), "hair"),
-    (Label.CLOTH, (240, 150, 0), "cloth"),
     (Label.OCCLUDER, (230, 30, 30), "something in front of the face"),
     (Label.EYES, (0, 215, 215), "eyes"),
     (Label.MOUTH, (150, 60, 220), "mouth"),

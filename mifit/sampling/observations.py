@@ -20,7 +20,7 @@ from mifit.appearance.occlusion import OccludingMesh
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, hidden
 from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.process import on_all_cores
+from mifit.core.process import BLOCK, blocks, on_all_cores
 from mifit.core.uv import TexelMap, bilinear, rasterize_uv
 from mifit.errors import InputError
 from mifit.sampling.visibility import (
@@ -38,10 +38,6 @@ if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
     from mifit.render.gbuffer import GBuffer
 
-CHUNK_VALUES = 1 << 22
-"""Texels x images that are held at a time."""
-COMPARED = 1 << 14
-"""Texels whose images are compared at a time: what they need stays in a core's cache."""
 SHARED = ("step", "camera")
 """Fields of `Observations` that are the same for all texels."""
 
@@ -269,7 +265,7 @@ class Surface:
 
     def chunks(self, values: int = 8) -> list[NDArray[np.int64]]:
         """All texels in parts that bound the memory of so many values per observation."""
-        step = max(256, 8 * CHUNK_VALUES // (self.image_count * max(values, 8)))
+        step = max(256, 32 * BLOCK // (self.image_count * max(values, 8)))
         return [np.arange(i, min(i + step, len(self))) for i in range(0, len(self), step)]
 
     def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -371,7 +367,7 @@ class Surface:
         step = np.array([image.step for image in self._images])
         inlier = np.float32(1.0) - outlier
         if self.robust:
-            parts = [slice(at, at + COMPARED) for at in range(0, n, COMPARED)]
+            parts = blocks(n, 32 * j)
             compared = on_all_cores(
                 lambda r: inlier_probability(colour[r], weight[r], outlier[r], clipped[r], step), parts
             )

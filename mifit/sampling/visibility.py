@@ -40,9 +40,7 @@ SPREAD, RANGE = 0.2, 4.0
 of the range in which something else may show any."""
 ROUNDS = 4
 DARKEST = 0.004
-"""Linear colour below which ratios are noise."""
-BESIDE = 3
-"""Pixels beside the fitted outline that are left out of the background."""
+"""Linear colour, of images or of albedo, below which ratios are noise: one step of 8-bit codes."""
 ALIKE = 0.15
 """Part of its colour by which the background changes from the outline inwards."""
 
@@ -146,7 +144,7 @@ def background(image: NDArray, hit: NDArray[np.bool_], kept: NDArray[np.bool_]) 
     kept : (H, W) bool
         Pixels that are never background: the face area, whose outline is fitted.
     """
-    around = np.ones((2 * BESIDE + 1,) * 2, np.uint8)
+    around = np.ones((2 * round(EDGE_PIXELS) + 1,) * 2, np.uint8)
     off = ~cv2.dilate(hit.astype(np.uint8), around).astype(bool)
     if not off.any() or not hit.any():
         return np.zeros_like(hit)

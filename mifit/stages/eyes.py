@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import vertex_normals
-from mifit.core.process import on_all_cores
+from mifit.core.process import blocks, on_all_cores
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs, leading_faces
 
@@ -21,8 +21,6 @@ SEARCH_MM = 12.0
 """Depth of an eyeball outside the skin up to which it is found."""
 GAP_MM = 0.5
 """Distance that is left between lid and eyeball."""
-BLOCK = 1 << 17
-"""Rays times faces that are looked at together: they stay in the cache."""
 PASSES = 2
 """Vertices that have moved have other normals, along which a few more stand out."""
 
@@ -76,8 +74,7 @@ def _depth_outside(points: NDArray, normals: NDArray, vertices: NDArray, faces: 
     outward, across, along = np.cross(e1, e2), np.cross(e2, a), np.cross(a, e1)
     turned, height = np.cross(normals, points), (a * outward).sum(axis=1)
     depth = np.zeros(len(points))
-    step = max(1, BLOCK // max(len(faces), 1))
-    for rays in (slice(at, at + step) for at in range(0, len(points), step)):
+    for rays in blocks(len(points), 8 * len(faces)):
         n, p, m = normals[rays], points[rays], turned[rays]
         det = n @ outward.T
         u, v = m @ e2.T + n @ across.T, n @ along.T - m @ e1.T

@@ -26,6 +26,7 @@ from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.process import one_blas_thread
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.morphable.openings import leading_faces, skin_weights
+from mifit.morphable.topology import INNER
 from mifit.optim import Outcome
 from mifit.progress import Progress, silent
 from mifit.stages.geometry.points import corner_matrix
@@ -62,8 +63,6 @@ MOST_SWEEPS, SWEEPS_OF_LIDS = 5, 2
 """Of a level, and of the two finest ones once more where lids have been closed."""
 ROBUST_STEPS = 0.7
 """Distance from the surface, in steps of the sweep, where an offset counts as an outlier."""
-JAW = 17
-"""Landmarks of the jaw, which come first."""
 INDEPENDENT = 0.1
 """Part of the landmarks that count as measured on their own: neighbours are off alike."""
 OUTLIER_DEVIATIONS = 4.0
@@ -247,7 +246,7 @@ class Landmarks:
             for name in cameras:
                 frame = capture.frame(name, timestep)
                 if frame.landmarks is not None:
-                    index = np.flatnonzero(frame.visible[JAW:]) + JAW
+                    index = np.flatnonzero(frame.visible[INNER]) + INNER[0]
                     pixels = np.asarray(frame.landmarks[index], np.float64)
                     views.append((step, capture.camera(name), model.landmarks[index], pixels))
         return cls(model.n_vertices, views, max(geometry.landmark_noise, 1.0))

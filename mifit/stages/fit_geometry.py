@@ -34,9 +34,6 @@ from mifit.stages.geometry.rendering import refine_by_rendering
 from mifit.stages.geometry.summary import Journal, pack
 from mifit.stages.geometry.surfaces import displaced
 
-SMOOTH = 1.0
-"""Blur of the images from which albedo and lighting are found, pixels."""
-
 __all__ = ["fit_geometry", "fit_pose_expression"]
 
 
@@ -97,13 +94,13 @@ def fit_geometry(
     journal.phase("landmarks", _usable(start.solution, "landmarks"))
     state, world = start.state, world_vertices(model, start.state)
     seen = capture, model, cameras, timesteps
-    pixels = facial_pixels(*seen, world, config.pixels, SMOOTH, seed)
+    pixels = facial_pixels(*seen, world, config.pixels, seed)
     problem = gather(model, world, pixels, config.robust_colour, config.albedo_prior)
     lit = _usable(fit_appearance(problem, config.max_iterations), "albedo and lighting")
     appearance = lit.value
     if config.objective == "paper":
         for number in range(config.rounds):
-            pixels = facial_pixels(*seen, world_vertices(model, state), config.pixels, 0.0, seed + number)
+            pixels = facial_pixels(*seen, world_vertices(model, state), config.pixels, seed + number)
             # The paper's landmarks are fixed vertices.
             state, solution, appearance = refine_by_rendering(model, state, appearance, views, pixels, config)
             journal.phase("rendering", _usable(solution, "images"))

@@ -1,4 +1,4 @@
-"""What each image shows: skin, eyes, mouth, hair, cloth, something in front of the face, or the background.
+"""What each image shows: skin, eyes, mouth, something in front of the face, or the background.
 
 It starts from the fitted head under its light, shadows included. Every point of the face has one albedo, the median
 over all images, and an image that contradicts it over an area shows something else there. What is added light alone,
@@ -23,6 +23,7 @@ from mifit.core.estimate import Label
 from mifit.core.image import box, to_8_bit
 from mifit.core.mesh import interpolate
 from mifit.core.process import on_all_cores
+from mifit.morphable.topology import EYES_AND_MOUTH
 from mifit.sampling.visibility import DARKEST
 
 if TYPE_CHECKING:
@@ -51,15 +52,10 @@ SMALLEST = 0.004
 """Part of the face that an object covers at the least."""
 HIGHLIGHT = 0.5
 """Red over blue of what a highlight adds at the least: a window's is bluish."""
-ABOVE = 0.1
-"""Height above the brows, in multiples of that above the chin, from which on an object is hair."""
 LARGE = 0.02
 """The same of one that covers it in every image: birthmarks are smaller."""
 LEAST_SIZE = 16
 """Pixels: smaller faces and objects are left alone."""
-EYES, INNER_LIPS = (slice(36, 42), slice(42, 48)), slice(60, 68)
-"""iBUG points."""
-BROWS = slice(17, 22), slice(22, 27)
 MARGIN = 0.08
 """Distance around eyes and brows, as a part of the distance between the eyes' outer corners, that is theirs."""
 LONGEST = 640
@@ -180,7 +176,7 @@ def _segment_image(
     labels = np.where(hit, np.uint8(Label.SKIN), np.uint8(Label.BACKGROUND))
     facial = hit & model.face_mask[np.maximum(view.face, 0)]
     marks = view.camera.project(view.vertices[model.landmarks])
-    eyes, mouth = _polygons(hit.shape, marks, EYES), _polygons(hit.shape, marks, (INNER_LIPS,))
+    eyes, mouth = _polygons(hit.shape, marks, EYES_AND_MOUTH[:2]), _polygons(hit.shape, marks, EYES_AND_MOUTH[2:])
     if facial.any() and not frame.masked:
         usable = facial & frame.valid & number & ~eyes & ~mouth
         rows, columns = box(facial)
@@ -193,7 +189,7 @@ def _segment_image(
         shape = columns.stop - columns.start, rows.stop - rows.start
         found[rows, columns] = cv2.resize(objects.astype(np.uint8), shape, interpolation=cv2.INTER_NEAREST) > 0
         found &= hit
-        labels[found] = _kinds(found, marks)[found]
+        labels[found] = Label.OCCLUDER
     for area, label in ((eyes, Label.EYES), (mouth, Label.MOUTH)):
         labels[area & (labels == Label.SKIN)] = label
     labels[~frame.valid] = Label.BACKGROUND
@@ -303,26 +299,6 @@ def _highlight(linear: NDArray, predicted: NDArray) -> NDArray[np.bool_]:
     )
 
 
-def _kinds(found: NDArray[np.bool_], marks: NDArray) -> NDArray[np.uint8]:
-    """Labels of objects: hair where one reaches well above the brows, cloth where it lies below the chin."""
-    kinds = np.full(found.shape, np.uint8(Label.OCCLUDER))
-    up = marks[27] - marks[8]  # bridge of the nose from the chin
-    if not np.isfinite(marks[[8, 19, 24, 27]]).all():
-        return kinds
-    up = up / max(float(np.linalg.norm(up)), 1e-6)
-    brows, chin = float((marks[[19, 24]] @ up).mean()), float(marks[8] @ up)
-    _, pieces, figures, centres = cv2.connectedComponentsWithStats(found.astype(np.uint8))
-    y, x = np.mgrid[: found.shape[0], : found.shape[1]]
-    height = x * up[0] + y * up[1]
-    for piece in range(1, len(figures)):
-        inside = pieces == piece
-        if float(height[inside].max()) > brows + ABOVE * (brows - chin):
-            kinds[inside] = Label.HAIR
-        elif float(centres[piece] @ up) < chin:
-            kinds[inside] = Label.CLOTH
-    return kinds
-
-
 def _plain(shape: tuple[int, ...], marks: NDArray) -> NDArray[np.bool_]:
     """Pixels of forehead and upper cheeks, where skin has no features and no beard."""
     area = np.zeros(shape, np.uint8)
@@ -331,14 +307,14 @@ def _plain(shape: tuple[int, ...], marks: NDArray) -> NDArray[np.bool_]:
         return area > 0
     y, x = np.mgrid[: shape[0], : shape[1]]
     above = (x * up[0] + y * up[1]) > float(marks[29] @ up)
-    for part in (*EYES, *BROWS):
+    for part in (*EYES_AND_MOUTH[:2], range(17, 22), range(22, 27)):
         cv2.fillPoly(area, [cv2.convexHull(np.round(marks[part]).astype(np.int32))], 1)
     margin = max(1, round(MARGIN * float(np.linalg.norm(marks[45] - marks[36]))))
     features = cv2.dilate(area, np.ones((2 * margin + 1,) * 2, np.uint8)) > 0
     return above & ~features
 
 
-def _polygons(shape: tuple[int, ...], marks: NDArray, parts: Sequence[slice]) -> NDArray[np.bool_]:
+def _polygons(shape: tuple[int, ...], marks: NDArray, parts: Sequence[range]) -> NDArray[np.bool_]:
     area = np.zeros(shape, np.uint8)
     for part in parts:
         if np.isfinite(marks[part]).all():

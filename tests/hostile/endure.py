@@ -39,7 +39,6 @@ CONFIG = """
 rounds = 1
 max_iterations = 2
 pixels = 200
-surface_points = 300
 [surface]
 enabled = false
 [reflectance]

@@ -117,11 +117,11 @@ def test_papers_objective_brings_back_a_displaced_head(model):
     state, views = found.state, found.views
 
     def refined(state, appearance):
-        pixels = facial_pixels(capture, model, BOTH, (0,), world_vertices(model, state), config.pixels, 0.0, 0)
+        pixels = facial_pixels(capture, model, BOTH, (0,), world_vertices(model, state), config.pixels, 0)
         return refine_by_rendering(model, state, appearance, views, pixels, config)
 
     world = world_vertices(model, state)
-    pixels = facial_pixels(capture, model, BOTH, (0,), world, config.pixels, 1.0, 0)
+    pixels = facial_pixels(capture, model, BOTH, (0,), world, config.pixels, 0)
     appearance = fit_appearance(gather(model, world, pixels, 30.0, 1.0), 30).value
     displaced = state.x.copy()
     displaced[layout.at("rotation", 0)] += np.radians(2.0)

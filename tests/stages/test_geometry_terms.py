@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,7 +13,7 @@ from mifit.core.camera import Camera
 from mifit.core.mesh import normalize
 from mifit.core.sh import basis
 from mifit.stages.geometry.appearance import AppearanceProblem, fit_appearance
-from mifit.stages.geometry.images import PixelView, SmoothImage, blur
+from mifit.stages.geometry.images import PixelView, SmoothImage
 from mifit.stages.geometry.initial import align, pose_candidates, reprojection, triangulate
 from mifit.stages.geometry.landmarks import LandmarkProblem, LandmarkTerm, LandmarkView
 from mifit.stages.geometry.parameters import Frames, Layout, exponential, left_jacobian, rotation_angle
@@ -56,9 +57,7 @@ def camera(name, degrees, size=96):
 
 def smooth_image(rng, size=96, channels=3):
     raw = rng.uniform(0.1, 0.6, (size, size, channels))
-    return SmoothImage(
-        blur(raw.astype(np.float32), np.ones((size, size)), 4.0).astype(np.float64), np.ones((size, size))
-    )
+    return SmoothImage(cv2.GaussianBlur(raw, (0, 0), 4.0), np.ones((size, size)))
 
 
 def random_points(rng, model, count):

@@ -240,7 +240,7 @@ def test_maps_are_the_same_in_parts_and_texels_without_a_block_follow_the_others
     prior = np.full((size, size, 4), 0.5, np.float32)
     given = systems, index, prior, Smoothness(0.02, 0.05)
     whole, _ = solve_maps(*given, iterations=30)
-    monkeypatch.setattr("mifit.stages.reflectance.maps.CHUNK", 3 * size)
+    monkeypatch.setattr("mifit.core.process.BLOCK", 64 * 3 * size)
     np.testing.assert_allclose(solve_maps(*given, iterations=30)[0], whole, atol=1e-6)
     seen = np.zeros(size * size, bool)
     seen[index] = True

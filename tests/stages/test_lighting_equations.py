@@ -71,6 +71,7 @@ def plain_step(problem: LightingProblem, state: State) -> tuple[NDArray, NDArray
 @pytest.mark.parametrize("block", [8 * K, 1 << 20])
 def test_a_step_is_that_of_all_unknowns_at_once(problem, block, monkeypatch):
     monkeypatch.setattr(lighting_equations, "BLOCK", block)
+    monkeypatch.setattr("mifit.core.process.BLOCK", block)
     state = State(problem)
     equations = state.equations(problem)
     equations.diffuse += 1.0

@@ -17,8 +17,9 @@ from mifit.core.diagnostics import Diagnostic, worst_first
 from mifit.core.image import to_8_bit
 from mifit.core.process import one_blas_thread
 from mifit.morphable import MorphableModel
+from mifit.morphable.topology import INNER
 from mifit.stages.checks.hypotheses import UNITS_MM, Hypothesis, hypotheses
-from mifit.stages.checks.landmark_model import INNER, Explanation, FaceStatistics, Shot, explain, noise_of
+from mifit.stages.checks.landmark_model import Explanation, FaceStatistics, Shot, explain, noise_of
 
 TIMESTEPS, DELAY_TIMESTEPS = 2, 6
 """Timesteps whose landmarks are judged, and among which delays are looked for."""

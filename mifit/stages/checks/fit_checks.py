@@ -12,8 +12,9 @@ from mifit.capture import Capture
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
 from mifit.morphable import MorphableModel
+from mifit.morphable.topology import INNER
 from mifit.stages.checks.capture_checks import landmark_shots
-from mifit.stages.checks.landmark_model import INNER, noise_of
+from mifit.stages.checks.landmark_model import noise_of
 
 SHIFT = 1.5
 """Shift that the landmarks of all cameras share from the face that the images show, in deviations of one landmark,

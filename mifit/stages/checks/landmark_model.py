@@ -21,10 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from mifit.core.camera import Camera
 from mifit.morphable import MorphableModel
+from mifit.morphable.topology import INNER
 from mifit.stages.geometry.initial import pose_candidates, reprojection, triangulate
 
-INNER = np.arange(17, 68)
-"""The iBUG points inside the face: those of the contour slide over it as the head turns."""
 IDENTITY_MODES, EXPRESSION_MODES = 25, 8
 """Principal directions of the landmarks that are kept; what is left out is below a millimetre."""
 EXPRESSION_DEVIATION = 0.3

@@ -18,10 +18,7 @@ from mifit.core.camera import Camera
 from mifit.core.diagnostics import Diagnostic
 from mifit.morphable import MorphableModel
 from mifit.render.gbuffer import SurfaceScene
-from mifit.sampling.visibility import DARKEST
-
-BORDER = 2
-"""Pixels along the outline of the model that are left out: they mix it with what lies behind."""
+from mifit.sampling.visibility import DARKEST, EDGE_PIXELS
 
 
 @dataclass(frozen=True)
@@ -89,21 +86,6 @@ def _bspline(f: NDArray) -> tuple[NDArray, NDArray]:
     return value, slope
 
 
-def blur(values: NDArray, valid: NDArray, sigma: float) -> NDArray:
-    """Gaussian blur that ignores invalid pixels; 0 where no valid pixel is near."""
-    weight = valid.astype(np.float32)
-    weighted = values * (weight if values.ndim == 2 else weight[..., None])
-    total = cv2.GaussianBlur(weight, (0, 0), sigma)
-    out = cv2.GaussianBlur(weighted, (0, 0), sigma)
-    return out / np.maximum(total if values.ndim == 2 else total[..., None], 1e-4)
-
-
-def smooth_image(image: NDArray, valid: NDArray, sigma: float) -> SmoothImage:
-    """Image blurred by ``sigma`` pixels; invalid pixels ignored."""
-    values = blur(image, valid, sigma) if sigma > 0 else image
-    return SmoothImage(np.ascontiguousarray(values, np.float32), valid.astype(np.float32))
-
-
 @dataclass(frozen=True)
 class PixelView:
     """Facial pixels of one image.
@@ -132,7 +114,6 @@ def facial_pixels(
     timesteps: Sequence[int],
     world: NDArray,
     count: int,
-    sigma: float,
     seed: int,
 ) -> tuple[PixelView, ...]:
     """Up to ``count`` facial pixels of every image, chosen evenly at random; images without any are left out.
@@ -141,24 +122,23 @@ def facial_pixels(
     ----------
     world : (T, V, 3)
         The surface that is looked at.
-    sigma : float
-        Blur of the images, pixels.
     """
-    rng = np.random.default_rng(seed)
+    rng, around = np.random.default_rng(seed), np.ones((2 * round(EDGE_PIXELS) + 1,) * 2, np.uint8)
     out = []
     for step, (timestep, vertices) in enumerate(zip(timesteps, world, strict=True)):
         scene = SurfaceScene(vertices, model.faces)
         for name in cameras:
             camera, frame = capture.camera(name), capture.frame(name, timestep)
             buffer = scene.gbuffer(camera)
-            on = cv2.erode((buffer.face >= 0).astype(np.uint8), np.ones((2 * BORDER + 1,) * 2, np.uint8), borderValue=0)
+            on = cv2.erode((buffer.face >= 0).astype(np.uint8), around, borderValue=0)
             usable = (on > 0) & frame.valid & ~frame.clipped & (frame.image.max(axis=2) > DARKEST)
             facial = np.flatnonzero(usable & model.face_mask[np.maximum(buffer.face, 0)])
             if len(facial) > count:
                 facial = np.sort(rng.choice(facial, count, replace=False))
             if len(facial):
                 face, weights = buffer.face.reshape(-1)[facial], buffer.weights.reshape(-1, 3)[facial]
-                out.append(PixelView(step, camera, smooth_image(frame.image, frame.valid, sigma), face, weights))
+                image = SmoothImage(np.asarray(frame.image, np.float32), frame.valid.astype(np.float32))
+                out.append(PixelView(step, camera, image, face, weights))
     return tuple(out)
 
 

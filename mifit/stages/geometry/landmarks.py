@@ -14,6 +14,7 @@ from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
+from mifit.morphable.topology import INNER
 from mifit.optim import DenseSystem, Solution, geman_mcclure, minimize
 from mifit.stages.geometry.initial import pose_candidates, reprojection
 from mifit.stages.geometry.parameters import Frames, Layout, NormalEquations, Pose, prior_energy
@@ -23,8 +24,6 @@ FEWEST_LANDMARKS = 6
 FEW_IDENTITY_MODES = 20
 FARTHEST_PIXEL = 10.0  # in image sizes
 OUTLIER_PIXELS = 4.0  # in units of the landmark noise: where Geman and McClure's penalty turns
-JAW = np.arange(17)  # iBUG-68: the face contour, which a detector draws where it sees the silhouette
-SLIDE_LIMIT = 40.0  # pixels; a contour point farther than this from any silhouette vertex is dropped
 
 
 @dataclass(frozen=True)
@@ -185,26 +184,14 @@ def slide_contour(
         in_face = np.bincount(model.faces[model.face_mask].ravel(), minlength=len(world)) > 0
         contour = np.flatnonzero(seen & around & in_face)
         own = model.landmarks[view.index]
-        turned_away = np.isin(view.index, JAW) & ~seen[own]
-        chosen, keep = own.copy(), np.ones(len(own), dtype=bool)
+        turned_away = (view.index < INNER[0]) & ~seen[own]
+        chosen = own.copy()
         if turned_away.any() and len(contour):
             pixels = view.camera.project(world[contour])
             for k in np.flatnonzero(turned_away):
                 distance = np.linalg.norm(pixels - view.pixels[k], axis=1)
-                nearest = int(np.nanargmin(distance))
-                chosen[k], keep[k] = contour[nearest], distance[nearest] < SLIDE_LIMIT
-        if (chosen[keep] == view.vertices[keep]).all() and keep.all():
-            out.append(view)
-            continue
-        out.append(
-            replace(
-                view,
-                index=view.index[keep],
-                vertices=chosen[keep],
-                pixels=view.pixels[keep],
-                basis=PointBasis.at_vertices(model, chosen[keep]),
-            )
-        )
+                chosen[k] = contour[int(np.nanargmin(distance))]
+        out.append(replace(view, vertices=chosen, basis=PointBasis.at_vertices(model, chosen)))
     return tuple(out)
 
 

@@ -275,7 +275,7 @@ def refine_by_rendering(
     appearance : (Ka + 28,)
         Albedo coefficients, shading and ambient to start from.
     pixels : tuple of PixelView
-        Those of the images, without blur, as the surface at ``state`` covers them.
+        Those of the images, as the surface at ``state`` covers them.
 
     Returns
     -------

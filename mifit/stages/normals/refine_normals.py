@@ -9,7 +9,7 @@ quadratic majorant at the current point; its equations are solved by conjugate g
 Units of the weights. The paper's images and normal maps are 8-bit: a colour of 1 is 255 steps, a unit normal spans
 127.5 steps to either side. With linear images 0..1 and unit normals its weights become
 
-    w1 * 127.5 / 255^2,    w2 * 127.5^2 / 255^2 = w2 / 4.
+    w1 * 127.5 / 255^2 = w1 / 510,    w2 * 127.5^2 / 255^2 = w2 / 4.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
-IMAGE_STEPS, NORMAL_STEPS = 255.0, 127.5
+STEPS = 255.0
+"""Of 8-bit images and normal maps; a unit normal spans half of them to either side."""
 L1_FLOOR = 1e-4
 """Radians below which the L1 norm is rounded off: sqrt(c^2 + floor^2); its reweighting stays finite."""
 MOST = 1.0
@@ -224,8 +225,8 @@ def frame_problem(
         tangent_plane(base[rows]),
         texel_neighbours(patch),
         views,
-        config.laplacian_weight * NORMAL_STEPS / IMAGE_STEPS**2,
-        config.magnitude_weight * (NORMAL_STEPS / IMAGE_STEPS) ** 2,
+        0.5 * config.laplacian_weight / STEPS,
+        0.25 * config.magnitude_weight,
         None if prior is None else prior[rows],
     )
     return problem, rows, base

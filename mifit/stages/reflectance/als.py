@@ -12,7 +12,7 @@ from mifit.appearance import models
 from mifit.appearance.formation import Appearance, form_image
 from mifit.appearance.lobe import Lobe
 from mifit.config import ReflectanceConfig
-from mifit.core.process import on_all_cores
+from mifit.core.process import blocks, on_all_cores
 from mifit.core.uv import TexelMap
 from mifit.optim import Outcome
 from mifit.progress import Progress
@@ -30,12 +30,8 @@ MAP_PASSES = 3
 MAP_ITERATIONS = 40
 """ADMM iterations of a pass. Every pass starts from its maps alone: going on from the multipliers of the pass before
 saves half of them, but carries over what the last weights took an outlier for."""
-SUMMED = 1 << 13
-"""Texels whose observations are summed at a time."""
 FIRST_ITERATIONS = 12
 """Gauss-Newton iterations of the lighting by which objects in front of the face are found."""
-START_ITERATIONS = 5
-"""Gauss-Newton iterations where they are only a start: the objective over all texels is minimised afterwards."""
 SURROUNDINGS = 1 / 128
 """Half the side of the square of texels over which residuals are averaged, relative to the map."""
 
@@ -137,8 +133,7 @@ def lighting_of_subset(
 ) -> tuple[LightingSolution, NDArray[np.float32]]:
     """The lighting, and the maps (S, S, 4) that are expected of all texels."""
     subset = surface.sample(LIGHTING_TEXELS, np.random.default_rng(seed))
-    iterations = config.max_iterations if config.robust else min(START_ITERATIONS, config.max_iterations)
-    found = fit_lighting(surface.observe(subset), forward, albedo[subset], config.robust, iterations)
+    found = fit_lighting(surface.observe(subset), forward, albedo[subset], config.robust, config.max_iterations)
     prior = np.full((surface.texels.size, surface.texels.size, 4), found.expected, np.float32)
     prior[..., :3] = surface.texels.to_map(np.asarray(albedo, np.float32))
     return found, prior
@@ -188,7 +183,7 @@ class _Shaded:
 
     @property
     def _parts(self) -> list[slice]:
-        return [slice(at, at + SUMMED) for at in range(0, len(self.rows), SUMMED)]
+        return blocks(len(self.rows), 32 * self.colour.shape[1])
 
     def residual(self, albedo: NDArray) -> NDArray[np.float32]:
         """(n, J, 3) what images show beyond albedos (n, 4)."""

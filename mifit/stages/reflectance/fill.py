@@ -12,6 +12,7 @@ from mifit.core.mesh import interpolate
 from mifit.core.mesh_solve import membrane
 from mifit.core.uv import TexelMap, sample_map
 from mifit.morphable import MorphableModel
+from mifit.sampling.visibility import DARKEST
 from mifit.stages.geometry.points import corner_matrix
 
 BLEND = 0.05
@@ -20,8 +21,6 @@ TYPICAL = 3e-3
 """Weight of the typical value of skin beside that of a texel of confidence 1: it decides far from what was seen."""
 FEATURE = 0.06
 """Extent of the widest dark feature of a face, relative to the map: brows."""
-DARKEST = 1e-3
-"""Albedo below which ratios mean nothing."""
 STIFFNESS = 0.02
 """Of the membrane, beside texels of confidence 1."""
 

@@ -12,10 +12,8 @@ from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import ShadingModel
 from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, VertexTransfer
+from mifit.core.process import blocks
 from mifit.sampling.observations import Observations
-
-CHUNK = 1 << 19
-"""Points shaded at a time: bounds the memory of the basis functions."""
 
 
 @dataclass(frozen=True)
@@ -97,9 +95,8 @@ class Forward:
         """Diffuse and specular radiance (N, J, 3) at unit albedo, without ambient."""
         n, j = seen.weight.shape
         diffuse, specular = np.empty((n, j, 3), np.float32), np.empty((n, j, 3), np.float32)
-        appearance, step = self.under(light), max(1, CHUNK // j)
-        for start in range(0, n, step):
-            rows = slice(start, start + step)
+        appearance = self.under(light)
+        for rows in blocks(n, 2 * j):
             part = seen.take(rows)
             d, s = appearance.shade(*_flat(part), self.occlusion(part))
             diffuse[rows], specular[rows] = d.reshape(-1, j, 3), s.reshape(-1, j, 3)

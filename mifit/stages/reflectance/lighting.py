@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from mifit.appearance.formation import form_image
 from mifit.appearance.reception import fibonacci_sphere
-from mifit.core.process import on_all_cores
+from mifit.core.process import blocks, on_all_cores
 from mifit.core.sh import bands, basis
 from mifit.optim import Outcome
 from mifit.sampling.observations import Observations
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting_equations import (
-    BLOCK,
     PRIORS,
     SPECULAR_LIMIT,
     LightingEquations,
@@ -249,8 +248,7 @@ def active_weight(
             part = np.where(bound, part, part / (1.0 + (off / max(CAUCHY * sigma, 1e-4)) ** 2))
         active[rows] = part
 
-    step = max(1, BLOCK // 4 * len(active) // max(active.size, 1))
-    on_all_cores(fill, [slice(at, at + step) for at in range(0, len(active), step)])
+    on_all_cores(fill, blocks(len(active), 4 * active.size // max(len(active), 1)))
     return active, sigma
 
 

@@ -11,7 +11,7 @@ import scipy.optimize
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from mifit.core.process import on_all_cores
+from mifit.core.process import BLOCK, blocks, on_all_cores
 
 SPECULAR_SPREAD = 0.15
 """Standard deviation of the specular albedo over a face, relative to its median."""
@@ -22,8 +22,6 @@ FEW_IMAGES = 4
 """Images of a texel from which its four albedos are told by the images."""
 PATCHES = 100
 """Independent measurements that a face is worth: about as many patches have an error of their own."""
-BLOCK = 1 << 20
-"""Derivatives that are held at a time: they stay in the cache."""
 
 
 @dataclass(frozen=True)
@@ -274,9 +272,9 @@ class LightingEquations:
                 square[block, block] += squares[c]
             return square, side
 
-        reduced, right, step = sl.block_diag(*self.system), self.right.ravel().copy(), max(BLOCK // (8 * k), 1)
+        reduced, right = sl.block_diag(*self.system), self.right.ravel().copy()
         diagonal = np.diag(reduced).copy()
-        for square, side in on_all_cores(take, [slice(at, at + step) for at in range(0, n, step)]):
+        for square, side in on_all_cores(take, blocks(n, 8 * k)):
             reduced -= square
             right -= side
         reduced += np.diag(damping * diagonal + 1e-8 * diagonal.mean())

@@ -16,15 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 
-from mifit.core.process import threads
+from mifit.core.process import blocks, threads
 from mifit.optim import Outcome
 
 SPLIT = 0.5
 """Weight of ADMM's splits relative to the median curvature of the blocks."""
 RELAX = 1.7
 """Over-relaxation of both splits (Boyd et al. 2011, section 3.4.3): 40 iterations end nearer to it than 60 did."""
-CHUNK = 16384
-"""Texels that are looked at at once: what they need stays in a core's cache."""
 
 
 @dataclass(frozen=True)
@@ -290,8 +288,8 @@ def solve_maps(
     flat = prior.reshape(4, -1), base.reshape(4, -1)
     drawn = pull[:, None] * flat[0] + 0.5 * rho * flat[1]
     every = _Blocks.of(systems, index, 0.5 * rho + pull[:, None], drawn, 0.5 * rho)
-    rows = [slice(at, at + CHUNK) for at in range(0, size * size, CHUNK)]
-    lines = [slice(at, at + CHUNK // size) for at in range(0, size, CHUNK // size)]
+    rows = blocks(size * size, 64)
+    lines = blocks(size, 64 * size)
     parts = [(every.take(r), r) for r in rows]
     texel, outcome = prior.copy(), Outcome.MAX_ITERATIONS
 

@@ -20,16 +20,16 @@ from scipy.spatial import cKDTree
 from mifit.core.mesh import interpolate
 from mifit.core.uv import TexelMap, sample_map
 from mifit.morphable import MorphableModel
+from mifit.morphable.topology import EYES_AND_MOUTH
+from mifit.sampling.visibility import DARKEST
 from mifit.stages.reflectance.fill import mirrored_coordinates
 
 SYMMETRIC_SPREAD = 0.28
 """Standard deviation of the log luminance of skin over a face, brows and lips included, alike on both halves."""
 SIDED_SPREAD = 0.09
 """The same of half of the difference between opposite points."""
-DARKEST = 1e-3
-"""Albedo below which logarithms mean nothing."""
-OPENINGS, WIDER = (slice(36, 42), slice(42, 48), slice(60, 68)), 1.6
-"""Landmarks around eyes and inner lips, and how much wider than them the ellipse is that isn't judged as skin."""
+WIDER = 1.6
+"""How much wider than the landmarks around eyes and inner lips the ellipse is that isn't judged as skin."""
 FADE = 0.08
 """Part of the face's width inside the border of the face area over which the correction fades in."""
 SEEN = 0.3
@@ -125,7 +125,7 @@ def facial_share(model: MorphableModel, texels: TexelMap) -> NDArray[np.float64]
     if not model.face_mask.all():
         border = cKDTree(model.mean[np.unique(model.faces[~model.face_mask])])
         share *= np.clip(border.query(point)[0] / (FADE * np.ptp(marks, axis=0).max()), 0.0, 1.0)
-    for opening in OPENINGS:
+    for opening in EYES_AND_MOUTH:
         ring = marks[opening]
         along = np.linalg.svd(ring - ring.mean(axis=0))[2][:2].T
         reach = WIDER * np.abs((ring - ring.mean(axis=0)) @ along).max(axis=0)
