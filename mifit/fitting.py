@@ -171,7 +171,7 @@ def fit(
         Cameras to use; no other camera's images are read. Default: the capture's first two.
     timesteps : sequence of int or FrameChoice, optional
         Timesteps to fit jointly, named in any order; default: the first four. A choice (`mifit.choose_frames`) is kept
-        with its reasons in ``geometry.report.details["frames"]``.
+        with its reasons in the geometry's report, ``"frames"``.
     config : FitConfig, optional
     until : {"geometry", "reflectance", "normals"}
         Last stage to run; the mesh update goes with the normals.
@@ -253,8 +253,7 @@ def fit(
         None if watch is None else lambda so_far: watch(result(so_far)),
     )
     if choice is not None:
-        report = estimates["geometry"].report
-        report = replace(report, details={**report.details, "frames": choice.document()})
+        report = estimates["geometry"].report.noting(frames=choice.document())
         estimates["geometry"] = replace(estimates["geometry"], report=report)
     return result(estimates, seconds)
 

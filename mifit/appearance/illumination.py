@@ -8,12 +8,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mifit.core.calls import finite, whole
+from mifit.core.files import Document
 from mifit.core.limits import MAX_NUMBER
 from mifit.core.sh import SHLighting, basis, check_order, order_of
 from mifit.errors import InputError
@@ -68,11 +68,11 @@ class DistantLight:
         """(B*B, 3) SH coefficients of its radiance: what B bands can show of it."""
         return np.outer(basis(self.samples(), order).mean(0), self.colour)
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Document:
         """JSON values from which `light_from` makes it again."""
         return {"direction": self.direction.tolist(), "radius": self.radius, "irradiance": self.colour.tolist()}
 
-    def emitter(self) -> dict[str, Any]:
+    def emitter(self) -> Document:
         """A point at infinity, whatever its radius."""
         return {
             "type": "directional",
@@ -86,7 +86,7 @@ class DistantLight:
         return f"towards ({x:.2f}, {y:.2f}, {z:.2f}), with an angular radius of {math.degrees(self.radius):.1f} degrees"
 
 
-def light_from(document: dict[str, Any]) -> DistantLight:
+def light_from(document: Document) -> DistantLight:
     """The light of `DistantLight.document`.
 
     Raises

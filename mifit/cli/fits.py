@@ -202,7 +202,7 @@ def _with_refined(
     from mifit.extras.refine import refine
     from mifit.result.ownership import locked
 
-    if result.reflectance is not None and "refined" in result.reflectance.report.details:
+    if result.reflectance is not None and result.reflectance.report.detail("refined"):
         return result, wanted  # by a run before, which goes on here
     found = refine(result, capture, sorted({*result.timesteps, *wanted}) if wanted else None, arguments.seed, progress)
     with locked(arguments.result):

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.diagnostics import Diagnostic
+from mifit.core.files import Document
 from mifit.core.photometry import Photometry
 
 if TYPE_CHECKING:
@@ -35,7 +36,30 @@ class Report:
     energies: dict[str, list[float]] = field(default_factory=dict)
     seconds: float = 0.0
     warnings: tuple[Diagnostic, ...] = ()
-    details: dict = field(default_factory=dict)
+    details: Document = field(default_factory=dict)
+
+    def noting(self, **details: object) -> Report:
+        """The report with further details; those of the same names are replaced."""
+        return replace(self, details={**self.details, **details})
+
+    def after(self, seconds: float, phase: Document, warnings: Sequence[Diagnostic] = ()) -> Report:
+        """The report with one more phase."""
+        more = replace(self, seconds=self.seconds + seconds, warnings=(*self.warnings, *warnings))
+        return more.noting(phases=[*self.details.get("phases", []), phase])
+
+    def document(self) -> Document:
+        """As it stands in ``result.json``."""
+        return {
+            "status": self.outcome,
+            "seconds": self.seconds,
+            "energies": self.energies,
+            "warnings": [found.document() for found in self.warnings],
+            "details": self.details,
+        }
+
+    def detail(self, name: str) -> Document:
+        """A group of details; empty where there is none."""
+        return self.details.get(name) or {}
 
 
 @dataclass(frozen=True)

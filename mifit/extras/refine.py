@@ -64,7 +64,7 @@ def refine(
     -------
     Reconstruction
         With the timesteps that were fitted jointly; tracked ones, which belong to the old surface and maps, are to be
-        tracked again. A fit in the model's span stays there. ``reflectance.report.details["refined"]`` says which
+        tracked again. A fit in the model's span stays there. the reflectance's report (``"refined"``) says which
         frames entered and which were left out, and why.
 
     Raises
@@ -101,11 +101,7 @@ def refine(
     lines = tuple(
         Diagnostic("timestep-left-out", f"timestep {t}: left out of the refinement, {why}") for t, why in failed.items()
     )
-    report = replace(
-        reflectance.report,
-        warnings=(*reflectance.report.warnings, *lines),
-        details={**reflectance.report.details, "refined": refined},
-    )
+    report = replace(reflectance.report, warnings=(*reflectance.report.warnings, *lines)).noting(refined=refined)
     reflectance = replace(reflectance, report=report)
     home = geometry.at(fitted)
     normals = refine_normals(capture, model, home, reflectance, names, config.normals, seed=seed, progress=progress)

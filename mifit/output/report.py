@@ -272,8 +272,8 @@ def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]
 
 def _frames(result: Reconstruction) -> str:
     """Frames that were chosen, added or left out, and why; nothing where all was as asked for."""
-    chosen = result.geometry.report.details.get("frames", {})
-    refined = {} if result.reflectance is None else result.reflectance.report.details.get("refined", {})
+    chosen = result.geometry.report.detail("frames")
+    refined = {} if result.reflectance is None else result.reflectance.report.detail("refined")
     lines = [f"Timestep {t} was fitted: {why}." for t, why in chosen.get("why", {}).items()]
     lines += [f"Timestep {t} was not to be chosen: {why}." for t, why in chosen.get("left_out", {}).items()]
     if refined:

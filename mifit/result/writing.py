@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 import mifit
 from mifit.core.arrays import write_ply
-from mifit.core.estimate import Report
 from mifit.core.files import Document, file_name, write_bytes, write_text
 from mifit.core.image import encode_png, write_image
 from mifit.core.mesh import SplitMesh, split_at_seams, split_faces, tangent_space_map, vertex_normals
@@ -171,7 +170,7 @@ def _document(result: Reconstruction) -> Document:
             }
             for i, t in enumerate(result.timesteps)
         ],
-        "stages": {name: _report_document(report) for name, report in result.reports.items()},
+        "stages": {name: report.document() for name, report in result.reports.items()},
         "seconds": result.seconds,
         "peak_memory": int(result.peak_memory),
         "warnings": [found.document() for found in result.warnings],
@@ -183,16 +182,6 @@ def _source(source: str) -> str:
     """A model's source that still holds when the working folder changes."""
     named = source.partition(":")[0] == "builtin"
     return str(Path(source).resolve()) if source and not named and Path(source).exists() else source
-
-
-def _report_document(report: Report) -> Document:
-    return {
-        "status": report.outcome,
-        "seconds": report.seconds,
-        "energies": report.energies,
-        "warnings": [found.document() for found in report.warnings],
-        "details": report.details,
-    }
 
 
 def _finite(value: object) -> object:

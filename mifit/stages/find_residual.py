@@ -67,7 +67,7 @@ def find_residual(
     Returns
     -------
     ResidualEstimate
-        ``report.details`` has the root mean square of the images' deviation from the model over the face's texels,
+        Its report has the root mean square of the images' deviation from the model over the face's texels,
         before and after (``residual``, ``left``), linear.
 
     Raises

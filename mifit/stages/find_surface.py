@@ -21,7 +21,7 @@ from mifit.config import SurfaceConfig
 from mifit.core.calls import checked
 from mifit.core.camera import Camera
 from mifit.core.diagnostics import Diagnostic
-from mifit.core.estimate import GeometryEstimate, Report
+from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.process import one_blas_thread
 from mifit.core.uv import TexelMap, rasterize_uv
@@ -176,7 +176,7 @@ def find_surface(
         "seconds": seconds,
     }
     warnings = epipolar_warnings(residuals) + likeness_warnings(likenesses)
-    return replace(result, report=_extended(geometry.report, seconds, phase, warnings))
+    return replace(result, report=geometry.report.after(seconds, phase, warnings))
 
 
 def neighbours(cameras: Sequence[Camera], centre: NDArray) -> list[tuple[int, int]]:
@@ -519,16 +519,9 @@ def along_normals(change: NDArray, world: NDArray, faces: NDArray, vertices: NDA
 
 def _unchanged(geometry: GeometryEstimate, text: str, began: float) -> GeometryEstimate:
     """The input with a warning."""
-    report = _extended(geometry.report, time.perf_counter() - began, {"name": "surface", "outcome": "left out"})
+    report = geometry.report.after(time.perf_counter() - began, {"name": "surface", "outcome": "left out"})
     warning = Diagnostic("surface-in-span", text)
     return replace(geometry, report=replace(report, warnings=(*report.warnings, warning)))
-
-
-def _extended(report: Report, seconds: float, phase: dict, warnings: Sequence[Diagnostic] = ()) -> Report:
-    """A report with one more phase."""
-    details = {**report.details, "phases": [*report.details.get("phases", []), phase]}
-    warnings = (*report.warnings, *warnings)
-    return replace(report, seconds=report.seconds + seconds, details=details, warnings=warnings)
 
 
 def epipolar_warnings(residuals: Mapping[str, float | None]) -> list[Diagnostic]:

@@ -67,7 +67,7 @@ def fit_geometry(
     Returns
     -------
     GeometryEstimate
-        ``report.details`` holds the phases.
+        Its report's details hold the phases.
 
     Raises
     ------

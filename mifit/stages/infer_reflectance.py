@@ -72,7 +72,7 @@ def infer_reflectance(
     Returns
     -------
     ReflectanceEstimate
-        ``report.details`` holds the shading model, the gauge, residuals and coverage.
+        The details of its report hold the shading model, the gauge, residuals and coverage.
 
     Raises
     ------

@@ -149,8 +149,13 @@ def gather(
         parts.append((*(each[inside] for each in rows), np.full(inside.sum(), 1.0 / max(inside.sum(), 1))))
     face = np.unique(model.faces[model.face_mask])
     level = model.mean_albedo[face].mean(axis=0, dtype=np.float64)
+    mean, shifts, harmonics, observed, weight = (np.concatenate(each) for each in zip(*parts, strict=True))
     return AppearanceProblem(
-        *(np.concatenate(each) for each in zip(*parts, strict=True)),
+        mean,
+        shifts,
+        harmonics,
+        observed,
+        weight,
         robust,
         albedo_prior,
         model.albedo_modes[face].mean(axis=0, dtype=np.float64) / np.maximum(level, DARKEST)[:, None],
