@@ -108,7 +108,7 @@ def test_the_albedos_level_is_the_mean_faces_in_any_light(model, capture, fitted
 
 
 def test_papers_objective_brings_back_a_displaced_head(model):
-    """Without paint that the model can't make, rendering and image agree to the noise again."""
+    """Without paint that the model can't make; how far images agree depends on the pixels chosen anew."""
     capture = make_capture(model, painted=False)
     config = replace(QUICK, objective="paper", max_iterations=12)
     views = landmark_views(capture, model, BOTH, (0,), 1.0)
@@ -131,7 +131,7 @@ def test_papers_objective_brings_back_a_displaced_head(model):
     total = np.sum(list(solution.energies.values()), axis=0)
     assert np.all(np.diff(total) < 0) and total[-1] < 0.1 * total[0]
     end, solution, _ = refined(end, lit)  # visibility anew
-    assert solution.energy < 1.1 * settled.energy
+    assert solution.energies["landmarks"][-1] < 1.1 * settled.energies["landmarks"][-1]
     assert rotation_angle(end.frames.pose(layout, end.x, 0).rotation, capture.rotation[0]) < 3.0
 
 
