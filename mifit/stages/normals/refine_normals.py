@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.sparse as sp
 import scipy.sparse.linalg as ssl
 from numpy.typing import NDArray
 
@@ -274,7 +275,8 @@ class NormalProblem:
         magnitude_weight: float,
         prior: NDArray | None = None,
     ) -> None:
-        self.normals, self.tangents, self.neighbours, self.views = normals, tangents, neighbours, views
+        self.normals, self.tangents, self.views = normals, tangents, views
+        self.laplacian = graph_laplacian(neighbours)
         self.w1, self.w2 = laplacian_weight, magnitude_weight
         self.prior = np.zeros_like(normals) if prior is None else bend(normals, tangents, prior) - normals
 
@@ -287,7 +289,7 @@ class NormalProblem:
             residual = (view.colour - view.shade(n)[0])[rows].astype(np.float64)
             data += float((view.weight[rows] * (residual**2).sum(1)).sum())
         delta = n - self.normals
-        rough = np.sqrt(graph_laplacian(delta, self.neighbours) ** 2 + L1_FLOOR**2).sum() if self.w1 else 0.0
+        rough = np.sqrt((self.laplacian @ delta) ** 2 + L1_FLOOR**2).sum() if self.w1 else 0.0
         magnitude = ((delta - self.prior) ** 2).sum()
         return {"data": data, "laplacian": float(self.w1 * rough), "magnitude": float(self.w2 * magnitude)}
 
@@ -310,11 +312,11 @@ class NormalProblem:
         pull, stiffness = self.w2 * (delta - self.prior), np.zeros_like(delta)
         if self.w1:
             # w |c| <= w / 2 (c^2 / |c0| + |c0|): the majorant's Hessian is w / |c0|.
-            curvature = graph_laplacian(delta, self.neighbours)
+            curvature = self.laplacian @ delta
             stiffness = 0.5 * self.w1 / np.sqrt(curvature**2 + L1_FLOOR**2)
-            pull = pull + graph_laplacian(stiffness * curvature, self.neighbours)
+            pull = pull + self.laplacian @ (stiffness * curvature)
         gradient += np.einsum("nac,nc->na", turns, pull)
-        return NormalSystem(gradient.ravel(), blocks, turns, stiffness, self.neighbours)
+        return NormalSystem(gradient.ravel(), blocks, turns, stiffness, self.laplacian)
 
 
 @dataclass
@@ -329,31 +331,29 @@ class NormalSystem:
         Derivatives of the normals by the offsets.
     stiffness : (N, 3)
         Weight of each component of the Laplacian.
-    neighbours : (N, 4)
+    laplacian : (N, N) sparse
+        `graph_laplacian`.
     """
 
     gradient: NDArray[np.float64]
     blocks: NDArray[np.float64]
     turns: NDArray[np.float64]
     stiffness: NDArray[np.float64]
-    neighbours: NDArray[np.int64]
+    laplacian: sp.csr_matrix
 
     def product(self, step: NDArray) -> NDArray[np.float64]:
         """H times a vector (2 N,)."""
         offsets = step.reshape(-1, 2)
         out = np.einsum("nab,nb->na", self.blocks, offsets)
         if self.stiffness.any():
-            bent = graph_laplacian(np.einsum("nac,na->nc", self.turns, offsets), self.neighbours)
-            out += np.einsum("nac,nc->na", self.turns, graph_laplacian(self.stiffness * bent, self.neighbours))
+            bent = self.laplacian @ np.einsum("nac,na->nc", self.turns, offsets)
+            out += np.einsum("nac,nc->na", self.turns, self.laplacian @ (self.stiffness * bent))
         return out.ravel()
 
     def solve(self, damping: float, frozen: NDArray[np.bool_], gradient: NDArray | None = None) -> NDArray[np.float64]:
         """Damped step by conjugate gradients, preconditioned by the diagonal blocks of the whole matrix."""
-        own = self.blocks.copy()
-        for component in range(3):
-            around = self.stiffness[self.neighbours, component].sum(1) + 16.0 * self.stiffness[:, component]
-            turn = self.turns[..., component]
-            own += around[:, None, None] * turn[:, :, None] * turn[:, None, :]
+        around = self.laplacian.power(2) @ self.stiffness  # the diagonal of L S L
+        own = self.blocks + np.einsum("nac,nbc->nab", self.turns * around[:, None], self.turns)
         lift = damping * np.einsum("naa->na", self.blocks) + 1e-12
         own[:, [0, 1], [0, 1]] += lift
         inverse, free, size = np.linalg.inv(own), ~frozen, len(frozen)
@@ -370,9 +370,11 @@ class NormalSystem:
         return np.asarray(ssl.cg(matrix, right, rtol=SOLVED, maxiter=60, M=near)[0])
 
 
-def graph_laplacian(values: NDArray, neighbours: NDArray) -> NDArray:
-    """Degree times values (N, 3) less the neighbours' (N, 4): symmetric."""
-    return 4.0 * values - values[neighbours].sum(1)
+def graph_laplacian(neighbours: NDArray) -> sp.csr_matrix:
+    """(N, N) four times each value less the neighbours' (N, 4): symmetric."""
+    count = len(neighbours)
+    around = sp.csr_matrix((np.ones(4 * count), neighbours.ravel(), np.arange(0, 4 * count + 1, 4)), (count, count))
+    return (4.0 * sp.identity(count, format="csr") - around).tocsr()
 
 
 def check_maps(reflectance: ReflectanceEstimate) -> int:
