@@ -53,7 +53,7 @@ def _examine(arguments: Namespace) -> int:
         progress = console_progress(arguments.quiet)
         fitted = mifit.fit(capture, model, cameras, timesteps[:1], until="geometry", progress=progress)
         found = worst_first([*found, *fitted.diagnostics])
-        (surface,) = (one for one in fitted.geometry.report.details["phases"] if one["name"] == "surface")
+        surface = fitted.geometry.report.phase("surface")
         figures |= {key: surface.get(key, {}) for key in ("epipolar_pixels", "likeness")}
     if arguments.json:
         print(json.dumps({"findings": [one.document() for one in found], **figures}, indent=2))

@@ -57,6 +57,11 @@ class Report:
             "details": self.details,
         }
 
+    def phase(self, name: str) -> Document:
+        """What the last phase of a name told; empty where there is none."""
+        found = [phase for phase in self.details.get("phases", []) if phase["name"] == name]
+        return found[-1] if found else {}
+
     def detail(self, name: str) -> Document:
         """A group of details; empty where there is none."""
         return self.details.get(name) or {}

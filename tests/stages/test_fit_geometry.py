@@ -25,7 +25,7 @@ from mifit.stages.geometry.landmarks import (
     slide_contour,
     world_vertices,
 )
-from mifit.stages.geometry.parameters import Layout, Pose, exponential, rotation_angle
+from mifit.stages.geometry.parameters import Layout, exponential, rotation_angle
 from mifit.stages.geometry.rendering import refine_by_rendering
 from mifit.tracking import Follower
 
@@ -324,8 +324,7 @@ def test_contour_points_slide_to_the_silhouette(model):
     views = landmark_views(
         capture.changed(lambda n, t, f: replace(f, visible=np.ones(68, bool))), model, BOTH, (0,), 1.0
     )
-    pose = Pose(np.eye(3), np.zeros(3), 1.0, np.eye(3))
-    slid = slide_contour(model, views, capture.vertices, [pose])
+    slid = slide_contour(model, views, capture.vertices)
     corners = face_cross(capture.vertices[0], model.faces)
     moved = 0
     for before, after in zip(views, slid, strict=True):

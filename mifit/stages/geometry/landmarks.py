@@ -17,11 +17,10 @@ from mifit.morphable import MorphableModel
 from mifit.morphable.topology import INNER
 from mifit.optim import DenseSystem, Solution, geman_mcclure, minimize
 from mifit.stages.geometry.initial import pose_candidates, reprojection
-from mifit.stages.geometry.parameters import Frames, Layout, NormalEquations, Pose, prior_energy
+from mifit.stages.geometry.parameters import Frames, Layout, NormalEquations, prior_energy
 from mifit.stages.geometry.points import PointBasis, geometry_columns, project
 
 FEWEST_LANDMARKS = 6
-FEW_IDENTITY_MODES = 20
 FARTHEST_PIXEL = 10.0  # in image sizes
 OUTLIER_PIXELS = 4.0  # in units of the landmark noise: where Geman and McClure's penalty turns
 
@@ -158,7 +157,7 @@ class LandmarkProblem:
 
 
 def slide_contour(
-    model: MorphableModel, views: tuple[LandmarkView, ...], vertices: NDArray, poses: list[Pose]
+    model: MorphableModel, views: tuple[LandmarkView, ...], vertices: NDArray
 ) -> tuple[LandmarkView, ...]:
     """Let jaw-line points whose model vertex faces away slide to the silhouette.
 
@@ -168,14 +167,11 @@ def slide_contour(
     Parameters
     ----------
     vertices : (T, V, 3)
-        Object-space vertices per timestep.
-    poses : list of Pose
-        Per timestep.
+        World-space vertices per timestep.
     """
     out = []
     for view in views:
-        pose = poses[view.step]
-        world = pose.apply(vertices[view.step].astype(np.float64))
+        world = vertices[view.step].astype(np.float64)
         normal = face_cross(world, model.faces)
         centre = world[model.faces].mean(1)
         front = np.einsum("ij,ij->i", normal, view.camera.position - centre) > 0
@@ -304,29 +300,22 @@ def fit_landmarks(
     noise: float,
     priors: dict[str, float],
 ) -> LandmarkFit:
-    """Levenberg-Marquardt on landmarks and prior: pose alone, then few modes, then all, then all once more.
+    """Levenberg-Marquardt on landmarks and prior: pose alone, then shape too, at ever narrower outliers.
 
     Before the last two runs the contour slides; before the last one the noise is raised to what the residuals show.
     """
     layout = state.layout
     low, high = bounds(layout, model.expression_bounds)
     held = np.zeros(layout.size, dtype=bool)
-    solution: Solution | None = None
     # a wide outlier scale first: the mean face is far from every landmark
-    runs = ((0, False, 10.0), (FEW_IDENTITY_MODES, True, 3.0), (None, True, 1.0), (None, True, 1.0))
-    for number, (modes, expression, widening) in enumerate(runs):
+    for number, (bends, widening) in enumerate(((False, 10.0), (True, 3.0), (True, 1.0), (True, 1.0))):
         state = state.recentred()
-        held[:] = False
-        if modes is not None:
-            held[layout.at("identity")][modes:] = True
-        if not expression:
-            for k in range(layout.timesteps):
-                held[layout.at("expression", k)] = True
+        held[layout.at("identity")] = not bends
+        for k in range(layout.timesteps):
+            held[layout.at("expression", k)] = not bends
         low_now, high_now = np.where(held, state.x, low), np.where(held, state.x, high)
-        if solution is not None and modes is None:
-            vertices = object_vertices(model, state)
-            poses = [state.frames.pose(layout, state.x, k) for k in range(layout.timesteps)]
-            views = slide_contour(model, views, vertices, poses)
+        if number >= 2:
+            views = slide_contour(model, views, world_vertices(model, state))
         if number == 3:
             noise = max(noise, coordinate_deviation(state, views))
             views = tuple(replace(view, weight=noise**-2) for view in views)
@@ -341,7 +330,6 @@ def fit_landmarks(
             energy_tolerance=1e-5,
         )
         state = replace(state, x=solution.value)
-    assert solution is not None
     return LandmarkFit(state, solution, views, noise)
 
 
@@ -352,24 +340,9 @@ def coordinate_deviation(state: State, views: tuple[LandmarkView, ...]) -> float
     return 1.4826 * float(np.median(np.abs(np.concatenate(residual))))
 
 
-def object_vertices(model: MorphableModel, state: State) -> NDArray:
-    """(T, V, 3) vertices in object space."""
-    layout, x = state.layout, state.x
-    size = len(model.mean)
-    neutral = model.mean.reshape(-1) + model.identity.reshape(3 * size, -1) @ x[layout.at("identity")].astype(
-        np.float32
-    )
-    flat = model.expression.reshape(3 * size, -1)
-    return np.stack(
-        [
-            (neutral + flat @ x[layout.at("expression", k)].astype(np.float32)).reshape(size, 3)
-            for k in range(layout.timesteps)
-        ]
-    )
-
-
 def world_vertices(model: MorphableModel, state: State) -> NDArray[np.float64]:
     """(T, V, 3) vertices in world space."""
-    poses = [state.frames.pose(state.layout, state.x, k) for k in range(state.layout.timesteps)]
-    objects = object_vertices(model, state).astype(np.float64)
-    return np.stack([pose.apply(shape) for pose, shape in zip(poses, objects, strict=True)])
+    layout, x = state.layout, state.x
+    shapes = [model.shape(x[layout.at("identity")], x[layout.at("expression", k)]) for k in range(layout.timesteps)]
+    poses = [state.frames.pose(layout, x, k) for k in range(layout.timesteps)]
+    return np.stack([pose.apply(shape.astype(np.float64)) for pose, shape in zip(poses, shapes, strict=True)])
