@@ -65,7 +65,8 @@ class KeptTexture:
             moved = align_timesteps(model, moved, texels, [posed], looks)
         posed = self._posed(timestep, geometry.vertices[0].astype(np.float64), LEVELS[-1])
         by = interpolate(moved.vertices[0] - geometry.vertices[0], model.faces, texels.face, texels.weights)
-        if not self._apart(replace(posed, position=posed.position + by)) < self._apart(posed):
+        apart, share = self._compared(replace(posed, position=posed.position + by))
+        if not (apart < self._compared(posed)[0] and share > 0.5):
             return geometry
         return replace(
             moved,
@@ -75,13 +76,19 @@ class KeptTexture:
             },
         )
 
-    def _apart(self, posed: Posed) -> float:
-        """Median difference of what a timestep's views show from what is kept; infinite where they show nothing."""
-        apart = [
-            np.abs(look.value - self._mean)[(look.weight > 0) & self._known] for look in looks_at(self._texels, [posed])
-        ]
+    def _compared(self, posed: Posed) -> tuple[float, float]:
+        """Median difference of what a timestep's views show from what is kept, and how much of that they show.
+
+        The share is 1 for the same texture and about 0 for another, however noisy; 0 where nothing is seen.
+        """
+        apart, shown, kept = [np.zeros(0)], 0.0, 0.0
+        for look in looks_at(self._texels, [posed]):
+            rows = (look.weight > 0) & self._known
+            value, mean = look.value[rows], self._mean[rows]
+            apart.append(np.abs(value - mean))
+            shown, kept = shown + float(value @ mean), kept + float(mean @ mean)
         every = np.concatenate(apart)
-        return float(np.median(every)) if len(every) else np.inf
+        return float(np.median(every)) if len(every) else np.inf, shown / max(kept, 1e-12)
 
     def _posed(self, timestep: int, vertices: NDArray, level: int) -> Posed:
         scene = SurfaceScene(vertices, self._model.faces)
