@@ -31,6 +31,11 @@ quick:
 	@.ci/setup test
 	$(BIN)/python -m pytest -m "not slow"
 
+attack:
+	@.ci/setup test
+	$(BIN)/python -m tests.hostile.attack --json benchmarks/results/attacks.json
+	$(BIN)/python -m tests.hostile.endure --json benchmarks/results/endurance.json
+
 bench:
 	@.ci/setup bench
 	$(BIN)/python -m benchmarks

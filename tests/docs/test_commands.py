@@ -81,6 +81,12 @@ def test_a_documented_command_is_understood(page: str, command: str) -> None:
         assert all(extra in extras for extra in re.findall(r"\[(\w+)\]", command))
 
 
+def test_every_target_of_make_has_a_recipe() -> None:
+    text = (ROOT / "Makefile").read_text()
+    named = {*re.search(r"^\.PHONY: (.*)$", text, re.MULTILINE)[1].split(), *re.findall(r'"make ([\w-]+) ', text)}
+    assert named == set(re.findall(r"^([\w-]+):.*\n\t", text, re.MULTILINE))
+
+
 @pytest.fixture(scope="module")
 def workspace(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with all that the commands name: footage, calibrations, environments, a result."""
