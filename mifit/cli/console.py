@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import os
 import sys
 import time
-from collections.abc import Iterator
 from typing import TextIO
 
-from mifit.core.process import set_decoding_context
+from mifit.core.process import no_chatter, set_decoding_context
 from mifit.progress import Progress, silent
 
 
@@ -31,25 +28,6 @@ def drop_chatter() -> None:
     if "cv2" in sys.modules:
         sys.modules["cv2"].utils.logging.setLogLevel(0)
     set_decoding_context(no_chatter)
-
-
-@contextlib.contextmanager
-def no_chatter() -> Iterator[None]:
-    """Send descriptor 2 and Python's standard output nowhere inside the block."""
-    try:
-        saved = os.dup(2)
-    except OSError:  # no standard error at all
-        yield
-        return
-    sink = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(sink, 2)
-        with contextlib.redirect_stdout(io.StringIO()):
-            yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(sink)
 
 
 def _lines(out: TextIO) -> Progress:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -88,3 +89,22 @@ def set_decoding_context(around: Callable[[], AbstractContextManager[None]]) -> 
     """Say what surrounds every decoder call; for programs that own their standard error."""
     global _around
     _around = around
+
+
+@contextlib.contextmanager
+def no_chatter() -> Iterator[None]:
+    """Send descriptor 2 and Python's standard output nowhere inside the block."""
+    try:
+        saved = os.dup(2)
+    except OSError:  # no standard error at all
+        yield
+        return
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 2)
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(sink)

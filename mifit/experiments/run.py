@@ -27,6 +27,7 @@ import mifit
 from mifit import cache
 from mifit.core.files import FULL, Document, file_name, read_text, write_text
 from mifit.core.limits import MAX_SETTINGS_BYTES
+from mifit.core.process import no_chatter, set_decoding_context
 from mifit.errors import InputError, MifitError
 from mifit.experiments.plan import Experiment, Plan, Run, SynthRun, load_plan
 from mifit.experiments.tables import draw, over_subjects, runs_table, subjects_table
@@ -115,7 +116,8 @@ def _executor(jobs: int, dask: str | None) -> Iterator[Executor]:
     if dask is None:
         # A process per run, never a forked one: Mitsuba's threads don't survive a fork, and its memory goes with it.
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(jobs, mp_context=context, max_tasks_per_child=1) as pool:
+        quiet = {"initializer": set_decoding_context, "initargs": (no_chatter,)}
+        with ProcessPoolExecutor(jobs, mp_context=context, max_tasks_per_child=1, **quiet) as pool:
             yield pool
         return
     try:

@@ -21,7 +21,7 @@ from mifit.extras.board_calibration import BoardCalibration, calibrate_boards, w
 from mifit.extras.boards import Board
 from tests.extras.board_video import Studio, pair, poses
 
-CHARUCO = "charuco:9x6:30:22"
+CHARUCO = "charuco:9x6:30:22:DICT_5X5_250"
 
 
 def write(folder: Path, images: list[np.ndarray]) -> ImageFiles:
