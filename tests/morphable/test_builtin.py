@@ -33,7 +33,7 @@ def template():
 
 def test_sizes(coarse):
     assert 6500 < coarse.n_vertices < 8500
-    assert (coarse.n_identity, coarse.n_expression, coarse.n_albedo) == (100, 79, 100)
+    assert (coarse.n_identity, coarse.n_expression, coarse.n_albedo) == (160, 79, 100)
     full = make_template()
     assert 29_000 < len(full.vertices) < 33_000
     assert 57_000 < (full.face_part == SKIN).sum() < 62_000
@@ -271,3 +271,14 @@ def test_jacobian_products_copy_no_basis(coarse):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 0.1 * coarse.identity.nbytes
+
+
+def test_lengths_of_faces_deviate_as_people_do(coarse):
+    """Standard deviations in mm of one sex: Zhuang and Bradtmiller (2005), men."""
+    drawn = np.random.default_rng(0).standard_normal((2000, coarse.n_identity))
+    points = coarse.mean[coarse.landmarks] + np.einsum("vak,nk->nva", coarse.identity[coarse.landmarks], drawn)
+    points *= coarse.unit_mm
+    for a, b, deviation in ((0, 16, 6.9), (27, 8, 7.0), (27, 33, 4.1), (48, 54, 4.2)):
+        found = np.linalg.norm(points[:, a] - points[:, b], axis=1).std()
+        assert found == pytest.approx(deviation, rel=0.15), (a, b)
+    assert (points[:, 30, 2] - points[:, 33, 2]).std() == pytest.approx(2.7, rel=0.15)

@@ -90,7 +90,7 @@ def test_landmark_maps():
 
 def test_info_names_what_is_odd(coarse):
     text = describe.model_info(coarse)
-    assert "identity          100 modes" in text and "79 bounded" in text and coarse.digest in text
+    assert "identity          160 modes" in text and "79 bounded" in text and coarse.digest in text
     assert "notice" not in text
     skewed = coarse.identity[:, :, :2].copy()
     skewed[:, :, 1] += skewed[:, :, 0]

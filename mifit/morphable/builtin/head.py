@@ -20,7 +20,7 @@ def make_head(coarse: bool = False) -> MorphableModel:
     t = make_template(2 if coarse else 1)
     landmarks = landmark_vertices(t)
     mask = template_face_mask(t)
-    identity = identity_modes(t, 100)
+    identity = identity_modes(t, 160)
     expression, names, bounds = expression_modes(t)
     mean_albedo, albedo_modes = skin_model(t.vertices, t.faces[mask], landmarks, 1.0, 100, t.part == SKIN)
     ball = t.part == EYEBALL
