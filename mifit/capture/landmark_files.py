@@ -1,22 +1,15 @@
-"""Files of 68 iBUG landmarks: JSON, ``.pts`` and ``.npy``.
-
-All are read to the project's pixel convention, the centre of the first pixel at (0.5, 0.5). JSON files of a capture
-are in it already. ``.pts`` and ``.npy`` files come from tools that put that centre at (0, 0) (iBUG's, written by
-MATLAB tools, at (1, 1)); the caller names the origin where it matters.
-"""
+"""Files of 68 iBUG landmarks: JSON, in the project's pixels, the centre of the first one at (0.5, 0.5)."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.arrays import read_npy
-from mifit.core.files import read_bytes, read_text, write_text
+from mifit.core.files import read_text, write_text
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 
@@ -47,17 +40,10 @@ class Landmarks:
     deviation: float = 0.0
 
 
-def read_landmarks(path: str | Path, first_pixel: float | None = None) -> Landmarks:
-    """Read a landmark file, its kind told by its suffix.
+def read_landmarks(path: str | Path) -> Landmarks:
+    """Read ``{"points": [[x, y], ...], "visible": [...], "deviation": 0}``, or a bare list of points.
 
-    Parameters
-    ----------
-    path : path
-        ``.json`` (``{"points": [[x, y], ...], "visible": [...], "deviation": 0}``, or a bare list), ``.pts`` or
-        ``.npy`` ((68, 2), or (68, 3) with visibility as third column). A point without finite coordinates is invisible.
-    first_pixel : float, optional
-        Coordinate of the first pixel's centre in the file: 0.5 by default for JSON, 1 for ``.pts`` (iBUG's
-        convention), 0 for ``.npy`` (image-array convention).
+    A point without finite coordinates is invisible.
 
     Raises
     ------
@@ -65,17 +51,13 @@ def read_landmarks(path: str | Path, first_pixel: float | None = None) -> Landma
         A missing or malformed file, or another number of points than 68.
     """
     path = Path(path)
-    reader = {".json": _read_json, ".pts": _read_pts, ".npy": _read_npy}.get(path.suffix.lower())
-    if reader is None:
-        raise InputError(f"{path}: found suffix {path.suffix!r}, expected .json, .pts or .npy landmarks")
     try:
-        points, visible, deviation = reader(path)
+        points, visible, deviation = _read(path)
     except InputError:
         raise
-    except (
-        OSError, ValueError, KeyError, TypeError, EOFError, OverflowError, RecursionError, SyntaxError, TokenError
-    ) as error:  # fmt: skip
-        raise InputError(f"{path}: not a readable landmark file: {_brief(error)}") from None
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        brief = (str(error) or type(error).__name__).splitlines()[0][:200]
+        raise InputError(f"{path}: not a readable landmark file, expected JSON: {brief}") from None
     if points.shape != (COUNT, 2):
         raise InputError(
             f"{path}: found {len(points)} landmarks of shape {points.shape}, expected 68 points (iBUG-68) of x and y"
@@ -85,9 +67,7 @@ def read_landmarks(path: str | Path, first_pixel: float | None = None) -> Landma
     if not (np.isfinite(deviation) and deviation >= 0):
         raise InputError(f"{path}: deviation: found {deviation}, expected a number of pixels not below 0")
     _check_spread(path, points[visible & np.isfinite(points).all(axis=1)])
-    default = {".json": 0.5, ".pts": 1.0, ".npy": 0.0}[path.suffix.lower()]
-    points = points + (0.5 - (default if first_pixel is None else first_pixel))
-    finite = np.isfinite(points).all(axis=1)
+    finite: NDArray[np.bool_] = np.isfinite(points).all(axis=1)
     return Landmarks(np.where(finite[:, None], points, 0.0), visible & finite, deviation)
 
 
@@ -114,7 +94,7 @@ def write_landmarks(path: str | Path, landmarks: Landmarks) -> None:
     write_text(path, text + "\n")
 
 
-def _read_json(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
+def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
     data = json.loads(read_text(path, MAX_SETTINGS_BYTES, "landmark file"))
     if isinstance(data, list):
         data = {"points": data}
@@ -127,28 +107,3 @@ def _read_json(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], floa
     flags = data.get("visible")
     visible = np.ones(len(points), dtype=bool) if flags is None else np.array(flags, dtype=bool)
     return points, visible, float(data.get("deviation", 0.0))
-
-
-def _read_pts(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
-    text = read_bytes(path, MAX_SETTINGS_BYTES, "landmark file").decode("utf-8", errors="replace")
-    opened, closed = text.find("{"), text.find("}")
-    if opened < 0 or closed < opened:
-        raise InputError(f"{path}: found no {{ ... }} block, expected the iBUG .pts layout")
-    values = np.array(text[opened + 1 : closed].split(), dtype=np.float64)
-    if values.size % 2:
-        raise InputError(f"{path}: found {values.size} numbers, expected {2 * COUNT} (x and y of 68 points)")
-    points = values.reshape(-1, 2)
-    return points, np.ones(len(points), dtype=bool), 0.0
-
-
-def _read_npy(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
-    values = read_npy(path, MAX_SETTINGS_BYTES, "landmark file")
-    if values.ndim != 2 or values.shape[1] not in (2, 3):
-        raise InputError(f"{path}: found an array of shape {values.shape}, expected (68, 2) or (68, 3)")
-    visible = values[:, 2] > 0.5 if values.shape[1] == 3 else np.ones(len(values), dtype=bool)
-    return values[:, :2].astype(np.float64), visible, 0.0
-
-
-def _brief(error: Exception) -> str:
-    """One line of an exception's text."""
-    return (str(error) or type(error).__name__).splitlines()[0][:200]

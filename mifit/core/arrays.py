@@ -26,7 +26,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import DTypeLike, NDArray
 
-from mifit.core.files import FULL, check_file, opened, read_bytes, write_bytes
+from mifit.core.files import FULL, check_file, read_bytes, write_bytes
 from mifit.core.image import to_8_bit
 from mifit.core.limits import MAX_MODEL_BYTES, MAX_UNPACKING, UNPACKING_SLACK
 from mifit.errors import InputError
@@ -81,17 +81,6 @@ def read_npz(path: str | Path, keys: Iterable[str] | None = None) -> dict[str, N
     except _DAMAGE as error:
         raise InputError(f"{path}: damaged .npz file: {error}") from None
     return out
-
-
-def read_npy(path: str | Path, limit: int, what: str = "file") -> NDArray:
-    """Read one array from an ``.npy`` file of at most ``limit`` bytes; InputError as `read_npz` raises it."""
-    with opened(path, limit, what) as (stream, size):
-        try:
-            return _read_npy(stream, size, f"{path}: not a readable {what}")
-        except InputError:
-            raise
-        except _DAMAGE as error:
-            raise InputError(f"{path}: not a readable {what}: {' '.join(str(error).split())[:100]}") from None
 
 
 def _read_npy(stream, size: int, where: str) -> NDArray:

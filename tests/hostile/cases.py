@@ -483,7 +483,7 @@ def images(base: Path) -> Iterator[Case]:
 
 
 def landmarks(base: Path) -> Iterator[Case]:
-    """Landmark files of three kinds."""
+    """Landmark files."""
     command = ("import", "--transforms", "capture/transforms.json", "--out", "out")
     document = json.loads((base / "capture" / "transforms.json").read_text())
 
@@ -504,25 +504,6 @@ def landmarks(base: Path) -> Iterator[Case]:
         "deviation nan": {"points": points, "deviation": float("nan")}, "huge": [[HUGE, 1]] * 68, "map": {"a": 1},
     }.items():  # fmt: skip
         yield case(name, ".json", json.dumps(content).encode())
-    for name, text in {
-        "no braces": "1 2\n" * 68, "short": "{\n1 2\n}", "words": "{\n" + "a b\n" * 68 + "}", "odd": "{\n" + "1 2\n" * 67 + "1\n}",
-        "empty": "", "backwards": "}{", "binary": "\0\1\2",
-    }.items():  # fmt: skip
-        yield case(name, ".pts", text.encode())
-    head = b"\x93NUMPY\x01\x00"
-    for name, header in {
-        "huge": "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000, 2), }",
-        "object": "{'descr': '|O', 'fortran_order': False, 'shape': (68, 2), }",
-        "negative": "{'descr': '<f8', 'fortran_order': False, 'shape': (-68, 2), }",
-        "code": "__import__('os').system('touch x')",
-        "shape": "{'descr': '<f8', 'fortran_order': False, 'shape': (4, 34), }",
-        "text": "{'descr': '<U4', 'fortran_order': False, 'shape': (68, 2), }",
-        "void": "{'descr': '|V1000000000', 'fortran_order': False, 'shape': (68, 2), }",
-        "nested": "(" * 3000,
-    }.items():
-        text = header.ljust(117) + "\n"
-        yield case(name, ".npy", head + struct.pack("<H", len(text)) + text.encode() + bytes(68 * 16))
-    yield case("zip", ".npy", b"PK\x03\x04" + bytes(50))
     yield case("suffix", ".xyz", b"")
 
 
