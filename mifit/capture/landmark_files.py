@@ -67,7 +67,7 @@ def read_landmarks(path: str | Path) -> Landmarks:
     if not (np.isfinite(deviation) and deviation >= 0):
         raise InputError(f"{path}: deviation: found {deviation}, expected a number of pixels not below 0")
     _check_spread(path, points[visible & np.isfinite(points).all(axis=1)])
-    finite: NDArray[np.bool_] = np.isfinite(points).all(axis=1)
+    finite = np.asarray(np.isfinite(points).all(axis=1), dtype=bool)
     return Landmarks(np.where(finite[:, None], points, 0.0), visible & finite, deviation)
 
 

@@ -76,19 +76,13 @@ def import_(arguments: Namespace) -> None:
     from mifit.capture.sources import open_sources
     from mifit.extras.importers import KINDS, REGISTRATIONS, import_from
 
-    sources = {name: getattr(arguments, name) for name in ("calibration", "transforms", *KINDS, "digital_emily")}
+    sources = {name: getattr(arguments, name) for name in ("calibration", "transforms", *KINDS)}
     given = [name for name, path in sources.items() if path is not None]
     if len(given) > 1:
         raise InputError(f"found more than one of {', '.join(given)}, expected one")
     kind = given[0] if given else None
     if arguments.photos is not None and kind not in REGISTRATIONS:
         raise InputError(f"photos: found without a model to go with, expected one of {', '.join(REGISTRATIONS)}")
-    if kind == "digital_emily":
-        from mifit.extras.digital_emily import import_digital_emily
-
-        import_digital_emily(arguments.digital_emily, arguments.out)
-        print(f"Capture: {arguments.out}; it has no landmarks yet: mifit landmarks {arguments.out}")
-        return
     options = {name: getattr(arguments, name) for name in ("images", "every", "start", "count", "trim", "units")} | {
         "videos": arguments.video,
         "progress": console_progress(arguments.quiet),

@@ -95,7 +95,6 @@ import  captures.import_  a capture from videos, image folders, photogrammetry p
     --vhap            path  folder exported by VHAP
     --nersemble       path  folder of one sequence of NeRSemble
     --transforms      path  nerfstudio transforms.json
-    --digital-emily   path  checkout of the public Digital Emily repository
     --units           text  unit of length of the cameras: mm, cm, dm or m (default: as the source has it, or cm)
     {OFFSET}
     {TRIM}

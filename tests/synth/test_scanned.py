@@ -1,4 +1,4 @@
-"""Captures of scanned heads and the public Digital Emily scenes."""
+"""Captures of scanned heads."""
 
 import json
 import math
@@ -15,7 +15,6 @@ from mifit.cli import main
 from mifit.core.image import read_image, write_image
 from mifit.core.uv import sample_map
 from mifit.errors import InputError
-from mifit.extras.digital_emily import import_digital_emily, read_camera
 from mifit.morphable import MorphableModel
 from mifit.output.truth import relit_truths, true_mesh
 from mifit.synth import head as heads
@@ -131,62 +130,6 @@ def test_options_of_scans_and_of_models_do_not_mix(files, capsys):
 @pytest.fixture(scope="module")
 def coarse():
     return MorphableModel.load("builtin:coarse")
-
-
-PBRT = """Film "image"
-# Camera begin
-Scale -1 1 1
-LookAt {0} {1} {2} {3} {4} {5} 0 1 0
-Camera "perspective"
-    "float fov" [{6}]
-WorldBegin
-    Texture "fov" "float fov" [1]
-"""
-
-
-def emily(folder: Path) -> Path:
-    """The layout of the repository, with two cameras that look at the origin."""
-    data, images = folder / "maya/renderData", folder / "maya/images/Emily_2_1_Assemble_pbrt/1080x1680/jpg"
-    images.mkdir(parents=True)
-    data.mkdir(parents=True)
-    trimesh.creation.icosphere(radius=9.0).export(data / "__Cache__Emily_head_mesh.ply")
-    for number, (x, z) in ((1, (-30.0, 90.0)), (2, (0.0, 100.0))):
-        name = f"Emily_2_1_Assemble_pbrt.{number:04d}"
-        (data / f"{name}.pbrt").write_text(PBRT.format(x, 0, z, 0.5 * x, 0, 0.5 * z, 10))
-        cv2.imwrite(str(images / f"{name}.jpg"), np.full((90, 60, 3), 128, np.uint8))
-    (folder / "LICENSE").write_text("MIT")
-    return folder
-
-
-def test_digital_emily_becomes_a_capture_with_its_mesh_as_truth(tmp_path, capsys):
-    repository = emily(tmp_path / "repository")
-    assert main(["import", "--digital-emily", str(repository), "--out", str(tmp_path / "out")]) == 0
-    assert "mifit landmarks" in capsys.readouterr().out
-    capture = Capture.load(tmp_path / "out")
-    assert capture.cameras == ("c1", "c2") and capture.units == "cm"
-    for name in capture.cameras:
-        camera = capture.camera(name)
-        assert camera.project(np.zeros(3)) == pytest.approx((30, 45))
-        assert camera.fx == pytest.approx(30 / math.tan(math.radians(5)))
-        assert camera.project(np.array([0.0, 1.0, 0.0]))[1] < 45  # up is up
-    assert capture.camera("c1").position == pytest.approx((-30, 0, 90))
-    assert capture.camera("c1").project(np.array([1.0, 0, 0]))[0] > 30  # and right is right
-    truth = true_mesh(capture, 0)
-    assert np.linalg.norm(truth.vertices, axis=1) == pytest.approx(9.0)
-    assert (tmp_path / "out" / "LICENSE").exists()
-
-
-def test_other_folders_are_not_taken_for_digital_emily(tmp_path):
-    with pytest.raises(InputError, match="expected a checkout"):
-        import_digital_emily(tmp_path, tmp_path / "out")
-    repository = emily(tmp_path / "repository")
-    with pytest.raises(InputError, match="missing; expected the picture"):
-        import_digital_emily(repository, tmp_path / "out", size="3482x5218")
-    assert not (tmp_path / "out").exists()
-    scene = repository / "x.pbrt"
-    scene.write_text("LookAt 1 2 3 4 5 6 0 1 0\nWorldBegin")
-    with pytest.raises(InputError, match="found no float fov"):
-        read_camera(scene, "c1", 10, 10)
 
 
 def test_a_detectors_bias_is_the_same_in_all_images_of_a_head(coarse, variant):
