@@ -8,8 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import trimesh
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import mifit
@@ -19,6 +17,7 @@ from mifit.capture.stereo import write_stereo
 from mifit.cli import main
 from mifit.core.image import to_8_bit
 from mifit.extras.boards import Board
+from mifit.output.truth import nearest_points
 from tests.capture.test_clips import write_with_sound
 from tests.extras.board_video import Studio
 
@@ -93,12 +92,8 @@ def test_two_clips_become_a_face(shared: Path, tmp_path: Path, variant: str, cap
     for i, timestep in enumerate(result.timesteps):
         photograph = soft.timesteps[min(5 * timestep // HELD, 3)]
         truth = np.load(shared / "captures" / "soft" / "truth" / f"{photograph:04d}.npz")["vertices"]
-        mesh = trimesh.Trimesh(truth @ gauge[:3, :3].T + gauge[:3, 3], faces, process=False)
-        points = trimesh.sample.sample_surface(mesh, 200_000, seed=1)[0]
-        found = result.geometry.vertices[i][used]
-        if by == "board":  # the world's axes are those of the camera that the board gave, a tenth of a degree off
-            found = trimesh.registration.icp(found, points, scale=False, reflection=False, max_iterations=30)[1]
-        distance = cKDTree(points).query(found)[0] * result.unit_mm
+        truth = truth @ gauge[:3, :3].T + gauge[:3, 3]
+        distance = nearest_points(result.geometry.vertices[i][used], truth, faces)[0] * result.unit_mm
         assert np.median(distance) < 1.0, (timestep, np.median(distance))
         means.append(distance.mean())
     assert np.mean(means) < 1.0, means

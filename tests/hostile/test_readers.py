@@ -61,7 +61,7 @@ def test_keys_that_take_for_ever_to_hash(tmp_path: Path, how: str) -> None:
 
 def test_state_can_be_set_on_arrays_only(tmp_path: Path) -> None:
     path = pickled(tmp_path / "m.pkl", b"\x80\x02ccopy_reg\n_reconstructor\nN}U\x0c__defaults__)s\x86b.")
-    refused(MorphableModel.load, path, match="sets the state of a Name, which is refused")
+    refused(MorphableModel.load, path, match="sets the state of a function, which is refused")
 
 
 def test_arrays_of_protocol_5_are_read(tmp_path: Path) -> None:

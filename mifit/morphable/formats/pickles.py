@@ -108,20 +108,29 @@ class _Recipe:
         raise InputError("sets the state of a function, which is refused; expected arrays only")
 
 
-def _refuse(*_: object) -> object:
-    raise InputError("an object is built that is no array, which is refused")
+def _refused(name: str) -> _Recipe:
+    def refuse(*_: object) -> object:
+        raise InputError(f"wants to run {name}, which is refused; expected arrays only")
+
+    return _Recipe(refuse)
+
+
+def _object(kind: object, *_: object) -> Instance:
+    if kind is not Instance:
+        raise InputError(f"an object of type {_short(kind)} is built, expected an array")
+    return Instance()
 
 
 _RECIPES: dict[str, object] = {
     "numpy.dtype": _Recipe(_Dtype),
-    "numpy.ndarray": _Recipe(_refuse),
+    "numpy.ndarray": _refused("numpy.ndarray"),
     "numpy.core.multiarray._reconstruct": _Recipe(_Array),
     "numpy.core.multiarray.scalar": _Recipe(lambda dtype, data: _frombuffer(data, dtype, (), "C")),
     "numpy.core.numeric._frombuffer": _Recipe(_frombuffer),
-    "copyreg._reconstructor": _Recipe(lambda kind, *_: Instance() if kind is Instance else _refuse()),
+    "copyreg._reconstructor": _Recipe(_object),
     "_codecs.encode": _Recipe(_encode),
     "builtins.bytes": _Recipe(lambda: b""),
-    "builtins.object": _Recipe(_refuse),
+    "builtins.object": _refused("builtins.object"),
     "scipy.sparse._csc.csc_matrix": Instance,
     "chumpy.ch.Ch": Instance,
 }
