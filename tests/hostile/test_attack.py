@@ -10,16 +10,16 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-EVERY = 20
+EVERY = 40
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="forks, and limits processes as Linux does")
-def test_every_twentieth_attack_is_refused_in_one_line_and_changes_nothing(tmp_path: Path) -> None:
+def test_every_fortieth_attack_is_refused_in_one_line_and_changes_nothing(tmp_path: Path) -> None:
     report = tmp_path / "report.json"
     command = [sys.executable, "-m", "tests.hostile.attack", "--every", str(EVERY), "--json", str(report)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert report.exists(), done.stderr[-2000:]
     found = json.loads(report.read_text())
     assert found["wrong"] == {}, done.stdout
-    assert found["cases"] >= 90 and found["refused"] >= 80
+    assert found["cases"] >= 70 and found["refused"] >= 60
