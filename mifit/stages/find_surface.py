@@ -1,9 +1,10 @@
 """Stage 1b: the surface that the images of all views and timesteps show together.
 
-The surface is the model's modes and a smooth displacement under one Gaussian prior (`surface.displace`). It is
-measured by sweeps along its normals, which find where the views agree best (`surface.sweep`), and by the outlines of
-the head (`surface.outline`). Sweeps and solutions take turns, coarse to fine, at each level until the surface rests:
-coarse levels reach far in few samples, and the prior holds what they don't measure. Stage 1 is only a start.
+The surface is the model's modes, the head's pose and a smooth displacement under one Gaussian prior
+(`surface.displace`). It is measured by sweeps along its normals, which find where the views agree best
+(`surface.sweep`), and by the outlines of the head (`surface.outline`). Sweeps and solutions take turns, coarse to
+fine, at each level until the surface rests: coarse levels reach far in few samples, and the prior holds what they
+don't measure. Stage 1 is only a start.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mifit.config import SurfaceConfig
 from mifit.core.calls import checked
@@ -65,6 +67,8 @@ ROBUST_STEPS = 0.7
 """Distance from the surface, in steps of the sweep, where an offset counts as an outlier."""
 INDEPENDENT = 0.1
 """Part of the landmarks that count as measured on their own: neighbours are off alike."""
+MEDIAN_DEVIATIONS = 1.4826
+"""Standard deviation of a normal distribution over the median of its absolute value."""
 OUTLIER_DEVIATIONS = 4.0
 """Distance from the surface, in deviations, where a landmark counts as an outlier."""
 THIN = 2
@@ -73,6 +77,8 @@ FORGET_MM = 150.0
 """Wavelength above which displacements fall back to the model where nothing is measured."""
 CONTACT_MM = 1.5
 """Gap below which opposed parts of the surface, such as closed lips, move together."""
+POSE_MM = 10.0
+"""Standard deviation of the head's pose in the first estimate, as movement of its surface."""
 SLACK = 0.01
 """Pixels that the surface may move by before what rays meet is built anew."""
 OFF_PIXELS = 1.0
@@ -127,10 +133,12 @@ def find_surface(
 
     # The prior: modes and plate on the skin, which pieces that were added to the model, such as eyes, go along with.
     skin = Skin.of(model)
+    neutral = model.shape(geometry.identity).astype(np.float64)
+    motion = Motion.of(neutral, POSE_MM / model.unit_mm)
     prior = SurfacePrior.of(
-        model.shape(geometry.identity)[: skin.count],
+        neutral[: skin.count],
         skin.faces,
-        np.concatenate([model.identity, model.expression], axis=2)[: skin.count],
+        np.concatenate([model.identity, model.expression, motion.modes(neutral)], axis=2)[: skin.count],
         FORGET_MM / model.unit_mm,
         CONTACT_MM / model.unit_mm,
     )
@@ -138,7 +146,9 @@ def find_surface(
     reach = config.reach / capture.unit_mm
     sight = Sight(capture, model, tuple(cameras), scenes, resolution.pixel, reach, config.finest)
     landmarks = Landmarks.of(capture, model, cameras, geometry)
-    search = Search(geometry, model, pairs, skin, prior, landmarks, sight, level_step, config.stiffness, progress)
+    search = Search(
+        geometry, model, pairs, skin, prior, motion, landmarks, sight, level_step, config.stiffness, progress
+    )
 
     # Sweep and solve in turn, each level until the surface rests.
     rest = Rest(State.of(model, geometry))
@@ -228,13 +238,10 @@ class Landmarks:
     Attributes
     ----------
     views : sequence of (step, Camera, model vertices (n,), pixels (n, 2))
-    deviation : float
-        Of a coordinate, pixels.
     """
 
     n_vertices: int
     views: Sequence[tuple[int, Camera, NDArray, NDArray]]
-    deviation: float
 
     @classmethod
     def of(
@@ -249,21 +256,29 @@ class Landmarks:
                     index = np.flatnonzero(frame.visible[INNER]) + INNER[0]
                     pixels = np.asarray(frame.landmarks[index], np.float64)
                     views.append((step, capture.camera(name), model.landmarks[index], pixels))
-        return cls(model.n_vertices, views, max(geometry.landmark_noise, 1.0))
+        return cls(model.n_vertices, views)
+
+    @staticmethod
+    def _deviation(residuals: Sequence[NDArray]) -> float:
+        """Of a coordinate, pixels: by the median residual, in which what the surface lacks counts as the detector's."""
+        apart = np.concatenate([np.zeros(0), *(np.abs(one).ravel() for one in residuals)])
+        apart = apart[np.isfinite(apart)]
+        return max(MEDIAN_DEVIATIONS * float(np.median(apart)), 1.0) if len(apart) else 1.0
 
     def at(self, world: NDArray, rotation: NDArray) -> Measurements:
         """What they measure at a surface (T, V, 3), with directions in object space."""
         rows, directions, offsets, precisions = [np.zeros(0, int)], [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0)]
-        for step, camera, vertices, pixels in self.views:
+        residuals = [pixels - camera.project(world[step][vertices]) for step, camera, vertices, pixels in self.views]
+        deviation = self._deviation(residuals)
+        for (step, camera, vertices, _), apart in zip(self.views, residuals, strict=True):
             depth = camera.to_camera(world[step][vertices])[:, 2]
-            apart = pixels - camera.project(world[step][vertices])
             good = np.flatnonzero((depth > 0) & np.isfinite(apart).all(axis=1))
             for axis, focal in ((0, camera.fx), (1, camera.fy)):
                 pixel = depth[good] / focal
                 rows.append(vertices[good])
                 directions.append(np.tile(camera.rotation[axis] @ rotation[step], (len(good), 1)))
                 offsets.append(apart[good, axis] * pixel)
-                precisions.append(1.0 / (len(self.views) * (self.deviation * pixel) ** 2))
+                precisions.append(1.0 / (len(self.views) * (deviation * pixel) ** 2))
         index = np.concatenate(rows)
         ones = np.ones(len(index), np.float32)
         points = sp.csr_matrix((ones, index, np.arange(len(index) + 1)), shape=(len(index), self.n_vertices))
@@ -323,6 +338,39 @@ class State:
             vertices=self.world(model).astype(np.float32),
             displacement=self.displacement.astype(np.float32),
         )
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Rigid motion of the head, linear in six coefficients of unit deviation: a rotation and a translation.
+
+    ``centre`` (3,) of the rotation and ``radius``, root mean square distance from it, in object space; ``deviation``
+    is the length of a movement of unit deviation.
+    """
+
+    centre: NDArray[np.float64]
+    radius: float
+    deviation: float
+
+    @classmethod
+    def of(cls, vertices: NDArray, deviation: float) -> Motion:
+        """Of a head (V, 3)."""
+        centre = vertices.mean(axis=0)
+        return cls(centre, float(np.sqrt(((vertices - centre) ** 2).sum(axis=1).mean())), deviation)
+
+    def modes(self, vertices: NDArray) -> NDArray[np.float32]:
+        """(V, 3, 6) change of vertices by the coefficients."""
+        turned = np.cross(np.eye(3), (vertices - self.centre)[:, None] / self.radius)
+        shifted = np.broadcast_to(np.eye(3), turned.shape)
+        modes = self.deviation * np.concatenate([turned, shifted], axis=1)
+        return modes.transpose(0, 2, 1).astype(np.float32)
+
+    def of_head(self, state: State, coefficients: NDArray) -> State:
+        """A state whose poses have this motion in addition."""
+        turn = Rotation.from_rotvec(self.deviation / self.radius * coefficients[:3]).as_matrix()
+        shift = self.centre - turn @ self.centre + self.deviation * coefficients[3:]
+        translation = state.translation + state.scale * state.rotation @ shift
+        return replace(state, rotation=state.rotation @ turn, translation=translation)
 
 
 @dataclass(frozen=True)
@@ -404,6 +452,7 @@ class Search:
     pairs: Sequence[tuple[int, int]]
     skin: Skin
     prior: SurfacePrior
+    motion: Motion
     landmarks: Landmarks
     sight: Sight
     level_step: float
@@ -445,14 +494,15 @@ class Search:
             if skin.weights is not None:
                 rows = replace(rows, points=rows.points @ skin.weights)
             mean = state.expression.mean(axis=0)
-            coefficients = np.concatenate([state.identity, mean])
+            coefficients = np.concatenate([state.identity, mean, np.zeros(6)])
             surface = self.prior.move(coefficients) + state.displacement[: skin.count]
             factor = factor or self.prior.factor(rows, self.stiffness)
             solved = self.prior, rows, surface, self._bounds(state), self.stiffness, factor
             moved_by, coefficients = solve_surface(*solved)
-            identity, changed = np.split(coefficients, [len(state.identity)])
+            identity, changed, rigid = np.split(coefficients, [len(state.identity), len(coefficients) - 6])
             expression = state.expression + (changed - mean)
             state = replace(state, identity=identity, expression=expression, displacement=skin.spread(moved_by))
+            state = self.motion.of_head(state, rigid)
 
             measured = np.unique(model.faces[texels.face[found.precision > 0]])
             moved = along_normals(state.world(model) - world, world, model.faces, measured)
@@ -469,7 +519,8 @@ class Search:
         mean = state.expression.mean(axis=0)
         low, high = (low - state.expression).max(axis=0), (high - state.expression).min(axis=0)
         of_mean = np.stack([mean + np.minimum(low, 0.0), mean + np.maximum(high, 0.0)], axis=1)
-        return np.concatenate([np.tile([-np.inf, np.inf], (len(state.identity), 1)), of_mean])
+        free = [-np.inf, np.inf]
+        return np.concatenate([np.tile(free, (len(state.identity), 1)), of_mean, np.tile(free, (6, 1))])
 
 
 def measurements(

@@ -293,13 +293,14 @@ def test_an_outlier_counts_little():
 
 def test_biased_landmarks_bend_the_shape_less(model, bumpy):
     """Landmarks that are off the same way in every image: the surface that all views see sets them right."""
-    rng = np.random.default_rng(5)
-    offset = 6.0 * rng.normal(size=(68, 2))
-    biased = bumpy.changed(lambda name, t, frame: replace(frame, landmarks=frame.landmarks + offset))
-    start = fitted_to(model, biased)
-    found = find_surface(biased, model, start, BOTH)
-    before = off_mm(model, bumpy, start).mean()
-    assert off_mm(model, bumpy, found).mean() < 0.3 * before
+    before = after = 0.0
+    for seed in range(5, 9):  # the result of one set hangs on single landmarks
+        offset = 6.0 * np.random.default_rng(seed).normal(size=(68, 2))
+        biased = bumpy.changed(lambda name, t, frame, by=offset: replace(frame, landmarks=frame.landmarks + by))
+        start = fitted_to(model, biased)
+        before += off_mm(model, bumpy, start).mean()
+        after += off_mm(model, bumpy, find_surface(biased, model, start, BOTH)).mean()
+    assert after < 0.3 * before
 
 
 def test_expressions_stay_within_their_bounds(model, found):

@@ -68,7 +68,7 @@ class Opening:
 
 LIPS = (Opening("mouth", slice(60, 68), 6.0, 0.08, False, shows_teeth),)
 LIDS = tuple(
-    Opening(name, marks, 8.0, 0.04, True, shows_an_eye)
+    Opening(name, marks, np.inf, 0.04, True, shows_an_eye)
     for name, marks in zip(("right eye", "left eye"), EYES, strict=True)
 )
 

@@ -235,8 +235,8 @@ def _correlate(
 def _peak(score: NDArray, weight: NDArray, offsets: NDArray) -> Found:
     """Best offset by a parabola through the best layer and its neighbours."""
     layers, count = score.shape
-    score = score - (FAR * (np.linspace(-1.0, 1.0, layers) ** 2)).astype(np.float32)[:, None]
-    best = score.argmax(0)
+    # Where all offsets match alike the middle is chosen, and has no precision: it is the views that have a peak.
+    best = (score - (FAR * (np.linspace(-1.0, 1.0, layers) ** 2)).astype(np.float32)[:, None]).argmax(0)
     inner = np.clip(best, 1, layers - 2)
     column = np.arange(count)
     low, mid, high = score[inner - 1, column], score[inner, column], score[inner + 1, column]
