@@ -116,8 +116,7 @@ def _executor(jobs: int, dask: str | None) -> Iterator[Executor]:
     if dask is None:
         # A process per run, never a forked one: Mitsuba's threads don't survive a fork, and its memory goes with it.
         context = multiprocessing.get_context("spawn")
-        quiet = {"initializer": set_decoding_context, "initargs": (no_chatter,)}
-        with ProcessPoolExecutor(jobs, mp_context=context, max_tasks_per_child=1, **quiet) as pool:
+        with ProcessPoolExecutor(jobs, context, set_decoding_context, (no_chatter,), max_tasks_per_child=1) as pool:
             yield pool
         return
     try:
