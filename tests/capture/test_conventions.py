@@ -156,11 +156,15 @@ def test_bad_stereo_rotation(tmp_path: Path, factor: float, message: str) -> Non
         ),
         ("cameras.txt", "1 PINHOLE 340 240 700 700 170", r"line 1: found 3 parameters, expected 4 of PINHOLE"),
         ("cameras.txt", "1 PINHOLE 340 240 -700 700 170 120", r"found focal length -700"),
-        ("cameras.txt", "1 PINHOLE 340 240 nan 700 170 120", r"found a NaN"),
+        (
+            "cameras.txt",
+            "1 PINHOLE 340 240 nan 700 170 120",
+            r"line 1: found '340 240 nan 700 170 120', expected 6 finite numbers",
+        ),
         ("images.txt", "1 1 0 0 0 0 0 0 9 a.png\n\n", r"line 1: camera 9 is not in cameras.txt"),
         ("images.txt", "1 2 0 0 0 0 0 0 1 a.png\n\n", r"found a quaternion of length 2, expected 1"),
         ("images.txt", "1 1 0 0\n\n", r"line 1: found 4 fields"),
-        ("images.txt", "1 1 0 0 x 0 0 0 1 a.png\n\n", r"expected numbers"),
+        ("images.txt", "1 1 0 0 x 0 0 0 1 a.png\n\n", r"line 1: found '1 0 0 x 0 0 0', expected 7 finite numbers"),
         ("images.txt", "", r"found no image"),
     ],
 )
