@@ -194,15 +194,6 @@ def _based(case: dict[str, Any], mesh: str, region: str = "skin", measure: str =
     return f"{text} ({blend})" if blend and (region, measure) == ("skin", "psnr") else text
 
 
-def _measures(measure: str, digits: int) -> Columns:
-    columns: Columns = {}
-    for region in ("skin", "face", "whole"):
-        for title, row in (("`full`", "full"), ("model alone", "model alone"), ("refitted", "refit")):
-            columns[f"{title}, {region}"] = lambda c, r=row, g=region: _figure(c, digits, "held_out", r, g, measure)
-        columns[f"image-based, {region}"] = lambda c, g=region: _based(c, "our mesh", g, measure, digits)
-    return columns
-
-
 def _millimetres(case: dict[str, Any], row: str) -> str:
     return " / ".join(_figure(case, 2, "mesh", row, key) for key in ("median_mm", "mean_mm", "p90_mm"))
 
@@ -264,6 +255,9 @@ SEPARATION: Columns = {
 
 
 def _table(cases: Sequence[dict[str, Any]], columns: Columns) -> list[str]:
+    """A row per case; columns that no case has are left out."""
+    fitted = [case for case in cases if "failed" not in case]
+    columns = {title: cell for title, cell in columns.items() if any(cell(case).strip("-/ ") for case in fitted)}
     lines = ["| head (fitted model), fitted → held out | set | " + " | ".join(columns) + " |"]
     lines.append("|---|---|" + "---|" * len(columns))
     for case in cases:
@@ -317,9 +311,6 @@ def markdown(cases: Sequence[dict[str, Any]], run: Mapping[str, Any] | None = No
         "",
         *_table(cases, HELD_OUT),
     ]
-    for measure, title, digits in (("psnr", "PSNR dB", 1), ("ssim", "SSIM", 3), ("flip", "FLIP", 3)):
-        lines += ["", f"{title} over skin, face (the hull where a fitted view sees it) and the whole hull:", ""]
-        lines += _table(cases, _measures(measure, digits))
     lines += ["", "The surface at the scan's points that all fitted views see, without alignment:", ""]
     lines += _table(cases, SURFACE)
     for key, columns, title in (
