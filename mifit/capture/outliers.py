@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
+from mifit.core.metrics import NORMAL
 
 
 def temporal_outliers(points: NDArray, floor: float = 0.05) -> NDArray[np.bool_]:
@@ -88,7 +89,7 @@ def _beyond(residual: NDArray, floor: NDArray) -> NDArray[np.bool_]:
     if not len(seen):
         return np.zeros(residual.shape, dtype=bool)
     with np.errstate(invalid="ignore"):
-        return np.asarray(residual > np.fmax(floor, 4.5 * 1.4826 * np.median(seen)))
+        return np.asarray(residual > np.fmax(floor, 4.5 * NORMAL * np.median(seen)))
 
 
 def _align(source: NDArray, target: NDArray) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Image error measures over a region of pixels: RMSE, PSNR, SSIM and FLIP."""
+"""Image error measures over a region of pixels, RMSE, PSNR, SSIM and FLIP, and the deviation of residuals."""
 
 from __future__ import annotations
 
@@ -13,6 +13,13 @@ from mifit.errors import InputError
 
 Image = NDArray
 Mask = NDArray[np.bool_] | None
+NORMAL = 1.4826
+"""Standard deviation of a normal distribution over the median of its absolute value."""
+
+
+def median_deviation(residuals: NDArray) -> float:
+    """Standard deviation by the median of absolute residuals, which outliers don't move; 0 of none."""
+    return NORMAL * float(np.median(np.abs(residuals))) if residuals.size else 0.0
 
 
 def rmse(image: Image, reference: Image, mask: Mask = None) -> float:

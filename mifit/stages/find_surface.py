@@ -25,6 +25,7 @@ from mifit.core.camera import Camera
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.metrics import median_deviation
 from mifit.core.process import one_blas_thread
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.morphable.openings import leading_faces, skin_weights
@@ -67,8 +68,6 @@ ROBUST_STEPS = 0.7
 """Distance from the surface, in steps of the sweep, where an offset counts as an outlier."""
 INDEPENDENT = 0.1
 """Part of the landmarks that count as measured on their own: neighbours are off alike."""
-MEDIAN_DEVIATIONS = 1.4826
-"""Standard deviation of a normal distribution over the median of its absolute value."""
 OUTLIER_DEVIATIONS = 4.0
 """Distance from the surface, in deviations, where a landmark counts as an outlier."""
 THIN = 2
@@ -258,18 +257,13 @@ class Landmarks:
                     views.append((step, capture.camera(name), model.landmarks[index], pixels))
         return cls(model.n_vertices, views)
 
-    @staticmethod
-    def _deviation(residuals: Sequence[NDArray]) -> float:
-        """Of a coordinate, pixels: by the median residual, in which what the surface lacks counts as the detector's."""
-        apart = np.concatenate([np.zeros(0), *(np.abs(one).ravel() for one in residuals)])
-        apart = apart[np.isfinite(apart)]
-        return max(MEDIAN_DEVIATIONS * float(np.median(apart)), 1.0) if len(apart) else 1.0
-
     def at(self, world: NDArray, rotation: NDArray) -> Measurements:
         """What they measure at a surface (T, V, 3), with directions in object space."""
         rows, directions, offsets, precisions = [np.zeros(0, int)], [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0)]
         residuals = [pixels - camera.project(world[step][vertices]) for step, camera, vertices, pixels in self.views]
-        deviation = self._deviation(residuals)
+        apart = np.concatenate([np.zeros((0, 2)), *residuals])
+        # Of a coordinate, pixels: what the surface lacks counts as the detector's.
+        deviation = max(median_deviation(apart[np.isfinite(apart)]), 1.0)
         for (step, camera, vertices, _), apart in zip(self.views, residuals, strict=True):
             depth = camera.to_camera(world[step][vertices])[:, 2]
             good = np.flatnonzero((depth > 0) & np.isfinite(apart).all(axis=1))

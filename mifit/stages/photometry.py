@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from mifit.config import PhotometryConfig
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate
+from mifit.core.metrics import median_deviation
 from mifit.core.photometry import Photometry
 from mifit.core.sh import bands, basis, cosine_coefficients
 from mifit.optim import geman_mcclure
@@ -243,7 +244,7 @@ def solve_factors(seen: Observations, albedo: NDArray, factors: Factors) -> Solu
         albedo_step = (right_albedo - mixed @ step) / diagonal
         damped = min(1.0, 0.5 / max(float(np.abs(albedo_step).max()), 1e-12)) if number < 3 else 1.0
         x, log_albedo = x + damped * step, log_albedo + damped * albedo_step
-        sigma = max(1.4826 * float(np.median(np.abs(residual[measured]))), 1e-3)
+        sigma = max(median_deviation(residual[measured]), 1e-3)
         if number > 5 and np.abs(step[:u]).max() < SETTLED:
             break
     return Solution(factors, x[:u], np.sqrt(np.diag(np.linalg.inv(system + floor)))[:u])

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from mifit.core.estimate import Label
 from mifit.core.image import box, to_8_bit
 from mifit.core.mesh import interpolate
+from mifit.core.metrics import NORMAL
 from mifit.core.process import on_all_cores
 from mifit.morphable.topology import EYES_AND_MOUTH
 from mifit.sampling.visibility import DARKEST
@@ -104,7 +105,7 @@ def common_albedos(surface: Surface, appearance: Forward, light: NDArray) -> Alb
     skin = np.median(centre[known], axis=0).astype(np.float64) if known.any() else np.zeros(3)
     bare = known & ~no_skin(centre, skin)
     apart = np.abs(flat - centre[:, None])[(weight > 0) & bare[:, None]]
-    deviation = np.maximum(1.4826 * np.median(apart, axis=0).astype(np.float64), FLOOR) if len(apart) else FLOOR
+    deviation = np.maximum(NORMAL * np.median(apart, axis=0).astype(np.float64), FLOOR) if len(apart) else FLOOR
     index, size = surface.texels.index[np.concatenate(texels)], surface.texels.size
 
     def to_map(values: NDArray) -> NDArray[np.float32]:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from mifit.core.metrics import psnr, rmse, ssim
+from mifit.core.metrics import median_deviation, psnr, rmse, ssim
 from mifit.errors import InputError
 
 
@@ -61,3 +61,10 @@ def test_bad_input_is_named():
         rmse(np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((2, 2), bool))
     with pytest.raises(InputError, match="mask of shape"):
         psnr(np.zeros((2, 2)), np.zeros((2, 2)), np.ones((3, 2), bool))
+
+
+def test_outliers_do_not_move_the_deviation_of_residuals():
+    residuals = 2.0 * np.random.default_rng(0).normal(size=20_000)
+    residuals[:1000] = 1e6
+    assert median_deviation(residuals) == pytest.approx(2.0, rel=0.1)
+    assert median_deviation(np.zeros(0)) == 0.0

@@ -12,6 +12,7 @@ from mifit.capture import Capture
 from mifit.config import GeometryConfig
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross
+from mifit.core.metrics import median_deviation
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.topology import INNER
@@ -337,7 +338,7 @@ def coordinate_deviation(state: State, views: tuple[LandmarkView, ...]) -> float
     """Robust standard deviation of a landmark coordinate's residual, pixels."""
     term = LandmarkTerm(views, np.inf)
     residual = [term.distances(view, state.layout, state.frames, state.x).ravel() for view in views]
-    return 1.4826 * float(np.median(np.abs(np.concatenate(residual))))
+    return median_deviation(np.concatenate(residual))
 
 
 def world_vertices(model: MorphableModel, state: State) -> NDArray[np.float64]:

@@ -12,6 +12,7 @@ from mifit.appearance import models
 from mifit.appearance.formation import Appearance, form_image
 from mifit.appearance.lobe import Lobe
 from mifit.config import ReflectanceConfig
+from mifit.core.metrics import median_deviation
 from mifit.core.process import blocks, on_all_cores
 from mifit.core.uv import TexelMap
 from mifit.optim import Outcome
@@ -273,7 +274,7 @@ def residual_sizes(shaded: _Shaded, weight: NDArray, residual: NDArray) -> tuple
     measured = weight > 0
     size = np.abs(residual) * np.sqrt(weight)
     some = size[measured]
-    usual = 1.4826 * float(np.median(some[:: max(1, len(some) // 200_000)])) if len(some) else 0.0
+    usual = median_deviation(some[:: max(1, len(some) // 200_000)])
     sums = np.sqrt(np.pi / 2) * np.where(measured, size, 0.0).sum((1, 2))
     return usual, shaded.spread(np.stack([sums, measured.sum((1, 2))], axis=1).astype(np.float32))
 

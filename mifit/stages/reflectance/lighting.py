@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mifit.appearance.formation import form_image
 from mifit.appearance.reception import fibonacci_sphere
+from mifit.core.metrics import median_deviation
 from mifit.core.process import blocks, on_all_cores
 from mifit.core.sh import bands, basis
 from mifit.optim import Outcome
@@ -237,7 +238,7 @@ def active_weight(
     """Weights of this iteration: clipped observations count only where the model is too dark, outliers less."""
     measured = np.flatnonzero((weight > 0) & ~clipped[..., None])
     some = measured[:: max(1, len(measured) // 200_000)]
-    sigma = 1.4826 * float(np.median(np.abs(residual.reshape(-1)[some]))) if len(some) else 0.0
+    sigma = median_deviation(residual.reshape(-1)[some])
     active = np.empty(np.broadcast_shapes(weight.shape, residual.shape), np.float32)
 
     def fill(rows: slice) -> None:

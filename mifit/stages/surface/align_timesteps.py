@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate
+from mifit.core.metrics import median_deviation
 from mifit.core.process import threads
 from mifit.core.uv import TexelMap
 from mifit.morphable import MorphableModel
@@ -198,7 +199,7 @@ def _steps(
         return None
     mean = (weight * value).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-6)
     residual = np.where(used, value - mean, 0.0)
-    spread = max(1.4826 * float(np.median(np.abs(residual[used]))), LEAST_SPREAD)
+    spread = max(median_deviation(residual[used]), LEAST_SPREAD)
     weight = np.where(used, weight / (1.0 + (residual / (2.0 * spread)) ** 2) ** 2, 0.0) * INDEPENDENT / spread**2
     prior = np.diag(wide**-2.0)
     system, gradient = np.tile(prior, (len(spent), 1, 1)), spent @ prior

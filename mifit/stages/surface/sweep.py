@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.mesh import normalize
+from mifit.core.metrics import median_deviation
 from mifit.core.process import threads
 from mifit.core.uv import TexelMap
 from mifit.stages.surface.band import FeatureImage
@@ -205,7 +206,7 @@ def _without_glare(difference: NDArray, valid: NDArray, deviations: float) -> ND
     if not valid.any():
         return np.ones(len(difference), np.float32)
     difference = difference - np.median(difference[valid])
-    spread = 1.4826 * float(np.median(np.abs(difference[valid]))) if deviations else 0.0
+    spread = median_deviation(difference[valid]) if deviations else 0.0
     return (1.0 / (1.0 + (difference / max(GLARE, deviations * spread)) ** 2) ** 2).astype(np.float32)
 
 
