@@ -169,7 +169,7 @@ evaluate  results.evaluate  error on a held-out view
     result       path   result folder of mifit fit
     --capture!   path   capture that has the view
     --camera!    text   camera to judge by, one that was not fitted
-    --timesteps  steps  default: all of the result; at one without a fit landmarks place the head
+    --timesteps  steps  of the result; default: all
     --region     face|skin|truth=face  the fitted model's face area (default); skin, as the benchmarks have it; the
         truth's face area
     --fitted     flag   of a camera that was fitted: its error is no held-out one

@@ -32,12 +32,11 @@ def evaluate(arguments: Namespace) -> int:
 def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> int:
     """`evaluate` of a result that has been read, or just been made and written into ``arguments.result``."""
     from mifit.fitting import fitted_to
-    from mifit.output.evaluate import Comparison, evaluate, held_out
+    from mifit.output.evaluate import Comparison, evaluate
     from mifit.output.report import SHOWN_TIMESTEPS, write_report
     from mifit.result.ownership import replacing_files
 
-    judged = {"camera": arguments.camera, "timesteps": arguments.timesteps or result.timesteps}
-    if not held_out(result, judged) and not arguments.fitted:
+    if arguments.camera in [camera.name for camera in result.cameras] and not arguments.fitted:
         raise InputError(
             f"camera {arguments.camera!r} was fitted, so this is no held-out error; name another one, or --fitted to "
             "see how well it was fitted"
@@ -63,11 +62,6 @@ def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> int
         asked = {key: value for key, value in found.items() if key != "baseline" or arguments.baseline}
         write_text(arguments.json, json.dumps(asked, indent=2) + "\n")
     print(f"camera {found['camera']}, timesteps {found['timesteps']}, {found['region_pixels']} pixels")
-    placed = {f"timestep {t} was not fitted: the head was placed by its": p for t, p in found.get("posed", {}).items()}
-    if "resected" in found:
-        placed[f"camera {found['camera']} is not calibrated: placed against the fitted head by its"] = found["resected"]
-    for what, figures in placed.items():
-        print(f"{what} landmarks, {figures['landmark_pixels']:.1f} pixels beside them")
     _print_measures(found["methods"])
     if arguments.baseline:
         print(f"image-based rendering on the same mesh, {found['baseline']['region_pixels']} pixels that it can fill")

@@ -19,7 +19,6 @@ from mifit.core.image import to_8_bit
 from mifit.errors import InputError
 from mifit.output.compare import Errors, pass_region, separation, skin_region
 from mifit.output.deferred import shade_methods, visible_surface
-from mifit.output.placement import needs_resection, pose_head, resect
 from mifit.output.truth import landmarks_of, true_mesh, true_passes
 from mifit.progress import Progress, silent
 from mifit.render.image_based import BLENDS, image_based
@@ -39,8 +38,7 @@ class Comparison:
     ``region`` (H, W) are pixels that count, the same for all methods; ``renders`` (H, W, 4) by method are colour, 0
     where the model covers nothing, and coverage. ``baseline`` (H, W, 3) is image-based rendering from the fitted views
     on the fitted mesh (`render.image_based`) by several blends, the first one ``image_based``; ``seen`` (H, W) the
-    pixels of the region whose point a fitted view sees, those that it is compared on. Of a timestep that wasn't fitted
-    ``landmark_pixels`` says how far the head that its landmarks placed lies beside them.
+    pixels of the region whose point a fitted view sees, those that it is compared on.
     """
 
     timestep: int
@@ -49,7 +47,6 @@ class Comparison:
     renders: dict[Method, NDArray[np.uint8]]
     baseline: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
     seen: NDArray[np.bool_] | None = None
-    landmark_pixels: float | None = None
 
 
 @checked
@@ -67,9 +64,7 @@ def evaluate(
     """Errors of renders against photographs over the face area, in 8-bit sRGB.
 
     The region is the same for all methods. A pixel of it that the fitted model doesn't cover counts as black; pixels
-    without a value after undistortion don't count. Over several timesteps squared errors are pooled over all pixels. A
-    camera of an uncalibrated capture that was not fitted, and the head of a timestep that was not fitted, are placed by
-    landmarks (`output.placement`); image-based rendering then takes its colours from all fitted timesteps.
+    without a value after undistortion don't count. Over several timesteps squared errors are pooled over all pixels.
 
     Parameters
     ----------
@@ -78,7 +73,7 @@ def evaluate(
     camera : str
         A camera of the capture.
     timesteps : sequence of int, optional
-        Default: the timesteps that were fitted.
+        Of the result; default: all of it.
     region : {"face", "skin", "truth"}
         ``face``: face area of the fitted model, eroded by 2 pixels; ``truth``: that of the capture's true mesh;
         ``skin``: the hull of the landmarks without eyes and inner mouth (`output.compare.skin_region`), where a fitted
@@ -97,24 +92,19 @@ def evaluate(
         ``camera``, ``timesteps``, ``region``, ``region_pixels``, ``methods``: by method what
         `output.compare.Errors.figures` gives; ``per_timestep``: a list of ``timestep``, ``region_pixels`` and
         ``methods``. With ``baseline`` also ``baseline``: ``region_pixels`` and ``methods`` over the pixels that a
-        fitted view sees, ``image_based``, ``image_based_nearest`` and ``image_based_angle`` among them. For a camera
-        that had to be placed ``resected``: ``landmark_pixels`` and ``focal_pixels``; for timesteps without a fit
-        ``posed``, by timestep ``landmark_pixels``; with ``passes`` what `output.compare.separation` gives.
+        fitted view sees, ``image_based``, ``image_based_nearest`` and ``image_based_angle`` among them; with
+        ``passes`` what `output.compare.separation` gives.
 
     Raises
     ------
     InputError
-        Unknown camera or timestep, a head or a camera that has too few landmarks to be placed by, no ground truth, or
-        a face area that is not visible.
+        Unknown camera or timestep, a camera without calibration, no ground truth, or a face area that is not visible.
     """
     steps = result.timesteps if timesteps is None else tuple(timesteps)
     if not steps:
         raise InputError("timesteps: found none, expected at least one")
-    placed = resect(result, capture, camera) if needs_resection(result, capture, camera) else None
-    if placed is not None:
-        capture = capture.with_estimate([*result.cameras, placed[0]])
     separated = separation_of(result, capture, camera) if passes else None
-    per_timestep, posed = [], {}
+    per_timestep = []
     whole: dict[str, Errors] = defaultdict(Errors)
     seen: dict[str, Errors] = defaultdict(Errors)
     progress("Evaluating", 0, len(steps))
@@ -126,8 +116,6 @@ def evaluate(
             for name, image in {**found.baseline, **renders}.items():
                 seen[name].add(image, found.photograph, found.seen)
         per_timestep.append({"timestep": timestep, "region_pixels": int(found.region.sum()), "methods": figures})
-        if found.landmark_pixels is not None:
-            posed[str(timestep)] = {"landmark_pixels": found.landmark_pixels}
         if watch is not None:
             watch(found)
         progress("Evaluating", done + 1, len(steps))
@@ -142,10 +130,6 @@ def evaluate(
         out["baseline"] = _figures(seen)
     if separated is not None:
         out["passes"] = separated
-    if posed:
-        out["posed"] = posed
-    if placed is not None:
-        out["resected"] = {"landmark_pixels": placed[1], "focal_pixels": placed[0].fx}
     return out
 
 
@@ -168,7 +152,7 @@ def separation_of(result: Reconstruction, capture: Capture, camera: str) -> dict
     if timestep not in result.timesteps or "diffuse" not in result.methods:
         raise InputError(f"--passes: needs reflectance and timestep {timestep}, of which the truth's passes are")
     alone = replace(result, residual=None)
-    view = located(capture, result, camera).camera(camera)
+    view = result.seen(capture).camera(camera)
     surface = visible_surface(alone, view, timestep)
     linear = shade_methods(alone, surface, timestep, ("full", "diffuse"))
     full, diffuse = (linear[method] for method in ("full", "diffuse"))
@@ -186,28 +170,21 @@ def compare(
     baseline: bool = False,
 ) -> Comparison:
     """Render one view by all methods and find the region in which to compare it; see `evaluate`."""
-    capture = located(capture, result, camera)
-    view = capture.camera(camera)
-    shown, moments, off = result, None, None
-    if timestep not in result.timesteps:
-        shown, off = pose_head(result, capture, timestep)
-        moments = dict(zip(result.timesteps, result.geometry.vertices, strict=True))
-    elif timestep not in capture.timesteps:
+    if timestep not in capture.timesteps:
         raise InputError(f"timestep {timestep} is not in the capture; it has {', '.join(map(str, capture.timesteps))}")
+    capture = result.seen(capture)
+    view = capture.camera(camera)
+    model, vertices = result.model, result.geometry.vertices[result.index(timestep)]
     frame = capture.frame(camera, timestep)
-    linear = shade_methods(shown, visible_surface(shown, view, timestep), timestep, shown.methods)
-    model, vertices = shown.model, shown.geometry.vertices[shown.index(timestep)]
+    linear = shade_methods(result, visible_surface(result, view, timestep), timestep, result.methods)
     if region == "face":
         area = face_area(vertices, model.faces, model.face_mask, view)
     elif region == "skin":
         true = None
         with suppress(InputError):  # a truth of unknown faces
             true = true_mesh(capture, timestep, model)
-        points, moved = vertices, moments
-        faces: NDArray = model.faces
-        if true is not None:
-            points, faces, moved = true.vertices, true.faces, None
-        sight = image_based(capture, shown.cameras, view, timestep, points, faces, moments=moved, oversampling=2)
+        mesh = (vertices, model.faces) if true is None else (true.vertices, true.faces)
+        sight = image_based(capture, result.cameras, view, timestep, *mesh, oversampling=2)
         area = skin_region(landmarks_of(capture, camera, timestep), view) & sight.seen
     elif region == "truth":
         truth = true_mesh(capture, timestep, result.model)
@@ -225,27 +202,11 @@ def compare(
     renders = {m: rgba_8_bit(image) for m, image in linear.items()}
     photograph = to_8_bit(frame.image)
     if not baseline:
-        return Comparison(timestep, photograph, area, renders, landmark_pixels=off)
-    given = capture, shown.cameras, view, timestep, vertices, model.faces
-    base = image_based(*given, moments=moments, blends=BLENDS, oversampling=2)
+        return Comparison(timestep, photograph, area, renders)
+    base = image_based(capture, result.cameras, view, timestep, vertices, model.faces, blends=BLENDS, oversampling=2)
     names = {blend: "image_based" if blend == BLENDS[0] else f"image_based_{blend}" for blend in BLENDS}
     blended = {names[blend]: to_8_bit(image) for blend, image in base.colours.items()}
-    return Comparison(timestep, photograph, area, renders, blended, area & base.seen, off)
-
-
-def held_out(result: Reconstruction, found: Document) -> bool:
-    """Whether nothing that an evaluation compared with was fitted: another camera, or timesteps without a fit."""
-    fitted = found["camera"] in [c.name for c in result.cameras]
-    return not fitted or not set(found["timesteps"]) & set(result.timesteps)
-
-
-def located(capture: Capture, result: Reconstruction, camera: str) -> Capture:
-    """The capture with the fitted cameras, and with the named one placed where it is neither calibrated nor fitted."""
-    if needs_resection(result, capture, camera):
-        return capture.with_estimate([*result.cameras, resect(result, capture, camera)[0]])
-    if camera in capture.estimated:
-        return capture
-    return result.seen(capture)
+    return Comparison(timestep, photograph, area, renders, blended, area & base.seen)
 
 
 def rgba_8_bit(linear: NDArray) -> NDArray[np.uint8]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import mifit
 from mifit.core.files import Document, write_text
 from mifit.core.image import to_8_bit
-from mifit.output.evaluate import Comparison, compare, face_area, held_out, rgba_8_bit
+from mifit.output.evaluate import Comparison, compare, face_area, rgba_8_bit
 from mifit.output.figures import (
     CLIPPED_TINT,
     HEAT_LIMIT,
@@ -142,7 +142,8 @@ def _summary(result: Reconstruction, evaluation: Document | None) -> str:
     if evaluation is None:
         parts.append("<p>No held-out view was evaluated; <code>mifit evaluate</code> adds one to this page.</p>")
     else:
-        kind = "held out, never fitted" if held_out(result, evaluation) else "this camera was fitted, so it is no test"
+        fitted = evaluation["camera"] in [camera.name for camera in result.cameras]
+        kind = "this camera was fitted, so it is no test" if fitted else "held out, never fitted"
         area = {"face": "the fitted model's face area", "skin": "skin"}.get(evaluation["region"], "the true face area")
         parts.append(
             f"<p>Error on camera <b>{html.escape(evaluation['camera'])}</b> ({kind}), over "

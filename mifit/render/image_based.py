@@ -12,7 +12,7 @@ skin is like.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -26,7 +26,6 @@ from mifit.render.visible import occluding_mesh, trace_mesh
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
-    from mifit.render.gbuffer import SurfaceScene
 
 Blend = Literal["cosine", "nearest", "angle"]
 BLENDS: tuple[Blend, ...] = ("cosine", "nearest", "angle")
@@ -63,8 +62,6 @@ def image_based(
     timestep: int,
     vertices: NDArray,
     faces: NDArray,
-    scene: SurfaceScene | None = None,
-    moments: Mapping[int, NDArray] | None = None,
     blends: Sequence[Blend] = ("cosine",),
     oversampling: int = 1,
 ) -> ImageBased:
@@ -79,46 +76,43 @@ def image_based(
     camera : Camera
         Undistorted camera of the wanted view.
     vertices : (V, 3), faces : (F, 3)
-        Mesh in the capture's world space; ``scene`` is one of it, where there is one.
-    moments : dict of timestep to (V, 3), optional
-        Timesteps whose photographs give the colours, with the mesh's vertices then; ``timestep`` alone by default.
+        Mesh in the capture's world space.
     blends : sequence of {"cosine", "nearest", "angle"}
     oversampling : int
         Samples per pixel along each side; a pixel is the mean of its samples that hit, and has a face (that of one of
         them) or is seen where all of its samples do.
     """
-    surface = trace_mesh(vertices, faces, camera, oversampling, scene)
+    surface = trace_mesh(vertices, faces, camera, oversampling)
     face, wanted, count = surface.face, surface.view, len(surface.face)
     total = {blend: np.zeros((count, 3)) for blend in blends}
     weight = {blend: np.zeros(count) for blend in blends}
     spare, best = np.zeros((count, 3)), np.full(count, -np.inf)
-    for moment, then in (moments or {timestep: vertices}).items():
-        there = scene if then is vertices and scene is not None else occluding_mesh(then, faces).scene
-        normal = normalize(face_cross(then, faces)[face])
-        point = interpolate(np.asarray(then, np.float64), faces, face, surface.weights)
-        for view in fitted:
-            frame = capture.frame(view.name, moment)
-            x, y = (view.project(point) - 0.5).T
-            inside = (x >= 0) & (y >= 0) & (x <= view.width - 1) & (y <= view.height - 1)
-            x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
-            inside &= bilinear(frame.valid.astype(np.float32), x, y) > 0.999
-            colour = bilinear(frame.image, x, y)
-            towards = normalize(view.position - point)
-            cosine = np.sum(normal * towards, axis=1)
-            facing = np.where(inside, cosine, -np.inf)
-            spare[facing > best] = colour[facing > best]
-            best = np.maximum(best, facing)
-            # At a flatter angle a pixel covers too much of the surface.
-            visible = inside & (cosine > 0.15) & there.visible_from(point, view.position)
-            for blend in blends:
-                share = np.where(visible, _weight(blend, cosine, np.sum(towards * wanted, axis=1)), 0.0)
-                if blend == "nearest":  # the largest takes all
-                    nearer = share > weight[blend]
-                    total[blend][nearer] = share[nearer, None] * colour[nearer]
-                    weight[blend] = np.maximum(weight[blend], share)
-                else:
-                    total[blend] += share[:, None] * colour
-                    weight[blend] += share
+    there = occluding_mesh(vertices, faces).scene
+    normal = normalize(face_cross(vertices, faces)[face])
+    point = interpolate(np.asarray(vertices, np.float64), faces, face, surface.weights)
+    for view in fitted:
+        frame = capture.frame(view.name, timestep)
+        x, y = (view.project(point) - 0.5).T
+        inside = (x >= 0) & (y >= 0) & (x <= view.width - 1) & (y <= view.height - 1)
+        x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
+        inside &= bilinear(frame.valid.astype(np.float32), x, y) > 0.999
+        colour = bilinear(frame.image, x, y)
+        towards = normalize(view.position - point)
+        cosine = np.sum(normal * towards, axis=1)
+        facing = np.where(inside, cosine, -np.inf)
+        spare[facing > best] = colour[facing > best]
+        best = np.maximum(best, facing)
+        # At a flatter angle a pixel covers too much of the surface.
+        visible = inside & (cosine > 0.15) & there.visible_from(point, view.position)
+        for blend in blends:
+            share = np.where(visible, _weight(blend, cosine, np.sum(towards * wanted, axis=1)), 0.0)
+            if blend == "nearest":  # the largest takes all
+                nearer = share > weight[blend]
+                total[blend][nearer] = share[nearer, None] * colour[nearer]
+                weight[blend] = np.maximum(weight[blend], share)
+            else:
+                total[blend] += share[:, None] * colour
+                weight[blend] += share
     seen = next(iter(weight.values())) > 0
     colours = {}
     for blend in blends:

@@ -45,17 +45,15 @@ def trace_mesh(
     faces: NDArray,
     camera: Camera,
     oversampling: int,
-    scene: SurfaceScene | None = None,
     joined: NDArray[np.bool_] | None = None,
 ) -> VisibleSurface:
     """The front-facing surface of a mesh under a camera's samples.
 
     A sample whose nearest surface shows its back (the inside of the head through an eye opening) is not covered.
-    ``scene`` is one of this mesh, where there is one. A pixel's samples on one of the faces ``joined`` (F,) become one
-    in their middle.
+    A pixel's samples on one of the faces ``joined`` (F,) become one in their middle.
     """
     k, shape = oversampling, (camera.height, camera.width)
-    buffer = (scene or occluding_mesh(vertices, faces).scene).gbuffer(camera if k == 1 else camera.resized(k))
+    buffer = occluding_mesh(vertices, faces).scene.gbuffer(camera if k == 1 else camera.resized(k))
     by_pixel = buffer.face.reshape(shape[0], k, shape[1], k).transpose(0, 2, 1, 3).reshape(-1, k * k)
     covered = np.flatnonzero((by_pixel >= 0).any(axis=1))
     face = by_pixel[covered]
