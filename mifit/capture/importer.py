@@ -68,7 +68,7 @@ def import_capture(
         One video per camera; lengths, rates and sizes may differ, and frames are paired by time. Cameras are called
         after the files' stems.
     calibration : path, optional
-        OpenCV stereo calibration, YAML or XML.
+        OpenCV stereo calibration, YAML.
     images : sequence of path
         One folder of images per camera, in the order of the numbers in the file names; or one photograph each.
     transforms : path, optional

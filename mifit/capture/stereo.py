@@ -1,28 +1,35 @@
-"""OpenCV stereo calibrations: YAML or XML with M1, D1, M2, D2, R, T, as OpenCV's stereo sample writes them.
+"""OpenCV stereo calibrations: YAML with M1, D1, M2, D2, R, T, as OpenCV's stereo sample writes them.
 
 A point ``x`` in the first camera's frame is ``R x + T`` in the second's. OpenCV puts the first pixel's centre at
 (0, 0); principal points move by half a pixel on the way in and out. World space is chosen as the first camera's
-frame with OpenGL axes (y up, the subject looking along +z).
+frame with OpenGL axes (y up, the subject looking along +z). Files are read without OpenCV, whose own reader ends the
+process on some damaged ones.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from mifit.capture.lens import opencv_matrix
-from mifit.capture.opencv_nodes import Nodes, read_nodes
 from mifit.capture.transforms import View, nearest_rotation
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
-from mifit.core.files import replacing
+from mifit.core.files import read_text, replacing
+from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 
 _MATRICES = (("M1", "K1", "cameraMatrix1"), ("M2", "K2", "cameraMatrix2"))
 _DISTORTIONS = (("D1", "distCoeffs1"), ("D2", "distCoeffs2"))
+_Loader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
+"""Builds text, lists and maps and nothing else, whatever the tags say; numbers are made of the text here."""
+
+Nodes = dict[str, NDArray[np.float64] | float]
 
 
 def read_stereo(path: str | Path, names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> tuple[View, View]:
@@ -31,7 +38,7 @@ def read_stereo(path: str | Path, names: Sequence[str], sizes: Sequence[tuple[in
     Parameters
     ----------
     path : path
-        YAML or XML file. Without ``R`` and ``T`` in it, ``extrinsics`` of the same suffix beside it is read too.
+        YAML file. Without ``R`` and ``T`` in it, ``extrinsics`` of the same suffix beside it is read too.
     names : two str
         Names of the first and the second camera.
     sizes : two (width, height)
@@ -117,3 +124,65 @@ def _check_size(found: Nodes, sizes: Sequence[tuple[int, int]], path: Path) -> N
                 f"{path}: calibrated for {width} x {height} pixels, but the images have "
                 f"{size[0]} x {size[1]}; calibrate at their size"
             )
+
+
+def read_nodes(path: Path) -> Nodes:
+    """Matrices and numbers at the top level of an OpenCV YAML file by name; strings, lists and maps are left out.
+
+    Raises
+    ------
+    InputError
+        The file is missing, no YAML of OpenCV's, or a matrix holds another number of values than it says.
+    """
+    text = read_text(path, MAX_SETTINGS_BYTES, "calibration file").lstrip("\ufeff \r\n\t")
+    if not text.startswith("%YAML"):
+        raise _unreadable(path, f"it starts with {text[:12]!r}, expected %YAML")
+    text = re.sub(r"\A%YAML[: ]1\.\d", "%YAML 1.1", text)  # OpenCV 4 writes %YAML:1.0, 5 writes %YAML 1.2
+    try:
+        depth = 0
+        for event in yaml.parse(text, Loader=_Loader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > 16:  # OpenCV's matrices are two deep
+                raise _unreadable(path, "nested more than 16 deep")
+            if isinstance(event, yaml.AliasEvent):
+                raise _unreadable(path, "an alias, which OpenCV never writes")
+        documents = list(yaml.load_all(text, Loader=_Loader))  # OpenCV appends as another document
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        raise _unreadable(path, str(error)) from None
+    found: Nodes = {}
+    for document in documents:
+        for name, value in document.items() if isinstance(document, dict) else ():
+            if isinstance(value, dict) and isinstance(value.get("data"), list):
+                found[str(name)] = _node_matrix(value, f"{path}: {name}")
+            elif (number := _number(str(value))) is not None:
+                found[str(name)] = number
+    if not found:
+        raise _unreadable(path, "no matrix and no number found")
+    return found
+
+
+def _node_matrix(node: dict, where: str) -> NDArray[np.float64]:
+    rows, columns, kind = (str(node.get(key, "")) for key in ("rows", "cols", "dt"))
+    values = [_number(str(word)) for word in node["data"]]
+    shaped = rows.isdecimal() and columns.isdecimal() and len(rows + columns) < 10
+    if not shaped or int(rows) * int(columns) != len(values) or None in values or len(kind.strip('"')) > 1:
+        raise InputError(
+            f"{where}: found {len(values)} values for {rows or '?'} x {columns or '?'} of type {kind or '?'}, expected "
+            "a matrix of single numbers, as many as rows times cols"
+        )
+    return np.array(values, dtype=np.float64).reshape(int(rows), int(columns))
+
+
+def _number(text: str) -> float | None:
+    """A number as OpenCV writes it (infinities are ``.Inf``, the other one ``.Nan``), or None."""
+    word = text.strip()
+    if word.lstrip("+-").lower() in (".inf", ".nan"):
+        word = word.replace(".", "", 1)
+    try:
+        return float(word)
+    except ValueError:
+        return None
+
+
+def _unreadable(path: Path, reason: str) -> InputError:
+    return InputError(f"{path}: not a readable OpenCV YAML file ({' '.join(reason.split())[-80:]})")

@@ -74,15 +74,14 @@ def import_(arguments: Namespace) -> None:
     """Make a capture from other files."""
     from mifit.capture import import_capture
     from mifit.capture.sources import open_sources
-    from mifit.extras.importers import KINDS, REGISTRATIONS, import_from
+    from mifit.extras.colmap import import_colmap
 
-    sources = {name: getattr(arguments, name) for name in ("calibration", "transforms", *KINDS)}
+    sources = {name: getattr(arguments, name) for name in ("calibration", "transforms", "colmap")}
     given = [name for name, path in sources.items() if path is not None]
     if len(given) > 1:
         raise InputError(f"found more than one of {', '.join(given)}, expected one")
-    kind = given[0] if given else None
-    if arguments.photos is not None and kind not in REGISTRATIONS:
-        raise InputError(f"photos: found without a model to go with, expected one of {', '.join(REGISTRATIONS)}")
+    if arguments.photos is not None and arguments.colmap is None:
+        raise InputError("--photos: found without a model to go with, expected --colmap")
     options = {name: getattr(arguments, name) for name in ("images", "every", "start", "count", "trim", "units")} | {
         "videos": arguments.video,
         "progress": console_progress(arguments.quiet),
@@ -91,8 +90,8 @@ def import_(arguments: Namespace) -> None:
         options["starts"] = start_times(
             arguments, open_sources(arguments.video, ()), arguments.offset, options["progress"]
         )
-    if kind in KINDS:
-        import_from(kind, sources[kind], arguments.out, photos=arguments.photos, **options)
+    if arguments.colmap is not None:
+        import_colmap(arguments.colmap, arguments.out, photos=arguments.photos, **options)
     else:
         import_capture(arguments.out, calibration=arguments.calibration, transforms=arguments.transforms, **options)
     print(f"Capture: {arguments.out}")

@@ -84,16 +84,12 @@ synth  captures.synth  path-traced captures with ground truth
     --relit+         path             of --head: environments of relit true views
     --force          flag             write into a folder that holds something already
 
-import  captures.import_  a capture from videos, image folders, photogrammetry projects, nerfstudio, VHAP or NeRSemble
+import  captures.import_  a capture from videos, image folders, COLMAP text models or nerfstudio
     --video*          path  one camera's video; repeat per camera
     --images*         path  one camera's folder of images; repeat
-    --calibration     path  OpenCV stereo calibration, YAML or XML
-    --colmap          path  folder of a COLMAP model, text or binary
-    --metashape       path  cameras exported by Metashape as XML
-    --realitycapture  path  folder of RealityCapture's XMP files
-    --photos          path  folder of the photographs of these three (default: beside them)
-    --vhap            path  folder exported by VHAP
-    --nersemble       path  folder of one sequence of NeRSemble
+    --calibration     path  OpenCV stereo calibration, YAML
+    --colmap          path  folder of a COLMAP text model
+    --photos          path  of --colmap: folder of the photographs (default: beside the model)
     --transforms      path  nerfstudio transforms.json
     --units           text  unit of length of the cameras: mm, cm, dm or m (default: as the source has it, or cm)
     {OFFSET}

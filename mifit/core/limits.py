@@ -22,8 +22,6 @@ MAX_VIDEO_FRAMES = 10**6
 """Frames of one video, nine hours at 30 per second."""
 MAX_DOCUMENT_BYTES = 64 * 2**20
 """``transforms.json``, ``result.json``, COLMAP and other text with an entry per image."""
-MAX_XML_BYTES = 8 * 2**20
-"""A document of cameras in XML, which takes many times its size in memory: thousands of cameras."""
 MAX_SETTINGS_BYTES = 2**20
 """A configuration, an experiment, a calibration, the landmarks of one image: kilobytes, all of them."""
 MAX_MODEL_BYTES = 4 * 2**30

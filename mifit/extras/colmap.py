@@ -1,21 +1,31 @@
-"""COLMAP's text models: ``cameras.txt`` and ``images.txt``.
+"""``import_colmap``: photographs with the cameras of a COLMAP text model -> a capture folder.
 
-COLMAP's pixels are ours (the first centre at 0.5, 0.5), its camera axes OpenCV's, its poses world to camera.
+COLMAP's pixels are ours (the first centre at 0.5, 0.5), its camera axes OpenCV's, its poses world to camera. Other
+programs write its files too: Metashape and RealityScan among them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from mifit.capture.importer import Material, Selection, import_material, match_views, sources_of
+from mifit.capture.sources import ImageFiles
 from mifit.capture.transforms import View
 from mifit.core.files import read_text
-from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_PIXELS
+from mifit.core.image import SUFFIXES
+from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_NUMBER, MAX_PIXELS
 from mifit.errors import InputError
-from mifit.extras.photos import Photo, local, parse_numbers, view_name
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 _MODELS = {  # where fx, fy, cx, cy and OpenCV's distortion coefficients are among the parameters
     "SIMPLE_PINHOLE": ((0, 0, 1, 2), ()),
@@ -27,6 +37,67 @@ _MODELS = {  # where fx, fy, cx, cy and OpenCV's distortion coefficients are amo
 }
 
 _Camera = tuple[int, int, tuple[float, float, float, float], tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One registered photograph: its name where it was registered (it may have folders) and its camera."""
+
+    name: str
+    view: View
+
+
+def view_name(photo_name: str) -> str:
+    """Camera name of a photograph: its innermost folder, or its stem."""
+    path = PurePosixPath(photo_name.replace("\\", "/"))
+    return path.parent.name or path.stem
+
+
+def import_colmap(
+    model: str | Path,
+    out: str | Path,
+    videos: Sequence[str | Path] = (),
+    images: Sequence[str | Path] = (),
+    photos: str | Path | None = None,
+    units: str | None = None,
+    **options: Unpack[Selection],
+) -> Path:
+    """Make a capture folder from the cameras of a COLMAP model; else as `mifit.capture.import_capture`.
+
+    Parameters
+    ----------
+    model : path
+        Folder with ``cameras.txt`` and ``images.txt``.
+    out : path
+        Folder to make; it must be missing or empty.
+    videos, images : sequence of path
+        Pixels in place of the photographs, for cameras of these names.
+    photos : path, optional
+        Folder of the photographs; default: the model's, or one of the three above it.
+    units : str, optional
+        Default: cm.
+    **options
+        ``every``, ``start``, ``count``, ``starts``, ``trim`` and ``progress``.
+
+    Raises
+    ------
+    InputError
+        Input that is missing, damaged, not synchronous, or doesn't fit together.
+    """
+    model = Path(model)
+
+    def gather() -> Material:
+        sources, found = sources_of(videos, images), read_colmap(model)
+        if sources:
+            views = match_views(sources, [photo.view for photo in found], str(model))
+            return Material(sources, views, {}, units or "cm")
+        folders = (model, *model.absolute().parents[:3]) if photos is None else (Path(photos),)
+        cameras = group_photos(found)
+        files = [ImageFiles.of(name, [find_photo(p.name, folders) for p in group]) for name, group in cameras.items()]
+        views = match_views(files, [group[0].view for group in cameras.values()], str(model))
+        return Material(files, views, {}, units or "cm")
+
+    return import_material(out, gather, units, **options)
 
 
 def read_colmap(folder: str | Path) -> tuple[Photo, ...]:
@@ -60,7 +131,9 @@ def read_colmap(folder: str | Path) -> tuple[Photo, ...]:
         matrix[:3, 3] = pose[4:]
         columns, rows, intrinsics, distortion = cameras[key]
         photos.append(Photo(name, View(view_name(name), columns, rows, intrinsics, distortion, matrix)))
-    return local(photos, str(folder))
+    if not photos:
+        raise InputError(f"{folder / 'images.txt'}: found no image with a pose, expected at least one")
+    return tuple(photos)
 
 
 def _camera(where: str, model: str, words: list[str]) -> _Camera:
@@ -100,3 +173,75 @@ def _lines(path: Path, every: int = 1) -> Iterator[tuple[str, list[str]]]:
     for i, line in kept[::every]:
         if line.strip():
             yield f"{path}: line {i}", line.split()
+
+
+def find_photo(name: str, folders: Sequence[Path]) -> Path:
+    """The file of a photograph, in one of the folders or its ``images``; its name may lack the suffix.
+
+    Raises
+    ------
+    InputError
+        There is none.
+    """
+    relative = PurePosixPath(name.replace("\\", "/"))
+    last = PurePosixPath(relative.name)
+    # a registration may name folders of another machine: then the name alone counts
+    choices = [last] if relative.is_absolute() or ".." in relative.parts or ":" in name else [relative, last]
+    for base in (place for folder in folders for place in (folder, folder / "images")):
+        for choice in dict.fromkeys(choices):
+            file = base / choice
+            if file.is_file():
+                return file
+            if choice.suffix.lower() not in SUFFIXES:
+                beside = (file.with_name(choice.name + end) for s in SUFFIXES for end in (s, s.upper()))
+                if (found := next((path for path in beside if path.is_file()), None)) is not None:
+                    return found
+    raise InputError(
+        f"{folders[0] / relative}: no such image; expected it there or in 'images', or --photos and its folder"
+    )
+
+
+def parse_numbers(words: Sequence[str], count: int, where: str) -> NDArray[np.float64]:
+    """As many numbers as a text must have; InputError for others, NaN and numbers beyond `MAX_NUMBER`."""
+    try:
+        values = np.array([float(word) for word in words[: count + 1]])
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != count or not (np.abs(values) <= MAX_NUMBER).all():
+        text = " ".join(words)
+        found = repr(text if len(text) < 60 else text[:57] + "...")
+        raise InputError(f"{where}: found {found}, expected {count} finite numbers")
+    return values
+
+
+def group_photos(photos: Iterable[Photo]) -> dict[str, list[Photo]]:
+    """Photographs by camera, each in the order of the names.
+
+    Photographs of one folder with one pose are the timesteps of one camera, called after the folder. Where poses differ
+    a camera has moved about a still head: each photograph is a camera of its own, called after its file.
+
+    Raises
+    ------
+    InputError
+        Two photographs that would have one name.
+    """
+    folders: dict[str, list[Photo]] = {}
+    for photo in photos:
+        folders.setdefault(view_name(photo.name), []).append(photo)
+    cameras: dict[str, list[Photo]] = {}
+    for folder, inside in folders.items():
+        first = inside[0].view
+        fixed = all(_same(first, photo.view) for photo in inside)
+        for photo in sorted(inside, key=lambda photo: photo.name):
+            name = folder if fixed else PurePosixPath(photo.name.replace("\\", "/")).stem
+            if name in cameras and not (fixed and cameras[name][0].view.name == folder):
+                raise InputError(
+                    f"photograph {photo.name!r}: another one is called {name!r} too, expected different names"
+                )
+            cameras.setdefault(name, []).append(Photo(photo.name, dataclasses.replace(photo.view, name=name)))
+    return cameras
+
+
+def _same(a: View, b: View) -> bool:
+    pairs = (a.world_to_camera, b.world_to_camera), (a.intrinsics, b.intrinsics)
+    return all(x is not None and y is not None and np.allclose(x, y, rtol=1e-6, atol=1e-6) for x, y in pairs)

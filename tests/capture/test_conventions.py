@@ -91,8 +91,7 @@ def test_stereo_files_hold_opencv_pixels(tmp_path: Path) -> None:
     write_stereo(tmp_path / "s.yml", make_camera("a", -20.0), make_camera("b", 20.0))
     text = (tmp_path / "s.yml").read_text()
     assert "170.80" in text  # 171.3 with the first pixel's centre at 0.5 is 170.8 with it at 0
-    write_stereo(tmp_path / "s.xml", make_camera("a", -20.0), make_camera("b", 20.0))
-    left, _ = read_stereo(tmp_path / "s.xml", ("a", "b"), [(340, 240)] * 2)
+    left, _ = read_stereo(tmp_path / "s.yml", ("a", "b"), [(340, 240)] * 2)
     assert left.intrinsics == pytest.approx((701.25, 699.5, 171.3, 118.9))
 
 

@@ -14,7 +14,7 @@ from mifit.capture import Capture, import_capture
 from mifit.capture.stereo import write_stereo
 from mifit.core.image import read_image
 from mifit.errors import InputError
-from mifit.extras.importers import import_from
+from mifit.extras.colmap import import_colmap
 from tests.extras.photogrammetry import write_colmap
 
 
@@ -121,7 +121,7 @@ def test_numbers_in_names_give_the_order(tmp_path: Path) -> None:
 def test_colmap_model_with_its_images(tmp_path: Path, folder: Path) -> None:
     original = Capture.load(folder)
     write_colmap(folder / "sparse" / "0", [(original.camera(n), f"{n}/0000.png") for n in original.cameras])
-    capture = Capture.load(import_from("colmap", folder / "sparse" / "0", tmp_path / "out"))
+    capture = Capture.load(import_colmap(folder / "sparse" / "0", tmp_path / "out"))
     assert (capture.cameras, capture.timesteps) == (("left", "right"), (0,))
     points = np.random.default_rng(0).normal(size=(20, 3)) * 5
     for name in original.cameras:
@@ -129,7 +129,7 @@ def test_colmap_model_with_its_images(tmp_path: Path, folder: Path) -> None:
             capture.camera(name).project(points), original.camera(name).project(points), atol=1e-3
         )
     images = [folder / "images/left", folder / "images/right"]
-    both = import_from("colmap", folder / "sparse" / "0", tmp_path / "b", images=images)
+    both = import_colmap(folder / "sparse" / "0", tmp_path / "b", images=images)
     assert Capture.load(both).timesteps == (0, 1)
 
 
@@ -177,7 +177,7 @@ def test_bad_imports(tmp_path: Path, folder: Path, pair: list[Path]) -> None:
     other, gone = "has cameras left, expected one called 'right'", "left.0000.png: no such image"
     for images, message in (([left, right], other), ([], gone)):
         with pytest.raises(InputError, match=message):
-            import_from("colmap", tmp_path / "model", out, images=images)
+            import_colmap(tmp_path / "model", out, images=images)
         assert not out.exists()
     with pytest.raises(InputError, match="is there already and not empty"):
         import_capture(folder, images=[left])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import re
 import shlex
 import shutil
@@ -21,7 +20,6 @@ from mifit.core.image import to_8_bit
 from mifit.experiments import load_plan
 from mifit.extras.boards import Board
 from mifit.output.views import write_video
-from tests.extras import photogrammetry
 from tests.extras.board_video import Studio, pair, poses
 from tests.extras.photogrammetry import write_colmap
 
@@ -103,7 +101,6 @@ def workspace(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
             cv2.imwrite(str(folder / name / f"{t:04d}.png"), frame[..., ::-1])
     write_stereo(folder / "stereo.yml", capture.camera("left"), capture.camera("right"))
     write_colmap(folder / "sparse" / "0", [(capture.camera(n), f"{n}/0000.png") for n in ("left", "right")])
-    _photogrammetry(folder, head, capture)
     _film_a_board(folder / "filmed")
     shutil.copytree(head, folder / "scene")
     shutil.copytree(head, folder / "CAPTURE")
@@ -126,23 +123,6 @@ def _film_a_board(folder: Path) -> None:
         (folder / name).mkdir(parents=True)
         for i, place in enumerate(places):
             cv2.imwrite(str(folder / name / f"{i:04d}.png"), studio.render(place, i))
-
-
-def _photogrammetry(folder: Path, head: Path, capture: Capture) -> None:
-    """The first timestep as photographs of other programs, and all of them as data sets."""
-    (folder / "photos").mkdir()
-    for name in ("left", "right"):
-        shutil.copy(folder / name / "0000.png", folder / "photos" / f"{name}.png")
-    photos = [(capture.camera(name), f"{name}.png") for name in ("left", "right")]
-    photogrammetry.write_metashape(folder / "cameras.xml", photos)
-    photogrammetry.write_xmp(folder / "photos", photos)
-    photogrammetry.write_vhap(folder / "export" / "074", head)
-    images = folder / "074" / "sequences" / "EMO-1" / "images"
-    for name in ("left", "right"):
-        shutil.copytree(folder / name, images / f"cam_{name}")
-    (folder / "074" / "calibration").mkdir()
-    parameters = photogrammetry.nersemble_parameters([camera for camera, _ in photos], 1.0)
-    (folder / "074" / "calibration" / "camera_params.json").write_text(json.dumps(parameters))
 
 
 NOT_HERE = {
