@@ -19,6 +19,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 from typing_extensions import dataclass_transform
 
+from mifit.core.limits import MAX_LANDMARK_NOISE
 from mifit.errors import InputError
 
 T = TypeVar("T")
@@ -151,7 +152,7 @@ class GeometryConfig:
         "pixels",
         source="set by hand",
         above=0,
-        most=1000,
+        most=MAX_LANDMARK_NOISE,
     )
     scale_deviation: float = number(
         0.0,

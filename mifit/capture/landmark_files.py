@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.files import read_text, write_text
-from mifit.core.limits import MAX_SETTINGS_BYTES
+from mifit.core.limits import MAX_LANDMARK_NOISE, MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 
 COUNT = 68
@@ -64,8 +64,9 @@ def read_landmarks(path: str | Path) -> Landmarks:
         )
     if visible.shape != (COUNT,):
         raise InputError(f"{path}: found {visible.size} visibility flags, expected {COUNT}")
-    if not (np.isfinite(deviation) and deviation >= 0):
-        raise InputError(f"{path}: deviation: found {deviation}, expected a number of pixels not below 0")
+    if not 0 <= deviation <= MAX_LANDMARK_NOISE:
+        most = f"{MAX_LANDMARK_NOISE:g}"
+        raise InputError(f"{path}: deviation: found {deviation}, expected a number of pixels from 0 to {most}")
     _check_spread(path, points[visible & np.isfinite(points).all(axis=1)])
     finite = np.asarray(np.isfinite(points).all(axis=1), dtype=bool)
     return Landmarks(np.where(finite[:, None], points, 0.0), visible & finite, deviation)

@@ -43,7 +43,7 @@ doctor  setup.doctor  what of the set-up, or of a capture, is wrong, and what me
     --model      text=auto  of a capture: a path, builtin or auto (default)
     --cameras    names      of a capture: cameras to examine; default: the first two
     --timesteps  steps      of a capture: default: the first four
-    --dense      flag       of a capture: fit the first timestep and compare the views on its surface too
+    --dense      flag       of a capture: fit it, compare the views on its surface and test the calibration by it
     {STRICT}
     --json       flag       print JSON
     --install    landmarks  fetch the networks that find landmarks, then check

@@ -51,10 +51,16 @@ def _examine(arguments: Namespace) -> int:
     if arguments.dense:
         use_variant(arguments)
         progress = console_progress(arguments.quiet)
-        fitted = mifit.fit(capture, model, cameras, timesteps[:1], until="geometry", progress=progress)
-        found = worst_first([*found, *fitted.diagnostics])
+        from mifit.extras.check_calibration import check_calibration
+
+        fitted = mifit.fit(capture, model, cameras, timesteps[:4], until="geometry", progress=progress)
+        named = any(one.severity == "fault" for one in found)  # then the fit is of something else
+        tested = [] if named else cameras
+        checked = check_calibration(fitted.seen(capture), model, fitted.geometry, tested, progress)
+        found = worst_first([*found, *fitted.diagnostics, *checked.diagnostics])
         surface = fitted.geometry.report.phase("surface")
         figures |= {key: surface.get(key, {}) for key in ("epipolar_pixels", "likeness")}
+        figures["calibration"] = checked.document()
     if arguments.json:
         print(json.dumps({"findings": [one.document() for one in found], **figures}, indent=2))
     else:
@@ -68,6 +74,8 @@ def _examine(arguments: Namespace) -> int:
             alike = figures["likeness"][names]
             if value is not None and alike is not None:
                 print(f"cameras {names}: {value:.2f} pixels off epipolar lines, images correlate by {alike:.2f}")
+        for line in checked.lines if arguments.dense else ():
+            print(line)
     return tell(arguments, found)
 
 

@@ -99,7 +99,12 @@ def opened(path: str | Path, limit: int, what: str = "file") -> Iterator[tuple[B
         os.close(descriptor)
         raise InputError(f"{path}: {problem}")
     with os.fdopen(descriptor, "rb") as stream:
-        yield stream, found.st_size
+        try:
+            yield stream, found.st_size
+        except OSError as error:
+            if error.filename is not None or error.errno in FULL:
+                raise
+            raise InputError(f"{path}: can't be read: {error.strerror or error}") from None
 
 
 def check_file(path: str | Path, limit: int, what: str = "file") -> int:
@@ -111,10 +116,7 @@ def check_file(path: str | Path, limit: int, what: str = "file") -> int:
 def read_bytes(path: str | Path, limit: int, what: str = "file") -> bytes:
     """Content of a file of at most ``limit`` bytes; InputError as `opened` raises it."""
     with opened(path, limit, what) as (stream, size):
-        try:
-            return stream.read(size)
-        except OSError as error:
-            raise InputError(f"{path}: can't be read: {error.strerror}") from None
+        return stream.read(size)
 
 
 def read_text(path: str | Path, limit: int, what: str = "file") -> str:

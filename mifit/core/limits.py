@@ -38,6 +38,8 @@ MAX_SAMPLES = 2**20
 """Samples per pixel."""
 MAX_NUMBER = 1e9
 """Magnitude of lengths, coefficients, colours and angles in files and options: what is larger is damage."""
+MAX_LANDMARK_NOISE = 1000.0
+"""Standard deviation of a landmark, pixels."""
 MAX_LIGHTS = 16
 """Compact lights of one result: each is traced to every point that is shown."""
 MAX_SEED = 2**31 - 1

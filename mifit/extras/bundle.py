@@ -45,14 +45,11 @@ class Freedom:
         To the C logarithms of focal lengths, then turn and shift of each camera, camera axes.
     mean : (R,), precision : (R, R)
         Of the prior; precision 0 where nothing is known.
-    focals : int
-        How many of z, the first ones, are logarithms of unknown focal lengths.
     """
 
     design: NDArray[np.float64]
     mean: NDArray[np.float64]
     precision: NDArray[np.float64]
-    focals: int = 0
 
     @classmethod
     def of_focals(cls, group: NDArray, focal: NDArray, expected: NDArray, deviation: float) -> Freedom:
@@ -67,7 +64,7 @@ class Freedom:
         mean, precision = np.zeros((2, design.shape[1]))
         mean[:count] = [np.log(expected[g] / focal[group == g][0]) for g in range(count)]
         precision[:count] = deviation**-2.0
-        return cls(design, mean, np.diag(precision), count)
+        return cls(design, mean, np.diag(precision))
 
 
 @dataclass(frozen=True)
@@ -102,16 +99,22 @@ class AdjustedBundle:
     Attributes
     ----------
     bundle : Bundle
-    deviation : float
-        Largest standard deviation of the logarithm of an unknown focal length, from the normal equations with all else
-        eliminated, scaled by the residuals. Errors that matches share aren't in it. 0 where a calibration holds them.
+    movement : (R,)
+        What cameras were moved by, in the order of the freedom's design.
+    deviations : (R,)
+        Their standard deviations, from the normal equations with all else eliminated, scaled by the residuals. Errors
+        that matches share aren't in them.
+    energy : float
+        Of matches and priors.
     residual : float
         Median distance of a point from its match, pixels.
     settled : bool
     """
 
     bundle: Bundle
-    deviation: float
+    movement: NDArray[np.float64]
+    deviations: NDArray[np.float64]
+    energy: float
     residual: float
     settled: bool
 
@@ -130,15 +133,15 @@ def adjust_bundle(start: Bundle, seen: Sightings, freedom: Freedom, modes: NDArr
     modes = np.zeros((len(start.points), 3, 0)) if modes is None else modes
     problem = _Problem(start, seen, freedom, modes)
     solution = minimize(problem, problem.start(), energy_tolerance=1e-5)
-    residual, deviation = problem.project(solution.value).residual, 0.0
-    if freedom.focals:
-        few = np.eye(len(solution.value), freedom.focals)
-        variance = np.diag(problem.linearize(solution.value).inverse(few)[: freedom.focals])
-        scale = problem.weights(residual)[1] @ np.sum(residual**2, axis=1) / max(residual.size - len(few), 1)
-        deviation = float(np.sqrt(variance.max() * scale)) if variance.min() > 0 else np.inf
+    residual, opened = problem.project(solution.value).residual, freedom.design.shape[1]
+    variance = np.diag(problem.linearize(solution.value).inverse(np.eye(len(solution.value), opened))[:opened])
+    scale = problem.weights(residual)[1] @ np.sum(residual**2, axis=1) / max(residual.size - opened, 1)
+    energies = problem.energies(solution.value)
     return AdjustedBundle(
         problem.bundle(solution.value),
-        deviation,
+        solution.value[:opened],
+        np.sqrt(np.where(variance > 0, variance, np.inf) * scale),
+        energies["matches"] + energies["prior"],
         float(np.median(np.linalg.norm(residual, axis=1))),
         solution.outcome in (Outcome.CONVERGED, Outcome.STALLED),
     )

@@ -16,14 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
-from mifit.core.mesh import interpolate
 from mifit.core.process import one_blas_thread
-from mifit.core.uv import rasterize_uv
 from mifit.extras.bundle import AdjustedBundle, Bundle, Freedom, Sightings, adjust_bundle
 from mifit.extras.calibrate_heads import FOCAL_PRIOR, HeadCalibration, calibrate_heads
-from mifit.extras.tracks import FEWEST_IMAGES, focal_of, follow_points, sightings_of, unwrap_image
+from mifit.extras.tracks import FEWEST_IMAGES, focal_of, follow_head, points_of, sightings_of
 from mifit.progress import Progress, silent
-from mifit.stages.surface.views import texture_size
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -114,38 +111,24 @@ def calibrate_densely(
         return _left(start, cameras, "one camera can't tell expressions from perspective, expected two")
     if images < FEWEST_IMAGES:
         return _left(start, cameras, f"{images} images can't tell more, expected {FEWEST_IMAGES}")
-    total = images + 2
-    progress("match views", 0, total)
     vertices = _vertices(start, model)
     world = [vertices @ pose[:3, :3].T + pose[:3, 3] for pose in OPENGL_FROM_OPENCV @ start.heads]
     views = [capture.camera(name) for name in cameras]
-    texels = rasterize_uv(model.uv, model.faces_uv, _size(model, world[0], views), model.face_mask)
-    unwrapped = []
-    for j, timestep in enumerate(timesteps):
-        for camera in views:
-            frame = capture.frame(camera.name, timestep)
-            unwrapped.append(unwrap_image(frame, camera, world[j], model.faces, texels))
-            progress("match views", len(unwrapped), total)
-    tracks = follow_points(unwrapped)
-    progress("match views", images + 1, total)
+    tracks, texels = follow_head(capture, model, views, timesteps, world, progress)
     if len(tracks.texel) < FEWEST_TRACKS:
         count = f"{len(tracks.texel)} points are found in {FEWEST_IMAGES} or more images"
         return _left(start, cameras, f"{count}, expected {FEWEST_TRACKS}; add timesteps where the head turns")
-    step, which = np.divmod(tracks.image, len(views))
-    seen = sightings_of(tracks, views, which, step)
-    at = np.searchsorted(texels.index, tracks.texel)
-    points = np.asarray(interpolate(vertices, model.faces, texels.face[at], texels.weights[at]), dtype=np.float64)
-    corners, weights = model.faces[texels.face[at]], texels.weights[at].astype(np.float64)
-    modes = np.einsum("nc,ncik->nik", weights, model.expression[corners].astype(np.float64))
-    adjusted = _adjust(start, views, unknown, seen, points, modes * (model.unit_mm / capture.unit_mm))
-    progress("match views", total, total)
-    if adjusted.deviation > LARGEST_DEVIATION:
-        found = f"matches give it to {_percent(adjusted.deviation)} only"
+    seen = sightings_of(tracks, views)
+    points, modes = points_of(tracks, texels, model, vertices)
+    adjusted, focals = _adjust(start, views, unknown, seen, points, modes * (model.unit_mm / capture.unit_mm))
+    deviation = float(adjusted.deviations[:focals].max())
+    if deviation > LARGEST_DEVIATION:
+        found = f"matches give it to {_percent(deviation)} only"
         return _left(start, cameras, f"{found}, expected {_percent(LARGEST_DEVIATION)}; add timesteps where it turns")
     if adjusted.residual > 4.0 * seen.deviation:  # not the tracks of one head
         found = f"matches are {adjusted.residual:.1f} pixels from those of a moving head"
         return _left(start, cameras, f"{found}; views may be out of step")
-    return _calibration(start, views, points, adjusted)
+    return _calibration(start, views, points, adjusted, deviation)
 
 
 def _left(start: HeadCalibration, cameras: Sequence[str], why: str) -> DenseCalibration:
@@ -166,13 +149,6 @@ def _vertices(start: HeadCalibration, model: MorphableModel) -> NDArray[np.float
     return shape * (model.unit_mm / start.capture.unit_mm)
 
 
-def _size(model: MorphableModel, world: NDArray, views: Sequence[Camera]) -> int:
-    """Side of the map that holds about what the images show."""
-    centre = world.mean(axis=0)
-    pixel = min(float(np.linalg.norm(centre - view.position)) / view.fx for view in views)
-    return texture_size(model, world, pixel, 320)
-
-
 def _adjust(
     start: HeadCalibration,
     views: Sequence[Camera],
@@ -180,8 +156,11 @@ def _adjust(
     seen: Sightings,
     points: NDArray,
     modes: NDArray,
-) -> AdjustedBundle:
-    """Points (N, 3) on the head that landmarks gave, and expression modes there (N, 3, K), are where it starts."""
+) -> tuple[AdjustedBundle, int]:
+    """The adjusted bundle, and how many focal lengths were free: the first of its movements.
+
+    Points (N, 3) on the head that landmarks gave, and expression modes there (N, 3, K), are where it starts.
+    """
     side = np.array([max(view.width, view.height) for view in views], dtype=np.float64)
     numbers = np.full(len(views), -1)
     sides, numbers[unknown] = np.unique(side[unknown], return_inverse=True)
@@ -195,11 +174,12 @@ def _adjust(
         points,
         np.zeros((len(start.heads), modes.shape[2])),
     )
-    return adjust_bundle(bundle, seen, Freedom.of_focals(numbers, focal, FOCAL_PRIOR[0] * sides, FOCAL_PRIOR[1]), modes)
+    freedom = Freedom.of_focals(numbers, focal, FOCAL_PRIOR[0] * sides, FOCAL_PRIOR[1])
+    return adjust_bundle(bundle, seen, freedom, modes), len(sides)
 
 
 def _calibration(
-    start: HeadCalibration, views: Sequence[Camera], first: NDArray, adjusted: AdjustedBundle
+    start: HeadCalibration, views: Sequence[Camera], first: NDArray, adjusted: AdjustedBundle, deviation: float
 ) -> DenseCalibration:
     bundle = adjusted.bundle
     # images alone leave the scale open; medians, as a few points may have gone anywhere
@@ -215,9 +195,9 @@ def _calibration(
     lengths = ", ".join(dict.fromkeys(f"{bundle.focal[k]:.0f}" for k in free))
     before = ", ".join(dict.fromkeys(f"{views[k].fx:.0f}" for k in free))
     note = (
-        f"focal length {lengths} pixels (+- {_percent(adjusted.deviation)}) is from {len(first)} dense matches, "
+        f"focal length {lengths} pixels (+- {_percent(deviation)}) is from {len(first)} dense matches, "
         f"residual {adjusted.residual:.2f} pixels; landmarks gave {before}"
     )
     if not adjusted.settled:
         note += "; the adjustment hasn't settled"
-    return DenseCalibration(start.capture.with_estimate(found), note, adjusted.deviation, adjusted.residual)
+    return DenseCalibration(start.capture.with_estimate(found), note, deviation, adjusted.residual)

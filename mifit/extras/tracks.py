@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -18,10 +19,15 @@ from numpy.typing import NDArray
 from mifit.capture import Frame
 from mifit.core.camera import Camera
 from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.uv import TexelMap, bilinear
+from mifit.core.uv import TexelMap, bilinear, rasterize_uv
 from mifit.extras.bundle import Sightings
+from mifit.progress import Progress, silent
 from mifit.render.gbuffer import SurfaceScene
-from mifit.stages.surface.views import shows_surface
+from mifit.stages.surface.views import shows_surface, texture_size
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
 
 FEWEST_IMAGES = 3
 """Images that must show a point: two can't contradict one another but across epipolar lines."""
@@ -93,15 +99,51 @@ def unwrap_image(frame: Frame, camera: Camera, vertices: NDArray, faces: NDArray
     return Unwrapped(detail, inner, texels.to_map(at.astype(np.float32) + np.float32(0.5)))
 
 
-def sightings_of(tracks: Tracks, views: Sequence[Camera], camera: NDArray, timestep: NDArray) -> Sightings:
-    """What a bundle adjustment takes of tracks; ``camera`` and ``timestep`` are those of the sightings' images.
+def follow_head(
+    capture: Capture,
+    model: MorphableModel,
+    views: Sequence[Camera],
+    timesteps: Sequence[int],
+    world: Sequence[NDArray],
+    progress: Progress = silent,
+) -> tuple[Tracks, TexelMap]:
+    """Tracks through all views of a head, timestep by timestep, and the texels that they start from.
 
-    A match errs by 0.3 pixels along an axis.
+    ``world`` has the model's vertices (V, 3) at each timestep, in world space.
     """
+    centre = world[0].mean(axis=0)
+    pixel = min(float(np.linalg.norm(centre - view.position)) / view.fx for view in views)
+    side = texture_size(model, world[0], pixel, 320)  # about what the images show
+    texels = rasterize_uv(model.uv, model.faces_uv, side, model.face_mask)
+    total = len(views) * len(timesteps) + 1
+    unwrapped: list[Unwrapped] = []
+    for vertices, timestep in zip(world, timesteps, strict=True):
+        for view in views:
+            progress("match views", len(unwrapped), total)
+            frame = capture.frame(view.name, timestep)
+            unwrapped.append(unwrap_image(frame, view, vertices, model.faces, texels))
+    tracks = follow_points(unwrapped)
+    progress("match views", total, total)
+    return tracks, texels
+
+
+def sightings_of(tracks: Tracks, views: Sequence[Camera]) -> Sightings:
+    """What a bundle adjustment takes of the tracks of a head. A match errs by 0.3 pixels along an axis."""
+    step, camera = np.divmod(tracks.image, len(views))
     focal, pixel = (np.array([value(v) for v in views]) for value in (focal_of, lambda v: (v.fx, v.fy)))
     centre = np.array([(view.cx, view.cy) for view in views])
     pixels = (tracks.pixels - centre[camera]) * (focal[:, None] / pixel)[camera]
-    return Sightings(pixels, tracks.point, camera, timestep, 0.3 * image_scale(views))
+    return Sightings(pixels, tracks.point, camera, step, 0.3 * image_scale(views))
+
+
+def points_of(
+    tracks: Tracks, texels: TexelMap, model: MorphableModel, vertices: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where tracks (N,) start on a head with vertices (V, 3), and the model's expression modes (N, 3, K) there."""
+    at = np.searchsorted(texels.index, tracks.texel)
+    corners, weights = model.faces[texels.face[at]], texels.weights[at].astype(np.float64)
+    modes = np.einsum("nc,ncik->nik", weights, model.expression[corners].astype(np.float64))
+    return np.einsum("nc,nci->ni", weights, vertices[corners].astype(np.float64)), modes
 
 
 def focal_of(view: Camera) -> float:

@@ -15,6 +15,7 @@ from mifit.capture.transforms import Shot, View, write_transforms
 from mifit.core.image import write_image
 from mifit.extras.bundle import Bundle, Freedom, Sightings, adjust_bundle
 from mifit.extras.calibrate_densely import calibrate_capture
+from mifit.extras.check_calibration import explain_matches
 from mifit.morphable import MorphableModel
 from tests.stages.memory_capture import make_capture
 
@@ -85,7 +86,7 @@ def test_many_sightings_are_thinned_by_whole_tracks(model, uncalibrated, monkeyp
 
     found = []
     follow = tracks.follow_points
-    monkeypatch.setattr("mifit.extras.calibrate_densely.follow_points", lambda images: found.append(follow(images)))
+    monkeypatch.setattr("mifit.extras.tracks.follow_points", lambda images: found.append(follow(images)))
     for most in (10**6, 3000):
         monkeypatch.setattr(tracks, "MOST_SIGHTINGS", most)
         with pytest.raises(AttributeError):  # nothing is handed on
@@ -152,7 +153,7 @@ def test_the_deviation_is_that_of_repeated_noise() -> None:
         noisy = replace(seen, pixels=seen.pixels + 0.3 * rng.normal(size=seen.pixels.shape))
         found = adjust_bundle(truth, noisy, freedom(truth), modes)
         logs.append(np.log(found.bundle.focal[0]))
-        told.append(found.deviation)
+        told.append(found.deviations[0])
     assert np.mean(told) == pytest.approx(np.std(logs, ddof=1), rel=0.6)  # twelve samples give it to 20 %
 
 
@@ -160,7 +161,7 @@ def test_two_views_of_a_head_that_keeps_still_determine_no_focal_length() -> Non
     truth, seen, modes = exact(TURNS[:1])
     noisy = replace(seen, pixels=seen.pixels + 0.3 * np.random.default_rng(3).normal(size=seen.pixels.shape))
     found = adjust_bundle(truth, noisy, freedom(truth), modes)
-    assert found.deviation > 0.1
+    assert found.deviations[0] > 0.1
 
 
 def test_known_focal_lengths_stay() -> None:
@@ -169,3 +170,46 @@ def test_known_focal_lengths_stay() -> None:
     found = adjust_bundle(start, seen, freedom(start, (-1, 0)), modes)
     assert found.bundle.focal[0] == FOCAL
     assert found.bundle.focal[1] == pytest.approx(FOCAL, rel=2e-3)
+
+
+MISTAKES = {
+    "none": lambda truth: (truth, 0.0),
+    "focal lengths": lambda truth: (replace(truth, focal=1.15 * truth.focal), 0.0),
+    "one focal length": lambda truth: (replace(truth, focal=truth.focal * (1.0, 1.15)), 0.0),
+    "turn": lambda truth: (replace(truth, cameras=np.stack([truth.cameras[0], turned(1.0) @ truth.cameras[1]])), 0.0),
+    "principal point": lambda truth: (truth, 20.0),
+}
+
+
+def turned(degrees: float):
+    """A turn about the vertical."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0, degrees, 0], degrees=True).as_matrix()
+    return turn
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_wrong_calibration_is_named_with_its_correction(name: str) -> None:
+    truth, seen, modes = exact(TURNS, 0.2)
+    start, shift = MISTAKES[name](truth)
+    pixels = seen.pixels + 0.3 * np.random.default_rng(4).normal(size=seen.pixels.shape)
+    pixels[seen.camera == 1, 0] += shift
+    found = explain_matches(start, replace(seen, pixels=pixels), modes, BOTH)
+    told = {(one.camera, len(one.value)): one for one in found.errors}
+    assert [one.code for one in found.diagnostics] == ([] if name == "none" else ["calibration-doubtful"])
+    assert len(told) == 5 and found.points == 400 and len(found.lines) == 6
+    if name == "none":
+        assert found.residual < 0.5 and not any(one.large for one in found.errors)
+        return
+    camera, text = {
+        "focal lengths": (None, "all focal lengths by -13"),
+        "one focal length": ("right", "the focal length of right by -13"),
+        "turn": ("right", "a turn of right by 1.0"),
+        "principal point": ("right", "pixels)"),
+    }[name]
+    assert text in found.diagnostics[0].text and found.diagnostics[0].camera in (camera, None)
+    if name in ("turn", "principal point"):
+        degrees = {"turn": -1.0, "principal point": np.degrees(np.arctan(20.0 / FOCAL))}[name]
+        assert told["right", 3].value[1] == pytest.approx(degrees, abs=0.15)
+    else:
+        assert told[camera, 1].value[0] == pytest.approx(1 / 1.15 - 1, abs=0.03)
