@@ -19,7 +19,6 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 from typing_extensions import dataclass_transform
 
-from mifit.core.limits import MAX_LANDMARK_NOISE
 from mifit.errors import InputError
 
 T = TypeVar("T")
@@ -152,7 +151,7 @@ class GeometryConfig:
         "pixels",
         source="set by hand",
         above=0,
-        most=MAX_LANDMARK_NOISE,
+        most=1000,
     )
     scale_deviation: float = number(
         0.0,
