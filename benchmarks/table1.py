@@ -22,9 +22,10 @@ import sys
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 import mifit
 from benchmarks.foreign import replace_size, without_specular
@@ -33,8 +34,11 @@ from benchmarks.record import RESULTS, SHARED, conditions, machine, record
 from benchmarks.truth import truth_errors
 from mifit import Capture, FitConfig, MorphableModel, Reconstruction
 from mifit.core.files import write_text
-from mifit.output.evaluate import evaluate
-from mifit.output.relight import evaluate_relit
+from mifit.core.image import to_8_bit
+from mifit.core.metrics import psnr, rmse
+from mifit.errors import InputError
+from mifit.output.evaluate import evaluate, face_area
+from mifit.result import Method
 
 ENVIRONMENTS = ("apartment", "studio", "softbox")
 TONES = (0.0, 0.25, 0.5, 0.75, 1.0)  # fair to deep; three lights and five tones meet once in fifteen subjects
@@ -325,6 +329,57 @@ def relight(subjects: Iterable[int], work: Path, model: str, size: dict[str, int
         kinds = {"fitted_under": ENVIRONMENTS[subject % len(ENVIRONMENTS)], "relit_by": environment.stem}
         rows.append({"subject": subject, **kinds, **judged})
     return rows
+
+
+def evaluate_relit(
+    result: Reconstruction,
+    environment: str | Path | NDArray,
+    capture: Capture,
+    camera: str,
+    integrator: Literal["local", "path"] = "local",
+) -> dict[str, Any]:
+    """Errors of a relit result against photographs of the same head, in the same poses, under that environment.
+
+    The two captures' exposures are not known to each other, so each method gets one factor on its brightness: the
+    least-squares one over the cameras that were fitted, in the new capture. InputError where the judged camera was
+    fitted, or a camera or timestep is missing in the capture.
+
+    Returns
+    -------
+    dict
+        ``camera``, ``timesteps``, ``region_pixels`` and ``methods``: PSNR (dB), RMSE (0..255) in 8-bit sRGB over the
+        fitted model's face area, and the exposure, for ``diffuse`` and ``full``.
+    """
+    if camera in [c.name for c in result.cameras]:
+        raise InputError(f"camera {camera}: was fitted; expected another one to judge by")
+    lit = result.relight(environment)
+    capture = capture.with_fitted(result.cameras)
+    steps = [t for t in lit.timesteps if t in capture.timesteps]
+    if not steps:
+        raise InputError(f"the capture has none of the timesteps {', '.join(map(str, lit.timesteps))}")
+
+    def views(name: str, timesteps: list[int], method: Method) -> tuple[NDArray, NDArray]:
+        """Photographed and rendered linear colours (N, 3) in the face area."""
+        view = capture.camera(name)
+        photographs, renders = [], []
+        for t in timesteps:
+            frame = capture.frame(name, t)
+            vertices = lit.geometry.vertices[lit.index(t)]
+            area = face_area(vertices, lit.model.faces, lit.model.face_mask, view) & frame.valid
+            shown = lit.render(view, t, method, integrator)
+            photographs.append(frame.image[area])
+            renders.append(shown[area][:, :3])
+        return np.concatenate(photographs), np.concatenate(renders)
+
+    methods = {}
+    for method in ("diffuse", "full"):
+        pairs = [views(c.name, steps[:1], method) for c in result.cameras]
+        photograph, render = (np.concatenate(part).astype(np.float64) for part in zip(*pairs, strict=True))
+        exposure = float((photograph * render).sum() / max(float((render * render).sum()), 1e-12))
+        photograph, render = views(camera, steps, method)
+        codes, expected = to_8_bit(exposure * render)[None], to_8_bit(photograph)[None]
+        methods[method] = {"psnr": psnr(codes, expected), "rmse": rmse(codes, expected), "exposure": exposure}
+    return {"camera": camera, "timesteps": steps, "region_pixels": len(photograph), "methods": methods}
 
 
 def relit_markdown(rows: list[dict[str, Any]]) -> str:

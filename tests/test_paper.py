@@ -211,7 +211,7 @@ def test_the_printed_highlight_is_the_quotient(variant):
     import mitsuba as mi
 
     from mifit.appearance.arrays import on_device
-    from mifit.appearance.models import SMALLEST, paper_specular
+    from mifit.appearance.models import PaperModel, PrintedModel, paper_specular
 
     n = RNG.normal(size=(200, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
@@ -219,11 +219,11 @@ def test_the_printed_highlight_is_the_quotient(variant):
     to = mi.Vector3f(*map(float, v)), mi.Vector3f(*map(float, d))
     cosine, h = n @ d, (d + v) / np.linalg.norm(d + v)
     lit = cosine > 0.05
-    found = np.array(paper_specular(on_device(mi.Vector3f, n), *to, 5.0, SMALLEST))
+    found = np.array(paper_specular(on_device(mi.Vector3f, n), *to, 5.0, PrintedModel.guard))
     expected = np.maximum(n @ h, 0) ** 5 / np.maximum(cosine, 1e-9)
     np.testing.assert_allclose(found[lit], expected[lit], rtol=2e-3)
     assert (found[cosine <= 0] == 0).all()
-    guarded = np.array(paper_specular(on_device(mi.Vector3f, n), *to, 5.0))
+    guarded = np.array(paper_specular(on_device(mi.Vector3f, n), *to, 5.0, PaperModel.guard))
     assert (guarded[lit] < 0.999 * expected[lit]).any()
 
 

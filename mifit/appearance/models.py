@@ -129,24 +129,18 @@ class ShadingModel(ABC):
 
 # The package's models ----------------------------------------------------------------------------------------------
 
-GUARD = 0.1
-"""Cosine between normal and dominant direction below which the paper's L(p) is faded out."""
-
-SMALLEST = 1e-3
-"""The same where nothing is to be added to the paper: as small as single precision bears."""
-
 
 class PaperModel(ShadingModel):
     """Ambient, SH irradiance, and the plain lobe ``(n . h)^m`` under a light in the dominant direction d.
 
     Its strength is the local irradiance undone of its cosine, ``L(p) = shading(n) / (n . d)``, as in the paper
-    (section 5), with the quotient replaced by ``shading * c / (c^2 + GUARD^2)`` with ``c = max(n . d, 0)``: equal to
-    within 4 % where n . d > 0.5, zero at the terminator instead of infinite, with a derivative below
-    ``1 / GUARD^2``. The lobe is always the plain one, without a Fresnel factor.
+    (section 5), with the quotient replaced by ``shading * c / (c^2 + guard^2)`` with ``c = max(n . d, 0)`` and a
+    ``guard`` of 0.1: equal to within 4 % where n . d > 0.5, zero at the terminator instead of infinite, with a
+    derivative below ``1 / guard^2``. The lobe is always the plain one, without a Fresnel factor.
     """
 
     name = "paper"
-    guard = GUARD
+    guard = 0.1
     turns = True
     bands = 3
     exponent = 5.0
@@ -164,13 +158,13 @@ class PaperModel(ShadingModel):
 
 
 class PrintedModel(PaperModel):
-    """The paper's shading as it is printed: ``L(p)`` is the quotient itself but for where its divisor vanishes."""
+    """The paper's shading as it is printed: the guard is as small as single precision bears."""
 
     name = "printed"
-    guard = SMALLEST
+    guard = 1e-3
 
 
-def paper_specular(n: Jit, v: Jit, direction: Jit, exponent: Jit, guard: float = GUARD) -> Jit:
+def paper_specular(n: Jit, v: Jit, direction: Jit, exponent: Jit, guard: float) -> Jit:
     """Factor by which the paper's specular term scales the shading: ``(n . h)^m / (n . d)``, guarded."""
     import drjit as dr
 

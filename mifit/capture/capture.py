@@ -19,7 +19,7 @@ from mifit.capture.transforms import UNITS_MM, Shot, Transforms, View, read_tran
 from mifit.core.camera import Camera
 from mifit.core.files import file_digest, note_read
 from mifit.core.image import load_image
-from mifit.core.limits import MAX_IMAGE_BYTES
+from mifit.core.limits import MAX_FILE_BYTES
 from mifit.core.photometry import Photometry
 from mifit.errors import InputError
 
@@ -250,7 +250,7 @@ class Capture:
             for timestep in self.timesteps if timesteps is None else timesteps:
                 shot = self._shot(name, timestep)
                 for file in (shot.image, shot.mask, shot.landmarks):
-                    result.update(b"-" if file is None else file_digest(file, MAX_IMAGE_BYTES, "file of the capture"))
+                    result.update(b"-" if file is None else file_digest(file, MAX_FILE_BYTES, "file of the capture"))
         return result.hexdigest()
 
     def with_estimate(self, cameras: Sequence[Camera]) -> Capture:

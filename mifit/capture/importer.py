@@ -16,7 +16,7 @@ from mifit.capture.stereo import read_stereo
 from mifit.capture.transforms import UNITS_MM, Shot, View, read_transforms, write_transforms
 from mifit.core.files import file_name, read_bytes, replacing_folder, write_bytes
 from mifit.core.image import decode_image, image_kind
-from mifit.core.limits import MAX_IMAGE_BYTES
+from mifit.core.limits import MAX_FILE_BYTES
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
 
@@ -195,7 +195,7 @@ def _copy_annotations(
             continue
         source = annotated[shot.camera][numbers[shot.timestep]]
         if source.mask is not None:
-            content = read_bytes(source.mask, MAX_IMAGE_BYTES, "mask")
+            content = read_bytes(source.mask, MAX_FILE_BYTES, "mask")
             found, expected = decode_image(content, source.mask).pixels.shape[:2], sizes[shot.camera]
             if found != expected:
                 raise InputError(

@@ -15,7 +15,7 @@ import numpy as np
 
 from mifit.core.files import check_file, read_bytes
 from mifit.core.image import SUFFIXES, decode_image, encode_png, image_kind, load_image
-from mifit.core.limits import MAX_IMAGE_BYTES, MAX_PIXELS, MAX_VIDEO_BYTES, MAX_VIDEO_FRAMES
+from mifit.core.limits import MAX_COUNT, MAX_FILE_BYTES, MAX_PIXELS
 from mifit.core.process import decoding
 from mifit.errors import InputError
 
@@ -71,7 +71,7 @@ class ImageFiles:
     def files(self, numbers: Sequence[int]) -> Iterator[tuple[str, bytes]]:
         """Contents as they are on disk, once they have been seen to decode to the right size; suffix by content."""
         for path in (self.paths[i] for i in numbers):
-            content = read_bytes(path, MAX_IMAGE_BYTES, "image file")  # once: what is checked is what is copied
+            content = read_bytes(path, MAX_FILE_BYTES, "image file")  # once: what is checked is what is copied
             height, width = decode_image(content, path).pixels.shape[:2]
             if (width, height) != self.size:
                 raise InputError(
@@ -94,11 +94,11 @@ class Video:
     @classmethod
     def open(cls, path: Path, name: str) -> Video:
         """Read a video's header; InputError when it isn't one."""
-        check_file(path, MAX_VIDEO_BYTES, "video file")
+        check_file(path, float("inf"), "video file")  # decoded frame by frame
         with opened_video(path) as reader:
             size = (int(reader.get(cv2.CAP_PROP_FRAME_WIDTH)), int(reader.get(cv2.CAP_PROP_FRAME_HEIGHT)))
             length, rate = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)), float(reader.get(cv2.CAP_PROP_FPS))
-        if not 1 <= length <= MAX_VIDEO_FRAMES or min(size) < 1 or size[0] * size[1] > MAX_PIXELS or not rate > 0:
+        if not 1 <= length <= MAX_COUNT or min(size) < 1 or size[0] * size[1] > MAX_PIXELS or not rate > 0:
             raise InputError(
                 f"{path}: found {length} frames of {size[0]} x {size[1]} pixels at {rate:g} a second, expected a whole "
                 "video"

@@ -13,7 +13,7 @@ from typing import NoReturn
 
 from mifit.core.diagnostics import Diagnostic, worst_first
 from mifit.core.files import check_overwriting, overwriting
-from mifit.core.limits import MAX_NUMBER, MAX_RENDERED_PIXELS, MAX_SAMPLES, MAX_SEED, MAX_TIMESTEPS
+from mifit.core.limits import MAX_COUNT, MAX_NUMBER
 from mifit.errors import InputError
 
 Command = Callable[[Namespace], "int | None"]
@@ -118,8 +118,8 @@ def timesteps(text: str) -> list[int]:
             steps = range(int(first), int(last if dash else first) + 1)
         except ValueError:
             raise argparse.ArgumentTypeError(f"found {text[:60]!r}, expected numbers such as 0,1,2 or 0-7") from None
-        if len(steps) > MAX_TIMESTEPS or (steps and steps[-1] > sys.maxsize):
-            raise argparse.ArgumentTypeError(f"found {text[:60]!r}, expected at most {MAX_TIMESTEPS} timesteps")
+        if len(steps) > MAX_COUNT or (steps and steps[-1] > sys.maxsize):
+            raise argparse.ArgumentTypeError(f"found {text[:60]!r}, expected at most {MAX_COUNT} timesteps")
         found.extend(steps)
     if not found:
         raise argparse.ArgumentTypeError(f"found {text!r}, expected a first number not above the last, such as 0-7")
@@ -135,7 +135,7 @@ def timesteps_or_auto(text: str) -> list[int] | int:
         found = int(count) if colon else 4
     except ValueError:
         found = 0
-    if not 1 <= found <= MAX_TIMESTEPS:
+    if not 1 <= found <= MAX_COUNT:
         raise argparse.ArgumentTypeError(f"found {text[:60]!r}, expected auto or a number of timesteps, such as auto:4")
     return found
 
@@ -220,8 +220,5 @@ READERS: dict[str, Callable[[str], object]] = {
     "exposure": exposure,
     "offsets": offsets,
     "span": span,
-    "pixels": whole(16, MAX_RENDERED_PIXELS // 16),
-    "samples": whole(1, MAX_SAMPLES),
-    "seed": whole(0, MAX_SEED),
 }
 """Readers of arguments by the kind that `cli.options` names."""

@@ -10,14 +10,14 @@ from argparse import Namespace
 import mifit
 from mifit.cli.arguments import READERS, Parser, whole
 from mifit.core.files import Document
-from mifit.core.limits import MAX_TIMESTEPS
+from mifit.core.limits import MAX_COUNT, MAX_SEED
 
-COMMON = """
+COMMON = f"""
 --quiet    flag       no progress on stderr, warnings alone
 --debug    flag       show the traceback of an error
 --variant  text=auto  Mitsuba variant; auto: CUDA where it works, else LLVM (default: auto)
 --threads  1..1024    processor cores to use; default: all
---seed     seed=0     seed of everything random (default: 0)
+--seed     0..{MAX_SEED}=0  seed of everything random (default: 0)
 """
 FORCE = "--force  flag  replace files that are there, but never what is read"
 STRICT = "--strict  flag  exit with 3 where a fault of the capture is named"
@@ -71,9 +71,9 @@ synth  captures.synth  path-traced captures with ground truth
     --timesteps      1..=4      moments of a capture (default: 4)
     --env            path             lat-long HDR environment; default: a procedural studio
     --model          text=builtin     morphable model: a path or builtin
-    --width          pixels=680  pixels (default: 680)
-    --height         pixels=480  pixels (default: 480)
-    --spp            samples=64       samples per pixel (default: 64)
+    --width          16..=680         pixels (default: 680)
+    --height         16..=480         pixels (default: 480)
+    --spp            1..=64           samples per pixel (default: 64)
     --tone           real             skin from 0, fair, to 1, deep; default: drawn for each subject
     --outside        real=0.5         millimetres by which heads leave the model's span (default: 0.5)
     --landmark-bias  real=0.0         millimetres; a detector's is about 2 (default: 0)
@@ -203,10 +203,7 @@ turntable  results.turntable  novel views about the vertical axis, with and with
     --from>start  real=-35.0   first angle in degrees (default: -35)
     --to>stop     real=35.0    last angle in degrees (default: 35)
     --steps       1..=7  number of views (default: 7)
-    --sequence    flag         play the timesteps while the camera turns: sequence.mp4, one frame per timestep in place
-        of --steps
     {LIGHT.format(need="")}
-    {FPS}
 
 view  results.view  a live view in the browser: turn the head and the light, switch parts, load an environment
     result  path  result folder
@@ -221,7 +218,7 @@ relight  results.relight  relit views under a measured environment
     --video       path         of --turn: .mp4 or .webp to write in place of images
     --camera      text         a fitted camera; default: all of them, with --turn the front
     --yaw         real         a view of the face from so many degrees about the vertical
-    --size        pixels       width in pixels
+    --size        16..         width in pixels
     --integrator  local|path=local  fast (default) or path tracing
     --check       flag         compare both integrators in one small view
     {FPS}
@@ -322,5 +319,5 @@ def _reader(kind: str) -> Document:
         return {"type": READERS[kind]}
     low, dots, high = kind.partition("..")
     if dots:
-        return {"type": whole(int(low), int(high or MAX_TIMESTEPS))}
+        return {"type": whole(int(low), int(high or MAX_COUNT))}
     return {"choices": kind.split("|")}

@@ -139,20 +139,14 @@ def _result_and_variant(arguments: Namespace) -> Reconstruction:
 def turntable(arguments: Namespace) -> None:
     """Write novel views about the vertical axis."""
     result = _result_and_variant(arguments)
-    from mifit.output.views import write_sequence, write_turntable
+    from mifit.output.views import write_turntable
 
     if arguments.env:
         result = result.relight(arguments.env, arguments.rotate, arguments.exposure)
     elif arguments.rotate or arguments.exposure != 1.0:
         raise InputError("--rotate and --exposure: found without --env, the light that they are of")
     progress = console_progress(arguments.quiet)
-    if arguments.sequence:
-        path, methods = arguments.out / "sequence.mp4", result.methods[:0:-1] or result.methods
-        write_sequence(
-            result, path, arguments.start, arguments.stop, methods=methods, fps=arguments.fps, progress=progress
-        )
-    else:
-        write_turntable(result, arguments.out, arguments.start, arguments.stop, arguments.steps, progress=progress)
+    write_turntable(result, arguments.out, arguments.start, arguments.stop, arguments.steps, progress=progress)
     print(f"Views: {arguments.out}")
 
 

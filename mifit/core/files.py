@@ -76,7 +76,7 @@ def _is_same(path: str | Path, other: str) -> bool:
 
 
 @contextmanager
-def opened(path: str | Path, limit: int, what: str = "file") -> Iterator[tuple[BinaryIO, int]]:
+def opened(path: str | Path, limit: float, what: str = "file") -> Iterator[tuple[BinaryIO, int]]:
     """Open an input file of at most ``limit`` bytes; yields the stream and its size.
 
     A pipe, a device or a folder is refused without waiting for it, and a file that is too large before it is read, by
@@ -107,7 +107,7 @@ def opened(path: str | Path, limit: int, what: str = "file") -> Iterator[tuple[B
             raise InputError(f"{path}: can't be read: {error.strerror or error}") from None
 
 
-def check_file(path: str | Path, limit: int, what: str = "file") -> int:
+def check_file(path: str | Path, limit: float, what: str = "file") -> int:
     """Size in bytes of an input file that a library will open; InputError as `opened` raises it."""
     with opened(path, limit, what) as (_, size):
         return size
@@ -146,7 +146,7 @@ def file_name(text: str) -> str:
     plain = unicodedata.normalize("NFC", text[: 4 * MAX_NAME_BYTES])
     plain = "".join(c if c.isalnum() or c in ".-_+=" else "-" for c in plain).strip(".-")
     plain = plain.encode("utf-8")[:MAX_NAME_BYTES].decode("utf-8", "ignore")
-    reserved = plain.split(".")[0].upper() in _RESERVED
+    reserved = _RESERVED.match(plain) is not None
     if plain == text and plain and not reserved:
         return plain
     digest = hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:8]
@@ -154,7 +154,7 @@ def file_name(text: str) -> str:
     return f"{'_' if reserved else ''}{short}-{digest}" if short else f"x-{digest}"
 
 
-_RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{port}{i}" for port in ("COM", "LPT") for i in range(1, 10))}
+_RESERVED = re.compile(r"(CON|PRN|AUX|NUL|(COM|LPT)[1-9])(\.|$)", re.IGNORECASE)
 
 
 def check_no_links(folder: str | Path, path: str | Path) -> None:

@@ -1,14 +1,15 @@
 """Image files: PNG, JPEG, TIFF, OpenEXR and Radiance HDR, read to linear float32 and written whole or not at all.
 
-8- and 16-bit files hold sRGB-coded values, or those of a PNG's own gamma, and are decoded to linear Rec. 709, 0..1;
-floating-point files (EXR, HDR) are linear already. Their primaries and the exposure of a Radiance file are heeded;
-files of luminance and chroma or XYZ are refused. The first bytes give the kind of a file, not its name. Sizes
+8- and 16-bit files hold sRGB-coded values and are decoded to linear Rec. 709, 0..1; floating-point files (EXR, HDR) are
+linear already. The exposure of a Radiance file is heeded. A header that names another gamma, other primaries, luminance
+and chroma, or XYZ is refused. The first bytes give the kind of a file, not its name. Sizes
 are read from the header and checked before a pixel is decoded, so a small file can't claim gigabytes. An orientation
 tag is not applied: pixel coordinates of a calibration refer to the pixels as stored.
 """
 
 from __future__ import annotations
 
+import functools
 import io
 import re
 import warnings
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mifit.core.files import read_bytes, write_bytes
-from mifit.core.limits import MAX_DECODED_BYTES, MAX_IMAGE_BYTES, MAX_PIXELS
+from mifit.core.limits import MAX_FILE_BYTES, MAX_PIXELS
 from mifit.core.process import decoding
 from mifit.errors import InputError
 
@@ -69,9 +70,6 @@ def to_8_bit(linear: ArrayLike) -> NDArray[np.uint8]:
     return np.asarray(np.clip(coded, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
-_TABLE_8 = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
-
-
 def read_image(path: str | Path) -> NDArray[np.float32]:
     """Linear float32 (H, W, 3) of an image file; see `load_image` for alpha, clipping, bit depth and errors."""
     return load_image(path).pixels
@@ -83,7 +81,7 @@ def load_image(path: str | Path) -> Image:
     Grey images become three equal channels. CMYK is refused: without its ink profile the colours would be a guess.
     InputError for a file that is missing, not an image, truncated, or larger than `mifit.core.limits.MAX_PIXELS`.
     """
-    return decode_image(read_bytes(path, MAX_IMAGE_BYTES, "image file"), path)
+    return decode_image(read_bytes(path, MAX_FILE_BYTES, "image file"), path)
 
 
 def decode_image(data: bytes, path: str | Path) -> Image:
@@ -148,26 +146,22 @@ def _decode_raster(data: bytes, path: str | Path) -> Image:
         if image.mode == "CMYK":
             raise InputError(f"{path}: found a CMYK image, expected RGB; convert it with its ink profile first")
         gamma = None if "srgb" in image.info else image.info.get("gamma")
+        if gamma is not None and not abs(gamma - 1 / 2.2) < 0.02:
+            raise InputError(f"{path}: found gamma {gamma:g} in the header (gAMA), expected sRGB's; save it as sRGB")
         if _bits(image, data) > 8:
             image.verify()
-            return _decode_16_bit(data, path, gamma)
+            return _decode_16_bit(data, path)
         has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
         codes = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
     alpha = np.float32(1 / 255) * codes[..., 3] if has_alpha else None
     colour = codes[..., :3]
-    return Image(_table(8, gamma, path)[colour], alpha, (colour == 255).any(-1), 8)
+    return Image(_linear(8)[colour], alpha, (colour == 255).any(-1), 8)
 
 
-def _table(bits: int, gamma: float | None, path: str | Path) -> NDArray[np.float32]:
-    """Linear value of each code: sRGB, or where a PNG has a gamma that isn't about sRGB's, code^(1 / gamma)."""
-    if bits == 8 and (gamma is None or abs(gamma - 1 / 2.2) < 0.02):
-        return _TABLE_8
-    codes = np.arange(2**bits) / (2**bits - 1.0)
-    if gamma is None or abs(gamma - 1 / 2.2) < 0.02:
-        return srgb_to_linear(codes).astype(np.float32)
-    if not 0.1 <= gamma <= 2.0:
-        raise InputError(f"{path}: found gamma {gamma:g} in the header (gAMA), expected 0.1 to 2; save it as sRGB")
-    return (codes ** (1.0 / gamma)).astype(np.float32)
+@functools.lru_cache(maxsize=2)
+def _linear(bits: int) -> NDArray[np.float32]:
+    """Linear value of each sRGB code."""
+    return srgb_to_linear(np.arange(2**bits) / (2**bits - 1.0)).astype(np.float32)
 
 
 def _bits(image: PIL.Image.Image, data: bytes) -> int:
@@ -180,7 +174,7 @@ def _bits(image: PIL.Image.Image, data: bytes) -> int:
     return 8
 
 
-def _decode_16_bit(data: bytes, path: str | Path, gamma: float | None) -> Image:
+def _decode_16_bit(data: bytes, path: str | Path) -> Image:
     codes = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if codes is None:
         raise _damaged(path)
@@ -191,7 +185,7 @@ def _decode_16_bit(data: bytes, path: str | Path, gamma: float | None) -> Image:
     channels = codes.shape[2]
     colour = codes[..., 2::-1] if channels >= 3 else np.repeat(codes[..., :1], 3, axis=-1)
     alpha = np.float32(1 / 65535) * codes[..., -1] if channels in (2, 4) else None
-    return Image(_table(16, gamma, path)[colour], alpha, (colour == 65535).any(-1), 16)
+    return Image(_linear(16)[colour], alpha, (colour == 65535).any(-1), 16)
 
 
 def _float_image(colour: NDArray, alpha: NDArray | None) -> Image:
@@ -201,7 +195,7 @@ def _float_image(colour: NDArray, alpha: NDArray | None) -> Image:
 
 
 def _exr_header(data: bytes) -> tuple[tuple[int, int], int]:
-    """(width, height) of the first part and the bytes of all channels of all parts when decoded."""
+    """(width, height) of the first part and the number of values in all channels of all parts."""
     import OpenEXR
 
     size, decoded = (0, 0), 0
@@ -209,7 +203,7 @@ def _exr_header(data: bytes) -> tuple[tuple[int, int], int]:
         for i, part in enumerate(file.parts):
             low, high = part.header["dataWindow"]
             width, height = (np.asarray(high, dtype=np.int64) - np.asarray(low, dtype=np.int64) + 1).tolist()
-            decoded += max(width, 0) * max(height, 0) * 4 * len(part.header["channels"])
+            decoded += max(width, 0) * max(height, 0) * len(part.header["channels"])
             size = (width, height) if i == 0 else size
     return size, decoded
 
@@ -219,10 +213,10 @@ def _decode_exr(data: bytes, path: str | Path) -> Image:
 
     size, decoded = _exr_header(data)
     _check_size(size, path)
-    if decoded > MAX_DECODED_BYTES:
+    if decoded > 8 * MAX_PIXELS:
         raise InputError(
-            f"{path}: the header claims {decoded} bytes in all channels and parts, expected at most "
-            f"{MAX_DECODED_BYTES}; save one part with R, G, B and A"
+            f"{path}: the header claims {decoded} values in all channels and parts, expected at most "
+            f"{8 * MAX_PIXELS}; save one part with R, G, B and A"
         )
     with OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:
         found = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
@@ -234,37 +228,18 @@ def _decode_exr(data: bytes, path: str | Path) -> Image:
         raise InputError(f"{path}: found channels of different resolutions, expected one; save them at full size")
     colour = np.stack([found[name] for name in names], axis=-1)
     if names[0] == "R" and primaries is not None:
-        colour = _from_primaries(colour, np.ravel(primaries), path)
+        _check_primaries(np.ravel(primaries), path)
     return _float_image(colour, found.get("A"))
 
 
-def _from_primaries(colour: NDArray, primaries: NDArray, path: str | Path) -> NDArray[np.float32]:
-    """Linear colour of other primaries in Rec. 709, its white adapted as by Bradford; what lies outside is cut off."""
-    rec_709 = np.array([0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290])  # x, y of red, green, blue and white
-    if primaries.shape == (8,) and np.allclose(primaries, rec_709, atol=2e-3):
-        return np.asarray(colour, np.float32)
-    bradford = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-    try:
-        (source, white), (target, white_709) = (_to_xyz(np.asarray(p, np.float64)) for p in (primaries, rec_709))
-        adapted = np.linalg.inv(bradford) @ np.diag(bradford @ white_709 / (bradford @ white)) @ bradford
-        matrix = np.linalg.inv(target) @ adapted @ source
-    except (np.linalg.LinAlgError, ValueError):
-        matrix = np.full((3, 3), np.nan)
-    if not (np.abs(matrix) < 100.0).all():
+def _check_primaries(found: NDArray, path: str | Path) -> None:
+    """Refuse colours of other primaries or another white than those of Rec. 709, given as x, y of each."""
+    rec_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+    if found.shape != (8,) or not np.allclose(found, rec_709, atol=2e-3):
         raise InputError(
-            f"{path}: found chromaticities {np.round(primaries, 4).tolist()}, expected those of red, green, blue and "
-            "white; save it as linear Rec. 709"
+            f"{path}: found chromaticities {np.round(found, 4).tolist()}, expected those of Rec. 709, "
+            f"{list(rec_709)}; convert it to linear Rec. 709"
         )
-    return np.maximum(colour @ matrix.T, 0.0).astype(np.float32)
-
-
-def _to_xyz(primaries: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(3, 3) from RGB to XYZ, and XYZ of white, of chromaticities (8,)."""
-    x, y = primaries.reshape(4, 2).T
-    if not (np.abs(y) > 1e-6).all():
-        raise ValueError("a chromaticity without luminance")
-    xyz = np.stack([x / y, np.ones(4), (1.0 - x - y) / y])
-    return xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3]), xyz[:, 3]
 
 
 def _hdr_header(data: bytes) -> tuple[tuple[int, int], int]:
@@ -281,7 +256,7 @@ def _decode_hdr(data: bytes, path: str | Path) -> Image:
     _check_size((width, height), path)
     if width * height > (len(data) - start) * 16:  # a run of 127 values of four channels takes two bytes
         raise _damaged(path)
-    factor, primaries = np.ones(3), None
+    factor = np.ones(3)
     for line in data[:start].decode("latin-1").splitlines():
         key, _, value = line.partition("=")
         if key == "FORMAT" and value.strip() != "32-bit_rle_rgbe":
@@ -289,7 +264,7 @@ def _decode_hdr(data: bytes, path: str | Path) -> Image:
         if key in ("EXPOSURE", "COLORCORR"):  # what the pixels were multiplied by; of several lines the product
             factor = factor * np.array(value.split(), dtype=np.float64)
         if key == "PRIMARIES" and value.split() != ["0"] * 8:  # which Photoshop writes for none
-            primaries = np.array(value.split(), dtype=np.float64)
+            _check_primaries(np.array(value.split(), dtype=np.float64), path)
     if not ((factor >= 1e-9) & (factor <= 1e9)).all():
         raise InputError(f"{path}: found an exposure of {factor.tolist()}, expected positive numbers within 1e9")
     # OpenCV gets a header of ours: it can't find another resolution than the one that was checked
@@ -297,8 +272,7 @@ def _decode_hdr(data: bytes, path: str | Path) -> Image:
     pixels = cv2.imdecode(np.frombuffer(head + data[start:], np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.shape != (height, width, 3):
         raise _damaged(path)
-    colour = pixels[..., ::-1] / factor.astype(np.float32)
-    return _float_image(colour if primaries is None else _from_primaries(colour, primaries, path), None)
+    return _float_image(pixels[..., ::-1] / factor.astype(np.float32), None)
 
 
 def read_environment(path: str | Path) -> NDArray[np.float32]:

@@ -25,10 +25,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mifit.core.calls import whole
+from mifit.core.limits import MAX_PIXELS
 from mifit.errors import InputError
 
-MAX_SIDE = 2**14
-"""Rows and columns of a lat-long image at most."""
 Array = NDArray[np.float64]
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -269,5 +268,6 @@ class SHLighting:
     def to_latlong(self, height: int = 128, width: int = 256) -> Array:
         """Radiance as a lat-long image (H, W, 3)."""
         for name, size in (("height", height), ("width", width)):
-            whole(size, 1, name, MAX_SIDE)
+            whole(size, 1, name, MAX_PIXELS)
+        whole(height * width, 1, "height x width", MAX_PIXELS)
         return self.evaluate(latlong_directions(height, width))

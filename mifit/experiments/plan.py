@@ -31,7 +31,7 @@ from mifit.config import (
     text,
 )
 from mifit.core.files import Document, check_file, file_digest, file_name
-from mifit.core.limits import MAX_IMAGE_BYTES, MAX_RUNS, MAX_SAMPLES, MAX_SEED, MAX_SETTINGS_BYTES
+from mifit.core.limits import MAX_COUNT, MAX_FILE_BYTES, MAX_SEED, MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class SynthRun:
     timesteps: int = number(4, "how many", least=1, most=10_000)
     width: int = number(340, "width of the images", "pixels", least=16, most=16_384)
     height: int = number(240, "height of the images", "pixels", least=16, most=16_384)
-    spp: int = number(48, "samples per pixel", least=1, most=MAX_SAMPLES)
+    spp: int = number(48, "samples per pixel", least=1, most=MAX_COUNT)
     seed: int = number(0, "seed of everything random", least=0, most=MAX_SEED)
     env: str | None = text(None, "lat-long HDR environment; none: a procedural studio")
     model: str = text("builtin", "morphable model: a path or builtin")
@@ -82,17 +82,10 @@ class EvaluateRun:
 
 @settings
 class RelightRun:
-    """Light the fit by an environment and compare the fast path with path tracing.
-
-    With ``capture``, photographs of the same head under the environment, the relit views are judged by its ``camera``;
-    with ``synth``, that capture is made (``synth.env`` must be the environment).
-    """
+    """Light the fit by an environment and compare the fast path with path tracing."""
 
     env: str = text(..., "lat-long environment, .hdr or .exr")
     rotate: float = number(0.0, "turn of the environment about the vertical", "degrees", least=-3600, most=3600)
-    capture: str | None = text(None, "capture folder")
-    synth: SynthRun | None = part(None, "a capture made for the experiment, instead of a folder")
-    camera: str = text("third", "camera of that capture")
 
 
 @settings
@@ -101,7 +94,7 @@ class RenderRun:
 
     scene: str = text(..., "scene file")
     parameters: dict[str, bool | int | float | str] = part(dict, "values of the scene's <default> names")
-    spp: int = number(64, "samples per pixel", least=1, most=MAX_SAMPLES)
+    spp: int = number(64, "samples per pixel", least=1, most=MAX_COUNT)
     seed: int = number(0, "seed of the samples", least=0, most=MAX_SEED)
 
 
@@ -110,7 +103,7 @@ class ReferenceRun:
     """The render of the same scene that a `RenderRun` is compared with."""
 
     parameters: dict[str, bool | int | float | str] = part(dict, "values of the scene's <default> names")
-    spp: int = number(1024, "samples per pixel", least=1, most=MAX_SAMPLES)
+    spp: int = number(1024, "samples per pixel", least=1, most=MAX_COUNT)
     seed: int = number(1, "seed of the samples", least=0, most=MAX_SEED)
 
 
@@ -227,7 +220,7 @@ def _assign(table: dict, key: str, value: object, where: str) -> None:
             raise InputError(f"{where}: {key}: {name} is a value, expected a table")
     table[last] = value
     other = {"capture": "synth", "synth": "capture"}.get(last)
-    if other and parents in (["fit"], ["relight"]):
+    if other and parents == ["fit"]:
         table.pop(other, None)
 
 
@@ -246,8 +239,8 @@ def _points(sweep: object, where: str) -> Iterator[Document]:
     if not isinstance(points, list) or not points or not all(isinstance(p, dict) for p in points):
         raise InputError(f"{where}: sweep.list: found {points!r}, expected a list of tables")
     count = len(points) * math.prod(map(len, grid.values()))
-    if count > MAX_RUNS:
-        raise InputError(f"{where}: sweep: found {count} runs, expected at most {MAX_RUNS}; split the sweep")
+    if count > MAX_COUNT:
+        raise InputError(f"{where}: sweep: found {count} runs, expected at most {MAX_COUNT}; split the sweep")
     for point, values in itertools.product(points, itertools.product(*grid.values())):
         yield dict(_flatten(point)) | dict(zip(grid, values, strict=True))
 
@@ -257,13 +250,12 @@ def _with_captures(sweep: object, path: Path) -> object:
     if not isinstance(sweep, dict) or not isinstance(sweep.get("grid"), dict):
         return sweep
     grid = dict(_flatten(sweep["grid"]))
-    for key in ("fit.capture", "relight.capture"):
-        folder = grid.get(key)
-        if isinstance(folder, str):
-            found = sorted(p.parent.name for p in (path.parent / folder).glob("*/transforms.json"))
-            if not found:
-                raise InputError(f"{path}: sweep.grid: {key}: found no capture in {folder!r}, expected folders of them")
-            grid[key] = [os.path.join(folder, name) for name in found]
+    key, folder = "fit.capture", grid.get("fit.capture")
+    if isinstance(folder, str):
+        found = sorted(p.parent.name for p in (path.parent / folder).glob("*/transforms.json"))
+        if not found:
+            raise InputError(f"{path}: sweep.grid: {key}: found no capture in {folder!r}, expected folders of them")
+        grid[key] = [os.path.join(folder, name) for name in found]
     return {**sweep, "grid": grid}
 
 
@@ -296,17 +288,12 @@ def _resolved(e: Experiment, folder: Path, where: str) -> Experiment:
     if e.fit and e.fit.synth:
         named += [("fit.cameras", name) for name in e.fit.cameras]
         named += [("evaluate.camera", e.evaluate.camera)] if e.evaluate else []
-    if e.relight and e.relight.synth:
-        named.append(("relight.camera", e.relight.camera))
     for key, name in named:
         if name not in ("left", "right", "third"):  # `synth.compose.place_cameras`
             raise InputError(
                 f"{where}: {key}: found {name!r}, expected one of left, right, third, as synthetic captures have"
             )
-    e = _absolute(e, folder)
-    if e.relight and e.relight.synth and (e.relight.capture is not None or e.relight.synth.env != e.relight.env):
-        raise InputError(f"{where}: relight.synth: expected its 'env' to be relight.env, and no 'capture'")
-    return e
+    return _absolute(e, folder)
 
 
 def _absolute(settings: Part, folder: Path) -> Part:
@@ -329,9 +316,6 @@ def _inputs(e: Experiment) -> dict[str, tuple]:
         found["scene"] = ("file", e.render.scene)
     if e.relight:
         found["env"] = ("file", e.relight.env)
-        if e.relight.capture is not None:
-            names = (*(e.fit.cameras if e.fit else ()), e.relight.camera)
-            found["lit_capture"] = ("capture", e.relight.capture, None, None, names)
     if e.fit:
         found["model"] = ("model", e.fit.model)
         if e.fit.capture is not None:
@@ -347,11 +331,10 @@ def _digest(
     name: str,
     cameras: tuple[str, ...] | None = None,
     timesteps: tuple[int, ...] | None = None,
-    needed: tuple[str, ...] = (),
 ) -> str:
     """Digest of the content of an input; InputError where it can't be used."""
     if kind == "file":
-        return file_digest(name, MAX_IMAGE_BYTES).hex()
+        return file_digest(name, MAX_FILE_BYTES).hex()
     if kind == "model":  # a built-in one is known by mifit's version, which every key holds
         path = Path(name)
         stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.exists() else None
@@ -359,9 +342,6 @@ def _digest(
     from mifit.fitting import choose, choose_timesteps
 
     capture = mifit.Capture.load(name)
-    choose("camera", capture.cameras, needed or None, 0)
-    if cameras is None:
-        return capture.digest()
     return capture.digest(choose("camera", capture.cameras, cameras, 2), choose_timesteps(capture, timesteps))
 
 

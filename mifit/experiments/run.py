@@ -101,9 +101,8 @@ def _execute_all(
         return
     arguments = [(run, str((folder / "runs" / run.folder).resolve()), str(folder.resolve()), variant) for run in runs]
     for run in runs:
-        for part in (run.experiment.fit, run.experiment.relight):
-            if part and part.synth:
-                _synthetic_capture(part.synth, folder, variant)
+        if run.experiment.fit and run.experiment.fit.synth:
+            _synthetic_capture(run.experiment.fit.synth, folder, variant)
     with _executor(min(jobs, len(runs)), dask) as executor:
         futures: dict[Future, Run] = {executor.submit(execute, *a): a[0] for a in arguments}
         for future in as_completed(futures):
@@ -171,7 +170,7 @@ def execute(run: Run, folder: str, experiment_folder: str, variant: str) -> None
 def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: str) -> dict[str, float]:
     """Fit, evaluate and relight; returns the figures of the table."""
     from mifit.output.evaluate import evaluate
-    from mifit.output.relight import evaluate_relit, write_relit
+    from mifit.output.relight import write_relit
     from mifit.output.report import write_report
 
     fit = e.fit
@@ -209,15 +208,6 @@ def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: 
             seed=fit.seed,
         )
         metrics["relight_fast_vs_path_psnr"] = found["check"]["psnr"]
-        lit_capture = e.relight.capture
-        if e.relight.synth:
-            lit_capture = str(_synthetic_capture(e.relight.synth, experiment_folder, variant))
-        if lit_capture is not None:
-            judged = evaluate_relit(
-                result, e.relight.env, mifit.Capture.load(lit_capture), e.relight.camera, e.relight.rotate
-            )
-            for method, figures in judged["methods"].items():
-                metrics[f"relit_psnr_{method}"] = figures["psnr"]
     if e.outputs.report:
         write_report(folder, result, capture, evaluation)
     return metrics

@@ -19,6 +19,7 @@ from mifit.core.mesh import edges, split_faces
 from mifit.errors import InputError
 
 EYES_AND_MOUTH = (range(36, 42), range(42, 48), range(60, 68))
+BROWS = (range(17, 22), range(22, 27))
 """iBUG landmarks around the three openings of a face."""
 
 INNER = np.arange(17, 68)

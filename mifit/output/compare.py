@@ -20,9 +20,7 @@ from mifit.core.image import linear_to_srgb, srgb_to_linear
 from mifit.core.metrics import flip, psnr_from_rmse, ssim
 from mifit.core.sh import LUMINANCE
 from mifit.errors import InputError
-
-EYES, INNER_LIPS, BROWS = ((36, 42), (42, 48)), (60, 68), ((17, 22), (22, 27))
-"""iBUG landmarks of what is no skin, first and past the last."""
+from mifit.morphable.topology import BROWS, EYES_AND_MOUTH
 
 Region = NDArray[np.bool_]
 
@@ -48,9 +46,9 @@ def relit_region(landmarks: NDArray, camera: Camera) -> Region:
 def pass_region(landmarks: NDArray, camera: Camera) -> Region:
     """(H, W) as `relit_region`, without brows and further from the hull: bare skin, for diffuse and specular images."""
     hair = np.zeros((camera.height, camera.width), np.uint8)
-    for first, last in BROWS:
+    for brow in BROWS:
         width = max(int(0.05 * np.ptp(landmarks[:, 0])), 1)  # half of a brow's height
-        cv2.polylines(hair, [landmarks[first:last].astype(np.int32)], False, 1, width)
+        cv2.polylines(hair, [landmarks[list(brow)].astype(np.int32)], False, 1, width)
     inner = face_region(landmarks, camera, 7)
     return inner & (_openings(landmarks, camera, 2.0, 2.0) == 0) & (hair == 0)
 
@@ -64,9 +62,9 @@ def _hull(points: NDArray, camera: Camera) -> NDArray[np.uint8]:
 def _openings(landmarks: NDArray, camera: Camera, eyes: float, mouth: float) -> NDArray[np.uint8]:
     """Hulls of eyes and inner mouth, grown about their middles by factors."""
     area = np.zeros((camera.height, camera.width), np.uint8)
-    for (first, last), factor in ((EYES[0], eyes), (EYES[1], eyes), (INNER_LIPS, mouth)):
-        middle = landmarks[first:last].mean(0)
-        area |= _hull(middle + factor * (landmarks[first:last] - middle), camera)
+    for marks, factor in zip(EYES_AND_MOUTH, (eyes, eyes, mouth), strict=True):
+        points = landmarks[list(marks)]
+        area |= _hull(points.mean(0) + factor * (points - points.mean(0)), camera)
     return area
 
 

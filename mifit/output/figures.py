@@ -19,13 +19,13 @@ from mifit.core.sh import SHLighting
 HEAT_LIMIT = 40.0
 """Error, in 8-bit steps, at which the heat map's colours end."""
 
-CLIPPED_TINT = (214, 39, 160)
-LABEL_TINTS = (
+TINTS = (
+    (None, (214, 39, 160), "clipped"),
     (Label.OCCLUDER, (230, 30, 30), "something in front of the face"),
     (Label.EYES, (0, 215, 215), "eyes"),
     (Label.MOUTH, (150, 60, 220), "mouth"),
 )
-"""Labels that the report colours, with their colour and name: apart in hue and lightness, and from skin."""
+"""What the report colours in a photograph, clipped pixels and labels: apart in hue and lightness, and from skin."""
 
 _CURVES = ("#0f6cbd", "#b3470a", "#2b7a3d", "#8a3ab9", "#a3262e", "#5b5f66", "#96750b", "#0b7a75")
 

@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from mifit.result import Reconstruction
 
 _KINDS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
-_SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
-SKIN, REST = range(2)
-"""Materials, in their order."""
 
 
 class _Buffer:
@@ -55,7 +52,7 @@ class _Buffer:
             "bufferView": self.view(array.tobytes(), target),
             "componentType": _KINDS[array.dtype],
             "count": len(array),
-            "type": _SHAPES[1 if array.ndim == 1 else array.shape[1]],
+            "type": "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}",
         }
         if bounds:
             entry |= {name: np.atleast_1d(f(array, axis=0)).tolist() for name, f in (("min", np.min), ("max", np.max))}
@@ -121,9 +118,10 @@ def write_glb(
 
     out = _Buffer()
     albedo = vertex_materials(result, skin=True)[:, :3]
-    kinds = {"face": SKIN, "rest": REST}
+    rest = {"name": "rest", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
     primitives = [
-        _primitive(out, part, base, shape.normals, targets, kinds[name], albedo) for name, part in shape.parts().items()
+        _primitive(out, part, base, shape.normals, targets, None if name == "face" else albedo)
+        for name, part in shape.parts().items()
     ]
     images, textures, skin = _skin(out, result, timestep, shape)
     subject = Path(path).stem
@@ -146,13 +144,9 @@ def write_glb(
     for camera in result.cameras:
         nodes.append(_camera_node(camera, len(cameras), metre))
         cameras.append(_camera(camera))
-    materials = [
-        skin,
-        {"name": "rest", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}},
-    ]
     document: Document = {
         "asset": {"version": "2.0", "generator": f"mifit {mifit.__version__}"},
-        "extensionsUsed": sorted({name for material in materials for name in material.get("extensions", {})}),
+        "extensionsUsed": list(skin["extensions"]),
         "scene": 0,
         "scenes": [
             {
@@ -167,7 +161,7 @@ def write_glb(
         ],
         "nodes": nodes,
         "meshes": [{"name": subject, "primitives": primitives}],
-        "materials": materials,
+        "materials": [skin, rest],
         "textures": textures,
         "images": images,
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
@@ -191,16 +185,15 @@ def _primitive(
     base: NDArray,
     normals: NDArray,
     targets: NDArray,
-    material: int,
-    albedo: NDArray,
+    albedo: NDArray | None,
 ) -> Document:
-    """One primitive: with texture coordinates and tangents, or of the material without maps with vertex colours."""
+    """One primitive: with texture coordinates and tangents, or with vertex albedo (V, 3) where there are no maps."""
     n = normals[part.origin]
     attributes = {
         "POSITION": out.accessor(base[part.origin], "<f4", bounds=True),
         "NORMAL": out.accessor(n, "<f4"),
     }
-    if material != REST:
+    if albedo is None:
         tangent, sign = tangents(base[part.origin], n, part.uv, part.faces)
         attributes["TANGENT"] = out.accessor(np.column_stack([tangent, sign]), "<f4")
         attributes["TEXCOORD_0"] = out.accessor(part.uv * (1, -1) + (0, 1), "<f4")
@@ -209,7 +202,7 @@ def _primitive(
     primitive: Document = {
         "attributes": attributes,
         "indices": out.accessor(part.faces.ravel(), "<u2" if len(part.origin) <= 2**16 else "<u4", target=34963),
-        "material": material,
+        "material": 0 if albedo is None else 1,
     }
     if targets.shape[2]:
         primitive["targets"] = [{"POSITION": out.sparse(targets[part.origin, :, k])} for k in range(targets.shape[2])]

@@ -21,16 +21,13 @@ from mifit.core.metrics import psnr, rmse
 from mifit.core.sh import LUMINANCE, SHLighting
 from mifit.errors import InputError
 from mifit.output.deferred import SampledMaterial, VisibleSurface, shade_methods, surface_material, visible_surface
-from mifit.output.evaluate import face_area
 from mifit.output.scene import render_view
 from mifit.output.views import check_moving, sheet, write_moving
 from mifit.progress import Progress, silent
 from mifit.result import Reconstruction
 
 if TYPE_CHECKING:
-    from mifit.capture import Capture
     from mifit.core.camera import Camera
-    from mifit.result import Method
 
 AGREEMENT = 30.0
 """PSNR in dB between fast and path-traced views below which a person is warned. Five measured environments gave 31.6 to
@@ -222,55 +219,3 @@ def _check(lit: Reconstruction, camera: Camera, timestep: int, seed: int) -> dic
     covered = (fast[..., 3] == 1) & (path[..., 3] > 0.99)
     a, b = to_8_bit(fast[..., :3])[covered][None], to_8_bit(path[..., :3])[covered][None]
     return {"psnr": psnr(a, b), "rmse": rmse(a, b)}
-
-
-def evaluate_relit(
-    result: Reconstruction,
-    environment: str | Path | NDArray,
-    capture: Capture,
-    camera: str,
-    rotate: float = 0.0,
-    integrator: Literal["local", "path"] = "local",
-) -> Document:
-    """Errors of a relit result against photographs of the same head, in the same poses, under that environment.
-
-    The two captures' exposures are not known to each other, so each method gets one factor on its brightness: the
-    least-squares one over the cameras that were fitted, in the new capture. InputError where the judged camera was
-    fitted, or a camera or timestep is missing in the capture.
-
-    Returns
-    -------
-    dict
-        ``camera``, ``timesteps``, ``region_pixels`` and ``methods``: PSNR (dB), RMSE (0..255) in 8-bit sRGB over the
-        fitted model's face area, and the exposure, for ``diffuse`` and ``full``.
-    """
-    if camera in [c.name for c in result.cameras]:
-        raise InputError(f"camera {camera}: was fitted; expected another one to judge by")
-    lit = relit(result, environment, [rotate])[0]
-    capture = capture.with_fitted(result.cameras)
-    steps = [t for t in lit.timesteps if t in capture.timesteps]
-    if not steps:
-        raise InputError(f"the capture has none of the timesteps {', '.join(map(str, lit.timesteps))}")
-
-    def views(name: str, timesteps: list[int], method: Method) -> tuple[NDArray, NDArray]:
-        """Photographed and rendered linear colours (N, 3) in the face area."""
-        view: Camera = capture.camera(name)
-        photographs, renders = [], []
-        for t in timesteps:
-            frame = capture.frame(name, t)
-            vertices = lit.geometry.vertices[lit.index(t)]
-            area = face_area(vertices, lit.model.faces, lit.model.face_mask, view) & frame.valid
-            shown = render_view(lit, view, t, method, integrator)
-            photographs.append(frame.image[area])
-            renders.append(shown[area][:, :3])
-        return np.concatenate(photographs), np.concatenate(renders)
-
-    methods = {}
-    for method in ("diffuse", "full"):
-        pairs = [views(c.name, steps[:1], method) for c in result.cameras]
-        photograph, render = (np.concatenate(part).astype(np.float64) for part in zip(*pairs, strict=True))
-        exposure = float((photograph * render).sum() / max(float((render * render).sum()), 1e-12))
-        photograph, render = views(camera, steps, method)
-        codes, expected = to_8_bit(exposure * render)[None], to_8_bit(photograph)[None]
-        methods[method] = {"psnr": psnr(codes, expected), "rmse": rmse(codes, expected), "exposure": exposure}
-    return {"camera": camera, "timesteps": steps, "region_pixels": len(photograph), "methods": methods}

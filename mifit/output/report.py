@@ -17,9 +17,8 @@ from mifit.core.files import Document, write_text
 from mifit.core.image import to_8_bit
 from mifit.output.evaluate import Comparison, compare, face_area, rgba_8_bit
 from mifit.output.figures import (
-    CLIPPED_TINT,
     HEAT_LIMIT,
-    LABEL_TINTS,
+    TINTS,
     bounding_box,
     draw_landmarks,
     energy_plot,
@@ -238,8 +237,7 @@ def _slider(found: Comparison) -> str:
 def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]) -> str:
     """Photographs with landmarks, under the fit, and with what was not used of them."""
     swatches = "".join(
-        f'<span><i style="background:rgb{colour};height:12px"></i>{name}</span>'
-        for colour, name in ((CLIPPED_TINT, "clipped"), *((colour, name) for _, colour, name in LABEL_TINTS))
+        f'<span><i style="background:rgb{colour};height:12px"></i>{name}</span>' for _, colour, name in TINTS
     )
     parts = [
         '<p class="soft">Cyan rings: detected landmarks. Orange dots: the fitted model\'s.</p>'
@@ -257,8 +255,8 @@ def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]
             area = face_area(vertices, model.faces, model.face_mask, view) & frame.valid
             clipped = frame.clipped & area
             labels = None if result.reflectance is None else result.reflectance.label(camera, timestep)
-            kinds = [] if labels is None else [(labels == kind, colour) for kind, colour, _ in LABEL_TINTS]
-            tinted = tint(photograph, (clipped, CLIPPED_TINT), *kinds)
+            areas = [(clipped if k is None else labels == k, c) for k, c, _ in TINTS if k is None or labels is not None]
+            tinted = tint(photograph, *areas)
             share = clipped.sum() / max(int(area.sum()), 1)
             figures += [
                 _figure(marked[box], f"{label}: input with landmarks", f"input from {label}"),

@@ -21,7 +21,7 @@ from mifit.core.calls import whole
 from mifit.core.camera import Camera
 from mifit.core.files import Document, write_text
 from mifit.core.image import write_image
-from mifit.core.limits import MAX_SAMPLES
+from mifit.core.limits import MAX_COUNT
 from mifit.core.mesh import interpolate, normalize
 from mifit.core.sh import SHLighting
 from mifit.core.uv import rasterize_uv
@@ -36,7 +36,6 @@ from mifit.result import METHODS
 if TYPE_CHECKING:
     from mifit.result import Method, Reconstruction
 
-SAMPLES = Parameter("spp", 64)
 Skin = Callable[[Mapping[str, Document]], Mapping[str, object]]
 """Makes a BSDF's dictionary of those of the maps' textures."""
 
@@ -89,7 +88,7 @@ def render_view(
     check_shown(result, timestep, method)
     check_active_variant()
     if samples is not None:
-        whole(samples, 1, "samples", MAX_SAMPLES)
+        whole(samples, 1, "samples", MAX_COUNT)
     if integrator == "local":
         return render_local(result, camera, timestep, method, samples or 2)
     if integrator == "path":
@@ -192,7 +191,7 @@ def load_result_scene(
 
     check_active_variant()
     check_shown(result, timestep, method)
-    whole(samples, 1, "samples", MAX_SAMPLES)
+    whole(samples, 1, "samples", MAX_COUNT)
     if not all(isinstance(camera, Camera) for camera in cameras):
         raise TypeError("scene: cameras: found other objects, expected Camera")
     chosen: Document = {"type": integrator} if isinstance(integrator, str) else dict(integrator)
@@ -221,7 +220,7 @@ def scene_description(
     stock: bool,
     files: str,
     integrator: Mapping[str, object] | None = None,
-    samples: int | Parameter = SAMPLES,
+    samples: int | None = None,
 ) -> Document:
     """The scene of `write_scene` as a plain dictionary (`render.description`), its files in the folder ``files``.
 
@@ -233,7 +232,9 @@ def scene_description(
     path = {"type": "path", "max_depth": Parameter("max_depth", 5), "hide_emitters": True}
     scene: Document = {"type": "scene", "integrator": path if integrator is None else dict(integrator)}
     for name, camera in zip(sensor_ids(cameras), cameras, strict=True):
-        scene[name] = sensor_description(camera.with_square_pixels() if stock else camera, samples)
+        scene[name] = sensor_description(
+            camera.with_square_pixels() if stock else camera, Parameter("spp", 64) if samples is None else samples
+        )
     scene["skin"] = _skin(result, files, stock)
     scene["face"] = _shape(f"{files}/face.ply", {"type": "ref", "id": "skin"})
     if not mapped_faces(result).all():

@@ -84,41 +84,6 @@ def write_turntable(
     write_moving(folder / "turntable.webp", rows[methods[0]] + rows[methods[0]][-2:0:-1], 12)
 
 
-def write_sequence(
-    result: Reconstruction,
-    path: str | Path,
-    start: float = 0.0,
-    stop: float = 0.0,
-    methods: Sequence[Method] | None = None,
-    fps: float = 12.0,
-    progress: Progress = silent,
-) -> None:
-    """Animate the timesteps of a result in order of time, the face moving as it did while a camera turns about it.
-
-    ``.mp4``, or ``.webp`` for an animated picture. The camera turns between two angles in degrees, as in a turntable
-    around the first frame; ``methods`` are side by side, by default the best that the result has. InputError for a
-    method that the result lacks, another suffix, or no cameras.
-    """
-    check_moving(path)
-    steps = sorted(result.timesteps)
-    shown = tuple(result.methods[-1:] if methods is None else methods)
-    for method in shown:
-        if method not in result.methods:
-            raise InputError(f"method {method!r}: found no such result, expected one of {result.methods}")
-    angles = np.linspace(start, stop, len(steps))
-    cameras = [orbit_camera(result, steps[0], float(angle)) for angle in angles]
-
-    def frames() -> Iterable[NDArray]:
-        for k, (timestep, camera) in enumerate(zip(steps, cameras, strict=True)):
-            progress("sequence", k, len(steps))
-            surface = visible_surface(result, camera, timestep)
-            images = shade_methods(result, surface, timestep, shown)
-            yield np.concatenate([images[m] for m in shown], axis=1)
-        progress("sequence", len(steps), len(steps))
-
-    write_moving(path, frames(), fps)
-
-
 def write_overlay(
     result: Reconstruction,
     capture: Capture,

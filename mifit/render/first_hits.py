@@ -1,4 +1,4 @@
-"""What primary rays meet, kept while neither they nor the meshes move, in an order that suits the maps."""
+"""What primary rays meet, kept while neither they nor the meshes move."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ from mifit.render.gbuffer import MESH_BUFFERS
 if TYPE_CHECKING:
     import mitsuba as mi
 
-TILES = 64
-"""Tiles along the maps' sides, in whose order the points of a view are shaded: a tile's gradients stay in the cache."""
-KEPT_BYTES, RAY_BYTES = 2**30, 260
-"""Of first hits at most, and of one of them with its ray and its point: a dozen views of 680 x 480."""
+KEPT_RAYS = 2**22
+"""Rays whose hits are kept at most, a dozen views of 680 x 480: a gigabyte."""
 
 
 def _buffers_of(mesh: mi.Mesh) -> list[mi.Float]:
@@ -39,15 +37,6 @@ def recording() -> bool:
     import drjit as dr
 
     return bool(dr.flag(dr.JitFlag.SymbolicScope) or dr.flag(dr.JitFlag.FreezingScope))
-
-
-def _by_tile(uv: mi.Point2f) -> mi.UInt32:
-    """The order of points in which those that share a tile of texels follow one another."""
-    import mitsuba as mi
-
-    column, row = (np.floor(np.array(x) * TILES).astype(np.int64) % TILES for x in (uv.x, uv.y))
-    order = np.argsort((row * TILES + column).astype(np.uint16), kind="stable")
-    return mi.UInt32(order.astype(np.uint32))
 
 
 class FirstHits:
@@ -80,10 +69,6 @@ class FirstHits:
             if kept is None or kept["moved"] != moved or not _same_rays(kept["ray"], still):
                 hits = scene.ray_intersect_preliminary(still, coherent=True)
                 index: mi.UInt32 = dr.compress(hits.is_valid())
-                if dr.width(index) > 0:
-                    met = dr.gather(type(hits), hits, index)
-                    met = met.compute_surface_interaction(dr.gather(mi.Ray3f, still, index))
-                    index = dr.gather(mi.UInt32, index, _by_tile(met.uv))
                 kept = {"ray": still, "moved": moved, "index": index}
                 if dr.width(index) > 0:
                     kept["hits"] = dr.gather(type(hits), hits, index)
@@ -93,7 +78,7 @@ class FirstHits:
                 kept["buffers"] = buffers
                 self.kept.pop(name, None)
                 self.kept[name] = kept
-                while sum(RAY_BYTES * rays for _, rays in self.kept) > KEPT_BYTES and len(self.kept) > 1:
+                while sum(rays for _, rays in self.kept) > KEPT_RAYS and len(self.kept) > 1:
                     self.kept.pop(next(iter(self.kept)))
         index = kept["index"]
         if dr.width(index) == 0:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.arrays import aligned, on_device
+from mifit.appearance.occlusion import OFFSET
 from mifit.core.arrays import Recent
 from mifit.core.camera import Camera
 from mifit.core.mesh import lengths
@@ -22,9 +23,6 @@ MESH_FACES = "faces"
 MESH_TEXCOORDS = "vertex_texcoords"
 MESH_NORMALS = "vertex_normals"
 MESH_BUFFERS = (MESH_POSITIONS, MESH_FACES, MESH_TEXCOORDS, MESH_NORMALS)
-
-SHADOW_EPSILON = 1e-3
-"""Part of a ray's far end, relative to the scene's diagonal, in which hits count as the surface point itself."""
 
 _Hits = tuple[tuple[slice, slice], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 """Pixels, and for each of them face, two barycentric weights and depth."""
@@ -191,7 +189,7 @@ class SurfaceScene:
     def visible_from(self, points: NDArray, origin: NDArray) -> NDArray[np.bool_]:
         """(N,) bool: nothing of the mesh lies between surface points (N, 3) and an origin (3,) outside the mesh.
 
-        The far end of each ray, ``SHADOW_EPSILON`` of the scene's diagonal, is left out, so that a point isn't hidden
+        The far end of each ray, `OFFSET` of the scene's diagonal, is left out, so that a point isn't hidden
         by its own surface. A point that faces away is hidden by what lies in front of it; at silhouettes the caller
         should test the normal as well.
         """
@@ -203,7 +201,7 @@ class SurfaceScene:
         direction = points - np.asarray(origin, dtype=np.float64)
         distance = lengths(direction)
         direction /= np.maximum(distance, 1e-30)[:, None]
-        reach = np.maximum(distance - SHADOW_EPSILON * self._diagonal, 0.0)
+        reach = np.maximum(distance - OFFSET * self._diagonal, 0.0)
         ray = mi.Ray3f(mi.Point3f(np.asarray(origin, dtype=np.float64)), on_device(mi.Vector3f, direction))
         ray.maxt = mi.Float(aligned(reach))
         hit = self.rays.ray_test(ray)
@@ -212,7 +210,7 @@ class SurfaceScene:
     def open_towards(self, points: NDArray, normals: NDArray, directions: NDArray) -> NDArray[np.uint32]:
         """(N,) uint32 whose bit d says whether a surface point sees the distant direction d past the mesh.
 
-        Rays start off the surface by ``SHADOW_EPSILON`` of the scene's diagonal along the normal. A direction below
+        Rays start off the surface by `OFFSET` of the scene's diagonal along the normal. A direction below
         the horizon counts as hidden. ``points`` and unit ``normals`` are (N, 3), unit ``directions`` (D, 3), at most
         32.
         """
@@ -225,7 +223,7 @@ class SurfaceScene:
             return np.zeros(0, np.uint32)
         n = on_device(mi.Vector3f, normals)
         # Opaque: the kernel is compiled once, not once for every mesh.
-        origin = on_device(mi.Vector3f, points) + dr.opaque(mi.Float, SHADOW_EPSILON * self._diagonal) * n
+        origin = on_device(mi.Vector3f, points) + dr.opaque(mi.Float, OFFSET * self._diagonal) * n
         toward = mi.Float(aligned(directions).ravel())
 
         def body(i: mi.UInt, bits: mi.UInt) -> tuple[mi.UInt, mi.UInt]:

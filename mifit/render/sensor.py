@@ -15,9 +15,6 @@ from mifit.render.description import Parameter, to_mitsuba
 if TYPE_CHECKING:
     import mitsuba as mi
 
-MITSUBA_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""OpenCV's camera axes (x right, y down) to Mitsuba's (x left, y up); both look along +z."""
-
 
 def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str = "multijitter") -> Document:
     """The sensor of an undistorted camera, as a plain dictionary (`render.description`).
@@ -39,10 +36,12 @@ def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str =
         }
     else:
         lens = {"type": "pinhole"} | {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
+    pose = np.linalg.inv(camera.world_to_camera)
+    pose[:, :2] *= -1.0  # Mitsuba's axes are x left, y up, z forward
     return lens | {
         "near_clip": 1e-2,
         "far_clip": 1e4,
-        "to_world": np.linalg.inv(camera.world_to_camera) @ MITSUBA_AXES,
+        "to_world": pose,
         "film": {
             "type": "hdrfilm",
             "width": camera.width,

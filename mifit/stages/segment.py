@@ -24,7 +24,7 @@ from mifit.core.image import box, to_8_bit
 from mifit.core.mesh import interpolate
 from mifit.core.metrics import NORMAL
 from mifit.core.process import on_all_cores
-from mifit.morphable.topology import EYES_AND_MOUTH
+from mifit.morphable.topology import BROWS, EYES_AND_MOUTH
 from mifit.sampling.visibility import DARKEST
 
 if TYPE_CHECKING:
@@ -308,7 +308,7 @@ def _plain(shape: tuple[int, ...], marks: NDArray) -> NDArray[np.bool_]:
         return area > 0
     y, x = np.mgrid[: shape[0], : shape[1]]
     above = (x * up[0] + y * up[1]) > float(marks[29] @ up)
-    for part in (*EYES_AND_MOUTH[:2], range(17, 22), range(22, 27)):
+    for part in (*EYES_AND_MOUTH[:2], *BROWS):
         cv2.fillPoly(area, [cv2.convexHull(np.round(marks[part]).astype(np.int32))], 1)
     margin = max(1, round(MARGIN * float(np.linalg.norm(marks[45] - marks[36]))))
     features = cv2.dilate(area, np.ones((2 * margin + 1,) * 2, np.uint8)) > 0

@@ -18,14 +18,7 @@ from mifit.capture.transforms import MIN_SIDE, Shot, View, write_transforms
 from mifit.core.camera import Camera
 from mifit.core.files import replacing, write_text
 from mifit.core.image import read_environment, write_image
-from mifit.core.limits import (
-    MAX_RENDERED_PIXELS,
-    MAX_RUNS,
-    MAX_SAMPLES,
-    MAX_SEED,
-    MAX_TIMESTEPS,
-    check_range,
-)
+from mifit.core.limits import MAX_COUNT, MAX_PIXELS, MAX_SEED, check_range
 from mifit.core.mesh import MeshPart, SplitMesh, split_at_seams, vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
@@ -107,12 +100,12 @@ def synthesize(  # noqa: PLR0913
     """
     out = Path(out)
     for name, value, low, high in (
-        ("subjects", subjects, 1, MAX_RUNS),
-        ("timesteps", timesteps, 1, MAX_TIMESTEPS),
-        ("width", width, MIN_SIDE, MAX_RENDERED_PIXELS // MIN_SIDE),
-        ("height", height, MIN_SIDE, MAX_RENDERED_PIXELS // MIN_SIDE),
-        ("width x height", width * height, MIN_SIDE**2, MAX_RENDERED_PIXELS),
-        ("spp", spp, 1, MAX_SAMPLES),
+        ("subjects", subjects, 1, MAX_COUNT),
+        ("timesteps", timesteps, 1, MAX_COUNT),
+        ("width", width, MIN_SIDE, MAX_PIXELS // MIN_SIDE),
+        ("height", height, MIN_SIDE, MAX_PIXELS // MIN_SIDE),
+        ("width x height", width * height, MIN_SIDE**2, MAX_PIXELS),
+        ("spp", spp, 1, MAX_COUNT),
         ("seed", seed, 0, MAX_SEED),
     ):
         check_range(name, value, low, high)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mifit.appearance.lobe import normalization
-from mifit.appearance.models import GUARD
+from mifit.appearance.models import PaperModel
 from mifit.core import sh
 from mifit.errors import InputError
 from tests import reference
@@ -64,7 +64,9 @@ def test_the_papers_model_is_the_papers_formula(variant: str) -> None:
     expected = 0.4 * shading * (power / np.where(lit, cosine, 1.0))[:, None]
     assert lit.sum() > 20
     assert np.abs(specular[lit] / expected[lit] - 1).max() < 0.041
-    guarded = 0.4 * shading * (power * np.maximum(cosine, 0) / (np.maximum(cosine, 0) ** 2 + GUARD**2))[:, None]
+    guarded = (
+        0.4 * shading * (power * np.maximum(cosine, 0) / (np.maximum(cosine, 0) ** 2 + PaperModel.guard**2))[:, None]
+    )
     assert np.abs(specular - guarded).max() < 1e-3 * np.abs(guarded).max()
 
 

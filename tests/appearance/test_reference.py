@@ -8,7 +8,7 @@ import pytest
 from mifit.appearance import kernels, models
 from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.lobe import Lobe
-from mifit.appearance.models import GUARD, SMALLEST
+from mifit.appearance.models import PaperModel, PrintedModel
 from mifit.core import sh
 from tests import reference
 from tests.shaded import diffuse_matrix, light_columns, shade_points
@@ -58,7 +58,7 @@ def test_shadowed(variant, lobe):
 
 
 @pytest.mark.parametrize("exponent", [1.0, 5.0, 1000.0])
-@pytest.mark.parametrize(("model", "guard"), [("paper", GUARD), ("printed", SMALLEST)])
+@pytest.mark.parametrize(("model", "guard"), [("paper", PaperModel.guard), ("printed", PrintedModel.guard)])
 def test_paper(variant, model, guard, exponent):
     n, v = directions()
     # Grey: Mitsuba's luminance has one more digit than ours, which turns the dominant direction of coloured light.
@@ -88,7 +88,7 @@ def test_compact_light(variant, lobe):
 @pytest.mark.parametrize(
     ("name", "plain"),
     [
-        ("paper", lambda n, v, c, m: reference.paper_light(n, v, c, m, GUARD)),
+        ("paper", lambda n, v, c, m: reference.paper_light(n, v, c, m, PaperModel.guard)),
         (
             "prefiltered",
             lambda n, v, c, m: reference.prefiltered_light(n, v, c, Lobe(m)),

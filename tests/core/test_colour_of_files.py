@@ -14,6 +14,7 @@ from mifit.core.image import encode_png, read_environment, read_image, write_ima
 from mifit.errors import InputError
 
 ACES = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 REC_2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
 
 
@@ -29,24 +30,15 @@ def flat(*colour: float) -> dict[str, np.ndarray]:
     return {name: np.full((16, 32), value) for name, value in zip("RGB", colour, strict=True)}
 
 
-def test_primaries_of_an_exr_are_converted(tmp_path: Path) -> None:
-    """White stays white; BT.2087's matrix of Rec. 2020 green; another white is adapted."""
+def test_other_primaries_of_an_exr_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "e.exr"
-    for primaries in (ACES, REC_2020):
-        grey = read_image(write_exr(path, flat(0.18, 0.18, 0.18), chromaticities=primaries))
-        np.testing.assert_allclose(grey, 0.18, rtol=2e-3)
-    colour = read_image(write_exr(path, flat(0.5, 0.4, 0.3), chromaticities=REC_2020))[0, 0]
-    matrix = [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]]
-    np.testing.assert_allclose(colour, np.array(matrix) @ [0.5, 0.4, 0.3], atol=1e-3)
-    assert read_image(write_exr(path, flat(0, 1, 0), chromaticities=REC_2020)).min() == 0
     plain = read_image(write_exr(path, flat(0.5, 0.4, 0.3)))[0, 0]
     np.testing.assert_array_equal(plain, np.float32([0.5, 0.4, 0.3]))
-
-
-def test_primaries_that_are_none_are_refused(tmp_path: Path) -> None:
-    for primaries in ((0.0,) * 8, (0.3,) * 8, (np.nan,) * 8):
-        with pytest.raises(InputError, match=r"e\.exr: found chromaticities"):
-            read_image(write_exr(tmp_path / "e.exr", flat(1, 1, 1), chromaticities=primaries))
+    same = read_image(write_exr(path, flat(0.5, 0.4, 0.3), chromaticities=REC_709))[0, 0]
+    np.testing.assert_array_equal(same, plain)
+    for primaries in (ACES, REC_2020, (0.0,) * 8, (0.3,) * 8, (np.nan,) * 8):
+        with pytest.raises(InputError, match=r"e\.exr: found chromaticities .*; convert it to linear Rec\. 709"):
+            read_image(write_exr(path, flat(1, 1, 1), chromaticities=primaries))
 
 
 @pytest.mark.parametrize("names", [("Y", "RY", "BY"), ("X", "Y", "Z")])
@@ -75,23 +67,21 @@ def test_exposure_of_a_radiance_file_is_undone(tmp_path: Path) -> None:
             read_image(radiance(path, header))
 
 
-def test_primaries_of_a_radiance_file_are_converted(tmp_path: Path) -> None:
+def test_other_primaries_of_a_radiance_file_are_refused(tmp_path: Path) -> None:
     path, rgbe = tmp_path / "e.hdr", "FORMAT=32-bit_rle_rgbe\n"
     plain = read_image(radiance(path, rgbe))[0, 0]
-    same = read_image(radiance(path, rgbe + "PRIMARIES=0.640 0.330 0.300 0.600 0.150 0.060 0.3127 0.3290\n"))[0, 0]
+    same = read_image(radiance(path, rgbe + f"PRIMARIES={' '.join(map(str, REC_709))}\n"))[0, 0]
     np.testing.assert_array_equal(same, plain)
     none = read_image(radiance(path, rgbe + "PRIMARIES=0 0 0 0 0 0 0 0\n"))[0, 0]
     np.testing.assert_array_equal(none, plain)
-    exr = write_exr(tmp_path / "e.exr", flat(*plain), chromaticities=REC_2020)
-    wide = read_image(radiance(path, rgbe + "PRIMARIES=" + " ".join(map(str, REC_2020)) + "\n"))[0, 0]
-    np.testing.assert_allclose(wide, read_image(exr)[0, 0], rtol=1e-5)
-    for value in ("0.3 0.3 0.3 0.3 0.3 0.3 0.3 0.3", "0.64 0.33", "x", "nan " * 8, ""):
+    wide = " ".join(map(str, REC_2020))
+    for value in (wide, "0.3 0.3 0.3 0.3 0.3 0.3 0.3 0.3", "0.64 0.33", "x", "nan " * 8, ""):
         with pytest.raises(InputError, match=r"e\.hdr: "):
             read_image(radiance(path, rgbe + f"PRIMARIES={value}\n"))
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-def test_gamma_of_a_png_is_heeded(tmp_path: Path, bits: int) -> None:
+def test_another_gamma_of_a_png_is_refused(tmp_path: Path, bits: int) -> None:
     import cv2
 
     path = tmp_path / "e.png"
@@ -110,9 +100,7 @@ def test_gamma_of_a_png_is_heeded(tmp_path: Path, bits: int) -> None:
     coded = stored(None)
     assert coded == pytest.approx(0.2159, abs=1e-3)
     assert stored(45455) == coded and stored(100000, srgb=True) == coded
-    assert stored(100000) == pytest.approx(128 / 255, abs=1e-4)
-    assert stored(55556) == pytest.approx((128 / 255) ** 1.8, abs=1e-3)
-    for gamma in (0, 2**31 - 1):
+    for gamma in (0, 55556, 100000, 2**31 - 1):
         with pytest.raises(InputError, match=r"e\.png: found gamma"):
             stored(gamma)
 

@@ -234,7 +234,7 @@ OPTIONS = {
     "--seed": (WHOLE, ("turntable", "result", "--out", "out")),
     "--timesteps": ((*WHOLE, "5-1", "0-", "-", "0-999999999", ",,", "0--1"), ("fit", "capture", "--out", "out")),
     "--steps": ((*WHOLE, "0"), ("turntable", "result", "--out", "out")),
-    "--fps": ((*REAL, "0", "-1"), ("turntable", "result", "--out", "out")),
+    "--fps": ((*REAL, "0", "-1"), ("export", "result", "--format", "glb", "--animate", "--out", "out.glb")),
     "--from": (REAL, ("turntable", "result", "--out", "out")),
     "--to": (REAL, ("turntable", "result", "--out", "out")),
     "--rotate": (REAL, ("relight", "result", "--env", "env.hdr", "--out", "out")),
@@ -1096,7 +1096,7 @@ def extremes(base: Path) -> Iterator[Case]:
             yield Case(f"extremes:result {place[-1]}:{value if np.ndim(value) == 0 else np.shape(value)}:{name}", command, needs, spoilt)  # fmt: skip
     for option in ("1e300", "1e9", "1e-300"):
         for name, command in (
-            ("glb", ("export", "result", "--format", "glb", "--animate", "--out", "out.glb")), ("turntable", ("turntable", "result", "--sequence", "--out", "out")),
+            ("glb", ("export", "result", "--format", "glb", "--animate", "--out", "out.glb")),
             ("relight", ("relight", "result", "--env", "env.hdr", "--turn", "2", "--video", "out.mp4", "--out", "out")),
         ):  # fmt: skip
             yield Case(f"extremes:fps:{option}:{name}", (*command, "--fps", option), (*needs, "env.hdr"))

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mifit.core.image import to_8_bit
@@ -18,11 +17,8 @@ from mifit.output.evaluate import rgba_8_bit
 from mifit.output.export import export
 from mifit.output.figures import overlay
 from mifit.output.views import (
-    on_backdrop,
-    orbit_camera,
     write_moving_pictures,
     write_overlay,
-    write_sequence,
     write_video,
 )
 from mifit.result.ownership import replacing_files
@@ -132,23 +128,3 @@ def test_quaternions_turn_the_short_way(ball, tmp_path):
     q = read(animation["samplers"][1]["output"])
     assert animation["channels"][1]["target"]["path"] == "rotation"
     np.testing.assert_allclose(np.sum(q[1:] * q[:-1], axis=1), np.cos(np.radians(30)), atol=1e-6)
-
-
-def test_sequence_plays_the_timesteps_from_a_moving_camera(ball, backwards, variant, tmp_path):
-    write_sequence(backwards, tmp_path / "s.mp4", -20, 20, methods=("full", "diffuse"))
-    frames, _ = read_video(tmp_path / "s.mp4")
-    assert frames.shape == (2, 64, 128, 3)
-    for frame, timestep, angle in zip(frames.astype(float), (0, 3), (-20, 20), strict=True):
-        expected = to_8_bit(on_backdrop(ball.render(orbit_camera(ball, 0, angle), timestep))).astype(float)
-        assert np.abs(frame[:, :64] - expected).mean() < 6
-        assert np.abs(frame[:, :64] - frame[:, 64:]).mean() > 0.1
-    write_sequence(ball, tmp_path / "s.webp")
-    with Image.open(tmp_path / "s.webp") as animation:
-        assert animation.n_frames == 2
-
-
-def test_sequences_that_can_not_be_are_refused(ball, stage_1_ball, tmp_path):
-    with pytest.raises(InputError, match=r"expected '\.mp4' or '\.webp'"):
-        write_sequence(ball, tmp_path / "s.gif")
-    with pytest.raises(InputError, match="method 'full'"):
-        write_sequence(stage_1_ball, tmp_path / "s.mp4", methods=("full",))

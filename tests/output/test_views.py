@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.table1 import evaluate_relit
 from mifit.core.image import write_image
 from mifit.core.sh import SHLighting, latlong_directions
 from mifit.errors import InputError
-from mifit.output.relight import evaluate_relit
 from mifit.output.views import orbit_camera, write_turntable
 from tests.output.conftest import ball_camera
 from tests.output.test_render_evaluate import FakeCapture

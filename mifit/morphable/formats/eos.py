@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.files import read_bytes
-from mifit.core.limits import MAX_TEXT_MODEL_BYTES
+from mifit.core.limits import MAX_FILE_BYTES
 from mifit.errors import InputError
 from mifit.morphable.assemble import complete, interleaved, single
 from mifit.morphable.model import MorphableModel
@@ -20,7 +20,7 @@ class _Cursor:
     """Reads values in turn; a count is checked against what remains before anything is allocated."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._data, self._at = path, read_bytes(path, MAX_TEXT_MODEL_BYTES, "eos model"), 0
+        self._path, self._data, self._at = path, read_bytes(path, MAX_FILE_BYTES, "eos model"), 0
 
     @property
     def remaining(self) -> int:

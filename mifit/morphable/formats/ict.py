@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mifit.core.arrays import read_npz
 from mifit.core.files import read_bytes, read_text
-from mifit.core.limits import MAX_SETTINGS_BYTES, MAX_TEXT_MODEL_BYTES
+from mifit.core.limits import MAX_FILE_BYTES, MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 from mifit.morphable.assemble import check_mesh, complete
 from mifit.morphable.model import MorphableModel
@@ -99,7 +99,7 @@ def load_ict_folder(path: Path) -> MorphableModel:
 
 
 def _obj_lines(path: Path) -> list[bytes]:
-    return read_bytes(path, MAX_TEXT_MODEL_BYTES, "mesh").splitlines()
+    return read_bytes(path, MAX_FILE_BYTES, "mesh").splitlines()
 
 
 def _obj_vertices(path: Path, lines: list[bytes], keyword: bytes = b"v ", columns: int = 3) -> NDArray[np.float64]:

@@ -108,49 +108,6 @@ def make() -> type:
             position = corner + mi.Vector2f(film.crop_offset())
             return ray, weight, position if film.rfilter().is_box_filter() else position + inside
 
-        def render(
-            self,
-            scene: mi.Scene,
-            sensor: mi.Sensor = 0,
-            seed: mi.UInt32 = 0,
-            spp: int = 0,
-            develop: bool = True,
-            evaluate: bool = True,
-        ) -> mi.TensorXf:
-            """Image (H, W, 3), or with alpha (H, W, 4).
-
-            One sample per pixel under a box filter is the pixel: it is written to its place, where Mitsuba's way adds
-            it to a block and divides that by its weights.
-            """
-            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            film = sensor.film()
-            plain = self._is_plain(film) and "pixel_format = rgb" in str(film) and dr.is_jit_v(mi.Float)
-            if not develop or not plain or (spp or sensor.sampler().sample_count()) != 1:
-                return super().render(scene, sensor, seed, spp, develop, evaluate)
-            with dr.suspend_grad():
-                sampler, _ = self.prepare(sensor, seed, spp, self.aov_names())
-                ray, weight, _ = self.sample_rays(scene, sensor, sampler)
-                index, value, behind, hit = self._seen(scene, ray, mi.Bool(True))
-                alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-                width, height = film.crop_size()
-                count = width * height
-                channels = 4 if alpha else 3
-                pixels = dr.zeros(mi.Float, count * channels)
-                if behind is not None or index is None:
-                    index, value = dr.arange(mi.UInt32, count), self._everywhere(index, value, behind, hit)
-                    opaque = dr.select(hit | (behind is not None), 1.0, 0.0)
-                else:
-                    opaque = dr.full(mi.Float, 1.0, dr.width(index))
-                value = value * at(weight, index)
-                for k, entry in enumerate([value.x, value.y, value.z, opaque][:channels]):
-                    dr.scatter(pixels, entry, index * channels + k, mode=dr.ReduceMode.Permute)
-                # What the film itself shows afterwards is formed when somebody asks for it.
-                every = dr.arange(mi.UInt32, count * (channels + 1))
-                pixel, k = every // (channels + 1), every % (channels + 1)
-                block = dr.select(k < channels, dr.gather(mi.Float, pixels, pixel * channels + k, k < channels), 1.0)
-                film.put_block(mi.ImageBlock(mi.TensorXf(block, (height, width, channels + 1))))
-                return mi.TensorXf(pixels, (height, width, channels))
-
         def render_backward(
             self,
             scene: mi.Scene,
@@ -206,7 +163,13 @@ def make() -> type:
         ) -> tuple[mi.Color3f, mi.Bool, list[mi.Float], None]:
             """Radiance along primary rays; plain automatic differentiation in every mode."""
             index, value, behind, hit = self._seen(scene, ray, active)
-            return self._everywhere(index, value, behind, hit), hit | (not self.hide), [], None
+            if index is not None:
+                radiance = dr.zeros(mi.Color3f, dr.width(hit))
+                dr.scatter(radiance, value, index, mode=dr.ReduceMode.Permute)
+                value = radiance
+            if behind is not None:
+                value = dr.select(hit, value, behind)
+            return value, hit | (not self.hide), [], None
 
         def _is_plain(self, film: mi.Film) -> bool:
             """Is a pixel the mean of its own samples' radiance?"""
@@ -220,16 +183,6 @@ def make() -> type:
             index, si = self._hits.find(scene, ray, active)
             behind = None if self.hide else self._emitters(scene)[0].radiance(ray.d)
             return index, self._shade(scene, si), behind, self._hits.hit(index, si, ray)
-
-        def _everywhere(
-            self, index: mi.UInt32 | None, value: mi.Color3f, behind: mi.Color3f | None, hit: mi.Bool
-        ) -> mi.Color3f:
-            """Radiance along every ray, of what `_seen` found."""
-            if index is not None:
-                radiance = dr.zeros(mi.Color3f, dr.width(hit))
-                dr.scatter(radiance, value, index, mode=dr.ReduceMode.Permute)
-                value = radiance
-            return value if behind is None else dr.select(hit, value, behind)
 
         def _shade(self, scene: mi.Scene, si: mi.SurfaceInteraction3f) -> mi.Color3f:
             """Radiance that leaves points of surfaces towards the camera; nothing where there is none."""
