@@ -19,7 +19,6 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 from typing_extensions import dataclass_transform
 
-from mifit.core.limits import MAX_NUMBER
 from mifit.errors import InputError
 
 T = TypeVar("T")
@@ -123,6 +122,9 @@ def parse_toml(text: str) -> dict:
     return tomllib.loads(text)
 
 
+WEIGHT = 1e9  # above any weight that makes sense, below what overflows in float32
+
+
 @settings
 class GeometryConfig:
     """Stage 1, morphable-model fitting (paper, section 4).
@@ -159,10 +161,10 @@ class GeometryConfig:
         most=10,
     )
     landmark_weight: float = number(
-        10.0, "objective paper: weight of the landmarks", source="paper", least=0, most=MAX_NUMBER
+        10.0, "objective paper: weight of the landmarks", source="paper", least=0, most=WEIGHT
     )
     prior_weight: float = number(
-        5e-5, "objective paper: weight of the model's prior", source="paper", least=0, most=MAX_NUMBER
+        5e-5, "objective paper: weight of the model's prior", source="paper", least=0, most=WEIGHT
     )
     pixels: int = number(
         2000,
@@ -177,14 +179,14 @@ class GeometryConfig:
         "of 255",
         source="set by hand",
         above=0,
-        most=MAX_NUMBER,
+        most=WEIGHT,
     )
     albedo_prior: float = number(
         0.2,
         "factor on the prior of the albedo; 1: contrasts as the model's modes have them, 0.2: as those of skin",
         source="measured spread of skin's luminance, 0.25, over that of the models' modes, 0.107",
         least=0,
-        most=MAX_NUMBER,
+        most=WEIGHT,
     )
     max_iterations: int = number(30, "Gauss-Newton iterations of a round", source="limit", least=1, most=10_000)
 
@@ -219,7 +221,7 @@ class SurfaceConfig:
         "resistance of the displacement to bending, relative to the precision of measurements",
         source="chosen on scan_city",
         above=0,
-        most=MAX_NUMBER,
+        most=WEIGHT,
     )
     close_lips: bool = flag(True, "close the lips on the lip line where the images show a closed mouth")
     close_lids: bool = flag(True, "close the lids where the images show closed eyes")
@@ -262,14 +264,14 @@ class ReflectanceConfig:
         most=10_000,
     )
     specular: bool = flag(True, "find specular reflection; false: all is diffuse")
-    specular_difference_weight: float = number(0.1, "the paper's lambda_S", source="paper", least=0, most=MAX_NUMBER)
-    smoothness_weight: float = number(0.001, "the paper's lambda_H", source="paper", least=0, most=MAX_NUMBER)
+    specular_difference_weight: float = number(0.1, "the paper's lambda_S", source="paper", least=0, most=WEIGHT)
+    smoothness_weight: float = number(0.001, "the paper's lambda_H", source="paper", least=0, most=WEIGHT)
     specular_smoothness: float = number(
         1000.0,
         "factor on lambda_H for the specular map: one channel, seen only where there is a highlight",
         source="set by hand",
         least=0,
-        most=MAX_NUMBER,
+        most=WEIGHT,
     )
     robust: bool = flag(
         True,
@@ -293,10 +295,10 @@ class NormalsConfig:
     """
 
     laplacian_weight: float = number(
-        1e-3, "the paper's w1, for images and normal maps in 8-bit steps", source="paper", least=0, most=MAX_NUMBER
+        1e-3, "the paper's w1, for images and normal maps in 8-bit steps", source="paper", least=0, most=WEIGHT
     )
     magnitude_weight: float = number(
-        3.0, "the paper's w2, likewise", source="chosen on soft; paper: 0.3", least=0, most=MAX_NUMBER
+        3.0, "the paper's w2, likewise", source="chosen on soft; paper: 0.3", least=0, most=WEIGHT
     )
     max_iterations: int = number(100, "iterations at most", source="limit", least=1, most=100_000)
 

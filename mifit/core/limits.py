@@ -25,7 +25,7 @@ MAX_UNPACKING, UNPACKING_SLACK = 100, 2**24
 MAX_COUNT = 10**5
 """Timesteps, frames, runs, or samples per pixel."""
 MAX_NUMBER = 1e9
-"""Magnitude of lengths, coefficients, colours, angles and weights: what is larger is damage."""
+"""Magnitude of lengths, coefficients, colours and angles in files and options: what is larger is damage."""
 MAX_LANDMARK_NOISE = 1000.0
 """Standard deviation of a landmark, pixels."""
 MAX_LIGHTS = 16
