@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mifit.errors import InputError
 
 ALIGNMENT = 64
+OFFSET = 1e-3
+"""Part of a mesh's diagonal by which rays start off its surface: facets don't shadow themselves."""
 Jit: TypeAlias = Any
 """A Dr.Jit array, vector or colour: its class belongs to the active variant, so no type can name it."""
 

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from mifit.appearance.arrays import Jit, on_device, stored
+from mifit.appearance.arrays import OFFSET, Jit, on_device, stored
 from mifit.appearance.illumination import Illumination
 from mifit.appearance.kernels import diffuse_transfer, sh_basis
 from mifit.core.mesh import vertex_normals
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 BOUNCE = 0.32
 """Albedo with which the mesh lights itself: skin of medium pigmentation, mean of the channels. Part of the light in
 the folds of a face has come this way; without it their albedo has to be too bright."""
-OFFSET = 1e-3
-"""Distance by which rays start off the surface, relative to the mesh's diagonal: facets don't shadow themselves."""
 
 
 @dataclass(frozen=True)

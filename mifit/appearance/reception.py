@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from mifit.appearance.arrays import Jit, aligned, on_device, stored
-from mifit.appearance.occlusion import OFFSET
+from mifit.appearance.arrays import OFFSET, Jit, aligned, on_device, stored
 from mifit.core.mesh import normalize, vertex_normals
 from mifit.core.sh import LUMINANCE
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.arrays import aligned, on_device
-from mifit.appearance.occlusion import OFFSET
+from mifit.appearance.arrays import OFFSET, aligned, on_device
 from mifit.core.arrays import Recent
 from mifit.core.camera import Camera
 from mifit.core.mesh import lengths
