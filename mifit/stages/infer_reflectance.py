@@ -20,10 +20,10 @@ from mifit.optim import Outcome
 from mifit.progress import Progress, silent
 from mifit.sampling.observations import Surface
 from mifit.stages.reflectance.als import find_forward, fit_als
-from mifit.stages.reflectance.fill import blend_unseen, light_known
+from mifit.stages.reflectance.fill import blend_unseen
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.paper_energy import energies, fit_paper
-from mifit.stages.reflectance.residual_shading import SYMMETRIC_SPREAD, separate_shading
+from mifit.stages.reflectance.residual_shading import light_error, light_known, light_level, separate_shading
 from mifit.stages.segment import segment
 
 if TYPE_CHECKING:
@@ -127,17 +127,14 @@ def infer_reflectance(
         details["objective"] = {**terms, "total": sum(terms.values())}
     diffuse, residual_shading = filled.diffuse, None
     if first is not None and config.residual_shading:
-        # What no light reached is as dark as it was seen under the capture's own light, and skin under any other. Where
-        # the lighting's error changes an albedo by as much as skin varies, skin is the better guess.
-        level = surface.texels.to_map(surface.brightness())
-        quality *= surface.texels.from_map(light_known(level, first.unexplained / SYMMETRIC_SPREAD))
-        filled = blend_unseen(model, surface.texels, solved.maps, quality, solved.observability)
+        # What no light reached is as dark as it was seen under the capture's own light, and skin under any other.
+        level = surface.texels.from_map(light_level(surface.texels.to_map(surface.brightness())))
+        lit = light_known(level, light_error(model, surface.texels, solved.maps, quality, level))
+        filled = blend_unseen(model, surface.texels, solved.maps, quality, solved.observability, lit)
         parted = separate_shading(model, surface.texels, filled.diffuse, filled.confidence)
         shade = (shown.diffuse @ LUMINANCE) / np.maximum(filled.diffuse @ LUMINANCE, 1e-3)
         diffuse = parted.skin
-        residual_shading = (
-            parted.residual_shading * np.where(surface.texels.mask, np.clip(shade, 0.0, 1.0), 1.0)
-        ).astype(np.float32)
+        residual_shading = (parted.residual_shading * np.where(surface.texels.mask, shade, 1.0)).astype(np.float32)
         details["spread"] = {"symmetric": parted.symmetric, "sided": parted.sided}
     return ReflectanceEstimate(
         diffuse=diffuse,

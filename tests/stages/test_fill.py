@@ -8,7 +8,8 @@ import pytest
 from mifit.core.mesh import interpolate
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
-from mifit.stages.reflectance.fill import blend_unseen, light_known
+from mifit.stages.reflectance.fill import blend_unseen
+from mifit.stages.reflectance.residual_shading import light_error, light_known, light_level
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +63,27 @@ def test_far_from_all_that_was_seen_skin_has_its_typical_colour(half_seen):
 
 
 def test_a_dark_feature_is_no_want_of_light():
-    level = np.full((100, 100), 0.3, np.float32)
-    level[40:46, 20:60] = 0.01
-    level[:, 80:] = 0.01
-    known = light_known(level, 0.03)
+    brightness = np.full((100, 100), 0.3, np.float32)
+    brightness[40:46, 20:60] = 0.01
+    brightness[:, 80:] = 0.01
+    known = light_known(light_level(brightness), 0.015)
     assert (known[:, :75] > 0.98).all() and (known[:, 80:] == 0).all()
+
+
+def test_the_error_of_the_light_is_what_darkens_dim_skin(half_seen):
+    """An error of a tenth of the light on bright skin: dim skin is estimated too dark, and the image counts less."""
+    model, texels, _, _, seen = half_seen
+    skin = interpolate(model.mean_albedo, model.faces, texels.face, texels.weights)
+    level = np.where(seen, 0.5, 0.08)
+    confidence = np.ones(len(level))
+
+    def error(light):
+        maps = texels.to_map(np.c_[skin * (light / level)[:, None], np.full(len(level), 0.3)].astype(np.float32))
+        return light_error(model, texels, maps, confidence, level), maps
+
+    right, wrong = error(level)[0], error(np.maximum(level - 0.05, 0.0))
+    assert right == 0.0 and 0.04 < wrong[0] < 0.09
+    lit = light_known(level, wrong[0])
+    blend = blend_unseen(replace(model, symmetry=None), texels, wrong[1], confidence, confidence, lit)
+    assert (texels.from_map(blend.confidence)[~seen] == 0).all() and (lit[seen] > 0.9).all()
+    assert np.median(texels.from_map(blend.diffuse)[~seen] / skin[~seen]) > 0.8

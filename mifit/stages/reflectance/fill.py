@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,8 +18,6 @@ BLEND = 0.05
 """Confidence at which a texel's own estimate counts as much as its surroundings'."""
 TYPICAL = 3e-3
 """Weight of the typical value of skin beside that of a texel of confidence 1: it decides far from what was seen."""
-FEATURE = 0.06
-"""Extent of the widest dark feature of a face, relative to the map: brows."""
 STIFFNESS = 0.02
 """Of the membrane, beside texels of confidence 1."""
 
@@ -43,7 +40,12 @@ class Filled:
 
 
 def blend_unseen(
-    model: MorphableModel, texels: TexelMap, maps: NDArray, confidence: NDArray, observability: NDArray
+    model: MorphableModel,
+    texels: TexelMap,
+    maps: NDArray,
+    confidence: NDArray,
+    observability: NDArray,
+    lit: NDArray | float = 1.0,
 ) -> Filled:
     """Replace texels that were hardly seen by the mean face's albedo times a factor that continues the seen ones.
 
@@ -61,11 +63,16 @@ def blend_unseen(
     observability : (N,)
         How far images determine the specular albedo, 0..1: not at all for a well visible texel in deep shade, or where
         no lobe points at a light.
+    lit : (N,)
+        Share of the images in the diffuse albedo where visibility is full (`residual_shading.light_known`).
     """
     expected = np.maximum(interpolate(model.mean_albedo, model.faces, texels.face, texels.weights), DARKEST)
     found = texels.from_map(maps).astype(np.float64)
     found[:, :3] = np.log(np.maximum(found[:, :3], DARKEST) / expected)
-    known = np.asarray(confidence, dtype=np.float64)
+    confidence, lit = (np.asarray(x, dtype=np.float64) for x in (confidence, lit))
+    # Variances add: that of visibility, and that of the light, both in units of `BLEND`'s texel.
+    variance = 1.0 / np.maximum(confidence, 1e-9) + (1.0 / np.maximum(lit, 1e-9) - 1.0) / BLEND
+    known, confidence = np.where(confidence * lit > 0, 1.0 / variance, 0.0), confidence * lit
     if model.symmetry is not None:
         opposite = mirrored_coordinates(model, texels)
         there = sample_map(texels.to_map(known.astype(np.float32)), opposite)
@@ -85,17 +92,6 @@ def blend_unseen(
     image = texels.to_map(np.clip(blended, 0.0, 1.0).astype(np.float32))
     both = (texels.to_map(np.asarray(x, np.float32)) for x in (confidence, confidence * observability))
     return Filled(image[..., :3], image[..., 3], *both)
-
-
-def light_known(level: NDArray[np.float32], dark: float) -> NDArray[np.float32]:
-    """(S, S) how far the light on texels is known, 0..1, from how bright (S, S) they are: 0 at ``dark`` and below.
-
-    Light changes over larger distances than brows and nostrils do: what is dark over less than `FEATURE` is itself dark
-    in the light of its surroundings.
-    """
-    side = 2 * round(0.5 * FEATURE * len(level)) + 1
-    light = cv2.morphologyEx(level, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))
-    return np.maximum(1.0 - (dark / np.maximum(light, 1e-12)) ** 2, 0.0).astype(np.float32)
 
 
 def mirrored_coordinates(model: MorphableModel, texels: TexelMap) -> NDArray[np.float64]:
