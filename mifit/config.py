@@ -103,6 +103,10 @@ def from_mapping(cls: type[T], values: object, where: str) -> T:
         raise InputError(_message(where, cls, error)) from None
 
 
+DEEPEST = 50
+"""Levels of tables and lists in a TOML file: a dotted key makes thousands, and what copies them recurses."""
+
+
 def read_toml(path: str | Path) -> dict:
     """Parse a TOML file; raises InputError when it is missing or malformed."""
     try:
@@ -119,7 +123,13 @@ def parse_toml(text: str) -> dict:
         import tomllib
     except ModuleNotFoundError:  # Python 3.10
         import tomli as tomllib  # type: ignore[no-redef]
-    return tomllib.loads(text)
+    document = tomllib.loads(text)
+    level: list = [document]
+    for _ in range(DEEPEST):
+        level = [v for t in level for v in (t.values() if isinstance(t, dict) else t) if isinstance(v, (dict, list))]
+    if level:
+        raise ValueError(f"found more than {DEEPEST} levels of tables and lists, expected fewer")
+    return document
 
 
 WEIGHT = 1e9  # above any weight that makes sense, below what overflows in float32

@@ -243,7 +243,8 @@ class _Entry:
         except OverflowError:  # an integer of hundreds of digits
             number = math.inf
         if not abs(number) <= MAX_NUMBER:
-            raise self.fail(key, expected if math.isinf(number) else f"{expected} within {MAX_NUMBER:g}")
+            within = "" if math.isinf(number) or "at most" in expected else f" within {MAX_NUMBER:g}"
+            raise self.fail(key, expected + within)
         return number
 
     def positive(self, key: str) -> float:

@@ -137,9 +137,24 @@ class MorphableModel:
             raise InputError(f"{self.name}: unit_mm is {self.unit_mm}, expected a positive number")
         if (self.expression_bounds[:, 0] > self.expression_bounds[:, 1]).any():
             raise InputError(f"{self.name}: expression_bounds has a lower bound above its upper bound")
-
+        self._check_face()
         if self.fingerprint and "/" not in self.fingerprint:
             self._set("fingerprint", f"{self.fingerprint}/{self._content}")
+
+    def _check_face(self) -> None:
+        """Raise InputError where the face has no extent, in space or in the texture, or no skin's colour."""
+        if not np.ptp(self.mean[self.landmarks], axis=0).any():
+            raise InputError(f"{self.name}: all landmarks lie in one point, expected 68 places of a face")
+        if not face_cross(self.mean.astype(np.float64), self.faces[self.face_mask]).any():
+            raise InputError(f"{self.name}: faces: none of the face has an area, expected triangles")
+        corners = self.uv[self.faces_uv[self.face_mask]].astype(np.float64)
+        a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        within = ((corners > -0.01) & (corners < 1.01)).all(axis=(1, 2))
+        if not (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])[within].any():
+            raise InputError(f"{self.name}: uv: the face covers no part of the texture, expected coordinates in 0..1")
+        middle = float(np.median(self.mean_albedo))
+        if not -0.5 < middle < 2.0:
+            raise InputError(f"{self.name}: mean_albedo: found a median of {middle:.3g}, expected reflectance in 0..1")
 
     def _set(self, key: str, value: object) -> None:
         object.__setattr__(self, key, value)

@@ -64,6 +64,7 @@ def _load(folder: Path, model: MorphableModel | None) -> Reconstruction:
                 f"(digest {document['model']['digest']}), but {document['model']['source']} is now "
                 f"{model.name!r} (digest {model.digest}); fit again, or bring the model back"
             )
+        _check_names(document)
         geometry = _geometry(folder, document, model)
         reflectance = _reflectance(folder, document)
         capture = document["capture"]
@@ -90,6 +91,18 @@ def _load(folder: Path, model: MorphableModel | None) -> Reconstruction:
         raise InputError(f"{path}: key {error} is missing; the file is damaged, fit again") from None
     except (TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise InputError(f"{path}: holds a value of the wrong kind ({error}); fit again") from None
+
+
+def _check_names(document: Document) -> None:
+    """Refuse settings that are no table, and cameras or timesteps that are missing or there twice."""
+    if not isinstance(document["config"], dict):
+        raise ValueError(f"config: found {type(document['config']).__name__}, expected a table of settings")
+    for kind, names in (
+        ("cameras", [entry["name"] for entry in document["capture"]["cameras"]]),
+        ("timesteps", [int(entry["timestep"]) for entry in document["timesteps"]]),
+    ):
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"{kind}: found {', '.join(map(str, names)) or 'none'}, expected one or more, each once")
 
 
 def read_document(folder: Path) -> Document:

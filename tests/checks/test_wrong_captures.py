@@ -141,3 +141,13 @@ def test_views_of_a_measured_head_are_not_questioned(cameras, shared, model):
 
 def test_a_capture_made_here_is_not_questioned(tiny_capture: Path, model):
     assert findings(Capture.load(tiny_capture), model) == []
+
+
+def test_black_images_are_no_copies(shared, model, tmp_path):
+    rough = read(shared / "captures/soft", 2, cameras=PAIR)
+    for frame in rough.of(*PAIR):
+        frame["image"] = 0 * frame["image"]
+    assert not {one.code for one in findings(Capture.load(write(rough, tmp_path)), model)} & {
+        "images-copied",
+        "timesteps-alike",
+    }

@@ -131,7 +131,7 @@ def all_cases(base: Path) -> Iterator[Case]:
     """Every case; the order is the same in every run."""
     for group in (
         places, numbers, words, transforms, documents, images, landmarks, calibrations, colmap, photogrammetry,
-        videos, models, results, result_files, experiments, names, links, planted, outputs, extremes, colours,
+        videos, models, results, result_files, experiments, names, links, planted, outputs, extremes, colours, shapes,
     ):  # fmt: skip
         yield from group(base)
 
@@ -500,7 +500,7 @@ def landmarks(base: Path) -> Iterator[Case]:
         "one point": [[9, 9]] * 68, "67": points[1:], "69": [*points, [1, 1]], "3d": [[1, 2, 3]] * 68, "text": "x", "none": [],
         "deep": [[[[1]]]] * 68, "ragged": [[1, 2], [3]] * 34, "convention": {"points": points, "convention": "x"},
         "flags": {"points": points, "visible": [True]}, "deviation": {"points": points, "deviation": -1},
-        "deviation nan": {"points": points, "deviation": float("nan")}, "huge": [[HUGE, 1]] * 68, "map": {"a": 1},
+        "deviation huge": {"points": points, "deviation": 1e300}, "deviation nan": {"points": points, "deviation": float("nan")}, "huge": [[HUGE, 1]] * 68, "map": {"a": 1},
     }.items():  # fmt: skip
         yield case(name, ".json", json.dumps(content).encode())
     yield case("suffix", ".xyz", b"")
@@ -876,7 +876,7 @@ def experiments(base: Path) -> Iterator[Case]:
         "twice": '[fit]\ncapture = "capture"\n[sweep.grid]\n"fit.seed" = [1, 1]\n', "key": '[fit]\ncapture = "capture"\nnothing = 1\n', "seed": '[fit]\ncapture = "capture"\nseed = -1\n',
         "seed huge": '[fit]\ncapture = "capture"\nseed = 99999999999999\n', "size": '[fit]\ncapture = "capture"\n[fit.reflectance]\ntexture_size = 1000000000\n', "timesteps": '[fit]\ncapture = "capture"\ntimesteps = [99]\n',
         "synth": "[fit.synth]\nwidth = 20000\nheight = 20000\n[fit]\n", "synth spp": "[fit]\n[fit.synth]\nspp = 0\n", "synth size": "[fit]\n[fit.synth]\nwidth = 200000\n", "digits": "a = " + "9" * 100_000, "deep": "a = " + "[" * 100_000,
-        "dates": "name = 2020-01-01\n[fit]\ncapture = 12:00:00\n", "null": 'name = "a\\u0000b"\n[render]\nscene = "x\\u0000"\n', "dotted": '[fit]\ncapture = "capture"\n[sweep.grid]\n"fit..seed" = [1]\n', "path key": '[fit]\ncapture = "capture"\n[sweep.grid]\n"../../x" = [1]\n',
+        "dates": "name = 2020-01-01\n[fit]\ncapture = 12:00:00\n", "null": 'name = "a\\u0000b"\n[render]\nscene = "x\\u0000"\n', "dotted": '[fit]\ncapture = "capture"\n[sweep.grid]\n"fit..seed" = [1]\n', "tables": "[fit" + ".a" * 2000 + "]\n", "path key": '[fit]\ncapture = "capture"\n[sweep.grid]\n"../../x" = [1]\n',
     }.items():  # fmt: skip
         yield Case(
             f"experiments:{name}",
@@ -1198,3 +1198,54 @@ def colours(base: Path) -> Iterator[Case]:
     imported = ("import", "--transforms", "capture/transforms.json", "--out", "out")
     yield Case("colours:mask of another size", imported, ("capture",), small_mask)
     yield Case("colours:camera model of one image", imported, ("capture",), fisheye)
+
+
+# -- arrays and lists of the right type that are none of the kind ----------------------------------------------------
+
+
+def shapes(base: Path) -> Iterator[Case]:
+    """Models without extent or skin, results with cameras and timesteps twice, a device that says it is a file."""
+    with np.load(base / "ball.npz") as stored:
+        model = dict(stored)
+    small = ("--width", "32", "--height", "32", "--spp", "1", "--timesteps", "1")
+    for key, change in {
+        "landmarks": lambda a: 0 * a, "mean": lambda a: 0 * a, "faces": lambda a: 0 * a, "uv": lambda a: 0 * a, "uv beyond": lambda a: 1e6 * a,
+        "mean_albedo": lambda a: 255 * a, "mean_albedo below": lambda a: a - 5,
+    }.items():  # fmt: skip
+
+        def changed(work: Path, key: str = key.split()[0], change: Callable = change) -> None:
+            np.savez(work / "bad.npz", **{**model, key: change(model[key]).astype(model[key].dtype)})
+
+        for name, command in (
+            ("info", ("model", "info", "bad.npz", "--preview", "out.png")), ("synth", ("synth", "--out", "out", "--model", "bad.npz", *small)),
+            ("fit", ("fit", "capture", "--out", "out", "--model", "bad.npz")),
+        ):  # fmt: skip
+            yield Case(f"shapes:model {key}:{name}", command, ("capture",), changed)
+    result = json.loads((base / "result" / "result.json").read_text())
+    steps, cameras = result["timesteps"], result["capture"]["cameras"]
+    for place, value in (
+        (("config",), []), (("timesteps",), []), (("timesteps",), steps[:1] * 2), (("capture", "cameras"), []), (("capture", "cameras"), cameras[:1] * 2),
+    ):  # fmt: skip
+
+        def spoilt(work: Path, place: tuple = place, value: Any = value) -> None:
+            _write_json(work / "result" / "result.json", _edit(result, place, value))
+
+        for name, command in (
+            ("track", ("track", "capture", "--result", "result", "--timesteps", "1")), ("relight", ("relight", "result", "--env", "env.hdr", "--out", "out")),
+        ):  # fmt: skip
+            yield Case(
+                f"shapes:result {place[-1]} {len(value)}:{name}",
+                command,
+                ("result", "capture", "ball.npz", "env.hdr"),
+                spoilt,
+            )
+    transforms = json.loads((base / "capture" / "transforms.json").read_text())
+
+    def memory(work: Path) -> None:
+        _write_json(
+            work / "capture" / "transforms.json", _edit(transforms, ("frames", 0, "file_path"), "/proc/self/mem")
+        )
+
+    yield Case(
+        "shapes:memory:fit", ("fit", "capture", "--out", "out", "--model", "ball.npz"), ("capture", "ball.npz"), memory
+    )

@@ -317,7 +317,8 @@ def _codes(capture: Capture, name: str, timestep: int) -> NDArray[np.float32]:
 
 
 def _same(a: NDArray, b: NDArray) -> bool:
-    return a.shape == b.shape and float(np.abs(a - b).mean()) < SAME_CODES
+    """Whether two images show the same; black ones show nothing."""
+    return a.shape == b.shape and bool(a.any()) and float(np.abs(a - b).mean()) < SAME_CODES
 
 
 def _skin(capture: Capture, name: str, timestep: int) -> NDArray[np.float32]:
