@@ -225,7 +225,7 @@ relight  results.relight  relit views under a measured environment
 
 export  results.export  geometry with its maps for other programs
     result      path       result folder of mifit fit
-    --format!   glb|obj|ply|mitsuba  kind of file
+    --format!   glb|obj|ply|usd|mitsuba  kind of file
     --out!      path       file to write
     {FORCE}
     --timestep  0..  default: the first of the result

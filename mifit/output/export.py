@@ -15,12 +15,13 @@ from mifit.core.image import encode_png, to_8_bit, write_image
 from mifit.errors import InputError
 from mifit.output.gltf import write_glb
 from mifit.output.surface import shape_of, surface_maps, vertex_materials
+from mifit.output.usd import write_usdz
 
 if TYPE_CHECKING:
     from mifit.result import Reconstruction
 
-Format = Literal["glb", "obj", "ply", "mitsuba"]
-SUFFIXES = {"glb": ".glb", "obj": ".obj", "ply": ".ply", "mitsuba": ".xml"}
+Format = Literal["glb", "obj", "ply", "usd", "mitsuba"]
+SUFFIXES = {"glb": ".glb", "obj": ".obj", "ply": ".ply", "usd": ".usdz", "mitsuba": ".xml"}
 
 
 PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
@@ -45,10 +46,10 @@ def export(
 
     Parameters
     ----------
-    format : {"glb", "obj", "ply", "mitsuba"}
+    format : {"glb", "obj", "ply", "usd", "mitsuba"}
         ``glb``: binary glTF (`write_glb`). ``obj``: mesh in world space, ``.mtl`` and maps beside it. ``ply``: mesh in
-        world space with UVs, normals and vertex colours. ``mitsuba``: a scene with mifit's plugins and, as
-        ``NAME_stock.xml``, one for plain Mitsuba, with their files in ``NAME_files``.
+        world space with UVs, normals and vertex colours. ``usd``: a ``.usdz`` package (`write_usdz`). ``mitsuba``: a
+        scene with mifit's plugins and, as ``NAME_stock.xml``, one for plain Mitsuba, with files in ``NAME_files``.
     path : path
         File to write; its suffix must be the format's.
     mesh : {"fitted", "refined"}
@@ -57,7 +58,7 @@ def export(
     animate : bool
         ``glb`` plays all timesteps, ``fps`` a second; maps, and a refined mesh's shape, stay those of ``timestep``.
     units : {"m", "cm", "mm"}, optional
-        Of ``obj`` and ``ply``; default: the result's. ``glb`` is in metres, as glTF has it.
+        Of ``obj`` and ``ply``; default: the result's. ``glb`` and ``usd`` are in metres.
 
     Raises
     ------
@@ -97,6 +98,8 @@ def export(
         split, at = shape.mesh, shape.mesh.origin
         albedo = result.geometry.vertex_albedo[at]
         write_ply(path, factor * shape.vertices[at], split.faces, shape.normals[at], split.uv, albedo)
+    elif format == "usd":
+        write_usdz(result, path, timestep)
     else:
         from mifit.output.scene import write_scene
 

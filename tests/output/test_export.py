@@ -203,7 +203,7 @@ def test_stage_1_exports_too(stage_1_ball, tmp_path):
 def test_bad_requests_are_named(ball, tmp_path):
     with pytest.raises(InputError, match=r"expected '\.glb' for format glb"):
         export(ball, "glb", tmp_path / "x.obj")
-    with pytest.raises(InputError, match="expected one of glb, obj, ply, mitsuba"):
+    with pytest.raises(InputError, match="expected one of glb, obj, ply, usd, mitsuba"):
         export(ball, "fbx", tmp_path / "x.fbx")
     with pytest.raises(InputError, match="timestep 5 is not in this result"):
         export(ball, "ply", tmp_path / "x.ply", timestep=5)
@@ -260,3 +260,36 @@ def test_obj_has_gltfs_roughness_and_links_its_normal_map(ball, glb, tmp_path):
     codes = read_image(tmp_path / "a_normal.exr")
     with_png = cv2.imread(str(tmp_path / "a_normal.png"))[..., ::-1] / 255.0
     np.testing.assert_allclose(codes, with_png, atol=0.003)
+
+
+def test_usd_opens_again_with_the_fitted_shape_and_its_maps(ball, tmp_path):
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import UsdGeom, UsdShade
+
+    path = tmp_path / "3 ball.usdz"
+    export(ball, "usd", path, timestep=3)
+    stage = usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0 and UsdGeom.GetStageUpAxis(stage) == "Y"
+    root = stage.GetDefaultPrim()
+    assert root.GetName() == "_3_ball"
+    split = split_at_seams(ball.model)
+    for name, selected in (("face", ball.model.face_mask), ("rest", ~ball.model.face_mask)):
+        part, mesh = part_of(split, selected), UsdGeom.Mesh(root.GetChild(name))
+        points = np.asarray(mesh.GetPointsAttr().Get())
+        np.testing.assert_allclose(points, ball.geometry.vertices[1][part.origin] / 100, atol=1e-6)
+        np.testing.assert_array_equal(np.reshape(mesh.GetFaceVertexIndicesAttr().Get(), (-1, 3)), part.faces)
+        material = UsdShade.MaterialBindingAPI(mesh.GetPrim()).ComputeBoundMaterial()[0]
+        surface = material.ComputeSurfaceSource()[0]
+        assert surface.GetIdAttr().Get() == "UsdPreviewSurface"
+        source = surface.GetInput("diffuseColor").GetConnectedSource()[0].GetPrim()
+        if name == "face":
+            image = UsdShade.Shader(source).GetInput("file").Get()
+            assert image.path.endswith("albedo.png") and image.resolvedPath  # inside the package
+            assert surface.GetInput("roughness").Get() ** 2 == pytest.approx(math.sqrt(2 / 14.0))
+    camera, own = UsdGeom.Camera(root.GetChild(f"camera_{ball.cameras[0].name}")), ball.cameras[0]
+    frustum = camera.GetCamera().frustum
+    point = ball.geometry.vertices[1][:50]
+    view = np.c_[point / 100, np.ones(len(point))] @ np.asarray(frustum.ComputeViewMatrix())
+    seen = view @ np.asarray(frustum.ComputeProjectionMatrix())
+    pixel = (seen[:, :2] / seen[:, 3:] * (1, -1) + 1) / 2 * (own.width, own.height)
+    np.testing.assert_allclose(pixel, own.project(point)[..., :2], atol=0.01)
