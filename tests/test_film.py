@@ -77,7 +77,7 @@ def test_two_clips_become_a_face(shared: Path, tmp_path: Path, variant: str, cap
     else:
         write_stereo(tmp_path / "stereo.yml", soft.camera("left"), soft.camera("right").resized(SCALE))
         command += ["--calibration", str(tmp_path / "stereo.yml")]
-    command += ["--until", "geometry", "--model", "builtin", "--timesteps", "auto:2"]
+    command += ["--until", "geometry", "--model", "builtin:coarse", "--timesteps", "auto:2"]
     assert main(command) == 0
     said = capsys.readouterr().err
     assert "right begins 0.400 s before left, by sound" in said

@@ -13,6 +13,7 @@ from mifit.morphable import MorphableModel
 from mifit.stages.checks import capture_checks
 from mifit.stages.checks.capture_checks import check_capture
 from mifit.stages.checks.landmark_model import Shot
+from mifit.synth import synthesize
 from tests.checks.wrong_captures import WRONG, frontal, make, read, write
 
 PAIR = ("left", "right")
@@ -141,6 +142,12 @@ def test_views_of_a_measured_head_are_not_questioned(cameras, shared, model):
 
 def test_a_capture_made_here_is_not_questioned(tiny_capture: Path, model):
     assert findings(Capture.load(tiny_capture), model) == []
+
+
+def test_a_face_of_fifty_pixels_is_too_small_for_a_detector_to_judge(variant, model, tmp_path):
+    size = {"width": 120, "height": 90, "spp": 4}
+    synthesize(tmp_path / "capture", timesteps=1, model="builtin:coarse", seed=0, **size)
+    assert findings(Capture.load(tmp_path / "capture"), model) == []
 
 
 def test_black_images_are_no_copies(shared, model, tmp_path):

@@ -36,6 +36,8 @@ ALIKE = 1.15
 SHIFTED = 1.5
 """Shift of an image's landmarks from a detector's, in deviations of one landmark, beyond which no two detectors differ,
 and how far single ones may then lie off at the median; on development heads 0.7 and 1.2 at most."""
+SMALLEST = 2.0
+"""Deviation of a landmark, pixels, from which a face is large enough for a detector to judge: some 100 pixels wide."""
 LARGEST_FACE = 1.6
 """Size of a face over the model's, and its inverse, beyond which nobody's is: outer corners of adults' eyes lie
 91 +- 5 mm apart, an infant's 60 mm (Farkas 1994)."""
@@ -164,10 +166,13 @@ def shift_diagnostics(capture: Capture, cameras: Sequence[str], timestep: int) -
         return []
     detector, said = open_detector("mediapipe"), []
     for shot in landmark_shots(capture, cameras, [timestep]):
+        noise = noise_of([shot])
+        if noise < SMALLEST:
+            continue
         seen = detector.detect(to_8_bit(capture.frame(shot.camera.name, timestep).image))
         if seen is None:
             continue
-        off, noise = (shot.pixels - seen)[INNER], noise_of([shot])
+        off = (shot.pixels - seen)[INNER]
         x, y = shift = np.nanmedian(off, axis=0)
         single = float(np.nanmedian(np.linalg.norm(off - shift, axis=1)))
         if np.hypot(x, y) > SHIFTED * noise and single < SHIFTED * noise:
