@@ -317,7 +317,6 @@ class NormalsConfig:
 class MeshConfig:
     """Vertices from refined normals (``stages.refine_mesh``)."""
 
-    subdivisions: int = number(0, "times that every face is split into four first", source="cost", least=0, most=3)
     detail: float = number(
         0.3, "length below which shape comes from the normals", "centimetres", source="set by hand", above=0, most=100
     )

@@ -291,7 +291,6 @@ def mesh_refiner(result: Reconstruction) -> MeshRefiner:
     """What refines the meshes of further timesteps as those of a result are."""
     assert result.mesh is not None and result.reflectance is not None
     settings = from_mapping(MeshConfig, result.config.get("mesh", {}), "result.json: config: mesh")
-    settings = replace(settings, subdivisions=result.mesh.subdivisions)
     return MeshRefiner(result.model, len(result.reflectance.diffuse), settings)
 
 
@@ -307,7 +306,7 @@ def _not_yet(result: Reconstruction, timesteps: Sequence[int], digests: Mapping[
 PER_TIMESTEP: dict[str, tuple[str, ...]] = {
     "geometry": ("vertices", "expression", "rotation", "translation"),
     "normals": ("normal_object",),
-    "mesh": ("vertices", "displacement"),
+    "mesh": ("vertices",),
 }
 """Arrays of a result's estimates that have a row for each timestep."""
 Room = dict[tuple[str, str], Rows]
@@ -351,8 +350,7 @@ def extend(
         tracked={**before.tracked, frame.timestep: digest},
     )
     if result.mesh is not None and refiner is not None:
-        vertices, height, _ = refiner.refine(frame.geometry, frame.timestep, frame.normal_object)
-        rows = {"vertices": vertices, "displacement": height}
+        rows = {"vertices": refiner.refine(frame.geometry, frame.timestep, frame.normal_object)[0]}
         parts["mesh"] = _longer(result.mesh, "mesh", frame.timestep, rows, room)
     return replace(result, **parts)
 

@@ -56,7 +56,7 @@ def test_nested_values_and_integers_for_floats():
         ({"geometry": {"objective": "sgd"}}, "found 'sgd', expected one of 'landmarks', 'paper'"),
         ({"reflectance": {"shading": "shadow"}}, "reflectance.shading: found 'shadow', expected one of"),
         ({"reflectance": 3}, "reflectance: found 3, expected a table"),
-        ({"mesh": {"subdivisions": -1}}, "mesh.subdivisions: found -1, expected a whole number from 0 to 3"),
+        ({"surface": {"finest": -1}}, "surface.finest: found -1, expected a whole number from 0 to 6"),
         ({"mesh": {"detail": 0}}, "mesh.detail: found 0, expected a finite number above 0, at most 100 centimetres"),
         ({"mesh": {"detail": 0}, "residual": {"prior": 0}}, "mesh.detail: found 0, .*; residual.prior: found 0"),
         ({"mesh": {"detail": "x" * 9999}}, r"found 'x{59}\.\.\., expected"),

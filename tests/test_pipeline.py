@@ -132,7 +132,7 @@ def another(section, name, value):
     """The settings of one section with one of them changed to something else that is allowed."""
     allowed = {
         "objective": "paper", "shading": "paper",
-        "exponent": 77.0, "subdivisions": 1, "bands": 5,
+        "exponent": 77.0, "bands": 5,
     }  # fmt: skip
     if name in allowed:
         changed = allowed[name]

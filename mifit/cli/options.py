@@ -232,8 +232,7 @@ export  results.export  geometry with its maps for other programs
     --units     m|cm|mm    of obj and ply; default: the result's
     --animate   flag       glb: play all timesteps, from --timestep's maps
     {FPS}
-    --mesh      fitted|refined=fitted  refined: with the refined normals as shape, and its displacement map (default:
-        fitted)
+    --mesh      fitted|refined=fitted  refined: with the refined normals as shape (default: fitted)
 """
 EXAMPLES = """examples:
   mifit demo                                               a face from a capture made on the spot

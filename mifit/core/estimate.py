@@ -217,21 +217,11 @@ class ResidualEstimate:
 
 @dataclass(frozen=True)
 class MeshEstimate:
-    """Meshes with the refined normals as shape, on one topology.
-
-    ``vertices`` (T, V', 3) are world space; with subdivision (``subdivisions`` times) the model's vertices come first.
-    ``displacement`` (T, S, S) is the distance from the fitted mesh along its normals, capture units; 0 outside the
-    texels.
-    """
+    """Meshes with the refined normals as shape: ``vertices`` (T, V, 3) are world space."""
 
     timesteps: tuple[int, ...]
     vertices: NDArray
-    faces: NDArray
-    faces_uv: NDArray
-    uv: NDArray
-    displacement: NDArray
     report: Report
-    subdivisions: int = 0
 
 
 class Label(IntEnum):

@@ -1,9 +1,8 @@
-"""Triangle meshes on plain arrays: normals, edges, subdivision, and vertices split at the seams of the atlas."""
+"""Triangle meshes on plain arrays: normals, edges, and vertices split at the seams of the atlas."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -68,33 +67,6 @@ def interpolate(values: NDArray, faces: NDArray, face: NDArray, weights: NDArray
     return mixing @ values
 
 
-class TexturedMesh(Protocol):
-    """Faces with the indices of their corners' positions and texture coordinates."""
-
-    @property
-    def faces(self) -> NDArray:
-        """(F, 3) indices of positions."""
-        ...
-
-    @property
-    def faces_uv(self) -> NDArray:
-        """(F, 3) indices of texture coordinates."""
-        ...
-
-    @property
-    def uv(self) -> NDArray:
-        """(T, 2) texture coordinates."""
-        ...
-
-
-class MeshPart(NamedTuple):
-    """Some faces with their texture coordinates: what `split_at_seams` takes, where there is no model."""
-
-    faces: NDArray
-    faces_uv: NDArray
-    uv: NDArray
-
-
 @dataclass(frozen=True)
 class SplitMesh:
     """A mesh with one vertex per pair of position and texture coordinate.
@@ -108,12 +80,14 @@ class SplitMesh:
     faces: NDArray[np.int32]
 
 
-def split_at_seams(mesh: TexturedMesh) -> SplitMesh:
-    """Split the vertices of a mesh where texture coordinates differ; the order is by model vertex."""
-    n = len(mesh.uv)
-    key = mesh.faces.astype(np.int64) * n + mesh.faces_uv
-    pairs, inverse = np.unique(key.ravel(), return_inverse=True)
-    return SplitMesh(pairs // n, mesh.uv[pairs % n].astype(np.float32), inverse.reshape(-1, 3).astype(np.int32))
+def split_at_seams(faces: NDArray, faces_uv: NDArray, uv: NDArray) -> SplitMesh:
+    """Split the vertices of a mesh where texture coordinates differ; the order is by model vertex.
+
+    ``faces`` and ``faces_uv`` (F, 3) are indices of positions and of texture coordinates ``uv`` (T, 2).
+    """
+    n = len(uv)
+    pairs, inverse = np.unique((faces.astype(np.int64) * n + faces_uv).ravel(), return_inverse=True)
+    return SplitMesh(pairs // n, uv[pairs % n].astype(np.float32), inverse.reshape(-1, 3).astype(np.int32))
 
 
 def part_of(mesh: SplitMesh, selected: NDArray[np.bool_]) -> SplitMesh:
@@ -185,65 +159,3 @@ def tangent_space_map(
     flat = out.reshape(-1, 3)
     flat[texels.index[keep]] = _unit(local[keep])
     return out
-
-
-class MaskedMesh(TexturedMesh, Protocol):
-    """A mesh of which some faces have maps, as morphable models are."""
-
-    @property
-    def mean(self) -> NDArray:
-        """(V, 3) positions."""
-        ...
-
-    @property
-    def face_mask(self) -> NDArray:
-        """(F,) bool, the faces that have maps."""
-        ...
-
-
-@dataclass(frozen=True)
-class Topology:
-    """A mesh with its faces split: ``faces`` and ``faces_uv`` (F', 3), ``uv`` (T', 2), ``face_mask`` (F',).
-
-    ``matrix`` (V', V) gives values at its vertices of those at the mesh's, which come first, unchanged.
-    """
-
-    faces: NDArray[np.int32]
-    faces_uv: NDArray[np.int32]
-    uv: NDArray[np.float32]
-    face_mask: NDArray[np.bool_]
-    matrix: sp.csr_matrix
-
-    @property
-    def n_vertices(self) -> int:
-        """Number of vertices V'."""
-        return self.matrix.shape[0]
-
-
-def split_faces(mesh: MaskedMesh, subdivisions: int) -> Topology:
-    """A mesh with every face split into four, ``subdivisions`` times."""
-    faces: NDArray = mesh.faces
-    faces_uv: NDArray = mesh.faces_uv
-    uv = mesh.uv.astype(np.float64)
-    matrix = sp.identity(len(mesh.mean), format="csr")
-    for _ in range(subdivisions):
-        (faces, step), (faces_uv, step_uv) = subdivide(faces, matrix.shape[0]), subdivide(faces_uv, len(uv))
-        matrix, uv = step @ matrix, step_uv @ uv
-    mask = np.repeat(mesh.face_mask, 4**subdivisions)
-    return Topology(faces.astype(np.int32), faces_uv.astype(np.int32), uv.astype(np.float32), mask, matrix)
-
-
-def subdivide(faces: NDArray, n_vertices: int) -> tuple[NDArray[np.int64], sp.csr_matrix]:
-    """Faces (4F, 3) split at the midpoints of their edges, and the matrix (V', V) from old vertices to new ones.
-
-    Face f becomes faces 4f .. 4f + 3; old vertices come first. Works for positions and for texture vertices.
-    """
-    f = np.asarray(faces, dtype=np.int64)
-    unique, which = np.unique(_sides(f), axis=0, return_inverse=True)
-    which = which.reshape(3, len(f))
-    ab, bc, ca = n_vertices + which
-    a, b, c = f.T
-    new = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
-    rows = np.repeat(np.arange(len(unique)), 2)
-    middle = sp.csr_matrix((np.full(2 * len(unique), 0.5), (rows, unique.ravel())), shape=(len(unique), n_vertices))
-    return new, sp.vstack([sp.identity(n_vertices), middle]).tocsr()

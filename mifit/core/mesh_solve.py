@@ -174,13 +174,6 @@ def interior_vertices(faces: NDArray, face_mask: NDArray[np.bool_], n_vertices: 
     return used & ~outside & ~border
 
 
-def displacement(texels: TexelMap, faces: NDArray, vertices: NDArray, moved: NDArray, normals: NDArray) -> NDArray:
-    """(N,) signed distance per covered texel from a mesh to its update, along unit normals (N, 3)."""
-    shift = np.asarray(moved, dtype=np.float64) - np.asarray(vertices, dtype=np.float64)
-    at = np.einsum("nk,nkc->nc", texels.weights, shift[faces[texels.face]])
-    return np.sum(at * normals, axis=1)
-
-
 def membrane(
     vertices: NDArray, faces: NDArray, where: sp.spmatrix, weight: NDArray, stiffness: float
 ) -> Callable[[NDArray], NDArray[np.float64]]:

@@ -53,8 +53,7 @@ def export(
     path : path
         File to write; its suffix must be the format's.
     mesh : {"fitted", "refined"}
-        ``refined`` has the refined normals as shape; its displacement from the fitted mesh, in the result's units
-        along that mesh's normals, is written as ``NAME_displacement.exr``.
+        ``refined`` has the refined normals as shape.
     animate : bool
         ``glb`` plays all timesteps, ``fps`` a second; maps, and a refined mesh's shape, stay those of ``timestep``.
     units : {"m", "cm", "mm"}, optional
@@ -76,7 +75,7 @@ def export(
     timestep = result.timesteps[0] if timestep is None else timestep
     result.index(timestep)
     beside = ("_diffuse.png", "_specular.png", "_normal.png", "_normal.exr", ".mtl") if format == "obj" else ()
-    for end in ("_displacement.exr", *beside) if mesh == "refined" else beside:
+    for end in beside:
         check_overwriting(path.with_name(path.stem + end))
     if animate and format != "glb":
         raise InputError(f"animate: found format {format!r}, expected 'glb', the only one that holds an animation")
@@ -86,9 +85,8 @@ def export(
         raise InputError(f"units: found {units!r} for {format}, expected m, cm or mm for obj or ply")
     factor = 1.0 if units is None else result.unit_mm / PER_UNIT[units]
     if mesh == "refined":
-        displacement = result.displacement(timestep)
         result = result.with_refined_mesh()
-        write_image(path.with_name(f"{path.stem}_displacement.exr"), displacement)
+        result.index(timestep)
     if format == "glb":
         write_glb(result, path, timestep, sorted(result.timesteps) if animate else None, fps)
     elif format == "obj":

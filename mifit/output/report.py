@@ -302,18 +302,12 @@ def picture_maps(result: Reconstruction, timestep: int) -> str:
         colours = np.round(np.where(np.any(refined != 0, axis=-1, keepdims=True), 127.5 * (refined + 1), 0))
         caption = f"Refined normals in object space, timestep {timestep}"
         figures.append(_figure(colours.astype(np.uint8), caption, "normal map"))
-    signed = {}
-    if result.residual is not None:
-        signed["What images show beyond the model", "", "residual"] = result.residual.at(timestep)
-    if result.mesh is not None and timestep in result.mesh.timesteps:
-        height = result.displacement(timestep) * result.unit_mm
-        signed["Displacement of the refined mesh", " mm outwards", "displacement map"] = height
-    for (caption, unit, alt), values in signed.items():
-        if values is not None:
-            white = _largest(np.abs(values))
-            codes = np.round(127.5 * (1 + np.clip(values / white, -1, 1))).astype(np.uint8)
-            text = f"{caption}, timestep {timestep} (mid-grey: nothing, white = {white:.2g}{unit})"
-            figures.append(_figure(codes, text, alt))
+    residual = None if result.residual is None else result.residual.at(timestep)
+    if residual is not None:
+        white = _largest(np.abs(residual))
+        codes = np.round(127.5 * (1 + np.clip(residual / white, -1, 1))).astype(np.uint8)
+        caption = f"What images show beyond the model, timestep {timestep} (mid-grey: nothing, white = {white:.2g})"
+        figures.append(_figure(codes, caption, "residual"))
     return _grid(figures)
 
 

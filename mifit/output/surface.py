@@ -75,8 +75,9 @@ def shape_of(result: Reconstruction, timestep: int, world: bool = True) -> Shape
     vertices = geometry.vertices[i]
     if not world:
         vertices = (vertices - geometry.translation[i]) @ geometry.rotation[i]
-    normals = vertex_normals(vertices, result.model.faces)
-    return Shape(vertices, normals, split_at_seams(result.model), mapped_faces(result))
+    model = result.model
+    normals = vertex_normals(vertices, model.faces)
+    return Shape(vertices, normals, split_at_seams(model.faces, model.faces_uv, model.uv), mapped_faces(result))
 
 
 def surface_maps(result: Reconstruction, timestep: int, skin: bool = False) -> SurfaceMaps:

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from mifit.appearance import models
 from mifit.appearance.illumination import Illumination, light_from
 from mifit.appearance.lobe import Lobe
-from mifit.config import MeshConfig
 from mifit.core.arrays import Rows, read_npz, read_ply
 from mifit.core.camera import Camera
 from mifit.core.diagnostics import Diagnostic
@@ -30,7 +29,7 @@ from mifit.core.estimate import (
 from mifit.core.files import Document, read_text
 from mifit.core.image import read_image, to_8_bit
 from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_LIGHTS, MAX_NUMBER, MAX_PIXELS
-from mifit.core.mesh import SplitMesh, split_at_seams, split_faces
+from mifit.core.mesh import SplitMesh, split_at_seams
 from mifit.core.photometry import Photometry
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
@@ -193,7 +192,7 @@ def _geometry(folder: Path, document: Document, model: MorphableModel) -> Geomet
     albedo = _array(entry["albedo"], (model.albedo_modes.shape[2],), "albedo")
     n = len(steps)
     expression = _array([s["expression"] for s in steps], (n, model.expression.shape[2]), "expression")
-    mesh = split_at_seams(model)
+    mesh = split_at_seams(model.faces, model.faces_uv, model.uv)
     vertices = Rows(n, (len(model.mean), 3), np.float32)
     vertex_albedo = model.albedo(albedo).astype(np.float32)
     scale, rotations = _positive(entry["scale"], "scale"), _rotations([s["rotation"] for s in steps], n)
@@ -291,9 +290,9 @@ def _reflectance(folder: Path, document: Document) -> ReflectanceEstimate | None
     diffuse = _read_map(folder / "maps" / "diffuse.exr", 3)
     labels = _labels(folder, document)
 
-    def optional(*names: str) -> NDArray[np.float32] | None:
-        paths = [path for name in names if (path := folder / "maps" / f"{name}.exr").exists()]
-        return _read_map(paths[0], 1, len(diffuse)) if paths else None
+    def optional(name: str) -> NDArray[np.float32] | None:
+        path = folder / "maps" / f"{name}.exr"
+        return _read_map(path, 1, len(diffuse)) if path.exists() else None
 
     return ReflectanceEstimate(
         diffuse=diffuse,
@@ -305,7 +304,7 @@ def _reflectance(folder: Path, document: Document) -> ReflectanceEstimate | None
         report=_report(document, "reflectance"),
         labels=tuple(labels.values()),
         labelled=tuple(labels),
-        residual_shading=optional("residual_shading", "relief"),
+        residual_shading=optional("residual_shading"),
         specular_confidence=optional("specular_confidence"),
     )
 
@@ -349,16 +348,12 @@ def _mesh(folder: Path, document: Document, model: MorphableModel, geometry: Geo
     if "mesh" not in document["stages"]:
         return None
     report = _report(document, "mesh")
-    subdivisions = MeshConfig(subdivisions=int(document["model"]["subdivisions"])).subdivisions  # in its bounds
-    topology = split_faces(model, subdivisions)
     timesteps = tuple(int(s["timestep"]) for s in document["timesteps"] if s["refined_mesh"])
-    mesh = split_at_seams(topology)
+    mesh = split_at_seams(model.faces, model.faces_uv, model.uv)
     # Vertices that no face uses are in no mesh file: they stay where the fit left them.
-    vertices = Rows(len(timesteps), (topology.matrix.shape[0], 3), np.float32)
+    vertices = Rows(len(timesteps), (len(model.mean), 3), np.float32)
     for timestep in timesteps:
-        row = topology.matrix @ geometry.vertices[geometry.index(timestep)]
+        row = geometry.vertices[geometry.index(timestep)].copy()
         row[mesh.origin] = _read_mesh(folder / "refined" / f"{timestep:04d}.ply", mesh)["vertices"]
         vertices.add(row)
-    heights = _read_maps(folder, "displacement", timesteps, 1)
-    atlas = topology.faces, topology.faces_uv, topology.uv
-    return MeshEstimate(timesteps, vertices.all, *atlas, heights, report, subdivisions)
+    return MeshEstimate(timesteps, vertices.all, report)

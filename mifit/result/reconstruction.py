@@ -28,11 +28,9 @@ from mifit.core.estimate import (
     ResidualEstimate,
 )
 from mifit.core.files import Document
-from mifit.core.mesh import split_faces
 from mifit.core.sh import SHLighting, radiance_of_shading
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
-from mifit.morphable.topology import finer_model
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -409,22 +407,9 @@ class Reconstruction:
             return None
         return self.normals.normal_object[self.normals.timesteps.index(timestep)]
 
-    def displacement(self, timestep: int) -> NDArray:
-        """(S, S) distance of the refined mesh from the fitted one, along its normals; InputError without one."""
-        if self.mesh is None or timestep not in self.mesh.timesteps:
-            raise InputError(
-                f"timestep {timestep} has no refined mesh in this result; fit with --until normals, which makes it"
-            )
-        return self.mesh.displacement[self.mesh.timesteps.index(timestep)]
-
     def with_refined_mesh(self) -> Reconstruction:
-        """This face on its refined mesh, which becomes model and geometry, to export or render; InputError without."""
+        """This face on its refined mesh, which becomes the geometry, to export or render; InputError without one."""
         if self.mesh is None:
             raise InputError("this result has no refined mesh; fit with --until normals, which makes it")
-        matrix = split_faces(self.model, self.mesh.subdivisions).matrix
-        geometry = replace(
-            self.geometry.at(self.mesh.timesteps),
-            vertices=self.mesh.vertices,
-            vertex_albedo=(matrix @ self.geometry.vertex_albedo).astype(np.float32),
-        )
-        return replace(self, model=finer_model(self.model, self.mesh.subdivisions), geometry=geometry, mesh=None)
+        geometry = replace(self.geometry.at(self.mesh.timesteps), vertices=self.mesh.vertices)
+        return replace(self, geometry=geometry, mesh=None)

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 import mifit
 from mifit.core.arrays import write_ply
 from mifit.core.files import Document, file_name, write_bytes, write_text
 from mifit.core.image import encode_png, write_image
-from mifit.core.mesh import SplitMesh, split_at_seams, split_faces, tangent_space_map, vertex_normals
+from mifit.core.mesh import split_at_seams, tangent_space_map, vertex_normals
 from mifit.core.process import on_all_cores
 from mifit.result.ownership import replacing_files
 from mifit.result.reconstruction import Reconstruction
@@ -38,8 +36,7 @@ def save(result: Reconstruction, folder: Path, write_scene: Callable[[Path], Non
     ``write_scene`` writes the scene file that it is given, and those beside it.
     """
     with replacing_files(folder, only=True, force=force) as new:
-        surfaces = _surfaces(result)
-        files = [partial(_write_timestep, result, new, timestep, surfaces) for timestep in result.timesteps]
+        files = [partial(_write_timestep, result, new, timestep) for timestep in result.timesteps]
         if result.reflectance is not None:
             for name in ("diffuse", "specular", "confidence", "residual_shading", "specular_confidence"):
                 found = getattr(result.reflectance, name)
@@ -58,7 +55,7 @@ def save(result: Reconstruction, folder: Path, write_scene: Callable[[Path], Non
 def add_timestep(result: Reconstruction, folder: Path, timestep: int) -> None:
     """Write the files of one timestep of a result into its folder, and ``result.json`` anew, all or none."""
     with replacing_files(folder) as new:
-        _write_timestep(result, new, timestep, _surfaces(result))
+        _write_timestep(result, new, timestep)
         _write_document(result, new)
 
 
@@ -66,43 +63,24 @@ def _write_document(result: Reconstruction, folder: Path) -> None:
     write_text(folder / "result.json", json.dumps(_document(result), indent=1, allow_nan=False) + "\n")
 
 
-def _surfaces(result: Reconstruction) -> list[_Surface]:
-    """The fitted mesh and, where there is one, the refined mesh, as files hold them."""
-    albedo = result.geometry.vertex_albedo
-    found = [_Surface("geometry", split_at_seams(result.model), result.model.faces, albedo)]
-    if result.mesh is not None:
-        albedo = split_faces(result.model, result.mesh.subdivisions).matrix @ albedo
-        found.append(_Surface("refined", split_at_seams(result.mesh), result.mesh.faces, albedo))
-    return found
-
-
-@dataclass(frozen=True)
-class _Surface:
-    """What the mesh files of one folder share over the timesteps; ``albedo`` (V, 3) is linear."""
-
-    folder: str
-    mesh: SplitMesh
-    faces: NDArray
-    albedo: NDArray
-
-    def write(self, result_folder: Path, timestep: int, vertices: NDArray, normals: NDArray) -> None:
-        """Write one timestep from its vertices and their normals (V, 3), world space."""
-        at = self.mesh.origin
-        path = result_folder / self.folder / f"{timestep:04d}.ply"
-        write_ply(path, vertices[at], self.mesh.faces, normals[at], self.mesh.uv, self.albedo[at])
-
-
-def _write_timestep(result: Reconstruction, folder: Path, timestep: int, surfaces: Sequence[_Surface]) -> None:
-    """Meshes, normal maps and displacement map of one timestep."""
-    i, fitted = result.index(timestep), surfaces[0]
+def _write_timestep(result: Reconstruction, folder: Path, timestep: int) -> None:
+    """Meshes and maps of one timestep."""
+    i, model = result.index(timestep), result.model
+    split = split_at_seams(model.faces, model.faces_uv, model.uv)
+    at, albedo = split.origin, result.geometry.vertex_albedo
     vertices = result.geometry.vertices[i]
-    normals = vertex_normals(vertices, result.model.faces)
-    fitted.write(folder, timestep, vertices, normals)
+    meshes = {"geometry": vertices}
+    if result.mesh is not None and timestep in result.mesh.timesteps:
+        meshes["refined"] = result.mesh.vertices[result.mesh.timesteps.index(timestep)]
+    for name, points in meshes.items():
+        normals = vertex_normals(points, model.faces)
+        path = folder / name / f"{timestep:04d}.ply"
+        write_ply(path, points[at], split.faces, normals[at], split.uv, albedo[at])
     refined = result.refined_normal(timestep)
     if refined is not None:
-        rotation, at = result.geometry.rotation[i], fitted.mesh.origin
+        rotation, normals = result.geometry.rotation[i], vertex_normals(vertices, model.faces)
         tangent = tangent_space_map(
-            refined, (vertices @ rotation)[at], (normals @ rotation)[at], fitted.mesh, result.model.face_mask
+            refined, (vertices @ rotation)[at], (normals @ rotation)[at], split, model.face_mask
         )
         write_image(folder / "maps" / f"normal_object_{timestep:04d}.exr", refined)
         codes = np.round(255 * np.clip(0.5 + 0.5 * tangent, 0, 1)).astype(np.uint8)  # no colours: no transfer curve
@@ -110,11 +88,6 @@ def _write_timestep(result: Reconstruction, folder: Path, timestep: int, surface
     residual = None if result.residual is None else result.residual.at(timestep)
     if residual is not None:
         write_image(folder / "maps" / f"residual_{timestep:04d}.exr", residual)
-    if result.mesh is not None and timestep in result.mesh.timesteps:
-        k = result.mesh.timesteps.index(timestep)
-        vertices = result.mesh.vertices[k]
-        surfaces[1].write(folder, timestep, vertices, vertex_normals(vertices, result.mesh.faces))
-        write_image(folder / "maps" / f"displacement_{timestep:04d}.exr", result.mesh.displacement[k])
 
 
 def _document(result: Reconstruction) -> Document:
@@ -154,7 +127,6 @@ def _document(result: Reconstruction) -> Document:
             "albedo": geometry.albedo.tolist(),
             "scale": float(geometry.scale),
             "displaced": geometry.displacement is not None,
-            "subdivisions": 0 if result.mesh is None else result.mesh.subdivisions,
         },
         "lighting": lighting,
         "timesteps": [

@@ -19,7 +19,7 @@ from mifit.core.camera import Camera
 from mifit.core.files import replacing, write_text
 from mifit.core.image import read_environment, write_image
 from mifit.core.limits import MAX_COUNT, MAX_PIXELS, MAX_SEED, check_range
-from mifit.core.mesh import MeshPart, SplitMesh, split_at_seams, vertex_normals
+from mifit.core.mesh import SplitMesh, split_at_seams, vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
@@ -187,7 +187,7 @@ def _draw_subject(model: MorphableModel, style: SkinStyle, timesteps: int, map_s
         if name == "rest":  # its tiles may overlap or lie outside the unit square
             uv, faces_uv = head.wrap_uv(uv, faces_uv)
         skin[name] = paint(rasterize_uv(uv, faces_uv, map_size), mean_mm, normals, faces, model.landmarks, style)
-        parts[name] = split_at_seams(MeshPart(faces, faces_uv, uv))
+        parts[name] = split_at_seams(faces, faces_uv, uv)
     neutral = head.neutral_shape(model, seed, outside)
     centre = neutral[model.landmarks[27:48]].mean(axis=0) - np.array([0.0, 0.0, 55.0 / model.unit_mm])
     rims = [] if "eye0" in parts else openings(model)[0]

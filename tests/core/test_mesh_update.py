@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from mifit.core.mesh import face_cross, normalize, subdivide, vertex_normals
+from mifit.core.mesh import face_cross, normalize, vertex_normals
 from mifit.core.mesh_solve import (
     MeshUpdater,
-    displacement,
     interior_vertices,
     rotate_between,
     wanted_face_normals,
@@ -126,30 +125,9 @@ def test_a_map_equal_to_its_base_asks_for_no_change():
     assert_allclose(wanted, face_normals(surface, faces), atol=1e-9)
 
 
-def test_subdivision_keeps_the_surface():
-    flat, _, faces = grid(5)
-    finer, matrix = subdivide(faces, len(flat))
-    vertices = matrix @ flat
-    assert len(finer) == 4 * len(faces)
-    assert_array_equal(vertices[: len(flat)], flat)
-    area = 0.5 * np.linalg.norm(face_cross(vertices, finer), axis=1)
-    assert_allclose(area.reshape(-1, 4), area.reshape(-1, 4)[:, :1] * np.ones(4), rtol=1e-12)
-    assert area.sum() == pytest.approx(4.0)
-    assert face_cross(vertices, finer)[:, 2].min() > 0
-    assert len(np.unique(vertices.round(9), axis=0)) == len(vertices) == 81
-
-
 def test_interior_excludes_boundary_and_neighbours_of_other_faces():
     flat, _, faces = grid(5)
     assert interior_vertices(faces, np.ones(len(faces), bool), 25).sum() == 9
     mask = flat[faces].mean(1)[:, 0] > 0
     inside = interior_vertices(faces, mask, 25)
     assert set(flat[inside][:, 0]) == {0.5}
-
-
-def test_displacement_is_the_height_along_the_normal():
-    flat, uv, faces = grid(9)
-    moved = flat + np.array([0.3, 0.0, 0.25])
-    texels = rasterize_uv(uv, faces, 16)
-    height = displacement(texels, faces, flat, moved, np.tile([0.0, 0.0, 1.0], (len(texels.index), 1)))
-    assert_allclose(height, 0.25, atol=1e-6)

@@ -244,7 +244,7 @@ SETTINGS = [
     "reflectance.texture_size=1000000000", "reflectance.texture_size=0", "reflectance.bands=99",
     "reflectance.exponent=-1.0", "reflectance.smoothness_weight=-1.0", "reflectance.max_iterations=-1",
     "geometry.prior_weight=-1.0", "geometry.landmark_weight=nan", "geometry.pixels=-5", "geometry.rounds=-1",
-    "geometry.max_iterations=0", "normals.laplacian_weight=-1.0", "normals.max_iterations=-3", "mesh.subdivisions=99",
+    "geometry.max_iterations=0", "normals.laplacian_weight=-1.0", "normals.max_iterations=-3",
     "mesh.detail=-1.0", "seed=-1",
 ]  # fmt: skip
 

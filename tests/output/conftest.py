@@ -131,7 +131,7 @@ def ball_result(size: int = 32, shading_model: str = "prefiltered") -> Reconstru
         geometry=geometry,
         reflectance=reflectance,
         normals=refined,
-        mesh=refine_mesh(model, geometry, refined, MeshConfig(subdivisions=1, detail=3.0)),
+        mesh=refine_mesh(model, geometry, refined, MeshConfig(detail=3.0)),
         config={"seed": 0, "reflectance": {"exponent": 12.0}},
         cameras=(ball_camera("left", -20), ball_camera("right", 20)),
         capture_digest="0123",

@@ -100,7 +100,7 @@ def test_animation_moves_every_vertex_to_where_it_was_tracked(backwards, ball, t
     values = {c["target"]["path"]: read(animation["samplers"][c["sampler"]]["output"]) for c in animation["channels"]}
     node = document["nodes"][animation["channels"][0]["target"]["node"]]
     assert node["name"] == "a" and "matrix" not in node
-    part = part_of(split_at_seams(ball.model), ball.model.face_mask)
+    part = part_of(split_at_seams(ball.model.faces, ball.model.faces_uv, ball.model.uv), ball.model.face_mask)
     primitive = document["meshes"][0]["primitives"][0]
     base, target = read(primitive["attributes"]["POSITION"]), read(primitive["targets"][0]["POSITION"])
     for k in range(2):

@@ -19,7 +19,7 @@ def test_stock_normalmap_shows_the_refined_normals(variant):
     model, camera = scene.model, scene.cameras["third"]
     vertices = scene.geometry.vertices[0]
     normals = vertex_normals(vertices, model.faces)
-    mesh = split_at_seams(model)
+    mesh = split_at_seams(model.faces, model.faces_uv, model.uv)
     tangent = tangent_space_map(scene.normal_map, vertices[mesh.origin], normals[mesh.origin], mesh, model.face_mask)
     # bitmap rows of a texture made from an array run with v, maps have row 0 at v = 1
     texture = mi.load_dict(

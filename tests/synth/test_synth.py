@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mifit.capture import Capture
-from mifit.core.mesh import MeshPart, split_at_seams
+from mifit.core.mesh import split_at_seams
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.synth.compose import FULL_WELL, READ_NOISE, expose, place_cameras
@@ -107,7 +107,7 @@ def test_a_given_tone_changes_nothing_else_of_a_subject() -> None:
 def test_seams_are_split_and_tiles_wrapped() -> None:
     faces, faces_uv = np.array([[0, 1, 2], [2, 1, 3]]), np.array([[0, 1, 2], [4, 3, 5]])
     uv = np.array([[0, 0], [1, 0], [0, 1], [1.2, 0.1], [1.1, 0.9], [1.9, 0.9]], dtype=np.float32)
-    mesh = split_at_seams(MeshPart(faces, faces_uv, uv))
+    mesh = split_at_seams(faces, faces_uv, uv)
     assert len(mesh.origin) == 6
     np.testing.assert_array_equal(mesh.origin[mesh.faces], faces)
     np.testing.assert_array_equal(mesh.uv[mesh.faces], uv[faces_uv])

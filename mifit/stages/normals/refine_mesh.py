@@ -1,4 +1,4 @@
-"""Meshes that carry their refined normals as shape: finer vertices and displacement maps."""
+"""Meshes that carry their refined normals as shape."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from mifit.config import MeshConfig
 from mifit.core.calls import checked
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, Report
-from mifit.core.mesh import interpolate, normalize, split_faces, vertex_normals
-from mifit.core.mesh_solve import MeshUpdater, displacement, interior_vertices, wanted_face_normals
+from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.mesh_solve import MeshUpdater, interior_vertices, wanted_face_normals
 from mifit.core.process import on_all_cores
 from mifit.core.uv import rasterize_uv
 from mifit.optim import Outcome
@@ -52,36 +52,18 @@ def refine_mesh(
     -----
     Nehab et al. 2005, see `core.mesh_solve`. The system is factorised once for all timesteps.
     """
-    began = time.perf_counter()
+    began, steps = time.perf_counter(), normals.timesteps
     refiner = MeshRefiner(model, normals.normal_object.shape[1], config or MeshConfig())
-    factorised = time.perf_counter()
-    steps = normals.timesteps
-    vertices = np.empty((len(steps), refiner.topology.n_vertices, 3), dtype=np.float32)
-    heights = np.empty(normals.normal_object.shape[:3], dtype=np.float32)
+    vertices = np.empty((len(steps), *model.mean.shape), dtype=np.float32)
     progress("refine mesh", 0, len(steps))
 
     def refine(i: int) -> Outcome:
-        vertices[i], heights[i], outcome = refiner.refine(geometry, steps[i], normals.normal_object[i])
+        vertices[i], outcome = refiner.refine(geometry, steps[i], normals.normal_object[i])
         return outcome
 
     outcomes = on_all_cores(refine, range(len(steps)))
     progress("refine mesh", len(steps), len(steps))
-    seconds = time.perf_counter() - factorised
-    details = {
-        "seconds_to_factorise": factorised - began,
-        "seconds_per_timestep": seconds / max(len(steps), 1),
-    }
-    topology = refiner.topology
-    return MeshEstimate(
-        steps,
-        vertices,
-        topology.faces,
-        topology.faces_uv,
-        topology.uv,
-        heights,
-        Report(Outcome.worst(outcomes).value, seconds=time.perf_counter() - began, details=details),
-        refiner.config.subdivisions,
-    )
+    return MeshEstimate(steps, vertices, Report(Outcome.worst(outcomes).value, seconds=time.perf_counter() - began))
 
 
 class MeshRefiner:
@@ -96,27 +78,22 @@ class MeshRefiner:
     """
 
     def __init__(self, model: MorphableModel, size: int, config: MeshConfig) -> None:
-        self.config = config
-        self.topology = top = split_faces(model, config.subdivisions)
-        self._texels = rasterize_uv(top.uv, top.faces_uv, size, top.face_mask)
+        self._faces = model.faces
+        self._texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
         # Object space is in model units; a wave of length L keeps the share 1 / (1 + weight (L / 2 pi)^2) of its
         # normals.
         length = config.detail * 10.0 / model.unit_mm / (2.0 * np.pi)
-        free = interior_vertices(top.faces, top.face_mask, top.n_vertices)
-        rest = top.matrix @ model.mean.astype(np.float64)
-        self._updater = MeshUpdater(rest, top.faces, free, 1.0 / length**2)
+        free = interior_vertices(model.faces, model.face_mask, len(model.mean))
+        self._updater = MeshUpdater(model.mean.astype(np.float64), model.faces, free, 1.0 / length**2)
 
     def refine(
         self, geometry: GeometryEstimate, timestep: int, normal_object: NDArray
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], Outcome]:
-        """World-space vertices (V', 3) of a timestep and its displacement map (S, S), from its normals (S, S, 3).
-
-        The outcome tells whether the vertices stood at the end.
-        """
-        k, faces, texels = geometry.index(timestep), self.topology.faces, self._texels
+    ) -> tuple[NDArray[np.float32], Outcome]:
+        """World-space vertices (V, 3) of a timestep from its normals (S, S, 3), and whether they stood at the end."""
+        k, faces, texels = geometry.index(timestep), self._faces, self._texels
         rotation, translation, scale = geometry.rotation[k], geometry.translation[k], geometry.scale
         world = geometry.vertices[k].astype(np.float64)
-        shape = self.topology.matrix @ ((world - translation) @ rotation / scale)
+        shape = (world - translation) @ rotation / scale
         base = normalize(interpolate(vertex_normals(shape, faces), faces, texels.face, texels.weights))
         refined = texels.from_map(normal_object).astype(np.float64)
         missing = np.linalg.norm(refined, axis=1) < 0.5
@@ -124,7 +101,5 @@ class MeshRefiner:
         wanted = wanted_face_normals(shape, faces, texels, base, refined)
         moved, change = self._updater.settle(shape, wanted, MAX_ITERATIONS, SETTLED)
         outcome = Outcome.CONVERGED if change <= SETTLED else Outcome.MAX_ITERATIONS
-        height = displacement(texels, faces, shape, moved, base)
         # As a shift of the world's vertices, so that those that stay are the same to the last bit.
-        vertices = self.topology.matrix @ world + scale * (moved - shape) @ rotation.T
-        return vertices.astype(np.float32), texels.to_map((scale * height).astype(np.float32)), outcome
+        return (world + scale * (moved - shape) @ rotation.T).astype(np.float32), outcome
