@@ -74,23 +74,6 @@ class Appearance:
             return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
         return scene.store(scene.with_lights(self._smooth(scene))(scene.n, scene.v))
 
-    def shade_bent(
-        self,
-        normals: ArrayLike,
-        base: ArrayLike,
-        view: ArrayLike,
-        occlusion: Occlusion = OPEN,
-        smooth_diffuse: bool = True,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """As `shade`, for normals that are bent away from those of the mesh (``base``), where shadows were traced.
-
-        Without ``smooth_diffuse`` the diffuse radiance is that of the compact lights alone.
-        """
-        scene = _Scene(self, base, view, occlusion)
-        if not scene.count:
-            return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
-        return scene.bent(normals, smooth_diffuse)
-
     def transfers(
         self, normals: ArrayLike, view: ArrayLike, occlusion: Occlusion = OPEN
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -225,16 +208,6 @@ class _Scene:
         self.coefficients = [mi.Color3f(*map(float, row)) for row in illumination.radiance]
         dr.make_opaque(self.coefficients)
         self.lobe: PreparedLobe = prepare(appearance.lobe, order)
-
-    def bent(self, normals: ArrayLike, smooth_diffuse: bool) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """See `Appearance.shade_bent`."""
-        import mitsuba as mi
-
-        n = on_device(mi.Vector3f, expect(normals, (self.count, 3), "normals"))
-        diffuse, specular = self.shader()(n, self.v)
-        if not smooth_diffuse:
-            diffuse, _ = self.with_lights(lambda *_: (mi.Color3f(0.0), mi.Color3f(0.0)))(n, self.v)
-        return self.store((diffuse, specular))
 
     def shader(self) -> Shade:
         """Shading of bent normals, compact lights included."""

@@ -173,18 +173,6 @@ class Camera:
         """(3, 3) intrinsic matrix for this module's pixel convention."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-    def with_square_pixels(self) -> Camera:
-        """This view with rows as high as columns are wide, for programs that know square pixels only.
-
-        Centre, axes and fx stay, fy becomes fx, and the number of rows changes with it, rounded up: scaled to the old
-        height the image is this camera's, up to the last row's fraction.
-        """
-        if self.fx == self.fy:
-            return self
-        ratio = self.fx / self.fy
-        rows = max(1, math.ceil(self.height * ratio - 1e-6))
-        return replace(self, height=rows, fy=self.fx, cy=self.cy * ratio)
-
     def resized(self, factor: float) -> Camera:
         """This camera with an image of another size: ``factor`` pixels per pixel, to the nearest whole number."""
         if not 0 < factor * max(self.width, self.height) <= MAX_PIXELS:

@@ -6,7 +6,7 @@ optimisers share.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mifit.appearance import models
 from mifit.appearance.environment import diffuse_light
-from mifit.appearance.formation import Appearance, form_image
+from mifit.appearance.formation import Appearance, BentShading, form_image
 from mifit.appearance.occlusion import MeshPoints
 from mifit.core.camera import Camera
 from mifit.core.mesh import interpolate, normalize, vertex_normals
@@ -117,10 +117,13 @@ def shade_methods(
         appearance = Appearance(models.get(reflectance.shading_model), reflectance.illumination, reflectance.lobe)
         points = MeshPoints(surface.points, base, surface.face, surface.weights)
         mesh = occluding_mesh(vertices, model.faces)
-        given = material.normal, base, surface.view, appearance.trace(mesh, points)
+        given = base, surface.view, appearance.trace(mesh, points)
+        diffuse, specular_light, _ = BentShading(appearance, *given)(material.normal)
         measured = result.environment if appearance.lobe.fresnel is not None else None
-        diffuse, specular_light = appearance.shade_bent(*given, smooth_diffuse=measured is None)
         if measured is not None:
+            illumination = appearance.illumination
+            lamps = replace(illumination, radiance=np.zeros_like(illumination.radiance))
+            diffuse = BentShading(replace(appearance, illumination=lamps), *given)(material.normal)[0].copy()
             turn = np.eye(3) if result.environment_rotation is None else result.environment_rotation
             place = mesh.scene, points, material.normal, vertex_materials(result)[:, :3]
             diffuse += diffuse_light(measured, turn, appearance.illumination.lights, *place)

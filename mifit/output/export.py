@@ -49,7 +49,7 @@ def export(
     format : {"glb", "obj", "ply", "usd", "mitsuba"}
         ``glb``: binary glTF (`write_glb`). ``obj``: mesh in world space, ``.mtl`` and maps beside it. ``ply``: mesh in
         world space with UVs, normals and vertex colours. ``usd``: a ``.usdz`` package (`write_usdz`). ``mitsuba``: a
-        scene with mifit's plugins and, as ``NAME_stock.xml``, one for plain Mitsuba, with files in ``NAME_files``.
+        scene with mifit's plugins, its files in ``NAME_files``.
     path : path
         File to write; its suffix must be the format's.
     mesh : {"fitted", "refined"}

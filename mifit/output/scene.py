@@ -1,4 +1,4 @@
-"""A reconstruction as a Mitsuba scene file, for mifit's plugins and for plain Mitsuba.
+"""A reconstruction as a Mitsuba scene file.
 
 The path integrator of ``mifit render`` reads the same file that a user gets, so the two can't differ.
 """
@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.lobe import Lobe
 from mifit.core.arrays import write_ply
 from mifit.core.calls import whole
 from mifit.core.camera import Camera
@@ -23,7 +22,6 @@ from mifit.core.files import Document, write_text
 from mifit.core.image import write_image
 from mifit.core.limits import MAX_COUNT
 from mifit.core.mesh import interpolate, normalize
-from mifit.core.sh import SHLighting
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.output.deferred import render_local, visible_surface
@@ -47,15 +45,13 @@ def write_scene(
     cameras: Sequence[Camera] | None = None,
     method: Method = "full",
 ) -> None:
-    """Write ``NAME.xml`` with mifit's plugins, ``NAME_stock.xml`` for plain Mitsuba, and their files in ``NAME_files``.
+    """Write ``NAME.xml``, which uses mifit's plugins, and its files in ``NAME_files``.
 
-    Faces with a place in the atlas have the maps; others have vertex albedo that continues them. In ``NAME.xml`` the
-    skin is ``blinnphong`` with the refined normals as slopes, and the light is ``shenv``. In ``NAME_stock.xml`` the
-    skin blends ``diffuse`` with a ``roughconductor`` of Beckmann roughness sqrt(2 / (m + 2)), which doesn't rise,
-    under a ``normalmap``, and the light is a lat-long ``envmap``, as it is in both of a relit result. A compact light
-    is a stock ``directional`` emitter. The ambient term stands for light that local shading leaves out, such as
-    interreflection, so a path-traced scene doesn't have it. A camera whose pixels aren't square is mifit's ``pinhole``
-    in ``NAME.xml`` and has square ones (`Camera.with_square_pixels`) in the other.
+    Faces with a place in the atlas have the maps; others have vertex albedo that continues them. The skin is
+    ``blinnphong`` with the refined normals as slopes, and the light is ``shenv``, or a lat-long ``envmap`` of a relit
+    result. A compact light is a ``directional`` emitter. The ambient term stands for light that local shading leaves
+    out, such as interreflection, so a path-traced scene doesn't have it. A camera whose pixels aren't square is
+    mifit's ``pinhole``.
 
     ``cameras`` are the sensors in this order, the fitted ones by default; ``method`` is that of
     `Reconstruction.render`. InputError for a camera with lens distortion; nothing is written then.
@@ -63,16 +59,9 @@ def write_scene(
     path = Path(path)
     cameras = result.cameras if cameras is None else cameras
     files = path.with_name(re.sub(r"[^\w.-]", "_", path.stem) + "_files")
-    scenes = [
-        (name, scene_description(result, cameras, method, stock, files.name), needs)
-        for name, stock, needs in (
-            (path, False, "Needs mifit.register_plugins()."),
-            (path.with_name(f"{path.stem}_stock.xml"), True, "Plain Mitsuba renders this."),
-        )
-    ]
+    scene = scene_description(result, cameras, method, files.name)
     _write_files(result, files, timestep, method)
-    for name, scene, needs in scenes:
-        write_text(name, to_xml(scene, f"Written by mifit. {needs}"))
+    write_text(path, to_xml(scene, "Written by mifit. Needs mifit.register_plugins()."))
 
 
 def render_view(
@@ -127,7 +116,8 @@ def render_path(
     return np.concatenate([colour, alpha], axis=-1).astype(np.float32)
 
 
-def _write_files(result: Reconstruction, files: Path, timestep: int, method: Method) -> None:
+def _write_files(result: Reconstruction, files: Path, timestep: int, method: Method) -> NDArray[np.float32]:
+    """Write meshes, maps and environment; returns the normals as slopes (S, S, 3), see `_slopes`."""
     if method == "pca":
         result = replace(result, reflectance=None, normals=None)
     shape, albedo = shape_of(result, timestep), vertex_materials(result)[:, :3]
@@ -138,18 +128,12 @@ def _write_files(result: Reconstruction, files: Path, timestep: int, method: Met
     maps = surface_maps(result, timestep)
     specular = maps.specular if method == "full" else np.zeros_like(maps.specular)
     slopes = _slopes(result, timestep, maps.normal, shape)
-    bent = normalize(np.concatenate([slopes[..., :2], np.ones_like(slopes[..., :1])], axis=-1))
     write_image(files / "diffuse.exr", np.clip(maps.diffuse, 0, 1))
     write_image(files / "specular.exr", np.clip(specular, 0, 1))
     write_image(files / "slopes.exr", slopes)
-    write_image(files / "normal.exr", 0.5 * bent + 0.5)
-    # A blend (1 - w) diffuse + w mirror with w = C_s wants its diffuse part to make up for the factor.
-    base = maps.diffuse / np.maximum(1 - specular[..., None], 1e-3)
-    write_image(files / "diffuse_stock.exr", np.clip(base, 0, 1))
-    environment = result.environment
-    if environment is None:
-        environment = np.maximum(SHLighting(result.illumination.radiance).to_latlong(128, 256), 0.0)
-    write_image(files / "environment.exr", environment)
+    if result.environment is not None:
+        write_image(files / "environment.exr", result.environment)
+    return slopes
 
 
 def _slopes(result: Reconstruction, timestep: int, normal_object: NDArray, shape: Shape) -> NDArray[np.float32]:
@@ -205,9 +189,11 @@ def load_result_scene(
         chosen = {"model": model, "ambient": float(ambient)} | chosen
     chosen = {"hide_emitters": True} | chosen
     with tempfile.TemporaryDirectory(prefix="mifit-scene-") as folder:
-        _write_files(result, Path(folder), timestep, method)
-        scene = scene_description(result, cameras, method, False, folder, chosen, samples)
+        slopes = _write_files(result, Path(folder), timestep, method)
+        scene = scene_description(result, cameras, method, folder, chosen, samples)
         if skin is not None:
+            bent = normalize(np.concatenate([slopes[..., :2], np.ones_like(slopes[..., :1])], axis=-1))
+            write_image(f"{folder}/normal.exr", 0.5 * bent + 0.5)
             names = {"diffuse": False, "specular": True, "slopes": True, "normal": True}
             scene["skin"] = dict(skin({name: _texture(f"{folder}/{name}.exr", raw) for name, raw in names.items()}))
         return load_scene(to_mitsuba(scene))
@@ -217,7 +203,6 @@ def scene_description(
     result: Reconstruction,
     cameras: Sequence[Camera],
     method: Method,
-    stock: bool,
     files: str,
     integrator: Mapping[str, object] | None = None,
     samples: int | None = None,
@@ -232,16 +217,22 @@ def scene_description(
     path = {"type": "path", "max_depth": Parameter("max_depth", 5), "hide_emitters": True}
     scene: Document = {"type": "scene", "integrator": path if integrator is None else dict(integrator)}
     for name, camera in zip(sensor_ids(cameras), cameras, strict=True):
-        scene[name] = sensor_description(
-            camera.with_square_pixels() if stock else camera, Parameter("spp", 64) if samples is None else samples
-        )
-    scene["skin"] = _skin(result, files, stock)
+        scene[name] = sensor_description(camera, Parameter("spp", 64) if samples is None else samples)
+    scene["skin"] = {
+        "type": "blinnphong",
+        "diffuse_reflectance": _texture(f"{files}/diffuse.exr", False),
+        "specular_reflectance": _texture(f"{files}/specular.exr"),
+        **result.lobe.parameters(),
+        "normal_correction": _texture(f"{files}/slopes.exr"),
+    }
     scene["face"] = _shape(f"{files}/face.ply", {"type": "ref", "id": "skin"})
     if not mapped_faces(result).all():
-        scene["rest"] = _shape(f"{files}/rest.ply", _vertex_albedo(stock))
-    if stock or result.environment is not None:
+        albedo = {"type": "mesh_attribute", "name": "vertex_color"}
+        bare = {"type": "blinnphong", "diffuse_reflectance": albedo, "specular_reflectance": 0.0}
+        scene["rest"] = _shape(f"{files}/rest.ply", bare)
+    if result.environment is not None:
         scene["light"] = {"type": "envmap", "filename": f"{files}/environment.exr"}
-        if result.environment is not None and result.environment_rotation is not None:
+        if result.environment_rotation is not None:
             pose = np.eye(4)
             pose[:3, :3] = result.environment_rotation
             scene["light"]["to_world"] = pose
@@ -269,36 +260,6 @@ def sensor_ids(cameras: Sequence[Camera]) -> list[str]:
 
 def _texture(file: str, raw: bool = True) -> Document:
     return {"type": "bitmap", "filename": file, "raw": raw, "wrap_mode": "clamp"}
-
-
-def _skin(result: Reconstruction, files: str, stock: bool) -> Document:
-    found = _mapped(result.lobe, files, stock)
-    if stock:
-        return {"type": "normalmap", "normalmap": _texture(f"{files}/normal.exr"), "nested": found}
-    return {**found, "normal_correction": _texture(f"{files}/slopes.exr")}
-
-
-def _mapped(lobe: Lobe, files: str, stock: bool) -> Document:
-    """The BSDF of the maps with a lobe."""
-    strength = _texture(f"{files}/specular.exr")
-    if stock:
-        mirror = {"type": "roughconductor", "material": "none", "distribution": "beckmann", "alpha": lobe.roughness}
-        base = {"type": "diffuse", "reflectance": _texture(f"{files}/diffuse_stock.exr", False)}
-        return {"type": "blendbsdf", "weight": strength, "base": base, "lobe": mirror}
-    return {
-        "type": "blinnphong",
-        "diffuse_reflectance": _texture(f"{files}/diffuse.exr", False),
-        "specular_reflectance": strength,
-        **lobe.parameters(),
-    }
-
-
-def _vertex_albedo(stock: bool) -> Document:
-    """The BSDF of what has no maps: the fitted model's vertex albedo, without a lobe."""
-    colour = {"type": "mesh_attribute", "name": "vertex_color"}
-    if stock:
-        return {"type": "diffuse", "reflectance": colour}
-    return {"type": "blinnphong", "diffuse_reflectance": colour, "specular_reflectance": 0.0}
 
 
 def _shape(file: str, bsdf: Document) -> Document:

@@ -16,18 +16,12 @@ import numpy as np
 from mifit.core.files import Document
 
 KINDS = {
-    "blendbsdf": "bsdf",
     "blinnphong": "bsdf",
-    "diffuse": "bsdf",
-    "normalmap": "bsdf",
-    "roughconductor": "bsdf",
     "directional": "emitter",
-    "point": "emitter",
     "envmap": "emitter",
     "shenv": "emitter",
     "hdrfilm": "film",
     "box": "rfilter",
-    "independent": "sampler",
     "multijitter": "sampler",
     "scene": "scene",
     "perspective": "sensor",

@@ -19,9 +19,8 @@ if TYPE_CHECKING:
 def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str = "multijitter") -> Document:
     """The sensor of an undistorted camera, as a plain dictionary (`render.description`).
 
-    Square pixels give Mitsuba's ``perspective``, others mifit's ``pinhole``; see `Camera.with_square_pixels` for what
-    programs without that plugin can be given. ``sampler`` is the plugin that draws ``spp`` samples per pixel.
-    InputError for a camera with lens distortion.
+    Square pixels give Mitsuba's ``perspective``, others mifit's ``pinhole``. ``sampler`` is the plugin that draws
+    ``spp`` samples per pixel. InputError for a camera with lens distortion.
     """
     if any(camera.distortion):
         raise InputError(f"camera {camera.name}: found lens distortion, expected an undistorted camera")

@@ -33,7 +33,7 @@ def check_ours(folder: Path, force: bool = False) -> None:
     """Refuse a folder that holds what mifit did not write.
 
     InputError for a file; a link where a result has a folder, or in ``.mifit``; or without ``force`` a folder that
-    isn't empty and has neither the mark nor a result in it.
+    isn't empty and doesn't have the mark.
     """
     if not os.path.lexists(folder):
         return
@@ -45,7 +45,7 @@ def check_ours(folder: Path, force: bool = False) -> None:
         if not place.is_dir():
             raise InputError(f"{place}: found a file, expected a folder or nothing; move it away")
     inside = sorted(p.name for p in folder.iterdir())
-    if force or not inside or (folder / MARK).is_dir() or _holds_a_result(folder):
+    if force or not inside or (folder / MARK).is_dir():
         return
     raise InputError(
         f"{folder}: found a folder that mifit did not make (it holds {', '.join(inside[:3])}"
@@ -274,15 +274,6 @@ def _digest_inside(folder: Path, name: str) -> str | None:
             return _digest(os.open(last, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0), dir_fd=at))
     except (OSError, InputError):
         return None
-
-
-def _holds_a_result(folder: Path) -> bool:
-    """Whether ``result.json`` is one that mifit wrote, before it marked folders."""
-    try:
-        document = json.loads(read_text(folder / "result.json", MAX_DOCUMENT_BYTES))
-    except (InputError, ValueError, RecursionError):
-        return False
-    return isinstance(document, dict) and "mifit_version" in document
 
 
 def _digest(path: Path | int) -> str:

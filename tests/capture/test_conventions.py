@@ -231,15 +231,6 @@ def test_a_rendered_point_lands_where_the_camera_projects_it(variant: str, fy: f
         assert np.hypot(*(found - camera.project(np.array(point)))) < 0.05
 
 
-def test_square_pixels_show_the_same_view() -> None:
-    camera = Camera("a", 340, 240, 707.0, 700.0, 240.3, 72.9, np.eye(4))
-    square = camera.with_square_pixels()
-    assert square.fx == square.fy == camera.fx and (square.width, square.height) == (340, 243)
-    points = np.array([[0.1, -0.2, 3.0], [-0.4, 0.3, 2.0]])
-    np.testing.assert_allclose(square.project(points) / (1.0, 1.01), camera.project(points), rtol=1e-12)
-    assert square.with_square_pixels() is square
-
-
 def test_the_sensor_refuses_a_lens(variant: str) -> None:
     from mifit.render.sensor import make_sensor
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from mifit.core.arrays import write_ply
 from mifit.core.mesh import split_at_seams, tangents, vertex_normals
 from mifit.core.photometry import Photometry
 from mifit.core.uv import rasterize_uv
@@ -142,7 +143,8 @@ def test_results_from_before_meshes_were_refined_load(saved, tmp_path):
 
 def test_a_refined_mesh_of_another_model_is_refused(saved, tmp_path):
     folder = copy_of(saved, tmp_path)
-    shutil.copy(folder / "geometry" / "0000.ply", folder / "refined" / "0000.ply")
+    three = np.eye(3, dtype=np.float32)
+    write_ply(folder / "refined" / "0000.ply", three, np.array([[0, 1, 2]]), three, three[:, :2], three)
     with pytest.raises(InputError, match=r"refined/0000\.ply: found \d+ vertices, expected \d+"):
         Reconstruction.load(folder)
 
