@@ -270,7 +270,7 @@ def test_usd_opens_again_with_the_fitted_shape_and_its_maps(ball, tmp_path):
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0 and UsdGeom.GetStageUpAxis(stage) == "Y"
     root = stage.GetDefaultPrim()
     assert root.GetName() == "_3_ball"
-    split = split_at_seams(ball.model)
+    split = split_at_seams(ball.model.faces, ball.model.faces_uv, ball.model.uv)
     for name, selected in (("face", ball.model.face_mask), ("rest", ~ball.model.face_mask)):
         part, mesh = part_of(split, selected), UsdGeom.Mesh(root.GetChild(name))
         points = np.asarray(mesh.GetPointsAttr().Get())
