@@ -47,14 +47,9 @@ RIDGE = 1e-3
 
 
 def draw_sheets() -> None:
-    """The mean from three sides, random heads and expressions."""
+    """The mean from three sides, and expressions."""
     model = MorphableModel.load("builtin")
     save_png(np.concatenate([sketch(model, yaw=y, size=340) for y in (0, 45, 90)], axis=1), IMAGES / "builtin_mean.png")
-    columns = []
-    for seed in range(1, 6):
-        identity, _, albedo = model.sample(seed)
-        columns.append(np.concatenate([sketch(model, identity, None, albedo, y, 220) for y in (0, 50)], axis=0))
-    save_png(np.concatenate(columns, axis=1), IMAGES / "builtin_subjects.png")
     tiles = []
     for names in EXPRESSIONS:
         coefficients = np.zeros(model.n_expression)

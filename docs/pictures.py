@@ -1,15 +1,19 @@
 """The pictures of the pages, made from fits of heads whose licences allow it.
 
-    python docs/pictures.py [--size 512] [--only hero gallery light sides]
+    python docs/pictures.py [--size 512] [--only hero gallery light sides] [--keep]
 
-Fits the shared captures of the Perry-Smith scan (CC-BY 3.0) and of Digital Emily (MIT) into ``out/pictures`` where
-there is no result yet, and writes ``docs/images``. People's photographs stay out.
+Fits the shared captures of the Perry-Smith scan (CC-BY 3.0) and of Digital Emily (MIT) into ``out/pictures``, and
+writes ``docs/images``. ``--keep`` takes the fits that are there. People's photographs stay out.
 """
 
 from __future__ import annotations
 
 import argparse
+import shutil
+import time
 from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -18,7 +22,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import mifit
-from mifit.core.camera import Camera
 from mifit.core.image import to_8_bit
 from mifit.output.deferred import surface_material, visible_surface
 from mifit.render.visible import trace_mesh
@@ -33,48 +36,55 @@ HEADS = {
 """Two fitted cameras, a third one that isn't, and the timesteps."""
 TILE = 240
 """Height of a picture in a row, pixels."""
+LEVEL = 0.2
+"""Median of skin in a relit picture, linear."""
 
 
 class Head:
-    """A capture and its fit."""
+    """A capture and its fit, seen by a third camera at the pictures' scale."""
 
     def __init__(self, name: str, size: int) -> None:
-        left, right, self.third, self.timesteps = HEADS[name]
-        self.name, self.cameras = name, (left, right)
+        left, right, third, timesteps = HEADS[name]
+        self.name, self.cameras, folder = name, (left, right), WORK / f"{name}_{size}"
         self.capture = mifit.Capture.load(SHARED / "captures" / name)
-        folder = WORK / f"{name}_{size}"
         if not (folder / "result.json").exists():
             model = mifit.MorphableModel.load(str(ICT))
             config = mifit.FitConfig(reflectance=mifit.ReflectanceConfig(texture_size=size))
-            mifit.fit(self.capture, model, self.cameras, self.timesteps, config).save(folder)
+            mifit.fit(self.capture, model, self.cameras, timesteps, config).save(folder)
         self.result = mifit.Reconstruction.load(folder)
+        self.third, view = third, self.capture.camera(third)
+        rows = np.nonzero(self.result.render(view.resized(0.25), 0, "pca", samples=1)[..., 3].any(axis=1))[0]
+        self.scale = min(1.0, 0.3 * TILE / np.ptp(rows))
+        self.view = view.resized(self.scale)
+        shown = self.result.render(self.view, 0, "pca", samples=1)[..., 3] > 0
+        self.box = around(shown)
+        self.relit = cache(self._relit)
 
-    @property
-    def box(self) -> tuple[slice, slice]:
-        """Rows and columns around the head in the third view."""
-        view = self.capture.camera(self.third)
-        rows, columns = np.nonzero(self.result.render(view, 0, "pca", samples=1)[..., 3] > 0)
-        return slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+    def _relit(self, environment: str) -> mifit.Reconstruction:
+        return self.result.relight(SHARED / "hdri" / f"{environment}.hdr", exposure="auto")
 
     def photograph(self, camera: str) -> NDArray[np.uint8]:
         """One photograph of the first timestep, cropped as the third view."""
-        return to_8_bit(self.capture.frame(camera, 0).image)[self.box]
+        image = to_8_bit(self.capture.frame(camera, 0).image)
+        return cv2.resize(image, (self.view.width, self.view.height), interpolation=cv2.INTER_AREA)[self.box]
 
     def shown(self, values: Callable[[object], NDArray]) -> NDArray[np.uint8]:
-        """Something of the surface's material (N, 3) in the third view."""
-        view = self.capture.camera(self.third)
-        surface = visible_surface(self.result, view, 0)
-        return on_white(surface.image(values(surface_material(self.result, surface, 0))))[self.box]
+        """Something of the skin's material (N, 3) in the third view."""
+        skin = self.relit("sunset")  # without what is left in the capture's own light
+        surface = visible_surface(skin, self.view, 0)
+        return on_white(surface.image(values(surface_material(skin, surface, 0))))[self.box]
 
-    def lit(
-        self, environment: str | None = None, rotate: float = 0.0, camera: Camera | None = None
-    ) -> NDArray[np.uint8]:
-        """The third view, or another, in the capture's light or under an environment."""
-        result = self.result
-        if environment is not None:
-            result = result.relight(SHARED / "hdri" / f"{environment}.hdr", rotate, exposure="auto")
-        picture = on_white(result.render(camera or self.capture.camera(self.third), 0))
-        return picture[self.box] if camera is None else picture
+    def lit(self, environment: str | None = None) -> NDArray[np.uint8]:
+        """The third view in the capture's light, or under an environment."""
+        if environment is None:
+            return on_white(self.result.render(self.view, 0))[self.box]
+        return on_white(exposed(self.relit(environment).render(self.view, 0)))[self.box]
+
+    def side(self, environment: str, yaw: float) -> NDArray[np.uint8]:
+        """The head under an environment from so many degrees beside the front."""
+        view = self.result.orbit(yaw=yaw).resized(self.scale)
+        image = self.relit(environment).render(replace(view, fx=0.7 * view.fx, fy=0.7 * view.fy), 0)
+        return on_white(exposed(image))[around(image[..., 3] > 0)]
 
     def scan(self) -> NDArray[np.uint8]:
         """The true mesh in the third view, shaded by its normals."""
@@ -84,7 +94,7 @@ class Head:
         path = truth / "0000.ply"
         mesh = trimesh.load(path if path.exists() else truth / "head.ply", process=False)
         vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
-        surface = trace_mesh(vertices, faces, self.capture.camera(self.third), 2)
+        surface = trace_mesh(vertices, faces, self.view, 2)
         return clay(surface, np.asarray(mesh.vertex_normals), faces)[self.box]
 
     def mesh(self) -> NDArray[np.uint8]:
@@ -92,8 +102,26 @@ class Head:
         vertices, faces = self.result.geometry.vertices[0], self.result.model.faces
         from mifit.core.mesh import vertex_normals
 
-        surface = trace_mesh(vertices, faces, self.capture.camera(self.third), 2)
+        surface = trace_mesh(vertices, faces, self.view, 2)
         return clay(surface, vertex_normals(vertices, faces), faces)[self.box]
+
+
+def around(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Rows and columns of the true pixels."""
+    rows, columns = np.nonzero(shown)
+    return slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+
+
+@cache
+def head(name: str, size: int) -> Head:
+    """A head, fitted once."""
+    return Head(name, size)
+
+
+def exposed(image: NDArray) -> NDArray[np.float32]:
+    """An image whose covered pixels have a median of `LEVEL`."""
+    level = np.median(image[image[..., 3] > 0.5, :3].mean(axis=1))
+    return image * np.float32([LEVEL / level] * 3 + [1.0])
 
 
 def on_white(image: NDArray) -> NDArray[np.uint8]:
@@ -137,60 +165,54 @@ def page(rows: list[NDArray], path: Path) -> None:
     print(f"wrote {path.relative_to(ROOT)}")
 
 
-def strip(head: Head) -> NDArray[np.uint8]:
+def strip(shown: Head) -> NDArray[np.uint8]:
     """Two photographs in; albedo, specular reflection, normals, mesh and scan, relit."""
-    rotation = head.capture.camera(head.third).world_to_camera[:3, :3]
+    rotation = shown.view.world_to_camera[:3, :3]
     pictures = {
-        "in": head.photograph(head.cameras[0]),
-        "in ": head.photograph(head.cameras[1]),
-        "diffuse albedo": head.shown(lambda m: m.diffuse),
-        "specular albedo": head.shown(lambda m: np.repeat(8.0 * m.specular[:, None], 3, axis=1)),
-        "normals": head.shown(lambda m: (0.5 + 0.5 * (m.normal @ rotation.T) * [1, -1, -1]) ** 2.2),
-        "mesh": head.mesh(),
-        "scan": head.scan(),
-        "relit": head.lit("sunset"),
+        "in": shown.photograph(shown.cameras[0]),
+        "in ": shown.photograph(shown.cameras[1]),
+        "diffuse albedo": shown.shown(lambda m: m.diffuse),
+        "specular albedo": shown.shown(lambda m: np.repeat(8.0 * m.specular[:, None], 3, axis=1)),
+        "normals": shown.shown(lambda m: (0.5 + 0.5 * (m.normal @ rotation.T) * [1, -1, -1]) ** 2.2),
+        "mesh": shown.mesh(),
+        "scan": shown.scan(),
+        "relit": shown.lit("sunset"),
     }
     return row([tile(image, label.strip()) for label, image in pictures.items()])
 
 
 def hero(size: int) -> None:
     """The first picture of the README."""
-    page([strip(Head("scan_city", size))], IMAGES / "hero.jpg")
+    page([strip(head("scan_city", size)), strip(head("emily", size))], IMAGES / "hero.jpg")
 
 
 def gallery(size: int) -> None:
     """Every head: the held-out photograph, our view of it, and three lights."""
     rows = []
     for name in HEADS:
-        head = Head(name, size)
-        own = {"held-out photograph": head.photograph(head.third), "full": head.lit()}
-        relit = {light: head.lit(light) for light in ("city", "studio", "sunset", "apartment")}
+        one = head(name, size)
+        own = {"held-out photograph": one.photograph(one.third), "full": one.lit()}
+        relit = {light: one.lit(light) for light in ("city", "studio", "sunset", "apartment")}
         rows.append(row([tile(image, f"{label}") for label, image in (own | relit).items()]))
     page(rows, IMAGES / "gallery.jpg")
 
 
-def light(size: int, frames: int = 24, height: int = 260) -> None:
+def light(size: int, frames: int = 24) -> None:
     """A light that turns about a head, as a small moving picture."""
-    head = Head("scan_city", size)
-    view, box = head.capture.camera(head.third), head.box
+    one = head("scan_city", size)
     turns = [360.0 * k / frames for k in range(frames)]
-    turned = head.result.relight(SHARED / "hdri" / "sunset.hdr", rotations=turns, exposure="auto")
-    images = []
-    for lit in turned:
-        picture = on_white(lit.render(view, 0, samples=1))[box]
-        width = round(picture.shape[1] * height / picture.shape[0])
-        images.append(Image.fromarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)))
+    turned = one.result.relight(SHARED / "hdri" / "sunset.hdr", rotations=turns, exposure="auto")
+    images = [Image.fromarray(on_white(lit.render(one.view, 0, samples=1))[one.box]) for lit in turned]
     path = IMAGES / "light.webp"
     images[0].save(path, save_all=True, append_images=images[1:], duration=90, loop=0, quality=70)
     print(f"wrote {path.relative_to(ROOT)}")
 
 
 def sides(size: int) -> None:
-    """The scan from five sides under the studio's light."""
-    result = Head("scan_city", size).result
-    lit = result.relight(SHARED / "hdri" / "studio.hdr", exposure="auto")
-    views = [result.orbit(yaw=yaw) for yaw in (-60, -30, 0, 30, 60)]
-    page([row([tile(on_white(lit.render(view, 0))) for view in views])], IMAGES / "five_sides.jpg")
+    """Two heads from five sides, each under a light of its own."""
+    views = list(zip((-70, -35, 0, 35, 70), ("city", "studio", "sunset", "apartment", "softbox"), strict=True))
+    rows = [row([tile(head(n, size).side(e, y), e) for y, e in views]) for n in ("scan_city", "emily")]
+    page(rows, IMAGES / "five_sides.jpg")
 
 
 PICTURES = {"hero": hero, "gallery": gallery, "light": light, "sides": sides}
@@ -201,11 +223,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, default=512, help="texels along the side of the maps")
     parser.add_argument("--only", nargs="*", choices=PICTURES, default=list(PICTURES))
+    parser.add_argument("--keep", action="store_true", help="take the fits in out/pictures")
     given = parser.parse_args()
+    if not ICT.exists():
+        raise SystemExit(f"{ICT}: not found; the pictures need the shared captures and models")
+    if not given.keep:
+        shutil.rmtree(WORK, ignore_errors=True)
     mifit.set_variant("auto")
     IMAGES.mkdir(exist_ok=True)
     for name in given.only:
+        started = time.perf_counter()
         PICTURES[name](given.size)
+        print(f"{name}: {time.perf_counter() - started:.0f} s")
 
 
 if __name__ == "__main__":
