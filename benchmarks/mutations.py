@@ -160,7 +160,7 @@ MUTATIONS = (
     M("all lights cast the first one's shadows", "occlusion._visible", "bits >> np.uint32(len(directions) % 32)",
       "bits", "tests/appearance/test_occlusion.py"),
     M("all timesteps have the first one's shadows", "occlusion.VertexTransfer.joined", "parts[s].corners + starts[s]",
-      "parts[s].corners", "tests/appearance/test_occlusion.py tests/stages/test_infer_reflectance.py"),
+      "parts[s].corners", "tests/appearance/test_occlusion.py"),
     M("specular transfers without the lobe's gain", "formation.Appearance.transfers", "found.gain * t", "t",
       "tests/appearance/test_models.py"),
     # Surface and maps.
@@ -170,7 +170,7 @@ MUTATIONS = (
       "0.5 * (low - high) / curvature", "tests/stages/test_find_surface.py"),
     M("views across time by cameras, not by the head", "sweep.across_time",
       "normalize(image.camera.position - step.position.mean(axis=0)) @ rotation[k]",
-      "normalize(image.camera.position - step.position.mean(axis=0))", "tests/stages/test_find_surface.py"),
+      "normalize(image.camera.position - step.position.mean(axis=0))", "tests/stages/test_align_timesteps.py"),
     M("walls kept at the best timestep", "thin_walls.keep_walls", "np.min(left, axis=0)", "np.max(left, axis=0)",
       "tests/stages/test_thin_walls.py"),
     M("eyeballs fear the backs of faces", "eyes._depth_outside", "(det > 0)", "(det < 0)", "tests/stages/test_eyes.py"),

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from mifit.appearance.occlusion import trace_transfer
+from mifit.appearance.occlusion import MeshPoints, VertexTransfer, _visible, trace_transfer
 from mifit.core import sh
+from mifit.core.mesh import normalize
 from mifit.errors import InputError
 from mifit.render.gbuffer import SurfaceScene
 from tests.shaded import diffuse_matrix
@@ -77,3 +78,21 @@ def test_bad_input_is_named(variant: str, wall) -> None:
     with pytest.raises(InputError, match="samples: found 0"):
         trace_transfer(SurfaceScene(*wall), POINT, UP, 3, samples=0)
     assert trace_transfer(SurfaceScene(*wall), POINT[:0], UP[:0], 3).shape == (0, 9)
+
+
+def test_each_light_has_its_own_shadows(variant: str, wall) -> None:
+    """One light behind the wall, of two samples, and one before it."""
+    points = MeshPoints(POINT, UP, np.zeros(1, int), np.ones((1, 3)) / 3)
+    behind, before = normalize(np.array([[-1.0, 0, 1], [-1, 0.1, 1]])), normalize(np.array([[1.0, 0, 1]]))
+    found = _visible(SurfaceScene(*wall), points, [behind, before])
+    assert [bits.tolist() for bits in found] == [[0], [1]]
+    assert [bits.tolist() for bits in _visible(SurfaceScene(*wall), points, [before, behind])] == [[1], [0]]
+
+
+def test_joined_shadows_are_those_of_each_timestep() -> None:
+    rng = np.random.default_rng(0)
+    parts = [VertexTransfer(rng.random((5, 4)), rng.integers(0, 5, (3, 3)), rng.random((3, 3))) for _ in range(2)]
+    joined = VertexTransfer.joined(parts, np.array([1, 0, 1]))
+    found = joined.values[joined.corners].reshape(3, 3, 3, 4)
+    for image, step in enumerate((1, 0, 1)):
+        np.testing.assert_array_equal(found[:, image], parts[step].values[parts[step].corners])

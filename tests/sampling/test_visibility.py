@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mifit.sampling.visibility import OUTLIER, background, inlier_probability, outlier_prior, outline_distance
+from mifit.sampling.visibility import (
+    OUTLIER,
+    background,
+    footprint,
+    inlier_probability,
+    outlier_prior,
+    outline_distance,
+)
+from tests.output.conftest import ball_camera
 
 SKIN, BACKGROUND = (0.5, 0.3, 0.25), (0.02, 0.02, 0.03)
 
@@ -84,3 +92,11 @@ def test_background_over_a_head_that_is_too_wide_is_found_and_the_face_is_not() 
     dark[25:35, 35:45] = 0.02  # as dark as the background, but joined to nothing of it
     assert not background(dark, hit, face)[27:33, 37:43].any()
     assert not background(image, np.ones_like(hit), face).any()
+
+
+def test_the_back_of_a_face_covers_no_pixels() -> None:
+    camera = ball_camera(angle=0.0)
+    corners, front = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
+    pixels = 0.5 * (camera.fx / 70.0) ** 2
+    assert footprint(corners, front, camera, np.array([2.0]))[0] == pytest.approx(0.5 * pixels)
+    assert footprint(corners, front[:, ::-1], camera, np.array([2.0]))[0] == 0.0

@@ -15,9 +15,11 @@ from mifit.stages.fit_geometry import fit_geometry
 from mifit.stages.geometry.parameters import exponential
 from mifit.stages.geometry.surfaces import moved_by
 from mifit.stages.surface.align_timesteps import align_timesteps
+from mifit.stages.surface.band import FeatureImage
 from mifit.stages.surface.kept_texture import KeptTexture
 from mifit.stages.surface.sweep import BEST_APART, MOST_PAIRS, Posed, across_time
 from mifit.stages.surface.views import pose_texels
+from tests.output.conftest import ball_camera
 from tests.stages.test_find_surface import QUICK
 
 BOTH, STEPS = ("left", "right"), (0, 1, 2)
@@ -156,3 +158,13 @@ def test_a_head_that_stands_still_has_no_pairs_across_time(capture):
     image.camera = camera
     still = [Posed(np.zeros((4, 3)), np.zeros((4, 3)), (image,), np.ones((1, 4), np.float32))] * 2
     assert across_time(still, np.tile(np.eye(3), (2, 1, 1))) == []
+
+
+def test_a_level_of_an_image_is_read_where_the_camera_sees_a_point():
+    camera = ball_camera(size=64)
+    x, y = np.meshgrid(np.arange(32) * 2.0 + 1.0, np.arange(32) * 2.0 + 1.0)  # centres in pixels of the full image
+    image = FeatureImage(camera, 0.5, np.stack([x, np.ones_like(x), y], axis=-1).astype(np.float32))
+    points, way = np.array([[1.0, 2, 3], [-2, 0.5, 1]]), np.array([[0.0, 0, 1], [0, 1, 0]])
+    found = image.sample(points, way, np.array([0.0, 0.5]))
+    for k, offset in enumerate((0.0, 0.5)):
+        np.testing.assert_allclose(found[k][:, [0, 2]], camera.project(points + offset * way), atol=1e-3)

@@ -87,3 +87,12 @@ def test_the_error_of_the_light_is_what_darkens_dim_skin(half_seen):
     blend = blend_unseen(replace(model, symmetry=None), texels, wrong[1], confidence, confidence, lit)
     assert (texels.from_map(blend.confidence)[~seen] == 0).all() and (lit[seen] > 0.9).all()
     assert np.median(texels.from_map(blend.diffuse)[~seen] / skin[~seen]) > 0.8
+
+
+def test_a_mark_on_one_side_is_not_painted_onto_the_other(half_seen):
+    """Where both sides were seen, each keeps its own."""
+    model, texels, truth, _, seen = half_seen
+    marked = np.where(seen[:, None], truth + 0.2, truth).astype(np.float32)
+    sure = np.ones(len(truth), np.float32)
+    found = texels.from_map(blend_unseen(model, texels, texels.to_map(marked), sure, sure).diffuse)
+    np.testing.assert_allclose(found, marked[:, :3], atol=0.03)

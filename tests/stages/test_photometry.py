@@ -11,7 +11,7 @@ from stages.reflectance_scene import turning_dome
 from mifit import Capture
 from mifit.config import PhotometryConfig
 from mifit.core.photometry import Photometry
-from mifit.stages.photometry import Factors, find_photometry
+from mifit.stages.photometry import Factors, Solution, find_photometry
 
 CAMERAS = ("left", "right")
 GAIN = (1.25, 0.9, 1.1)
@@ -106,3 +106,12 @@ def test_factors_round_trip_and_damaged_ones_are_refused():
     for damaged in ({"gain": {"a": [1.0, 2.0]}}, {"gain": {"a": [1.0, 0.0, 1.0]}}, {"exposure": {"a": {"0": -1.0}}}):
         with pytest.raises(ValueError, match="positive"):
             Photometry.from_document(damaged)
+
+
+def test_a_factor_counts_where_it_is_far_from_1_and_surely_so():
+    factors = Factors.of(np.array([0, 1]), np.array([0, 0]))
+    groups = {
+        deviation: Solution(factors, np.array([0.2, 0.01, 0.01]), np.full(3, deviation)).sure()
+        for deviation in (0.01, 0.2)
+    }
+    assert groups == {0.01: ["gain"], 0.2: []}

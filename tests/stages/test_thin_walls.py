@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -112,6 +114,23 @@ def test_the_surface_no_longer_intersects_itself(cup, pressed):
     found, _ = keep_walls(cup, pressed)
     assert len(intersections(10.0 * pressed.vertices[0], cup.faces)) > 10
     assert len(intersections(10.0 * found.vertices[0], cup.faces)) == 0
+
+
+def test_walls_are_kept_at_the_timestep_that_presses_them(cup, fit, pressed):
+    """An expression presses the outside in; at the other timestep it is neutral."""
+    inwards = (pressed.vertices[0] - fit.vertices[0])[..., None].astype(np.float32)
+    model = replace(cup, expression=inwards, expression_bounds=None)
+    both = replace(
+        fit,
+        timesteps=(0, 1),
+        expression=np.array([[0.0], [1.0]]),
+        rotation=np.stack([np.eye(3)] * 2),
+        translation=np.zeros((2, 3)),
+        vertices=np.concatenate([fit.vertices, pressed.vertices]),
+    )
+    found, count = keep_walls(model, both)
+    assert count > 3
+    assert (np.linalg.norm(found.vertices - both.vertices, axis=2).max(axis=1) > 1e-6).all()
 
 
 def test_a_face_without_cavities_has_no_walls():
