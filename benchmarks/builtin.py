@@ -1,6 +1,5 @@
-"""Files that are fitted or drawn with the built-in model, and how well it fits heads of another.
+"""A table that is fitted with the built-in model, and how well it fits heads of another.
 
-    python -m benchmarks.builtin sheets                      # the model's sheets in docs/images
     python -m benchmarks.builtin register [--heads 20]       # benchmarks/results/register_builtin.json
     python -m benchmarks.builtin face-mesh --out mifit/capture/face_mesh_68.json [--subjects 40]
 
@@ -28,35 +27,14 @@ from mifit.capture import Capture
 from mifit.core.files import write_text
 from mifit.core.image import load_image, to_8_bit
 from mifit.morphable import MorphableModel
-from mifit.morphable.describe import save_png, sketch
 from mifit.morphable.register import register
 from mifit.output.truth import nearest_points
 from mifit.synth import synthesize
 
-IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
-EXPRESSIONS = (
-    ("jawOpen",), ("smile_L", "smile_R", "cheekSquint_L", "cheekSquint_R"),
-    ("frown_L", "frown_R", "browInnerUp_L", "browInnerUp_R"), ("pucker",),
-    ("funnel", "browOuterUp_L", "browOuterUp_R"), ("browDown_L", "browDown_R", "sneer_L", "sneer_R"), ("blink_L",),
-    ("cheekPuff_L", "cheekPuff_R"),
-)  # fmt: skip
 POINTS = 64
 """Mesh points that a landmark is combined of."""
 RIDGE = 1e-3
 """Penalty on the weights, relative to squared eye distances."""
-
-
-def draw_sheets() -> None:
-    """The mean from three sides, and expressions."""
-    model = MorphableModel.load("builtin")
-    save_png(np.concatenate([sketch(model, yaw=y, size=340) for y in (0, 45, 90)], axis=1), IMAGES / "builtin_mean.png")
-    tiles = []
-    for names in EXPRESSIONS:
-        coefficients = np.zeros(model.n_expression)
-        coefficients[[model.expression_names.index(n) for n in names]] = 2.0
-        tiles.append(sketch(model, None, coefficients, yaw=15, size=240))
-    rows = [np.concatenate(tiles[k : k + 4], axis=1) for k in (0, 4)]
-    save_png(np.concatenate(rows, axis=0), IMAGES / "builtin_expressions.png")
 
 
 def distances(model: MorphableModel, ict: MorphableModel, seed: int) -> dict[str, float]:
@@ -138,16 +116,14 @@ def fit_face_mesh(name: str, subjects: int, seed: int, out: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["sheets", "register", "face-mesh"])
+    parser.add_argument("what", choices=["register", "face-mesh"])
     parser.add_argument("--heads", type=int, default=20)
     parser.add_argument("--model", help="default: builtin:coarse to register, the ICT model to synthesise")
     parser.add_argument("--subjects", type=int, default=40)
     parser.add_argument("--seed", type=int, default=5000)
     parser.add_argument("--out", type=Path, default=Path("face_mesh_68.json"))
     a = parser.parse_args()
-    if a.what == "sheets":
-        draw_sheets()
-    elif a.what == "register":
+    if a.what == "register":
         measure_registration(a.heads, a.model or "builtin:coarse")
     else:
         fit_face_mesh(a.model or ICT, a.subjects, a.seed, a.out)

@@ -13,7 +13,7 @@ from mifit.core.photometry import Photometry
 from mifit.errors import InputError
 from mifit.fitting import PARTS, Source, check_images, choose_timesteps, eyes_note, keys, one_place, steps
 from mifit.morphable import MorphableModel
-from mifit.morphable.openings import eyeballs, with_eyes
+from mifit.morphable.openings import eyeballs, leading_faces, with_eyes
 from tests.output.conftest import ball_camera, ball_result
 
 
@@ -56,10 +56,13 @@ def test_a_model_whose_eyes_are_holes_brings_a_note():
 
 
 def without_eyes(model):
-    seen = ~np.isin(model.faces, np.concatenate(eyeballs(model))).any(axis=1)
-    return dataclasses.replace(
-        model, faces=model.faces[seen], faces_uv=model.faces_uv[seen], face_mask=model.face_mask[seen]
-    )
+    """What it was before it got eyes: its first vertices."""
+    count = min(int(ball.min()) for ball in eyeballs(model))
+    own = leading_faces(model, count)
+    shapes = ("mean", "identity", "expression", "mean_albedo", "albedo_modes", "symmetry")
+    kept = {name: getattr(model, name)[:count] for name in shapes}
+    kept |= {name: getattr(model, name)[own] for name in ("faces", "faces_uv", "face_mask")}
+    return dataclasses.replace(model, **kept, fingerprint="")
 
 
 def test_a_fit_gives_a_model_eyes_that_has_none(monkeypatch):

@@ -104,17 +104,13 @@ def fit(arguments: Namespace) -> int:
         timesteps = 4  # of clips, the most informative moments
     if isinstance(timesteps, int):
         timesteps = _chosen(arguments, capture, timesteps)
-    progress, view = console_progress(arguments.quiet), None
+    progress = console_progress(arguments.quiet)
     told: list[Diagnostic] = []
 
     def tell_now(found: Sequence[Diagnostic]) -> None:
         told.extend(found)
         tell(arguments, found)
 
-    if arguments.view:
-        from mifit.extras.live_view import FitView
-
-        view = FitView(progress, lambda address: print(f"View: {address}", flush=True), arguments.host, arguments.port)
     result = fit_into(
         out,
         capture,
@@ -124,22 +120,15 @@ def fit(arguments: Namespace) -> int:
         config=config,
         until=arguments.until,
         seed=arguments.seed,
-        progress=view.progress if view else progress,
+        progress=progress,
         resume=arguments.resume,
         force=arguments.force,
-        watch=view.watch if view else None,
         tell=tell_now,
     )
     with replacing_files(out, force=arguments.force) as new:
         write_report(new, result, capture)
     code = tell(arguments, result.diagnostics, told)
     print(f"Result: {out}", flush=True)
-    if view:
-        from mifit.extras.live_view import serve
-
-        view.watch(result)  # where nothing had to be fitted it is the first
-        if view.live:
-            serve(view.live)
     return code
 
 

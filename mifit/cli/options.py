@@ -50,7 +50,6 @@ doctor  setup.doctor  what of the set-up, or of a capture, is wrong, and what me
 
 model info  setup.model  print a table
     model      text  a path, builtin or auto
-    --preview  path  also write a sheet of the mean and the first modes
     {FORCE}
 
 model convert  setup.model  write a model in mifit's own format
@@ -141,9 +140,7 @@ fit  fits.fit  fit geometry, reflectance and normals to a capture, or to clips o
     --until        geometry|reflectance|normals=normals  last stage (default: normals, everything)
     --resume       flag        go on with a run that was stopped
     --force        flag        replace an existing result
-    --view         flag        show the fit in the browser while it is being fitted, and after
     {STRICT}
-    {ADDRESS}
 
 track  fits.track  geometry and normals of further timesteps, reflectance and lighting fixed
     capture      path   capture folder, or its transforms.json

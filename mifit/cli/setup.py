@@ -79,7 +79,7 @@ def _examine(arguments: Namespace) -> int:
     return tell(arguments, found)
 
 
-@writes("preview", "out")
+@writes("out")
 def model(arguments: Namespace) -> None:
     """Inspect, convert or fetch a morphable model."""
     import mifit
@@ -93,9 +93,6 @@ def model(arguments: Namespace) -> None:
     elif arguments.action == "info":
         loaded = mifit.MorphableModel.load(arguments.model)
         print(describe.model_info(loaded))
-        if arguments.preview:
-            describe.save_preview(loaded, arguments.preview)
-            print(f"Preview: {arguments.preview}")
     else:
         options: Document = {"kind": arguments.kind} if arguments.kind else {}
         loaded = mifit.MorphableModel.load(arguments.source, **options)

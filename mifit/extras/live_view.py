@@ -36,7 +36,6 @@ from mifit.errors import InputError
 from mifit.output.deferred import render_local
 from mifit.output.relight import relit
 from mifit.output.views import on_backdrop, orbit_camera
-from mifit.progress import Progress
 from mifit.result import METHODS, Method, Reconstruction
 
 if TYPE_CHECKING:
@@ -49,8 +48,6 @@ MAX_UPLOAD_BYTES = 256 * 2**20
 """An environment that a browser sends: 16384 x 8192 pixels in a Radiance file, half of that in an EXR."""
 MAX_CLIENTS = 8
 """Browsers that are answered at once."""
-SHARE = 0.2
-"""Of a fit's time, what its view may take at most."""
 LABELS = {"pca": "morphable model", "diffuse": "without specular", "full": "everything"}
 
 
@@ -235,7 +232,6 @@ class LiveView:
         self._steps = sorted(result.timesteps)
         self._picture = Picture(result)
         self._shown = Shown(result.methods[-1], self._steps[0])
-        self._newest = result.methods[-1]
         self._rested = time.monotonic()
         self._changed: dict[int, float] = {}  # client -> when its picture went out of date
         self._coarse: set[int] = set()  # clients whose last picture was a small one
@@ -275,17 +271,6 @@ class LiveView:
                 self._coarse.discard(client)
                 self._send(handle, ROWS[1])
 
-    def replace(self, result: Reconstruction) -> None:
-        """Show a later state of the same fit: what it has newly is offered, and shown unless a person chose a part."""
-        new = result.methods[-1] if self._shown.method == self._newest else self._shown.method
-        if result.reflectance is not None and self._picture.result.reflectance is None:
-            self._light_controls()
-        self._newest = result.methods[-1]
-        self._picture = Picture(result)
-        self._parts.options = tuple(LABELS[m] for m in METHODS if m in result.methods)
-        self._parts.value = LABELS[new]  # type: ignore[misc]  # it has a setter
-        self._show(method=new)
-
     def say(self, text: str) -> None:
         """Write a line under the controls."""
         self._message.content = text
@@ -302,23 +287,18 @@ class LiveView:
             "Show", tuple(LABELS[m] for m in METHODS if m in result.methods), initial_value=LABELS[self._shown.method]
         )
         shown.on_update(lambda _: self._show(method=parts[shown.value]))
-        self._parts = shown
         if len(self._steps) > 1:
             step = gui.add_slider("Timestep", self._steps[0], self._steps[-1], 1, self._steps[0])
             step.on_update(lambda _: self._move_to(int(step.value)))
         if result.reflectance is not None:
-            self._light_controls()
+            turn = gui.add_slider("Turn light", -180.0, 180.0, 5.0, 0.0)
+            turn.on_update(lambda _: self._show(turn=float(np.clip(np.nan_to_num(turn.value), -180.0, 180.0))))
+            load = gui.add_upload_button("Load environment (.hdr, .exr)")
+            load.on_upload(lambda _: self._upload(load.value.name, load.value.content))
+            gui.add_button("Recovered light").on_click(lambda _: self._show(environment=None))
         front = gui.add_button("Look from the front")
         front.on_click(lambda event: self._place(event.client))
         self._message = gui.add_markdown("")
-
-    def _light_controls(self) -> None:
-        gui = self._server.gui
-        turn = gui.add_slider("Turn light", -180.0, 180.0, 5.0, 0.0)
-        turn.on_update(lambda _: self._show(turn=float(np.clip(np.nan_to_num(turn.value), -180.0, 180.0))))
-        load = gui.add_upload_button("Load environment (.hdr, .exr)")
-        load.on_upload(lambda _: self._upload(load.value.name, load.value.content))
-        gui.add_button("Recovered light").on_click(lambda _: self._show(environment=None))
 
     def _move_to(self, timestep: int) -> None:
         nearest = min(self._steps, key=lambda t: abs(t - timestep))
@@ -377,53 +357,6 @@ class LiveView:
         with warnings.catch_warnings():  # the page may have gone meanwhile
             warnings.simplefilter("ignore", UserWarning)
             client.scene.set_background_image(image, format="jpeg", jpeg_quality=90)
-
-
-class FitView:
-    """A live view of a fit while it is being fitted: `progress` and `watch` are given to it.
-
-    The first state appears once there is a geometry; the page answers whenever the fit reports progress.
-
-    Parameters
-    ----------
-    progress : Progress
-        Called as well.
-    opened : callable
-        Called with the address once there is something to see.
-    host, port
-        As of `LiveView`.
-    """
-
-    def __init__(self, progress: Progress, opened: Callable[[str], None], host: str, port: int) -> None:
-        check_address(host, port)
-        self.live: LiveView | None = None
-        self._progress, self._opened, self._where = progress, opened, (host, port)
-        self._thread = threading.get_ident()
-        self._next = 0.0
-
-    def progress(self, label: str, done: int, total: int) -> None:
-        """As `mifit.progress.Progress`; renders what browsers wait for, ten times a second and for `SHARE` at most."""
-        self._progress(label, done, total)
-        now = time.monotonic()
-        if self.live is None or threading.get_ident() != self._thread or now < self._next:
-            return
-        self.live.say(f"{label}: {done} of {total}")
-        self.live.poll()
-        after = time.monotonic()
-        self._next = after + max(0.1, (after - now) * (1.0 / SHARE - 1.0))
-
-    def watch(self, result: Reconstruction) -> None:
-        """Show the result so far."""
-        if self.live is not None:
-            self.live.replace(result)
-        else:
-            try:
-                self.live = LiveView(result, *self._where)
-            except InputError as error:  # the address was free when the fit began
-                print(f"mifit: warning: no view: {error}", file=sys.stderr)
-                return
-            self._opened(self.live.address)
-        self.live.poll()
 
 
 def serve(live: LiveView) -> None:

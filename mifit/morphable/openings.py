@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from mifit.core.mesh import face_cross
 from mifit.errors import InputError
 from mifit.morphable.model import MorphableModel
-from mifit.morphable.topology import adjacency, closed_borders
+from mifit.morphable.topology import EYES_AND_MOUTH, adjacency, closed_borders
 
 RADIUS_MM = 12.0
 """Of an eyeball; people differ by less than a millimetre."""
@@ -41,8 +41,6 @@ STRIP = 0.09
 MARGIN = 0.004
 SMALLEST = 50
 """Vertices of an eyeball at the least: more than those of a rim, each of which the tissue in the corners meets."""
-EYES, CORNERS, INNER_LIPS = (slice(36, 42), slice(42, 48)), ((36, 39), (45, 42)), slice(60, 68)
-"""iBUG points; corners from the outer to the inner one."""
 SUFFIX = "+eyes"
 """After a model's file: with these pieces."""
 
@@ -77,7 +75,7 @@ def eyeballs(model: MorphableModel) -> list[NDArray[np.int64]]:
     balls[sizes.argmax()] = False  # the skin
     balls &= np.isin(np.arange(len(sizes)), piece[model.faces[~model.face_mask].ravel()])
     found = []
-    for eye in EYES:
+    for eye in EYES_AND_MOUTH[:2]:
         around = model.mean[model.landmarks[eye]]
         centre, reach = around.mean(axis=0), np.ptp(around[:, 0])
         near = np.linalg.norm(0.5 * (low + high) - centre, axis=1) < reach
@@ -129,7 +127,7 @@ def with_eyes(model: MorphableModel) -> MorphableModel:
         face_mask=np.concatenate([model.face_mask, np.zeros(len(faces), bool)]),
         symmetry=None if model.symmetry is None else np.concatenate([model.symmetry, *mirror]),
         # The ball's centre is searched for, whose last digit differs between machines.
-        fingerprint=f"{model.digest}-eyes3",
+        fingerprint=f"{model.digest}-eyes4",
     )
     if model.source:
         found._set("_source", model.source + SUFFIX)
@@ -187,7 +185,7 @@ def openings(model: MorphableModel) -> tuple[list[NDArray[np.int64]], NDArray[np
     marks = model.mean[model.landmarks].astype(np.float64)
     borders = [loop for loop in closed_borders(model.faces) if len(loop) >= 8]  # vertices around an eye or the mouth
 
-    def at(part: slice) -> NDArray[np.int64] | None:
+    def at(part: range) -> NDArray[np.int64] | None:
         centre, extent = marks[part].mean(axis=0), float(np.ptp(marks[part][:, 0]))
         for loop in borders:
             points = model.mean[loop]
@@ -196,8 +194,8 @@ def openings(model: MorphableModel) -> tuple[list[NDArray[np.int64]], NDArray[np
                 return loop
         return None
 
-    eyes = [loop for part in EYES if (loop := at(part)) is not None]
-    return eyes, at(INNER_LIPS)
+    eyes = [loop for part in EYES_AND_MOUTH[:2] if (loop := at(part)) is not None]
+    return eyes, at(EYES_AND_MOUTH[2])
 
 
 def _eyeball(model: MorphableModel, loop: NDArray, which: int, corner: NDArray, width: float) -> _Piece:
@@ -222,7 +220,7 @@ def _eyeball(model: MorphableModel, loop: NDArray, which: int, corner: NDArray, 
         a, b = first + k * SEGMENTS, turn + k * SEGMENTS
         faces += [np.stack([a, a + SEGMENTS, b + SEGMENTS], axis=1), np.stack([a, b + SEGMENTS, b], axis=1)]
     found = _facing(points, np.concatenate(faces), points - centre)
-    corners = model.landmarks[list(CORNERS[which])]
+    corners = model.landmarks[list(((36, 39), (45, 42))[which])]  # from the outer to the inner one
     return _Piece(
         points, _means(loop, len(points), model.n_vertices), _means(corners, len(points), model.n_vertices),
         found, uv, albedo, np.arange(len(points)),
@@ -279,7 +277,9 @@ def _mouth(model: MorphableModel, loop: NDArray, corner: NDArray, extent: NDArra
     mirror[[0, -1]] = n - 1, 0
     mirror = np.append((np.arange(MOUTH_LINES)[:, None] * n + mirror).ravel(), len(lines) - 1)
     albedo = np.tile(MOUTH_ALBEDO, (len(lines), 1))
-    return _Piece(lines, rows, rows, np.concatenate(faces), uv, albedo, mirror)
+    found = np.concatenate(faces)
+    found = found[(face_cross(lines, found) ** 2).sum(axis=1) > 0]  # lips that mirror each other meet in the middle
+    return _Piece(lines, rows, rows, found, uv, albedo, mirror)
 
 
 def _other_lip(rim: NDArray) -> NDArray[np.float64]:

@@ -44,7 +44,6 @@ def skin_model(
     landmarks: NDArray,
     unit_mm: float,
     count: int,
-    skin: NDArray | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean albedo and albedo modes for a face surface.
 
@@ -60,8 +59,6 @@ def skin_model(
         Millimetres per unit of ``mean``.
     count : int
         Albedo modes to make.
-    skin : (V,) bool, optional
-        Vertices whose albedo varies; all by default.
 
     Returns
     -------
@@ -95,8 +92,6 @@ def skin_model(
         ],
         axis=2,
     )
-    if skin is not None:
-        columns[~skin] = 0.0
     modes = compress(columns.reshape(3 * n, -1), count)
     return albedo.astype(np.float32), modes.reshape(n, 3, -1)
 

@@ -1,10 +1,9 @@
-"""What can be learned from a face mesh alone: loops, openings, mirror images, spread-out points; finer models."""
+"""What can be learned from a face mesh alone: loops, openings, mirror images, spread-out points."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
@@ -133,7 +132,3 @@ def oriented_outwards(mean: NDArray, faces: NDArray) -> NDArray:
     n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     front = corners[:, :, 2].mean(1) > np.median(mean[:, 2])
     return faces if n[front, 2].sum() >= 0 else faces[:, [1, 0, 2]]
-
-
-if TYPE_CHECKING:
-    pass

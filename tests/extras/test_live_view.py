@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import threading
-import time
 from pathlib import Path
 
 import cv2
@@ -14,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mifit.core.image import write_image
 from mifit.errors import InputError
-from mifit.extras.live_view import FitView, LiveView, Picture, Shown, browser_camera, under, vertical
+from mifit.extras.live_view import LiveView, Picture, Shown, browser_camera, under, vertical
 from mifit.output.views import orbit_camera
 from tests.output import browser
 from tests.output.conftest import ball_result
@@ -90,69 +88,3 @@ def test_the_page_shows_the_head_and_what_the_controls_ask_for(variant, tmp_path
     assert left["first"].std() > 10
     assert np.abs(left["light"] - left["first"]).mean() > 1.0
     assert np.abs(left["head"] - left["light"]).mean() > 1.0
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(browser.CHROMIUM is None, reason="needs Chromium")
-def test_a_fit_is_shown_while_it_is_fitted(variant, tiny_capture, tmp_path, monkeypatch):
-    pytest.importorskip("viser", reason="needs the extra mifit[view]")
-    import mifit
-    from mifit.progress import silent
-
-    config = mifit.FitConfig(
-        geometry=mifit.GeometryConfig(rounds=1),
-        reflectance=mifit.ReflectanceConfig(texture_size=64, shading="prefiltered", bands=4, exponent=100),
-    )
-    capture, model = mifit.Capture.load(tiny_capture), mifit.MorphableModel.load("builtin:coarse")
-    seen: list[np.ndarray] = []
-    problems: list[str] = []
-    visits: list[threading.Thread] = []
-    shown: list[tuple[str, ...]] = []
-    steps: list[np.ndarray] = []
-
-    def part(image: np.ndarray) -> np.ndarray:
-        """Beside the controls and notices."""
-        return image[200:, :560].astype(int)
-
-    def look(address: str) -> None:
-        def visit() -> None:
-            with browser.opened(address, Path(tmp_path)) as page:
-                while fitting.is_set():
-                    seen.append(page.screenshot())
-                seen.append(page.settled())
-                problems.extend(page.problems)
-
-        visits.append(threading.Thread(target=visit))
-        visits[0].start()
-
-    fitting = threading.Event()
-    fitting.set()
-    view = FitView(silent, look, "127.0.0.1", 0)
-
-    def watch(result):
-        shown.append(result.methods)
-        view.watch(result)
-        taken, limit = len(seen), time.monotonic() + 30
-
-        def is_shown() -> bool:
-            return len(seen) > taken + 1 and part(seen[-1]).std() > 10
-
-        view.live.run(until=lambda: is_shown() or time.monotonic() > limit)  # the page shows this step
-        steps.append(part(seen[-1]))
-
-    watched = mifit.fit(capture, model, timesteps=[0], config=config, progress=view.progress, watch=watch)
-    fitting.clear()
-    view.live.run(until=lambda: not visits[0].is_alive())
-    view.live.close()
-    assert problems == []
-    assert shown[0] == ("pca",) and "full" in shown[-1] and len(shown) >= 4
-    for name, image in (("while", seen[len(seen) // 2]), ("after", seen[-1])):
-        cv2.imwrite(str(tmp_path / f"{name}.png"), image[..., ::-1])
-    left = [part(image) for image in seen]
-    assert left[-1].std() > 10
-    assert np.abs(left[-1] - steps[1]).mean() > 0.3  # not the second step's still; the page opens during the first
-    changes = [np.abs(a - b).mean() for a, b in itertools.pairwise(left)]
-    assert sum(change > 0.3 for change in changes) >= 2  # pictures came while the fit went on
-    alone = mifit.fit(capture, model, timesteps=[0], config=config)  # watching changes nothing
-    for part, name in (("geometry", "vertices"), ("reflectance", "diffuse"), ("normals", "normal_object")):
-        np.testing.assert_array_equal(getattr(getattr(watched, part), name), getattr(getattr(alone, part), name))

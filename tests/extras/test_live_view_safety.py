@@ -15,8 +15,7 @@ import pytest
 
 from mifit.cli import main
 from mifit.errors import InputError
-from mifit.extras.live_view import MAX_CLIENTS, SHARE, FitView, LiveView, browser_camera, is_of_our_page
-from mifit.progress import silent
+from mifit.extras.live_view import MAX_CLIENTS, LiveView, browser_camera, check_address, is_of_our_page
 from tests.output.conftest import ball_result
 
 viser = pytest.importorskip("viser", reason="needs the extra mifit[view]")
@@ -141,7 +140,7 @@ def test_a_camera_that_is_none_is_refused() -> None:
 @pytest.mark.parametrize("host", ["", "203.0.113.1", "no.such.host.invalid", "a" * 300, "\ud800"])
 def test_a_host_that_can_not_be_bound_is_an_error_at_once(host: str, tmp_path, capfd) -> None:
     with pytest.raises(InputError, match="can't listen there"):
-        FitView(silent, print, host, 0)
+        check_address(host, 0)
     ball_result().model.save(tmp_path / "ball.npz")
     import dataclasses
 
@@ -155,23 +154,3 @@ def test_a_port_that_is_taken(variant: str) -> None:
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"--port {port}: can't listen there"):
             LiveView(ball_result(), port=port)
-
-
-def test_a_view_takes_a_share_of_the_fits_time_alone() -> None:
-    view = FitView(silent, print, "127.0.0.1", 0)
-    spent = []
-
-    class Slow:
-        def say(self, text: str) -> None:
-            pass
-
-        def poll(self) -> None:
-            time.sleep(0.1)
-            spent.append(0.1)
-
-    view.live = Slow()  # type: ignore[assignment]
-    start = time.monotonic()
-    while time.monotonic() - start < 2.0:
-        view.progress("Fitting", 1, 2)
-        time.sleep(0.001)
-    assert 0 < sum(spent) < 2.0 * SHARE + 0.15

@@ -1023,7 +1023,7 @@ def outputs(base: Path) -> Iterator[Case]:
     for name, arguments, out in (
         ("render", (*view, "--out"), "capture/images/left/0000.png"), ("evaluate", (*judged, "--json"), "capture/transforms.json"),
         ("json", (*judged, "--json"), "result/result.json"), ("ply", ("export", "result", "--format", "ply", "--out"), "result/geometry/0000.ply"),
-        ("convert", ("model", "convert", "ball.npz"), "ball.npz"), ("preview", ("model", "info", "ball.npz", "--preview"), "ball.npz"),
+        ("convert", ("model", "convert", "ball.npz"), "ball.npz"),
         ("device", ("model", "convert", "ball.npz"), "/dev/null"), ("lock", (*view, "--out"), "capture/images/right/0001.png"),
     ):  # fmt: skip
         yield Case(f"outputs:{name}", (*arguments, out), needs)
@@ -1115,7 +1115,7 @@ def extremes(base: Path) -> Iterator[Case]:
 
             small = ("--width", "32", "--height", "32", "--spp", "1", "--timesteps", "1")
             for name, command in (
-                ("info", ("model", "info", "bad.npz", "--preview", "out.png")), ("synth", ("synth", "--out", "out", "--model", "bad.npz", *small)),
+                ("info", ("model", "info", "bad.npz")), ("synth", ("synth", "--out", "out", "--model", "bad.npz", *small)),
                 ("fit", ("fit", "capture", "--out", "out", "--model", "bad.npz")),
             ):  # fmt: skip
                 yield Case(f"extremes:model {key}:{value}:{name}", command, ("capture",), grown)

@@ -184,12 +184,11 @@ OUTPUTS = {
     ),
     "export": ("export", "result", "--format", "ply", "--out"),
     "convert": ("model", "convert", "ball.npz"),
-    "preview": ("model", "info", "ball.npz", "--preview"),
     "turntable": ("turntable", "result", "--steps", "1", "--out"),
     "relight": ("relight", "result", "--env", "env.hdr", "--out"),
 }
 MINE = {
-    "render": "x.png", "evaluate": "x.json", "export": "x.ply", "convert": "x.npz", "preview": "x.png",
+    "render": "x.png", "evaluate": "x.json", "export": "x.ply", "convert": "x.npz",
     "turntable": "x/turntable.png", "relight": "x/left.png",
 }  # fmt: skip
 READ = {
@@ -197,7 +196,6 @@ READ = {
     "evaluate": ("capture/transforms.json", "result/result.json"),
     "export": ("result/geometry/0000.ply", "ball.npz"),
     "convert": ("ball.npz",),
-    "preview": ("ball.npz",),
 }
 
 
@@ -215,7 +213,7 @@ def test_files_that_are_there_stay(variant: str, work: Path, tmp_path: Path, mon
     mine.write_text("mine")
     before = files_below(home)
     options = ("--quiet", "--variant", variant)
-    if command in ("convert", "preview"):
+    if command == "convert":
         options = ()
     assert main([*OUTPUTS[command], str(out), *options]) == 2
     assert f"{out}: is there already" in capfd.readouterr().err

@@ -61,7 +61,7 @@ def test_all_vertices_are_carried_by_those_of_the_skin(skin: MorphableModel, who
     np.testing.assert_array_equal(found[:n].toarray(), np.eye(n))
     np.testing.assert_allclose(np.asarray(found.sum(axis=1)), 1.0)
     np.testing.assert_allclose(found @ skin.identity[..., 3].astype(np.float64), whole.identity[..., 3], atol=1e-6)
-    assert skin_weights(skin) is None and skin_weights(MorphableModel.load("builtin:coarse")) is None
+    assert skin_weights(skin) is None
 
 
 def test_eyeballs_are_round_and_lie_behind_the_lids(whole: MorphableModel) -> None:

@@ -16,13 +16,14 @@ from mifit.config import SurfaceConfig
 from mifit.core.estimate import GeometryEstimate, Report
 from mifit.core.mesh import face_cross
 from mifit.morphable import MorphableModel
-from mifit.morphable.openings import eyeballs, with_eyes
+from mifit.morphable.openings import with_eyes
 from mifit.stages.geometry.parameters import exponential
 from mifit.stages.geometry.surfaces import displaced, moved_by
 from mifit.stages.surface.close_openings import LIDS, LIPS, close_again, close_openings
 from mifit.stages.surface.closed_line import heights, read_strip
 from mifit.stages.surface.margins import COLUMNS, Gap, Margins
 from tests.morphable.intersections import intersections
+from tests.test_pipeline import without_eyes
 
 BOTH = ("left", "right")
 RED, INSIDE, TEETH = (0.35, 0.16, 0.14), (0.02, 0.006, 0.005), (0.3, 0.27, 0.24)
@@ -247,7 +248,7 @@ def test_lids_take_their_rims_along_and_leave_the_rest(model, squinting, shut):
     assert len(near) > 20
     marks = np.r_[model.landmarks[:36], model.landmarks[48:]]
     assert np.linalg.norm(shut[0].vertices[:, marks] - squinting.vertices[:, marks], axis=2).max() < 0.02
-    skin = model.faces[~np.isin(model.faces, np.concatenate(eyeballs(model))).any(1)]
+    skin = without_eyes(model).faces
     less, more = (intersections(10.0 * g.vertices[0], skin) for g in (squinting, shut[0]))
     assert len(more) <= len(less)
 
@@ -291,19 +292,19 @@ def test_margins_that_have_moved_are_put_together_again(model, shut):
 
 def test_added_eyes_follow_the_lids(model, squinting):
     """What closes the corners of added eyes touches the lids' rims, though no edge joins them."""
-    seen = ~np.isin(model.faces, np.concatenate(eyeballs(model))).any(axis=1)
-    whole = with_eyes(replace(model, **{key: getattr(model, key)[seen] for key in ("faces", "faces_uv", "face_mask")}))
+    bare = without_eyes(model)
+    whole = with_eyes(bare)
     shapes = np.stack([whole.shape(squinting.identity, x) for x in squinting.expression]).astype(np.float64)
     vertices = (shapes @ squinting.rotation.transpose(0, 2, 1)).astype(np.float32)
     start = replace(squinting, vertices=vertices, vertex_albedo=whole.mean_albedo)
     found, _ = close_openings(eyed(whole, start, ("shut", "shut")), whole, start, BOTH, LIDS)
-    skin = np.unique(whole.faces[: seen.sum()])
-    away, nearest = cKDTree(whole.mean[skin]).query(whole.mean[model.n_vertices :])
+    skin = np.unique(whole.faces[: len(bare.faces)])
+    away, nearest = cKDTree(whole.mean[skin]).query(whole.mean[bare.n_vertices :])
     touching = np.flatnonzero(away * model.unit_mm < 0.1)
     moved = (found.vertices - start.vertices)[0]
     rim = skin[nearest[touching]]
     assert np.linalg.norm(moved[rim], axis=1).max() * model.unit_mm > 2.0
-    np.testing.assert_allclose(moved[model.n_vertices + touching], moved[rim], atol=0.02)
+    np.testing.assert_allclose(moved[bare.n_vertices + touching], moved[rim], atol=0.02)
 
 
 def test_lips_and_lids_are_left_alone_on_request(model, start, monkeypatch):

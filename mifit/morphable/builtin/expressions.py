@@ -1,8 +1,8 @@
 """Expression modes of the built-in head: action units drawn as displacements of named points.
 
 Each point's influence is a biharmonic function on the surface: one at the point, zero at all others and on the
-back of the head, and cut at the slits of eyes and mouth, so that lids and lips move apart. Lids and eyeballs
-move along spheres and are set directly.
+back of the head, and cut at the slits of eyes and mouth, so that lids and lips move apart. Lids move along
+spheres and are set directly.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mifit.morphable.builtin.action_units import (
     Motion,
 )
 from mifit.morphable.builtin.landmarks import PointFinder
-from mifit.morphable.builtin.template import EYEBALL, POUCH, SKIN, Template
+from mifit.morphable.builtin.template import Template
 
 ACTION_BOUND = 2.0
 """Full activation of an action unit, in standard deviations."""
@@ -34,7 +34,7 @@ _TMJ = np.array([0.0, -6.0, 6.0])  # axis of the jaw joints
 
 
 def expression_modes(template: Template) -> tuple[NDArray[np.float32], tuple[str, ...], NDArray[np.float32]]:
-    """Modes (V, 3, 79) in mm, premultiplied by their deviations, with their names and bounds (79, 2)."""
+    """Modes (V, 3, 77) in mm, premultiplied by their deviations, with their names and bounds (77, 2)."""
     influence, names = _influences(template)
     index = {n: k for k, n in enumerate(names)}
     anchors = _anchor_positions(template)
@@ -78,9 +78,6 @@ def expression_modes(template: Template) -> tuple[NDArray[np.float32], tuple[str
         field = _lid_motion(template, up, low)
         modes[f"{name}_L"], modes[f"{name}_R"] = field * left, field * (1 - left)
         bounds[f"{name}_L"] = bounds[f"{name}_R"] = (0.0, ACTION_BOUND)
-    for name, spin in (("gazeUp", (-1.0, 0.0, 0.0)), ("gazeSideways", (0.0, 1.0, 0.0))):
-        modes[name] = _gaze(template, spin, 16.0)
-        bounds[name] = (-ACTION_BOUND, ACTION_BOUND)
 
     out = {n: m / ACTION_BOUND for n, m in modes.items()}
     for point, axis, parity in LOCALISED:
@@ -124,30 +121,25 @@ def _influences(template: Template) -> tuple[NDArray[np.float64], list[str]]:
     """(V, A) biharmonic influence of every named point, and the points' names."""
     anchors = _anchor_vertices(template)
     v = template.vertices
-    skin = template.part == SKIN
-    faces = template.faces[template.face_part == SKIN]
+    faces = template.faces
     weights = _cotangents(v, faces)
     area = np.zeros(len(v))
     np.add.at(area, faces.ravel(), np.repeat(np.linalg.norm(face_cross(v, faces), axis=1) / 6.0, 3))
     bilaplacian = (weights @ sp.diags(1.0 / np.maximum(area, 1e-6)) @ weights).tocsc()
 
-    still = skin & ((v[:, 2] < 6.0) | (v[:, 1] > 66.0) | (v[:, 1] < -150.0))
+    still = (v[:, 2] < 6.0) | (v[:, 1] > 66.0) | (v[:, 1] < -150.0)
     points = np.array(list(anchors.values()))
     fixed = still.copy()
     fixed[points] = True
-    free = np.flatnonzero(skin & ~fixed)
+    free = np.flatnonzero(~fixed)
     rhs = -bilaplacian[free][:, points].toarray()
     out = np.zeros((len(v), len(points)))
     out[free] = splu(bilaplacian[free][:, free].tocsc()).solve(rhs)
     out[points, np.arange(len(points))] = 1.0
-    # the margins that are rolled inwards follow the visible rows beside them, the pouch follows its two rims
+    # the margins that are rolled inwards follow the visible rows beside them
     for margin, row in ((template.upper_lip, -1), (template.lower_lip, 1)):
         columns = np.searchsorted(template.grid[template.mouth_row], template.upper_lip)
         out[margin] = out[template.grid[template.mouth_row + row, columns]]
-    pouch = np.flatnonzero(template.part == POUCH).reshape(-1, len(template.upper_lip))
-    t = (np.arange(1, len(pouch) + 1) / (len(pouch) + 1))[:, None, None]
-    out[pouch] = (1 - t) * out[template.upper_lip] + t * out[template.lower_lip]
-    out[template.part == EYEBALL] = 0.0
     return out, list(anchors)
 
 
@@ -201,11 +193,3 @@ def _lid_motion(template: Template, upper: float, lower: float) -> NDArray[np.fl
         near = (1 - sculpt.smooth_step(np.sqrt(radius2), 14.5, 18.0)) * fade
         out[:, 2] += np.where(select & (v[:, 2] > 60), near * (new - v[:, 2]), 0.0)
     return out
-
-
-def _gaze(template: Template, axis: tuple[float, float, float], degrees: float) -> NDArray[np.float64]:
-    """Turn of both eyeballs, to first order in the angle."""
-    v = template.vertices
-    ball = template.part == EYEBALL
-    centre = sculpt.EYE * np.stack([np.sign(v[:, 0]), np.ones(len(v)), np.ones(len(v))], axis=1)
-    return np.where(ball[:, None], np.radians(degrees) * np.cross(axis, v - centre), 0.0)

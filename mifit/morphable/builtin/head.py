@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.morphable.builtin import sculpt
 from mifit.morphable.builtin.expressions import expression_modes
 from mifit.morphable.builtin.landmarks import landmark_vertices
-from mifit.morphable.builtin.template import EYEBALL, POUCH, SKIN, Template, make_template
+from mifit.morphable.builtin.template import Template, make_template
 from mifit.morphable.gaussian_process import deformation_modes
 from mifit.morphable.model import MorphableModel
-from mifit.morphable.openings import IRIS_ALBEDO, MOUTH_ALBEDO, PUPIL_ALBEDO, SCLERA_ALBEDO
+from mifit.morphable.openings import with_eyes
 from mifit.morphable.pigment import skin_model
 
 
@@ -20,17 +21,13 @@ def make_head(coarse: bool = False) -> MorphableModel:
     t = make_template(2 if coarse else 1)
     landmarks = landmark_vertices(t)
     mask = template_face_mask(t)
-    identity = identity_modes(t, 160)
+    v = t.vertices
+    identity = deformation_modes(v, (v[:, 2] > -30.0) & (v[:, 1] > -125.0), 160)
     expression, names, bounds = expression_modes(t)
-    mean_albedo, albedo_modes = skin_model(t.vertices, t.faces[mask], landmarks, 1.0, 100, t.part == SKIN)
-    ball = t.part == EYEBALL
-    mean_albedo[ball] = SCLERA_ALBEDO
-    mean_albedo[ball & (t.eye_angle < np.radians(28.5))] = IRIS_ALBEDO
-    mean_albedo[ball & (t.eye_angle < np.radians(10.5))] = PUPIL_ALBEDO
-    mean_albedo[t.part == POUCH] = MOUTH_ALBEDO
-    return MorphableModel(
-        name="builtin:coarse" if coarse else "builtin",
-        mean=0.1 * (t.vertices + np.array([0.0, 34.0, 10.0])),
+    mean_albedo, albedo_modes = skin_model(v, t.faces[mask], landmarks, 1.0, 100)
+    skin = MorphableModel(
+        name="builtin",
+        mean=0.1 * (v + np.array([0.0, 34.0, 10.0])),
         faces=t.faces,
         identity=np.float32(0.1) * identity,
         expression=np.float32(0.1) * expression,
@@ -45,26 +42,15 @@ def make_head(coarse: bool = False) -> MorphableModel:
         expression_names=names,
         expression_bounds=bounds,
     )
+    return replace(with_eyes(skin), name="builtin:coarse" if coarse else "builtin")
 
 
 def template_face_mask(t: Template) -> NDArray[np.bool_]:
     """(F,) faces from the hairline to under the jaw and to the ears, without the insides of lids and lips."""
     v = t.vertices
     inside = (v[:, 1] < 76.0) & (v[:, 1] > -120.0) & (v[:, 2] > 8.0 - 0.25 * np.maximum(v[:, 1], 0.0))
-    out = (t.face_part == SKIN) & inside[t.faces].all(1)
+    out = np.asarray(inside[t.faces].all(1))
     hidden = np.zeros(len(v), dtype=bool)
     for margin in (t.upper_lids, t.lower_lids, t.upper_lip, t.lower_lip):
         hidden[margin] = True
     return out & ~hidden[t.faces].any(1)
-
-
-def identity_modes(template: Template, count: int) -> NDArray[np.float32]:
-    """Identity modes (V, 3, count) in mm; eyeballs move as wholes so that they stay round."""
-    v = template.vertices
-    modes = deformation_modes(v, (v[:, 2] > -30.0) & (v[:, 1] > -125.0), count)
-    for sign in (-1, 1):
-        ball = (template.part == EYEBALL) & (np.sign(v[:, 0]) == sign)
-        rim = np.linalg.norm(v[:, :2] - sculpt.EYE[:2] * (sign, 1), axis=1)
-        lids = (template.part != EYEBALL) & (rim < 16.0) & (v[:, 2] > 60.0)
-        modes[ball] = modes[lids].mean(0)
-    return modes

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mifit.morphable.builtin import sculpt
-from mifit.morphable.builtin.template import SKIN, Template
+from mifit.morphable.builtin.template import Template
 from mifit.morphable.topology import IBUG_MIRROR
 
 # targets on the side x > 0 in mm; mirrored for x < 0
@@ -27,7 +27,7 @@ class PointFinder:
         self._t = template
         v = template.vertices
         self._half = template.grid.shape[1] // 2
-        self._candidates = np.flatnonzero((template.part == SKIN) & (v[:, 0] <= 1e-9))
+        self._candidates = np.flatnonzero(v[:, 0] <= 1e-9)
         self._candidates = np.setdiff1d(self._candidates, self._rolled())
         front = self._candidates[v[self._candidates, 2] > 20.0]
         self._front, self._tree_front = front, cKDTree(v[front, :2])

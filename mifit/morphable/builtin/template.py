@@ -1,8 +1,7 @@
 """The template mesh of the built-in head: a grid around the head with slits for eyes and mouth.
 
 Rows run from the crown to the neck, columns around the head from the nose's midline. Along the slits vertices
-are double, so lids and lips can part. A pouch behind the lips and two eyeballs close the openings; they belong
-to no face area.
+are double, so lids and lips can part.
 """
 
 from __future__ import annotations
@@ -13,13 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.morphable.builtin import sculpt
-
-SKIN, POUCH, EYEBALL = 0, 1, 2
-_POUCH_LINES = 7
-_EYE_RINGS = np.radians([0, 5, 9, 12, 16, 20, 24, 27, 29.5, 32, 38, 46, 56, 66, 80])
-_EYE_SEGMENTS = 28
-_CHART_FLOOR = 0.04
-"""Height of the strip at the bottom of the UV square that holds eyeballs and pouch."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +32,8 @@ class Template:
         Vertices on either side of the slits of the eyes at x < 0 and x > 0, corners left out.
     upper_lip, lower_lip : (L,) int32
         The same for the mouth.
-    part, face_part : (V,) and (F,) uint8
-        SKIN, POUCH or EYEBALL.
     eye_row, mouth_row : int
         Rows of the slits.
-    eye_angle : (V,) float64
-        On eyeballs the angle from the optical axis in radians; 0 elsewhere.
     """
 
     vertices: NDArray[np.float64]
@@ -58,11 +46,8 @@ class Template:
     lower_lids: NDArray[np.int32]
     upper_lip: NDArray[np.int32]
     lower_lip: NDArray[np.int32]
-    part: NDArray[np.uint8]
-    face_part: NDArray[np.uint8]
     eye_row: int
     mouth_row: int
-    eye_angle: NDArray[np.float64]
 
 
 def make_template(step: int = 1) -> Template:
@@ -100,66 +85,15 @@ def make_template(step: int = 1) -> Template:
 
     symmetry = [grid[:, mirrored(np.arange(n))].ravel(), copy_of[1], copy_of[0], copy_of[2][::-1]]
     faces, faces_uv, uv = _grid_faces(grid, below)
-    parts = [np.full(count, SKIN)]
     points = [vertices.reshape(-1, 3), *copies]
-    face_parts = [np.full(len(faces[0]) + len(faces[1]), SKIN)]
-    angles = [np.zeros(count)]
 
     # crown
-    pole = count
-    top = grid[0]
+    pole, top = count, grid[0]
     faces.append(np.stack([np.full(n, pole), top, np.roll(top, -1)], axis=1))
     faces_uv.append(np.stack([len(uv) + np.arange(n), np.arange(n), np.arange(1, n + 1)], axis=1))
     uv = np.concatenate([uv, np.stack([(np.arange(n) + 0.5) / n, np.full(n, 1.0)], axis=1)])
     points.append(np.array([[0.0, vertices[0, 0, 1] + 0.4, vertices[0, [0, half], 2].mean()]]))
     symmetry.append(np.array([pole]))
-    parts.append(np.array([SKIN]))
-    angles.append(np.zeros(1))
-    face_parts.append(np.full(n, SKIN))
-    count += 1
-
-    # the pouch behind the lips: lines of vertices between the upper and the lower lip
-    a, b = grid[mouth_row, lip_columns], copy_of[2]
-    lines = [a, *(count + np.arange(_POUCH_LINES * len(a)).reshape(_POUCH_LINES, len(a))), b]
-    t = np.arange(1, _POUCH_LINES + 1)[:, None] / (_POUCH_LINES + 1)
-    across = 1 - (np.abs(lip_columns - half) / corner)[None] ** 2
-    pa, pb = vertices[mouth_row, lip_columns], copies[2]
-    pouch = pa[None] + (pb - pa)[None] * t[..., None]
-    pouch[..., 1] += 5.0 * np.sqrt(across) * np.sin(2 * np.pi * t)
-    pouch[..., 2] -= 14.0 * across * np.sin(np.pi * t)
-    pouch[..., 0] *= 1 - 0.12 * np.sin(np.pi * t)
-    points.append(pouch.reshape(-1, 3))
-    symmetry.append(np.concatenate([line[::-1] for line in lines[1:-1]]))
-    parts.append(np.full(pouch[..., 0].size, POUCH))
-    angles.append(np.zeros(pouch[..., 0].size))
-    count += pouch[..., 0].size
-    ends = (grid[mouth_row, half - corner], grid[mouth_row, half + corner])
-    quads = np.stack([np.r_[ends[0], line, ends[1]] for line in lines])
-    local = np.arange(quads.size).reshape(quads.shape)
-    tri, tri_local = _quads(quads), _quads(local)
-    keep = (tri[:, 0] != tri[:, 1]) & (tri[:, 1] != tri[:, 2]) & (tri[:, 2] != tri[:, 0])
-    faces.append(tri[keep])
-    faces_uv.append(tri_local[keep] + len(uv))
-    s = np.stack(np.meshgrid(np.linspace(0.3, 0.7, quads.shape[1]), np.linspace(0.9, 0.1, len(quads))), -1)
-    uv = np.concatenate([uv, s.reshape(-1, 2) * (1, _CHART_FLOOR)])
-    face_parts.append(np.full(keep.sum(), POUCH))
-
-    # eyeballs
-    ball, ball_faces, ball_angle = _eyeball(_EYE_RINGS[::step] if step > 1 else _EYE_RINGS, _EYE_SEGMENTS // step)
-    flat = ball[:, :2] / np.abs(ball[:, :2]).max()
-    flip = _eyeball_mirror(len(ball), _EYE_SEGMENTS // step)
-    for k, sign in enumerate((-1.0, 1.0)):
-        here = ball if sign > 0 else ball[flip] * (-1, 1, 1)
-        points.append(here + sculpt.EYE * (sign, 1, 1))
-        faces.append(ball_faces + count)
-        faces_uv.append(ball_faces + len(uv))
-        centre = (0.5 + sign * 0.4, 0.5 * _CHART_FLOOR)
-        uv = np.concatenate([uv, flat * 0.45 * _CHART_FLOOR + centre])
-        symmetry.append(flip + count + (len(ball) if k == 0 else -len(ball)))
-        parts.append(np.full(len(ball), EYEBALL))
-        angles.append(ball_angle)
-        face_parts.append(np.full(len(ball_faces), EYEBALL))
-        count += len(ball)
 
     return Template(
         vertices=np.concatenate(points),
@@ -172,11 +106,8 @@ def make_template(step: int = 1) -> Template:
         upper_lip=grid[mouth_row, lip_columns].astype(np.int32),
         lower_lids=np.stack(copy_of[:2]).astype(np.int32),
         lower_lip=copy_of[2].astype(np.int32),
-        part=np.concatenate(parts).astype(np.uint8),
-        face_part=np.concatenate(face_parts).astype(np.uint8),
         eye_row=eye_row,
         mouth_row=mouth_row,
-        eye_angle=np.concatenate(angles),
     )
 
 
@@ -249,12 +180,6 @@ def _roll(
     return out
 
 
-def _quads(grid: NDArray) -> NDArray:
-    """Triangles of a grid of vertex indices; rows downwards and columns to the viewer's right face the viewer."""
-    a, b, c, d = (q.ravel() for q in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
-    return np.concatenate([np.stack([a, d, c], axis=1), np.stack([a, c, b], axis=1)])
-
-
 def _grid_faces(grid: NDArray, below: NDArray) -> tuple[list[NDArray], list[NDArray], NDArray]:
     """Faces of the skin grid, split mirror-symmetrically, with texture indices and texture vertices."""
     rows, n = grid.shape
@@ -272,29 +197,6 @@ def _grid_faces(grid: NDArray, below: NDArray) -> tuple[list[NDArray], list[NDAr
                 store.append(np.concatenate([np.stack([a, d, b], axis=1), np.stack([d, c, b], axis=1)]))
             else:
                 store.append(np.concatenate([np.stack([a, d, c], axis=1), np.stack([a, c, b], axis=1)]))
-    v = _CHART_FLOOR + 0.005 + (1 - _CHART_FLOOR - 0.01) * (1 - np.arange(rows) / (rows - 1))
+    v = 0.005 + 0.99 * (1 - np.arange(rows) / (rows - 1))
     u = np.arange(n + 1) / n
     return faces, faces_uv, np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-
-
-def _eyeball(rings: NDArray, segments: int) -> tuple[NDArray, NDArray, NDArray]:
-    """Vertices, faces and angles from the axis of the front of the eyeball at x > 0, around the origin."""
-    turn = 2 * np.pi * np.arange(segments) / segments
-    angle = np.concatenate([[0.0], np.repeat(rings[1:], segments)])
-    around = np.concatenate([[0.0], np.tile(turn, len(rings) - 1)])
-    r = sculpt.EYE_RADIUS
-    p = np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], axis=1) * r
-    stretch = np.where(p[:, 0] < 0, 0.42, 0.10)  # reach the eye's corners; the inner one is farther
-    p[:, 0] *= 1.0 + stretch * sculpt.smooth_step(angle, np.radians(32.0), np.radians(60.0))
-    k = 1 + np.arange((len(rings) - 1) * segments).reshape(-1, segments)
-    following = np.roll(k, -1, axis=1)
-    fan = np.stack([np.zeros(segments, dtype=int), k[0], following[0]], axis=1)
-    a, b, c, d = k[:-1].ravel(), k[1:].ravel(), following[1:].ravel(), following[:-1].ravel()
-    return p, np.concatenate([fan, np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]), angle
-
-
-def _eyeball_mirror(count: int, segments: int) -> NDArray:
-    """Index of each eyeball vertex's image under x -> -x within the other eyeball."""
-    k = np.arange(count - 1)
-    around = (segments // 2 - k % segments) % segments
-    return np.concatenate([[0], 1 + k // segments * segments + around])
