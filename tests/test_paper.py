@@ -17,7 +17,7 @@ from mifit.stages.geometry.landmarks import LandmarkTerm, LandmarkView, State
 from mifit.stages.geometry.parameters import Frames, Layout
 from mifit.stages.geometry.points import PointBasis
 from mifit.stages.geometry.rendering import RenderingProblem, paper_problem
-from mifit.stages.reflectance.maps import Smoothness, TexelSystems, laplacian, solve_maps
+from mifit.stages.reflectance.maps import TexelSystems, laplacian, solve_maps
 from mifit.stages.reflectance.paper_energy import energies, lighting_equations
 from tests.output.conftest import ball_camera, ball_model
 from tests.stages.test_geometry_terms import SmoothImage, random_points, scene  # noqa: F401
@@ -195,7 +195,7 @@ def test_the_maps_are_smoothed_as_an_offset_from_the_models_albedo():
     systems = TexelSystems.accumulate(
         noisy.reshape(256, 1, 3).astype(np.float32), ones, ones, 0 * ones, np.zeros((0, 2), int), 0.0
     )  # fmt: skip
-    found = solve_maps(systems, index, prior, Smoothness(1.0, 1.0), iterations=300)[0][..., :3] - prior[..., :3]
+    found = solve_maps(systems, index, prior, (1.0, 1.0), iterations=300)[0][..., :3] - prior[..., :3]
     assert found.mean() == pytest.approx(0.1, abs=0.02) and np.abs(laplacian(found)).mean() < 0.02
 
 

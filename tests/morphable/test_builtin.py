@@ -15,7 +15,7 @@ from intersections import intersections
 from mifit.core.mesh import edges, face_cross
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
-from mifit.morphable.builtin import cache, sculpt
+from mifit.morphable.builtin import head, sculpt
 from mifit.morphable.builtin.head import make_head
 from mifit.morphable.builtin.template import make_template
 from mifit.morphable.openings import eyeballs
@@ -127,8 +127,8 @@ def test_albedo_is_a_reflectance(coarse):
 def test_cache_is_used_and_a_damaged_one_replaced(tmp_path, monkeypatch, coarse):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     made = []
-    monkeypatch.setattr(cache, "make_head", lambda c: made.append(c) or coarse)
-    fresh = cache.builtin_model.__wrapped__
+    monkeypatch.setattr(head, "make_head", lambda c: made.append(c) or coarse)
+    fresh = head.builtin_model.__wrapped__
     first = fresh(True)
     (file,) = (tmp_path / "mifit").iterdir()
     assert fresh(True).digest == first.digest and made == [True]
@@ -139,13 +139,13 @@ def test_cache_is_used_and_a_damaged_one_replaced(tmp_path, monkeypatch, coarse)
 
 def test_models_of_other_versions_stay_while_they_are_used(tmp_path, monkeypatch, coarse):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(cache, "make_head", lambda c: coarse)
+    monkeypatch.setattr(head, "make_head", lambda c: coarse)
     (tmp_path / "mifit").mkdir()
     recent, old = (tmp_path / "mifit" / f"builtin-coarse-{n}.npz" for n in ("1" * 16, "2" * 16))
     for file in (recent, old):
         file.touch()
     os.utime(old, (0, time.time() - 30 * 86400 - 60))
-    cache.builtin_model.__wrapped__(True)
+    head.builtin_model.__wrapped__(True)
     assert recent.exists() and not old.exists()
 
 
@@ -153,8 +153,8 @@ def test_cache_folder_that_cannot_be_written_is_no_trouble(tmp_path, monkeypatch
     blocked = tmp_path / "file"
     blocked.write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
-    monkeypatch.setattr(cache, "make_head", lambda c: coarse)
-    assert cache.builtin_model.__wrapped__(True).digest == coarse.digest
+    monkeypatch.setattr(head, "make_head", lambda c: coarse)
+    assert head.builtin_model.__wrapped__(True).digest == coarse.digest
 
 
 def test_blink_closes_the_eye(coarse, template):

@@ -24,7 +24,7 @@ from mifit.stages.reflectance import lighting
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import fit_lighting, lighting_problem, solve_lighting
 from mifit.stages.reflectance.lighting_equations import LightingPriors
-from mifit.stages.reflectance.maps import Pull, Smoothness, TexelSystems, laplacian, solve_maps
+from mifit.stages.reflectance.maps import TexelSystems, laplacian, solve_maps
 
 SIZE = 24
 CONFIG = ReflectanceConfig(texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
@@ -103,7 +103,7 @@ def test_maps_have_one_minimum_whatever_the_start(dome):
         return blocks + np.abs(laplacian(offset)).sum((0, 1)) @ [1e-4, 1e-4, 1e-4, 1e-3]
 
     starts = (np.zeros_like(prior), np.ones_like(prior), np.random.default_rng(2).random(prior.shape))
-    weights = Smoothness(1e-4, 1e-3)
+    weights = (1e-4, 1e-3)
     ends = [solve_maps(systems, where, prior, weights, s, iterations=500, tolerance=1e-6)[0] for s in starts]
     found = [energy(end) for end in ends]
     assert np.ptp(found) < 1e-3 * min(energy(start) - min(found) for start in starts)
@@ -213,8 +213,8 @@ def recover(scene, shading, bands, exponent, fresnel, monkeypatch):
     systems = TexelSystems.accumulate(seen.colour, weight, shade, glint, surface.pairs, 0.1)
     prior = np.full((FINE, FINE, 4), 0.3, np.float32)
     where = surface.texels.index[seen.texel]
-    to_the_end = {"towards_prior": Pull(1e-7), "iterations": 1000, "tolerance": 1e-7}
-    maps, _ = solve_maps(systems, where, prior, Smoothness(0.0, 0.0), **to_the_end)
+    to_the_end = {"weak": 1e-7, "iterations": 1000, "tolerance": 1e-7}
+    maps, _ = solve_maps(systems, where, prior, (0.0, 0.0), **to_the_end)
     confidence = surface.texels.to_map(surface.quality())
     return light, maps, confidence
 

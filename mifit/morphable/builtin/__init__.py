@@ -1,5 +1,5 @@
 """The built-in head: a procedural template, its modes, and their cache."""
 
-from mifit.morphable.builtin.cache import builtin_model
+from mifit.morphable.builtin.head import builtin_model
 
 __all__ = ["builtin_model"]

@@ -1,19 +1,58 @@
-"""The built-in model put together: template, identity, expressions and albedo, in centimetres."""
+"""The built-in model: template, identity, expressions and albedo put together, in centimetres, and kept once made."""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import os
+import time
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.files import cache_folder
+from mifit.errors import InputError
 from mifit.morphable.builtin.expressions import expression_modes
 from mifit.morphable.builtin.landmarks import landmark_vertices
 from mifit.morphable.builtin.template import Template, make_template
+from mifit.morphable.formats.own import load_own, save_model
 from mifit.morphable.gaussian_process import deformation_modes
 from mifit.morphable.model import MorphableModel
 from mifit.morphable.openings import with_eyes
 from mifit.morphable.pigment import skin_model
+
+
+@cache
+def builtin_model(coarse: bool = False) -> MorphableModel:
+    """Return the built-in model, made now, read from the cache folder, or still in memory.
+
+    Parameters
+    ----------
+    coarse : bool
+        About 8 000 instead of 31 000 vertices.
+    """
+    path = cache_folder() / f"builtin-{'coarse' if coarse else 'full'}-{_DIGEST}.npz"
+    if path.is_file():
+        try:
+            model = load_own(path)
+        except InputError:
+            pass  # damaged: make it anew and replace it
+        else:
+            with contextlib.suppress(OSError):
+                os.utime(path)
+            return model
+    model = replace(make_head(coarse), fingerprint=path.stem)
+    try:
+        for other in path.parent.glob(f"{path.name.rsplit('-', 1)[0]}-*.npz"):
+            if time.time() - other.stat().st_mtime > 30 * 86400:  # of other versions, unused for a month
+                other.unlink(missing_ok=True)
+        save_model(model, path)
+    except (OSError, InputError):
+        pass  # a cache that can't be written only costs time
+    return model
 
 
 def make_head(coarse: bool = False) -> MorphableModel:
@@ -54,3 +93,22 @@ def template_face_mask(t: Template) -> NDArray[np.bool_]:
     for margin in (t.upper_lids, t.lower_lids, t.upper_lip, t.lower_lip):
         hidden[margin] = True
     return out & ~hidden[t.faces].any(1)
+
+
+def _source_digest() -> str:
+    """Digest of the code that makes the model: a cached file is valid for this code only."""
+    here = Path(__file__).parent
+    files = sorted(
+        [
+            *here.glob("*.py"),
+            *(here.parent / f for f in ("gaussian_process.py", "openings.py", "pigment.py", "topology.py")),
+            here.parents[1] / "core" / "mesh.py",
+        ]
+    )
+    h = hashlib.blake2b(digest_size=8)
+    for file in files:
+        h.update(file.read_bytes())
+    return h.hexdigest()
+
+
+_DIGEST = _source_digest()  # at import, while the files are those that were imported

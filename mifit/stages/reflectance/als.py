@@ -22,7 +22,7 @@ from mifit.stages.reflectance.compact_lights import EXPONENT, OBSERVATIONS, best
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution, active_weight, fit_lighting, noise_weight
 from mifit.stages.reflectance.lighting_equations import specular_pull
-from mifit.stages.reflectance.maps import Pull, Smoothness, TexelSystems, solve_maps
+from mifit.stages.reflectance.maps import TexelSystems, solve_maps
 
 LIGHTING_TEXELS = 6000
 """Texels that determine the lighting; a few hundred unknowns against 24 values of eight images each."""
@@ -226,7 +226,7 @@ def solve_texels(
 ) -> SolvedMaps:
     """Maps for a lighting, expected to be ``prior`` (S, S, 4); without robust weights in one pass."""
     chunks, index = surface.chunks(), surface.texels.index
-    smoothness = Smoothness(config.smoothness_weight, config.smoothness_weight * config.specular_smoothness)
+    smoothness = config.smoothness_weight, config.smoothness_weight * config.specular_smoothness
     passes, expected = MAP_PASSES if config.robust else 1, float(prior[0, 0, 3])
     maps, energy, sigma, outcome = start, [], found.sigma, Outcome.MAX_ITERATIONS
     observability = np.ones(len(index), np.float32)
@@ -255,8 +255,8 @@ def solve_texels(
         if sizes:
             usual, each = float(np.median([usual for usual, _ in sizes])), np.concatenate([each for _, each in sizes])
             observability = specular_observability(surface.texels, joined, each, usual, expected)
-        pull = Pull(specular=specular_pull(expected, sigma) if config.robust else 0.0)
-        maps, outcome = solve_maps(joined, index, prior, smoothness, maps, pull, MAP_ITERATIONS)
+        pull = specular_pull(expected, sigma) if config.robust else 0.0
+        maps, outcome = solve_maps(joined, index, prior, smoothness, maps, pull, iterations=MAP_ITERATIONS)
     progress("Reflectance maps", passes * len(chunks), passes * len(chunks))
     assert maps is not None
     return SolvedMaps(maps, energy, sigma, outcome, observability)

@@ -205,43 +205,14 @@ def laplacian_eigenvalues(size: int) -> NDArray[np.float32]:
     return (one[:, None] + one[None, :]).astype(np.float32)
 
 
-@dataclass(frozen=True)
-class Smoothness:
-    """Weights of the L1 norm of the Laplacian.
-
-    Attributes
-    ----------
-    diffuse, specular : float
-        lambda_H for the diffuse offset and for the specular map.
-    """
-
-    diffuse: float
-    specular: float
-
-
-@dataclass(frozen=True)
-class Pull:
-    """Weights of what is expected of the maps.
-
-    Attributes
-    ----------
-    weak : float
-        Of all of them, relative to the median block: decides where no image measures.
-    specular : float
-        Of the specular albedo in the blocks' own units, where it is above the weak one.
-    """
-
-    weak: float = 1e-4
-    specular: float = 0.0
-
-
 def solve_maps(
     systems: TexelSystems,
     index: NDArray[np.int64],
     prior: NDArray,
-    smoothness: Smoothness,
+    smoothness: tuple[float, float],
     start: NDArray | None = None,
-    towards_prior: Pull = Pull(),
+    pull: float = 0.0,
+    weak: float = 1e-4,
     iterations: int = 60,
     tolerance: float = 1e-4,
 ) -> tuple[NDArray[np.float32], Outcome]:
@@ -255,10 +226,14 @@ def solve_maps(
         Flat positions of the texels in the map.
     prior : (S, S, 4) float
         Diffuse albedo of the model, and the specular albedo expected where nothing is seen.
-    smoothness : Smoothness
+    smoothness : (float, float)
+        lambda_H of the L1 norm of the Laplacian: of the diffuse offset, and of the specular map.
     start : (S, S, 4), optional
         Start; the prior by default.
-    towards_prior : Pull
+    pull : float
+        Weight of the expected specular albedo, in the blocks' own units, where it is above the weak one.
+    weak : float
+        Weight of all that is expected, relative to the median block: decides where no image measures.
     iterations : int
     tolerance : float
         Stop when no map moves by more than this.
@@ -275,19 +250,19 @@ def solve_maps(
     base[3] = 0.0  # the paper smooths the offset from the model's albedo, and C_s itself
     scale = np.array([float(np.median(systems.dd))] * 3 + [float(np.median(systems.ss))], dtype=np.float32)
     scale = np.maximum(scale, 1e-6)
-    pull = towards_prior.weak * scale
-    pull[3] = max(pull[3], towards_prior.specular)
+    pulls = weak * scale
+    pulls[3] = max(pulls[3], pull)
     # Splitting weights near the blocks' own curvature let both sides of a split move at the same pace.
     rho = (SPLIT * scale)[:, None]
-    threshold = np.array([smoothness.diffuse] * 3 + [smoothness.specular], dtype=np.float32)[:, None] / rho
+    threshold = np.array([smoothness[0]] * 3 + [smoothness[1]], dtype=np.float32)[:, None] / rho
     inverse = 1.0 / (1.0 + laplacian_eigenvalues(size) ** 2)
     # Planes (4, S, S) without their base: the smooth copy, and the sums of each split's copy and its multiplier.
     smooth = (prior if start is None else start.transpose(2, 0, 1).astype(np.float32)) - base
     level, bend = smooth.copy(), plane_laplacian(smooth)
     # Texels without a block are solved like all others, by what draws them alone.
     flat = prior.reshape(4, -1), base.reshape(4, -1)
-    drawn = pull[:, None] * flat[0] + 0.5 * rho * flat[1]
-    every = _Blocks.of(systems, index, 0.5 * rho + pull[:, None], drawn, 0.5 * rho)
+    drawn = pulls[:, None] * flat[0] + 0.5 * rho * flat[1]
+    every = _Blocks.of(systems, index, 0.5 * rho + pulls[:, None], drawn, 0.5 * rho)
     rows = blocks(size * size, 64)
     lines = blocks(size, 64 * size)
     parts = [(every.take(r), r) for r in rows]
