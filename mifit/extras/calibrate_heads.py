@@ -20,13 +20,16 @@ from scipy.spatial.transform import Rotation
 
 from mifit.capture.capture import Capture
 from mifit.capture.landmark_files import COUNT, MIN_VISIBLE
-from mifit.capture.resection import landmark_weights, resect_camera
-from mifit.capture.transforms import update_frames
+from mifit.capture.transforms import View, update_frames
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.errors import InputError
 
 FOCAL_PRIOR = (1.8, 0.7)
 """Portrait lenses, loosely: focal length in multiples of the longer image side, and deviation of its logarithm."""
+LANDMARK_NOISE = 0.004
+"""Standard deviation of a landmark as a part of the image's longer side."""
+WEIGHTS = np.repeat([0.3, 1.0, 0.4], [17, 31, 20])
+"""Of landmarks: the jaw's lie on its outline, which slides over the head as it turns, mouths move."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ def calibrate_heads(
     modes: NDArray | None = None,
     cameras: Sequence[str] | None = None,
     timesteps: Sequence[int] | None = None,
-    noise: float = 0.004,
+    noise: float = LANDMARK_NOISE,
 ) -> HeadCalibration:
     """Estimate the cameras of a capture that came without calibration, and the head's poses and shape.
 
@@ -121,7 +124,6 @@ def _gather(
 ) -> _Problem:
     points = np.zeros((len(names), len(steps), COUNT, 2))
     weight = np.zeros(points.shape[:3])
-    counted = np.repeat([0.3, 1.0, 0.4], [17, 31, 20])  # jaw contours slide, mouths move
     for i, name in enumerate(names):
         for j, step in enumerate(steps):
             marks = capture.landmarks(name, step)
@@ -131,7 +133,7 @@ def _gather(
                     f"{capture.path}: camera {name!r}, timestep {step}: found {count} visible landmarks, expected at "
                     f"least {MIN_VISIBLE} to estimate an uncalibrated camera; run mifit landmarks, or leave it out"
                 )
-            points[i, j], weight[i, j] = marks.points, marks.visible * counted
+            points[i, j], weight[i, j] = marks.points, marks.visible * WEIGHTS
     views = [capture.views[name] for name in names]
     centre = [(v.width / 2, v.height / 2) if v.intrinsics is None else v.intrinsics[2:] for v in views]
     known = [np.nan if v.intrinsics is None else math.sqrt(v.intrinsics[0] * v.intrinsics[1]) for v in views]
@@ -245,7 +247,7 @@ def calibrate_others(
                 both = marks.visible[seen]
                 points.append(world[both])
                 pixels.append(marks.points[seen[both]])
-                weights.append(landmark_weights(seen[both]))
+                weights.append(np.where(seen[both] < 17, WEIGHTS[0], 1.0))
         if sum(map(len, points)) < MIN_VISIBLE:
             raise InputError(
                 f"camera {name!r}: found fewer than {MIN_VISIBLE} landmarks that the others see too, expected enough "
@@ -256,6 +258,52 @@ def calibrate_others(
         camera, error = resect_camera(view, where, at, weight, focal * max(size), size in sizes)
         found[name] = (capture.camera(name) if name in decided else camera), error
     return found
+
+
+def resect_camera(
+    view: View, points: NDArray, pixels: NDArray, weights: NDArray, focal: float, same: bool
+) -> tuple[Camera, float]:
+    """The camera that sees points where they are, and its root-mean-square error in pixels at weight 1.
+
+    Parameters
+    ----------
+    view : View
+        Its intrinsics are kept where it has any; else the principal point is the image's middle and pixels are square.
+    points : (N, 3), pixels : (N, 2), weights : (N,)
+        World space; undistorted pixels; weights of their distances.
+    focal : float
+        Expected focal length in pixels, where the view has none: to 2 % if ``same``, else to half of it.
+    same : bool
+        Whether its images have the size of those that ``focal`` is from.
+
+    Raises
+    ------
+    InputError
+        No pose explains the points.
+    """
+    fx, fy, cx, cy = view.intrinsics or (focal, focal, view.width / 2, view.height / 2)
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    found, turn, shift = cv2.solvePnP(points, pixels, matrix, np.zeros(4), flags=cv2.SOLVEPNP_SQPNP)
+    if not found:
+        raise InputError(f"camera {view.name!r}: no place explains its landmarks; check their order (iBUG-68)")
+    noise = LANDMARK_NOISE * max(view.width, view.height)
+
+    def zoom(x: NDArray) -> float:
+        return float(np.exp(x[6])) if view.intrinsics is None else 1.0
+
+    def off(x: NDArray) -> NDArray:
+        p = points @ Rotation.from_rotvec(x[:3]).as_matrix().T + x[3:6]
+        return np.asarray(zoom(x) * np.array((fx, fy)) * p[:, :2] / np.maximum(p[:, 2:], 1e-6) + (cx, cy) - pixels)
+
+    def residuals(x: NDArray) -> NDArray:
+        return np.append((off(x) * (weights / noise)[:, None]).ravel(), x[6] / (0.02, 0.5)[not same])
+
+    start = np.concatenate([turn.ravel(), shift.ravel(), [0.0]])
+    x = least_squares(residuals, start, loss="soft_l1", x_scale="jac", max_nfev=200).x
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(x[:3]).as_matrix(), x[3:6]
+    error = float(np.sqrt(np.mean(np.sum(off(x)[weights == 1.0] ** 2, axis=1))))
+    return Camera(view.name, view.width, view.height, zoom(x) * fx, zoom(x) * fy, cx, cy, pose), error
 
 
 def _places(

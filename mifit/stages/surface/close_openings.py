@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.estimate import GeometryEstimate
-from mifit.morphable.openings import EYES
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.geometry.surfaces import moved_by, object_shapes
 from mifit.stages.surface.closed_line import Strip, heights, read_strip, sample, shows_an_eye, shows_teeth
@@ -68,8 +67,8 @@ class Opening:
 
 LIPS = (Opening("mouth", slice(60, 68), 6.0, 0.08, False, shows_teeth),)
 LIDS = tuple(
-    Opening(name, marks, np.inf, 0.04, True, shows_an_eye)
-    for name, marks in zip(("right eye", "left eye"), EYES, strict=True)
+    Opening(name, slice(first, first + 6), np.inf, 0.04, True, shows_an_eye)
+    for name, first in (("right eye", 36), ("left eye", 42))
 )
 
 
