@@ -103,7 +103,7 @@ calibrate  captures.calibrate  cameras from a calibration board, or of a capture
     --video*     path       one camera's video of the board; repeat
     --images*    path       one camera's folder of images; repeat
     {OFFSET}
-    --board      text       charuco:9x6:30:22 or chessboard:10x7:25: columns, rows and lengths in millimetres;
+    --board      text       charuco:9x6:30:22: columns, rows and lengths in millimetres;
         without videos and images it is written for printing
     --names      names      of a board: names of the cameras; default: those of the files
     --units      text=cm    unit of length of the calibration: mm, cm or m (default: cm)

@@ -80,11 +80,6 @@ def calibrate_boards(
     """
     if len({file_name(source.name) for source in sources}) != len(sources):
         raise InputError("found cameras of one name, expected different names of videos or folders")
-    if len(sources) > 1 and board.turns_into_itself:
-        raise InputError(
-            f"--board: a chessboard of {board.columns} x {board.rows} squares looks the same after a half turn, so two "
-            "cameras can't agree on its corners; use an even and an odd number of squares, or a ChArUco board"
-        )
     board = recognise(board, sources[0])
     total = sum(min(source.length, SETTINGS.most_searched) for source in sources)
     watched, done = [], 0
@@ -108,7 +103,7 @@ def calibrate_boards(
 
 def recognise(board: Board, source: Source) -> Board:
     """The board with the dictionary whose markers a dozen of a camera's images show most of, where it was not named."""
-    if board.kind != "charuco" or board.named:
+    if board.named:
         return board
     every = range(0, source.length, max(source.length // 12, 1))
     pictures = [

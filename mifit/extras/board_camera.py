@@ -132,7 +132,7 @@ def look(
         wanted = max(6, round(SETTINGS.least_part * len(board.points)))
         if len(seen) >= wanted:
             found[i] = seen, edge_width(grey, seen)
-        elif board.kind != "chessboard" and len(board.find(np.ascontiguousarray(grey[:, ::-1]))) >= wanted:
+        elif len(board.find(np.ascontiguousarray(grey[:, ::-1]))) >= wanted:
             left_out[i] = "mirrored: the board is read in the mirrored image only; turn off the camera's mirror mode"
         elif len(seen):
             left_out[i] = f"partly seen: {len(seen)} of {len(board.points)} points, expected at least {wanted}"

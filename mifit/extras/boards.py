@@ -1,4 +1,4 @@
-"""Calibration boards: ChArUco and chessboard, printed and found in images."""
+"""ChArUco calibration boards, printed and found in images."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from mifit.core.files import replacing
 from mifit.errors import InputError
 
-FORMS = "charuco:COLUMNSxROWS:SQUARE:MARKER or chessboard:COLUMNSxROWS:SQUARE"
 DICTIONARY = "DICT_5X5_250"
 COMMON = ("DICT_5X5_1000", "DICT_4X4_50", "DICT_4X4_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL")
-"""Dictionaries of ChArUco boards to try where none was named; smaller ones of a size begin as these do."""
+"""Dictionaries to try where none was named; smaller ones of a size begin as these do."""
 PRINT_DPI = 300
 
 
@@ -45,60 +44,54 @@ class Board:
 
     Attributes
     ----------
-    kind : str
-        ``charuco`` or ``chessboard``.
     columns, rows : int
         Squares.
-    size, other : float
+    size, marker : float
         Millimetres: side of a square and of the marker in it.
     dictionary : str
-        OpenCV's name of the set of markers; empty for a chessboard.
+        OpenCV's name of the set of markers.
     named : bool
         Whether the user named it: then no other is tried.
     """
 
-    kind: str
     columns: int
     rows: int
     size: float
-    other: float = 0.0
-    dictionary: str = ""
+    marker: float
+    dictionary: str = DICTIONARY
     named: bool = False
 
     @classmethod
     def parse(cls, text: str) -> Board:
-        """Read ``charuco:9x6:30:22``, a dictionary's name behind it or not, or ``chessboard:10x7:25``.
+        """Read ``charuco:9x6:30:22``, a dictionary's name behind it or not.
 
         Raises
         ------
         InputError
             Another form, or sizes that no board has.
         """
+        form = f"--board: found {text[:80]!r}, expected charuco:COLUMNSxROWS:SQUARE:MARKER, lengths in millimetres"
         kind, *rest = text.split(":")
-        counts = {"charuco": 2, "chessboard": 1}
-        form = f"--board: found {text[:80]!r}, expected {FORMS}, lengths in millimetres"
-        if kind not in counts or not counts[kind] < len(rest) + (kind == "chessboard") - 0 <= counts[kind] + 2:
-            raise InputError(form)
         try:
-            columns, rows = (int(n) for n in rest[0].split("x"))
-            size, *others = (float(n) for n in rest[1 : 1 + counts[kind]])
+            shape, side, inside, *names = rest
+            columns, rows = (int(n) for n in shape.split("x"))
+            size, marker = float(side), float(inside)
         except ValueError:
             raise InputError(form) from None
-        other = others[0] if others else 0.0
-        names = rest[1 + counts[kind] :]
-        name = names[0] if names else DICTIONARY if kind == "charuco" else ""
+        if kind != "charuco" or len(names) > 1:
+            raise InputError(form)
         if not (3 <= columns <= 50 and 3 <= rows <= 50 and 0.1 <= size <= 10_000):
             raise InputError(f"{form}; 3 to 50 columns and rows")
-        if kind == "charuco" and not 0 < other < size:
+        if not 0 < marker < size:
             raise InputError(f"{form}; a marker smaller than its square")
-        if name and (kind == "chessboard" or not (name.startswith("DICT_") and hasattr(cv2.aruco, name))):
+        name = names[0] if names else DICTIONARY
+        if not (name.startswith("DICT_") and hasattr(cv2.aruco, name)):
             raise InputError(
                 f"--board: found dictionary {name[:40]!r}, expected a name of OpenCV's such as DICT_5X5_250"
             )
-        board = cls(kind, columns, rows, size, other, name, bool(names))
+        board = cls(columns, rows, size, marker, name, bool(names))
         try:
-            if kind == "charuco":
-                board._aruco  # noqa: B018 - OpenCV refuses what doesn't go together
+            board._aruco  # noqa: B018 - OpenCV refuses what doesn't go together
         except cv2.error:
             raise InputError(f"--board {text}: needs more markers than dictionary {name} has") from None
         return board
@@ -111,12 +104,11 @@ class Board:
 
     def describe(self) -> str:
         """What is looked for, in words."""
-        what = f"a {self.kind} board of {self.columns} x {self.rows} squares of {self.size:g} mm"
-        if self.kind == "chessboard":
-            return what
         others = ", ".join(name for name in (DICTIONARY, *COMMON) if name != self.dictionary)
-        what += f" with markers of {self.other:g} mm, dictionary {self.dictionary}"
-        return what + ("" if self.named else f" (tried too: {others})")
+        return (
+            f"a ChArUco board of {self.columns} x {self.rows} squares of {self.size:g} mm with markers of "
+            f"{self.marker:g} mm, dictionary {self.dictionary}" + ("" if self.named else f" (tried too: {others})")
+        )
 
     @cached_property
     def _aruco(self) -> cv2.aruco.CharucoBoard:
@@ -124,34 +116,22 @@ class Board:
         needed = self.columns * self.rows // 2
         if needed > len(markers.bytesList):
             raise cv2.error(f"{needed} markers")
-        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.size, self.other, markers)
+        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.size, self.marker, markers)
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
         """(P, 3) points in millimetres by their ids, z = 0."""
-        if self.kind == "charuco":
-            return np.asarray(self._aruco.getChessboardCorners(), dtype=np.float64)
-        x, y = np.meshgrid(np.arange(1.0, self.columns), np.arange(1.0, self.rows))
-        return np.asarray(self.size * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1), dtype=np.float64)
+        return np.asarray(self._aruco.getChessboardCorners(), dtype=np.float64)
 
     @property
     def extent(self) -> tuple[float, float]:
         """Width and height of the pattern in millimetres."""
         return self.columns * self.size, self.rows * self.size
 
-    @property
-    def turns_into_itself(self) -> bool:
-        """Whether a half turn changes nothing, so that two cameras may see it differently."""
-        return self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0
-
     def image(self, pixels_per_mm: float) -> NDArray[np.uint8]:
         """The pattern without a margin, 8-bit grey."""
-        width, height = (round(side * pixels_per_mm) for side in self.extent)
-        if self.kind == "chessboard":
-            x = (np.arange(width) / width * self.columns).astype(int)
-            y = (np.arange(height) / height * self.rows).astype(int)
-            return np.where((x[None] + y[:, None]) % 2 == 0, 0, 255).astype(np.uint8)
-        return np.asarray(self._aruco.generateImage((width, height), marginSize=0, borderBits=1))
+        size = tuple(round(side * pixels_per_mm) for side in self.extent)
+        return np.asarray(self._aruco.generateImage(size, marginSize=0, borderBits=1))
 
     def write(self, folder: Path) -> list[Path]:
         """Write ``board.png`` and ``board.pdf`` to print at 100 per cent, with a white margin of 10 mm."""
@@ -168,39 +148,17 @@ class Board:
 
     def find(self, grey: NDArray[np.uint8]) -> BoardPoints:
         """Points of the board in an 8-bit grey image (H, W); none when it isn't seen."""
-        ids, pixels = self._find_charuco(grey) if self.kind == "charuco" else self._find_chessboard(grey)
-        order = np.argsort(ids)
-        return BoardPoints(ids[order], pixels[order] + 0.5)
-
-    def _find_charuco(self, grey: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         corners, ids, *_ = cv2.aruco.CharucoDetector(self._aruco, detectorParams=parameters).detectBoard(grey)
         if ids is None or len(ids) == 0:
-            return _NONE
+            return BoardPoints(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
         pixels: NDArray = corners.reshape(-1, 1, 2).astype(np.float32)
         window = int(np.clip(0.2 * _spacing(pixels.reshape(-1, 2)), 2, 8))
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
         pixels = cv2.cornerSubPix(grey, pixels, (window, window), (-1, -1), criteria)
-        return ids.ravel().astype(np.int64), pixels.reshape(-1, 2).astype(np.float64)
-
-    def _find_chessboard(self, grey: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
-        shape = (self.columns - 1, self.rows - 1)
-        ok, corners = cv2.findChessboardCornersSB(
-            grey, shape, flags=cv2.CALIB_CB_NORMALIZE_IMAGE + cv2.CALIB_CB_ACCURACY
-        )
-        if not ok:
-            return _NONE
-        pixels = corners.reshape(shape[1], shape[0], 2).astype(np.float64)
-        across, down = pixels[0, -1] - pixels[0, 0], pixels[-1, 0] - pixels[0, 0]
-        if across[0] * down[1] - across[1] * down[0] < 0:  # seen from its front, rows go down where columns go right
-            pixels = pixels[:, ::-1]
-        if not self.turns_into_itself and _first_square(grey, pixels) > _first_square(grey, pixels[::-1, ::-1]):
-            pixels = pixels[::-1, ::-1]  # the square at the first corner is black
-        return np.arange(shape[0] * shape[1]), pixels.reshape(-1, 2)
-
-
-_NONE = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+        order = np.argsort(ids.ravel())
+        return BoardPoints(ids.ravel().astype(np.int64)[order], pixels.reshape(-1, 2).astype(np.float64)[order] + 0.5)
 
 
 def _spacing(pixels: NDArray) -> float:
@@ -210,13 +168,6 @@ def _spacing(pixels: NDArray) -> float:
     distance = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
     np.fill_diagonal(distance, np.inf)
     return float(np.median(distance.min(axis=1)))
-
-
-def _first_square(grey: NDArray[np.uint8], pixels: NDArray) -> float:
-    """Brightness of the square beyond the first inner corner."""
-    centre = pixels[0, 0] - 0.5 * ((pixels[0, 1] - pixels[0, 0]) + (pixels[1, 0] - pixels[0, 0]))
-    x, y = np.clip(np.round(centre).astype(int), 0, np.array(grey.shape[::-1]) - 1)
-    return float(grey[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].mean())
 
 
 def edge_width(grey: NDArray[np.uint8], found: BoardPoints) -> float:

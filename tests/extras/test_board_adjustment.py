@@ -13,7 +13,7 @@ from mifit.extras.board_camera import Watched
 from mifit.extras.boards import Board, BoardPoints
 from tests.extras.board_video import opencv_matrix, pair, poses
 
-BOARD = Board.parse("chessboard:10x7:25")
+BOARD = Board.parse("charuco:10x7:25:18")
 NOISE = 0.25
 
 
