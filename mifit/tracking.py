@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from mifit.config import GeometryConfig, MeshConfig, NormalsConfig, from_mapping
 from mifit.core.arrays import Rows
 from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
-from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, Report
+from mifit.core.estimate import GeometryEstimate, NormalsEstimate, Report
 from mifit.core.files import Document
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.process import one_blas_thread
@@ -43,8 +43,6 @@ from mifit.stages.surface.kept_texture import KeptTexture
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
-
-Moments = TypeVar("Moments", GeometryEstimate, NormalsEstimate, MeshEstimate)
 
 MEMORY = 4
 """Frames whose corrections make the prior of the next."""
@@ -271,13 +269,12 @@ def track_into(
     digests = {t: capture.digest([camera.name for camera in result.cameras], [t]) for t in timesteps}
     if resume:
         timesteps = _not_yet(result, timesteps, digests)
-    result = _without(result, [t for t in result.tracked if t in timesteps])
     folder = Path(folder)
     refiner = None if result.mesh is None or result.reflectance is None else mesh_refiner(result)
     with locked(folder):
-        result, room = _with_room(result, len(timesteps))
+        result, room = _with_room(result, [t for t in result.tracked if t in timesteps], len(timesteps))
         for frame in track(result.seen(capture), result, timesteps, config, seed=seed, progress=progress):
-            result = extend(result, frame, refiner, digests[frame.timestep], room)
+            result = _extended(result, frame, refiner, digests[frame.timestep], room)
             add_timestep(result, folder, frame.timestep)
     return result
 
@@ -313,72 +310,53 @@ Room = dict[tuple[str, str], Rows]
 """Where further rows of these arrays are written."""
 
 
-def _with_room(result: Reconstruction, count: int) -> tuple[Reconstruction, Room]:
-    """A result whose arrays lie where ``count`` further timesteps have room behind them."""
-    room: Room = {}
+def _with_room(result: Reconstruction, dropped: Sequence[int], count: int) -> tuple[Reconstruction, Room]:
+    """A result less some of its tracked timesteps, whose arrays lie where ``count`` further ones have room."""
     if result.normals is None and result.reflectance is not None:
         empty = np.zeros((0, *result.reflectance.diffuse.shape), np.float32)
         result = replace(result, normals=NormalsEstimate((), empty, Report("converged")))
+    room: Room = {}
+    parts: Document = {}
     for part, names in PER_TIMESTEP.items():
         estimate = getattr(result, part)
-        for name in names if estimate is not None else ():
+        if estimate is None:
+            continue
+        kept = [i for i, t in enumerate(estimate.timesteps) if t not in dropped]
+        arrays: Document = {}
+        for name in names:
             array = getattr(estimate, name)
-            room[part, name] = Rows(len(array) + count, array.shape[1:], array.dtype)
-            estimate = replace(estimate, **{name: room[part, name].extend(array)})
-        result = replace(result, **{part: estimate})
-    return result, room
+            rows = room[part, name] = Rows(len(kept) + count, array.shape[1:], array.dtype)
+            arrays[name] = rows.extend(array[i] for i in kept)
+        parts[part] = replace(estimate, timesteps=tuple(estimate.timesteps[i] for i in kept), **arrays)
+    if "normals" in parts:
+        left = {t: digest for t, digest in parts["normals"].tracked.items() if t not in dropped}
+        parts["normals"] = replace(parts["normals"], tracked=left)
+    return replace(result, **parts), room
 
 
-def extend(
-    result: Reconstruction,
-    frame: TrackedFrame,
-    refiner: MeshRefiner | None = None,
-    digest: str = "",
-    room: Room | None = None,
+def _extended(
+    result: Reconstruction, frame: TrackedFrame, refiner: MeshRefiner | None, digest: str, room: Room
 ) -> Reconstruction:
-    """A result with one more timestep, whose images have a digest.
-
-    With a refiner its refined mesh is made too. With ``room``, in which the result's arrays lie, they aren't copied.
-    """
-    rows = {name: getattr(frame.geometry, name)[0] for name in PER_TIMESTEP["geometry"]}
-    parts: Document = {"geometry": _longer(result.geometry, "geometry", frame.timestep, rows, room)}
-    before = result.normals or NormalsEstimate((), frame.normal_object[None][:0], Report("converged"))
+    """A result with one more timestep, whose images have a digest; its arrays lie in ``room`` and aren't copied."""
+    before = result.normals
+    assert before is not None
+    rows: Document = {
+        "geometry": {name: getattr(frame.geometry, name)[0] for name in PER_TIMESTEP["geometry"]},
+        "normals": {"normal_object": frame.normal_object},
+    }
+    if result.mesh is not None and refiner is not None:
+        rows["mesh"] = {"vertices": refiner.refine(frame.geometry, frame.timestep, frame.normal_object)[0]}
+    parts: Document = {}
+    for part, values in rows.items():
+        estimate = getattr(result, part)
+        arrays: Document = {name: room[part, name].add(row) for name, row in values.items()}
+        parts[part] = replace(estimate, timesteps=(*estimate.timesteps, frame.timestep), **arrays)
     seconds, warnings = before.report.seconds + frame.seconds, (*before.report.warnings, *frame.warnings)
     parts["normals"] = replace(
-        _longer(before, "normals", frame.timestep, {"normal_object": frame.normal_object}, room),
+        parts["normals"],
         report=replace(before.report, seconds=seconds, warnings=warnings),
         tracked={**before.tracked, frame.timestep: digest},
     )
-    if result.mesh is not None and refiner is not None:
-        rows = {"vertices": refiner.refine(frame.geometry, frame.timestep, frame.normal_object)[0]}
-        parts["mesh"] = _longer(result.mesh, "mesh", frame.timestep, rows, room)
-    return replace(result, **parts)
-
-
-def _longer(estimate: Moments, part: str, timestep: int, rows: Mapping[str, NDArray], room: Room | None) -> Moments:
-    """An estimate with a row of each of its arrays for one more timestep."""
-    arrays: Document = {
-        name: np.concatenate([getattr(estimate, name), row[None]]) if room is None else room[part, name].add(row)
-        for name, row in rows.items()
-    }
-    return replace(estimate, timesteps=(*estimate.timesteps, timestep), **arrays)
-
-
-def _without(result: Reconstruction, dropped: Sequence[int]) -> Reconstruction:
-    """A result less some of its tracked timesteps."""
-    parts: Document = {}
-    for part, names in PER_TIMESTEP.items() if dropped else ():
-        estimate = getattr(result, part)
-        if estimate is not None:
-            kept = [i for i, t in enumerate(estimate.timesteps) if t not in dropped]
-            arrays: Document = {}
-            for name in names:
-                array = getattr(estimate, name)
-                arrays[name] = Rows(len(kept), array.shape[1:], array.dtype).extend(array[i] for i in kept)
-            parts[part] = replace(estimate, timesteps=tuple(estimate.timesteps[i] for i in kept), **arrays)
-    if parts.get("normals") is not None:
-        left = {t: digest for t, digest in parts["normals"].tracked.items() if t not in dropped}
-        parts["normals"] = replace(parts["normals"], tracked=left)
     return replace(result, **parts)
 
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from mifit.errors import InputError
-
 MAX_PIXELS = 2**26
 """Largest image that is decoded or rendered: 8192 x 8192."""
 MAX_FILE_BYTES = 2**30
@@ -34,9 +32,3 @@ MAX_NAME_BYTES = 100
 """A file name made from text (`mifit.core.files.file_name`)."""
 MAX_SEED = int(np.iinfo(np.int32).max)
 """What both NumPy and Mitsuba take."""
-
-
-def check_range(where: str, value: float, low: float, high: float) -> None:
-    """Refuse a number outside ``low`` to ``high``; ``where`` names the option or argument in the message."""
-    if not low <= value <= high:
-        raise InputError(f"{where}: found {value}, expected {low} to {high}")

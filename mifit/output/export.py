@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from mifit.capture.transforms import UNITS_MM
 from mifit.core.arrays import write_ply
 from mifit.core.calls import checked
 from mifit.core.files import check_overwriting, write_bytes, write_text
@@ -24,8 +25,6 @@ Format = Literal["glb", "obj", "ply", "usd", "mitsuba"]
 SUFFIXES = {"glb": ".glb", "obj": ".obj", "ply": ".ply", "usd": ".usdz", "mitsuba": ".xml"}
 
 
-PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
-"""Millimetres."""
 OBJ_SPECULAR = 0.08
 """Reflectance along the normal where an OBJ's specular map, sRGB as Blender reads it, is white."""
 Mesh = Literal["fitted", "refined"]
@@ -81,9 +80,9 @@ def export(
         raise InputError(f"animate: found format {format!r}, expected 'glb', the only one that holds an animation")
     if not 1e-3 <= fps <= 1e3:
         raise InputError(f"fps: found {fps}, expected 0.001 to 1000")
-    if units is not None and (format not in ("obj", "ply") or units not in PER_UNIT):
-        raise InputError(f"units: found {units!r} for {format}, expected m, cm or mm for obj or ply")
-    factor = 1.0 if units is None else result.unit_mm / PER_UNIT[units]
+    if units is not None and (format not in ("obj", "ply") or units not in UNITS_MM):
+        raise InputError(f"units: found {units!r} for {format}, expected m, dm, cm or mm for obj or ply")
+    factor = 1.0 if units is None else result.unit_mm / UNITS_MM[units]
     if mesh == "refined":
         result = result.with_refined_mesh()
         result.index(timestep)

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from mifit.capture.landmark_files import write_landmarks
 from mifit.capture.transforms import MIN_SIDE, Shot, View, write_transforms
+from mifit.core.calls import whole
 from mifit.core.camera import Camera
 from mifit.core.files import replacing, write_text
 from mifit.core.image import read_environment, write_image
-from mifit.core.limits import MAX_COUNT, MAX_PIXELS, MAX_SEED, check_range
+from mifit.core.limits import MAX_COUNT, MAX_PIXELS, MAX_SEED
 from mifit.core.mesh import SplitMesh, split_at_seams, vertex_normals
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
@@ -108,7 +109,7 @@ def synthesize(  # noqa: PLR0913
         ("spp", spp, 1, MAX_COUNT),
         ("seed", seed, 0, MAX_SEED),
     ):
-        check_range(name, value, low, high)
+        whole(value, low, name, high)
     check_active_variant()
     for name, length in (("outside", outside), ("landmark_bias", landmark_bias)):
         if not 0 <= length <= MOST_MM:

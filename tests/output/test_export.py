@@ -243,7 +243,7 @@ def test_units_of_length_scale_the_mesh(ball, tmp_path, format):
         sizes[units] = np.ptp(trimesh.load(path, process=False, force="mesh").vertices, axis=0)
     np.testing.assert_allclose(sizes["m"] * 100, sizes[None], rtol=1e-4)
     np.testing.assert_allclose(sizes["mm"] / 10, sizes[None], rtol=1e-4)
-    with pytest.raises(InputError, match="units: found 'mm' for glb, expected m, cm or mm for obj or ply"):
+    with pytest.raises(InputError, match="units: found 'mm' for glb, expected m, dm, cm or mm for obj or ply"):
         export(ball, "glb", tmp_path / "a.glb", units="mm")
 
 

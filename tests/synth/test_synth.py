@@ -119,8 +119,8 @@ def test_seams_are_split_and_tiles_wrapped() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"timesteps": 0}, "timesteps: found 0, expected 1 to"),
-        ({"width": 8}, "width: found 8, expected 16 to"),
+        ({"timesteps": 0}, "timesteps: found 0, expected a whole number from 1 to"),
+        ({"width": 8}, "width: found 8, expected a whole number from 16 to"),
         ({"spp": 0}, "spp: found 0"),
         ({"tone": 1.5}, "tone: found 1.5, expected 0"),
         ({"env": "none.hdr", "model": "builtin:coarse"}, "none.hdr: no such image file"),
