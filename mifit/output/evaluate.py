@@ -183,8 +183,8 @@ def compare(
         true = None
         with suppress(InputError):  # a truth of unknown faces
             true = true_mesh(capture, timestep, model)
-        mesh = (vertices, model.faces) if true is None else (true.vertices, true.faces)
-        sight = image_based(capture, result.cameras, view, timestep, *mesh, oversampling=2)
+        points, faces = (vertices, model.faces) if true is None else (true.vertices, true.faces)
+        sight = image_based(capture, result.cameras, view, timestep, points, faces, oversampling=2)
         area = skin_region(landmarks_of(capture, camera, timestep), view) & sight.seen
     elif region == "truth":
         truth = true_mesh(capture, timestep, result.model)

@@ -255,8 +255,8 @@ def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]
             area = face_area(vertices, model.faces, model.face_mask, view) & frame.valid
             clipped = frame.clipped & area
             labels = None if result.reflectance is None else result.reflectance.label(camera, timestep)
-            areas = [(clipped if k is None else labels == k, c) for k, c, _ in TINTS if k is None or labels is not None]
-            tinted = tint(photograph, *areas)
+            kinds = [] if labels is None else [(np.asarray(labels == kind), colour) for kind, colour, _ in TINTS[1:]]
+            tinted = tint(photograph, (clipped, TINTS[0][1]), *kinds)
             share = clipped.sum() / max(int(area.sum()), 1)
             figures += [
                 _figure(marked[box], f"{label}: input with landmarks", f"input from {label}"),
