@@ -36,7 +36,7 @@ def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str =
     else:
         lens = {"type": "pinhole"} | {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
     pose = np.linalg.inv(camera.world_to_camera)
-    pose[:, :2] *= -1.0  # Mitsuba's axes are x left, y up, z forward
+    pose[:, :2] = 0.0 - pose[:, :2]  # Mitsuba's axes are x left, y up, z forward; no zero gets a sign
     return lens | {
         "near_clip": 1e-2,
         "far_clip": 1e4,
