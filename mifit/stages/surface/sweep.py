@@ -24,14 +24,14 @@ from mifit.stages.surface.band import FeatureImage
 
 NOISE = 0.012
 """Standard deviation of a feature that is noise: windows with less contrast say nothing."""
-FLOOR = 0.05
-"""Disagreement (1 - correlation) that remains at best."""
 FAR = 0.1
 """Correlation that the ends of the sweep must gain on its middle: little texture leaves the surface where it is."""
-UNIQUE = 0.2
-"""Correlation by which an offset must be ahead of all that aren't its neighbours to count fully."""
-POWER, INDEPENDENT = 1.5, 0.11
-"""Precision is INDEPENDENT * sharpness ** POWER: as the errors of offsets on rendered heads are."""
+NEAR = 7
+"""Side of the neighbourhood whose offsets are compared, texels."""
+FINEST = 0.3
+"""Deviation of an offset at best, in steps of the sweep."""
+INDEPENDENT = 0.022
+"""Part of the texels whose offsets count as measured on their own: windows overlap, and their errors are alike."""
 GLARE = 0.1
 """Least difference in log brightness between two views at which a match counts a quarter."""
 GLARE_DEVIATIONS = 3.5
@@ -121,7 +121,7 @@ def sweep(
                 total += scores[0]
                 weight += scores[1]
     score = np.where(weight > 0, total / np.maximum(weight, 1e-6), np.float32(-1))
-    return _peak(score, weight, offsets)
+    return _peak(texels, score, weight, offsets)
 
 
 @dataclass(frozen=True)
@@ -233,23 +233,32 @@ def _correlate(
     return out
 
 
-def _peak(score: NDArray, weight: NDArray, offsets: NDArray) -> Found:
-    """Best offset by a parabola through the best layer and its neighbours."""
+def _peak(texels: TexelMap, score: NDArray, weight: NDArray, offsets: NDArray) -> Found:
+    """Best offset by a parabola through the best layer and its neighbours, as precise as its neighbourhood agrees.
+
+    Offsets of windows that overlap are alike where they measure the surface, and scatter where they don't, however
+    well each of them matches: their variance around a texel is the variance of its offset.
+    """
     layers, count = score.shape
-    # Where all offsets match alike the middle is chosen, and has no precision: it is the views that have a peak.
+    # Where all offsets match alike the middle is chosen.
     best = (score - (FAR * (np.linspace(-1.0, 1.0, layers) ** 2)).astype(np.float32)[:, None]).argmax(0)
     inner = np.clip(best, 1, layers - 2)
     column = np.arange(count)
     low, mid, high = score[inner - 1, column], score[inner, column], score[inner + 1, column]
-    step = float(offsets[1] - offsets[0])
-    curvature = np.maximum(2 * mid - low - high, 1e-6)
-    shift = np.clip(0.5 * (high - low) / curvature, -1.0, 1.0)
-    offset = offsets[inner] + step * shift
+    shift = np.clip(0.5 * (high - low) / np.maximum(2 * mid - low - high, 1e-6), -1.0, 1.0)
     top = mid + 0.25 * (high - low) * shift
-    other = np.where(np.abs(np.arange(layers)[:, None] - best) > 2, score, -1.0).max(0)
-    unique = np.clip((top - other) / UNIQUE, 0.0, 1.0)
     around = np.minimum(np.minimum(weight[inner - 1, column], weight[inner, column]), weight[inner + 1, column])
-    usable = (best == inner) & (around > 0) & (top > LEAST_SCORE)
-    sharpness = unique * np.maximum(curvature, 0.0) / np.maximum(1.0 - top + FLOOR, FLOOR)
-    precision = np.where(usable, INDEPENDENT * around * sharpness**POWER / step**2, 0.0)
-    return Found(offset.astype(np.float64), precision.astype(np.float64), top)
+    matched = ((best == inner) & (around > 0) & (top > LEAST_SCORE)).astype(np.float32)
+    steps = matched * (inner - (layers - 1) / 2 + shift).astype(np.float32)  # offsets in units of the step
+
+    def near(values: NDArray) -> NDArray[np.float32]:
+        """Mean over a texel's neighbourhood."""
+        return texels.from_map(cv2.blur(texels.to_map(values), (NEAR, NEAR)))
+
+    count_near = np.maximum(near(matched), np.float32(1e-6))
+    mean = near(steps) / count_near
+    scatter = np.maximum(near(steps**2) / count_near - mean**2, 0.0) + (steps - mean) ** 2
+    share = count_near / np.maximum(near(np.ones_like(matched)), np.float32(1e-6))
+    step = float(offsets[1] - offsets[0])
+    precision = INDEPENDENT * matched * share**2 / ((FINEST**2 + scatter) * step**2)
+    return Found((steps * step).astype(np.float64), precision.astype(np.float64), top)
