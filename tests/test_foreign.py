@@ -203,12 +203,12 @@ def test_paper_settings_in_normalised_units_weigh_alike():
 def test_the_independent_scorer_finds_the_same_figures(tmp_path, monkeypatch, capsys):
     mifit.set_variant("auto")
     case = heads.Case("scan_studio", timesteps=(1,))
-    capture, model = mifit.Capture.load(case.path), mifit.MorphableModel.load(case.model)
+    capture, model = mifit.Capture.load(case.path), mifit.MorphableModel.load("builtin:coarse")
     config = foreign.replace_size(mifit.FitConfig(), 64)
     maps = replace(config.reflectance, shading="prefiltered", bands=4, exponent=40)
     config = replace(config, reflectance=maps)
     result = mifit.fit(capture, model, case.fitted, case.timesteps, config, until="reflectance")
-    replace(result, model_source="builtin").save(tmp_path / "result")
+    replace(result, model_source="builtin:coarse").save(tmp_path / "result")
 
     def command(line, **options):  # the scorer's calls of the command line, without a process for each
         assert line[0] == "mifit" and main(line[1:]) == 0

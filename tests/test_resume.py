@@ -28,13 +28,13 @@ def timed(command):
 
 
 def kill_and_resume(command, seconds, seed, start_over):
-    """Kill -9 up to three runs at random moments of their expected time, then let one end.
+    """Kill -9 up to two runs at random moments of their expected time, then let one end.
 
     Each kill leaves the next run less to do, so a later one may end before its moment. When the first one does, the
     expected time was too long (a cold start, a busy machine): start over with half of it.
     """
     kills, chance = 0, random.Random(seed)
-    while kills < 3:
+    while kills < 2:
         process = subprocess.Popen(command)
         try:
             process.wait(chance.uniform(0.3, 0.95) * seconds)

@@ -35,16 +35,22 @@ def one_line(text: str) -> str:
     return line if len(line) <= 1000 else f"{line[:500]} ... {line[-500:]}"
 
 
-def writes(*options: str) -> Callable[[Command], Command]:
+def writes(*options: str, outside: str = "") -> Callable[[Command], Command]:
     """Make a command refuse to write over files: without ``--force`` all, with it those that it reads.
 
     ``options`` name what its user says to write; a file, or a folder with something in it, is refused before any work.
+    Outside the folder of the option ``outside`` a PNG with coverage may be replaced: whoever scores results renders
+    into one file again and again.
     """
 
     def decorate(command: Command) -> Command:
         @functools.wraps(command)
         def run(arguments: Namespace) -> int | None:
-            with overwriting(arguments.force):
+            home = getattr(arguments, outside, None) if outside else None
+            free = (
+                home is not None and _is_render(arguments.out) and home.resolve() not in arguments.out.resolve().parents
+            )
+            with overwriting(arguments.force or free):
                 for out in filter(None, (getattr(arguments, option, None) for option in options)):
                     check_empty(out, arguments.force) if out.is_dir() else check_overwriting(out)
                 return command(arguments)
@@ -52,6 +58,15 @@ def writes(*options: str) -> Callable[[Command], Command]:
         return run
 
     return decorate
+
+
+def _is_render(path: Path) -> bool:
+    """Whether a file is a PNG with an alpha channel."""
+    if not path.is_file() or path.is_symlink():
+        return False
+    with open(path, "rb") as stream:
+        head = stream.read(26)
+    return head[:8] == b"\x89PNG\r\n\x1a\n" and head[25:] == b"\x06"
 
 
 def check_empty(folder: Path, force: bool = False) -> None:

@@ -153,6 +153,8 @@ def track(arguments: Namespace) -> int:
 
     finish(arguments.result)
     result = mifit.Reconstruction.load(arguments.result)
+    if not result.cameras:
+        raise InputError(f"{arguments.result}: found a result without cameras, expected those that it was fitted with")
     capture = mifit.Capture.load(arguments.capture)
     use_variant(arguments)
     from mifit.output.report import write_report

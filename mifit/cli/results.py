@@ -102,7 +102,7 @@ def score(arguments: Namespace) -> None:
     print(summary(found))
 
 
-@writes("out")
+@writes("out", outside="capture")
 def render(arguments: Namespace) -> None:
     """Render one timestep from a camera of the capture."""
     import mifit

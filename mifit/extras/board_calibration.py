@@ -31,6 +31,9 @@ from mifit.progress import Progress, silent
 LENS, POSE = 9, 6
 """Unknowns of a lens (fx, fy, cx, cy, k1, k2, p1, p2, k3) and of a pose (rotation vector, translation)."""
 
+RECOGNISED = 40
+"""Points of a board that tell the dictionary of its markers: other dictionaries give a few."""
+
 
 @dataclass(frozen=True)
 class BoardCalibration:
@@ -102,16 +105,21 @@ def calibrate_boards(
 
 
 def recognise(board: Board, source: Source) -> Board:
-    """The board with the dictionary whose markers a dozen of a camera's images show most of, where it was not named."""
+    """The board with the dictionary whose markers a camera's images show most of, where it was not named.
+
+    A dozen images are looked at, or as many as show `RECOGNISED` points of one of the dictionaries.
+    """
     if board.named:
         return board
-    every = range(0, source.length, max(source.length // 12, 1))
-    pictures = [
-        np.asarray(cv2.cvtColor(to_8_bit(decode_image(content, source.name).pixels), cv2.COLOR_RGB2GRAY), np.uint8)
-        for _, content in source.files(every)
-    ]
     boards = [board, *board.of_other_dictionaries()]
-    return max(boards, key=lambda one: sum(len(one.find(picture)) for picture in pictures))
+    points = np.zeros(len(boards), int)
+    for _, content in source.files(range(0, source.length, max(source.length // 12, 1))):
+        codes = to_8_bit(decode_image(content, source.name).pixels)
+        grey = np.asarray(cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY), np.uint8)
+        points += [len(one.find(grey)) for one in boards]
+        if points.max() >= RECOGNISED:
+            break
+    return boards[int(points.argmax())]
 
 
 def write_calibration(calibration: BoardCalibration, folder: str | Path, units: str) -> None:
