@@ -4,7 +4,7 @@
 
 Each subject is a random identity with its own skin, path traced with detail that the fitted model doesn't have, under
 one of three set-ups of light; every third head leaves the model's span by well over half a millimetre. Landmarks are
-those of a model of a detector: a bias per landmark and head, and noise (`mifit.synth.detector`); the row with perfect
+those of a model of a detector: a bias per landmark and head, and noise (`mifit.synth.head`); the row with perfect
 landmarks says what that costs. Cameras ``left`` and ``right`` are fitted, ``third`` is only compared with, over the
 face area of the true mesh, so on the same pixels for all rows. A finished subject is not run again, so that a stopped
 benchmark goes on; its figures stay in the work folder. With ``--relight`` the heads are path traced again, in the same
@@ -176,7 +176,7 @@ def outside(subject: int) -> float:
 def perfect_landmarks(capture: Path, out: Path, size: dict[str, int], model: str, subject: int) -> None:
     """The same capture with landmarks at the true vertices, a detector's noise on top."""
     from mifit.capture.landmark_files import Landmarks, write_landmarks
-    from mifit.synth.detector import NOISE
+    from mifit.synth.head import LANDMARK_NOISE
 
     shutil.rmtree(out, ignore_errors=True)
     shutil.copytree(capture, out)
@@ -186,7 +186,7 @@ def perfect_landmarks(capture: Path, out: Path, size: dict[str, int], model: str
         with np.load(out / "truth" / f"{timestep:04d}.npz") as truth:
             points = loaded.camera(camera).project(truth["vertices"][vertices].astype(np.float64))
         rng = np.random.default_rng([SEED + subject, timestep, len(camera), 23])
-        points += NOISE * size["width"] / 680 * rng.standard_normal(points.shape)
+        points += LANDMARK_NOISE * size["width"] / 680 * rng.standard_normal(points.shape)
         found = loaded.landmarks(camera, timestep)
         assert found is not None and shot.landmarks is not None
         write_landmarks(shot.landmarks, Landmarks(points, found.visible))

@@ -43,8 +43,8 @@ DARKEST, FRONTAL = 0.02, 3.0
 """Linear colour, and multiple of the grazing cosine, below which a colour says nothing of the factor."""
 BANDS, SPECULAR = 4, 0.03
 """Bands of the lighting; specular level of skin at normal incidence (refractive index 1.4)."""
-FACTOR_SPREAD, ALBEDO_SPREAD, SPECULAR_SPREAD = 0.3, 0.3, 0.5
-"""Prior standard deviations of logarithms: factors of images, albedo about the model's, specular level."""
+SPREAD, SPECULAR_SPREAD = 0.3, 0.5
+"""Prior standard deviations of logarithms: factors of images and albedo about the model's; specular level."""
 NEIGHBOURS = 0.03
 """Independent measurements per observation: neighbours share errors of the mesh."""
 SURE = 4.0
@@ -207,10 +207,10 @@ def solve_factors(seen: Observations, albedo: NDArray, factors: Factors) -> Solu
     k, u = BANDS**2, len(factors.group)
     light_at = [slice(u + c * k, u + (c + 1) * k) for c in range(3)]
     # Unknowns: factors, light per channel, log of the specular level over skin's. The albedo starts at the model's.
-    prior = np.concatenate([np.full(u, FACTOR_SPREAD**-2.0), np.zeros(3 * k), [SPECULAR_SPREAD**-2.0]])
+    prior = np.concatenate([np.full(u, SPREAD**-2.0), np.zeros(3 * k), [SPECULAR_SPREAD**-2.0]])
     rough = np.tile((bands(BANDS) * (bands(BANDS) + 1.0)) ** 2, 3)
     expected = np.log(albedo)
-    log_albedo, x, sigma = expected.copy(), np.zeros(u + 3 * k + 1), ALBEDO_SPREAD / 2.0
+    log_albedo, x, sigma = expected.copy(), np.zeros(u + 3 * k + 1), SPREAD / 2.0
     for c in range(3):
         flat = float(np.exp(np.median((level - expected[:, None])[..., c][measured])))
         x[light_at[c]][0] = flat / basis(np.array([[0.0, 0.0, 1.0]]), 1)[0, 0]
@@ -231,8 +231,8 @@ def solve_factors(seen: Observations, albedo: NDArray, factors: Factors) -> Solu
             jacobian[:, :, c, at] = (a[..., c, None] * phi + shining) / fitted[..., c, None]
         jacobian[..., -1] = specular / fitted
         by_albedo = w * (diffuse / fitted)
-        diagonal = (by_albedo * (diffuse / fitted)).sum(axis=1) + ALBEDO_SPREAD**-2.0
-        right_albedo = (by_albedo * residual).sum(axis=1) - (log_albedo - expected) / ALBEDO_SPREAD**2
+        diagonal = (by_albedo * (diffuse / fitted)).sum(axis=1) + SPREAD**-2.0
+        right_albedo = (by_albedo * residual).sum(axis=1) - (log_albedo - expected) / SPREAD**2
         mixed = np.einsum("njc,njcu->ncu", by_albedo, jacobian)
         rows = jacobian.reshape(-1, len(x))
         weighted = (rows * w.reshape(-1, 1)).T

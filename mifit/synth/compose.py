@@ -29,7 +29,7 @@ from mifit.progress import Progress, silent
 from mifit.render.gbuffer import SurfaceScene
 from mifit.render.pathtrace import Material, PathTracer, Surface
 from mifit.render.variant import check_active_variant
-from mifit.synth import detector, head
+from mifit.synth import head
 from mifit.synth.procedural import studio_environment
 from mifit.synth.skin import SkinMaps, SkinStyle, paint
 
@@ -85,7 +85,7 @@ def synthesize(  # noqa: PLR0913
     outside : float
         Millimetres by which heads leave what the model spans, see `head.neutral_shape`.
     landmark_bias : float
-        Millimetres, standard deviation of each coordinate of a landmark's bias, see `detector.draw_bias`; by default
+        Millimetres, standard deviation of each coordinate of a landmark's bias, see `head.draw_bias`; by default
         landmarks are true but for noise.
     progress : Progress
 
@@ -213,7 +213,7 @@ def _write_capture(
     with replacing(folder / "truth" / "mesh.npz") as temporary:
         np.savez_compressed(temporary, faces=subject.model.faces, face_mask=subject.model.face_mask)
     visibility = SurfaceScene(subject.neutral, subject.model.faces)
-    bias = detector.draw_bias(subject.seed, subject.landmark_bias / 10.0)  # mm -> cm
+    bias = head.draw_bias(subject.seed, subject.landmark_bias / 10.0)  # mm -> cm
     shots = []
     advance(1)
     for t, pose in enumerate(subject.poses):
@@ -232,7 +232,7 @@ def _write_capture(
             )
             assert shot.landmarks is not None
             write_image(shot.image, expose(image[..., :3] * exposure, rng))
-            marks = detector.mark(subject.model, world, camera, visibility, rng, bias @ pose.rotation.T)
+            marks = head.mark(subject.model, world, camera, visibility, rng, bias @ pose.rotation.T)
             write_landmarks(shot.landmarks, marks)
             shots.append(shot)
         with replacing(folder / "truth" / f"{t:04d}.npz") as temporary:

@@ -134,7 +134,7 @@ def coarse():
 
 def test_a_detectors_bias_is_the_same_in_all_images_of_a_head(coarse, variant):
     from mifit.render.gbuffer import SurfaceScene
-    from mifit.synth import detector
+    from mifit.synth import head as detector
     from mifit.synth.compose import place_cameras
 
     bias = detector.draw_bias(5, 0.2)
@@ -146,7 +146,7 @@ def test_a_detectors_bias_is_the_same_in_all_images_of_a_head(coarse, variant):
         true = camera.project(world[coarse.landmarks])
         pixels[camera.name] = np.mean(off, axis=0) - true
         scatter = np.std(off, axis=0).mean()
-        assert scatter == pytest.approx(detector.NOISE, rel=0.1)
+        assert scatter == pytest.approx(detector.LANDMARK_NOISE, rel=0.1)
     shown = np.linalg.norm(pixels["third"], axis=1).mean()
     assert shown == pytest.approx(1.25 * 0.2 * 1530 / 72, rel=0.15)
     # One displacement in space explains what all cameras show.

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.camera import Camera
+from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.morphable.topology import IBUG_MIRROR
 from mifit.stages.checks.landmark_model import Shot
 
@@ -161,11 +161,9 @@ POSES: dict[str, tuple[Change, str, str]] = {
     ),
 }
 """Mistakes of all poses."""
-AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From OpenGL's axes to OpenCV's."""
 INVERTED: tuple[Change, ...] = (
-    _pose(lambda pose: np.asarray(AXES @ np.linalg.inv(AXES @ pose), dtype=np.float64)),
-    _pose(lambda pose: np.asarray(np.linalg.inv(pose) @ AXES, dtype=np.float64)),
+    _pose(lambda pose: np.asarray(OPENGL_FROM_OPENCV @ np.linalg.inv(OPENGL_FROM_OPENCV @ pose), dtype=np.float64)),
+    _pose(lambda pose: np.asarray(np.linalg.inv(pose) @ OPENGL_FROM_OPENCV, dtype=np.float64)),
     _pose(lambda pose: np.asarray(np.linalg.inv(pose), dtype=np.float64)),
 )
 """Undo world-to-camera matrices where camera-to-world ones belong, or the reverse: of either convention's axes."""
