@@ -93,8 +93,7 @@ def test_a_fault_that_no_image_shows_is_not_taken_for_another(shared, tmp_path, 
 @pytest.mark.slow
 def test_landmarks_that_lie_beside_the_face_are_named_after_a_fit(shared, tmp_path, variant):
     found = said_of(make("landmarks shifted", shared / "captures/scan_city", tmp_path, 1), PAIR)
-    assert {code for code, _ in found} == {"landmarks-shifted"}
-    assert any("in all cameras alike" in text for _, text in found)
+    assert {code for code, _ in found} == {"landmarks-shifted"}  # of the fitted face alone: the test of `check_fit`
 
 
 @pytest.mark.slow
