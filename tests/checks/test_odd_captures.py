@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mifit.cli import main
+from mifit.core.process import no_chatter
 from tests.checks.wrong_captures import Change, Rough, both, lengths, read, scale, write
 
 FACTOR = 0.2
@@ -85,7 +86,8 @@ ODD: dict[str, tuple[Change, str]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ODD)
-def test_a_fit_of_an_odd_capture_ends_in_words(name, shared, tmp_path, capfd, variant):
+def test_a_fit_of_an_odd_capture_ends_in_words(name, shared, tmp_path, capfd, monkeypatch, variant):
+    monkeypatch.setattr("mifit.core.process._around", no_chatter)  # as the command does
     change, said = ODD[name]
     rough = read(shared / "captures/soft", timesteps=1, factor=FACTOR, cameras=("left", "right"))
     change(rough)
