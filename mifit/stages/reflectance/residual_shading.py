@@ -115,7 +115,7 @@ def light_level(brightness: NDArray[np.float32]) -> NDArray[np.float32]:
     closed, inner = (
         np.ones((2 * round(0.5 * part * len(brightness)) + 1,) * 2, np.uint8) for part in (FEATURE, BORDER)
     )
-    return cv2.erode(cv2.morphologyEx(brightness, cv2.MORPH_CLOSE, closed), inner)
+    return np.asarray(cv2.erode(cv2.morphologyEx(brightness, cv2.MORPH_CLOSE, closed), inner), np.float32)
 
 
 def light_error(model: MorphableModel, texels: TexelMap, maps: NDArray, confidence: NDArray, level: NDArray) -> float:
