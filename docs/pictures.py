@@ -1,6 +1,6 @@
 """The pictures of the pages, made from fits of heads whose licences allow it.
 
-    python docs/pictures.py [--size 512] [--only hero gallery light sides] [--keep]
+    python docs/pictures.py [--size 512] [--only hero gallery light sides methods] [--keep]
 
 Fits the shared captures of the Perry-Smith scan (CC-BY 3.0) and of Digital Emily (MIT) into ``out/pictures``, and
 writes ``docs/images``. ``--keep`` takes the fits that are there. People's photographs stay out.
@@ -18,11 +18,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.spatial import cKDTree
 
 import mifit
 from mifit.core.image import to_8_bit
+from mifit.core.mesh import vertex_normals
 from mifit.output.deferred import surface_material, visible_surface
 from mifit.render.visible import trace_mesh
 
@@ -36,6 +39,8 @@ HEADS = {
 """Two fitted cameras, a third one that isn't, and the timesteps."""
 TILE = 240
 """Height of a picture in a row, pixels."""
+FAR_MM = 2.0
+"""Distance to the scan that has full colour."""
 LEVEL = 0.2
 """Median of skin in a relit picture, linear."""
 
@@ -88,22 +93,62 @@ class Head:
 
     def scan(self) -> NDArray[np.uint8]:
         """The true mesh in the third view, shaded by its normals."""
-        import trimesh
-
-        truth = self.capture.path / "truth"
-        path = truth / "0000.ply"
-        mesh = trimesh.load(path if path.exists() else truth / "head.ply", process=False)
-        vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
-        surface = trace_mesh(vertices, faces, self.view, 2)
-        return clay(surface, np.asarray(mesh.vertex_normals), faces)[self.box]
+        return self.clay(*self.truth())
 
     def mesh(self) -> NDArray[np.uint8]:
         """The fitted mesh in the third view, shaded by its normals."""
-        vertices, faces = self.result.geometry.vertices[0], self.result.model.faces
-        from mifit.core.mesh import vertex_normals
+        return self.clay(self.result.geometry.vertices[0], self.result.model.faces)
 
+    def start(self) -> NDArray[np.uint8]:
+        """The mesh of the morphable model's fit alone."""
+        fit = mifit.fit_geometry(self.capture, self.result.model, self.cameras, (0,), mifit.GeometryConfig())
+        return self.clay(fit.vertices[0], self.result.model.faces)
+
+    def truth(self) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        """Vertices and faces of the scan."""
+        folder = self.capture.path / "truth"
+        path = folder / "0000.ply"
+        mesh = trimesh.load(path if path.exists() else folder / "head.ply", process=False)
+        return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
+
+    def clay(self, vertices: NDArray, faces: NDArray) -> NDArray[np.uint8]:
+        """A mesh in the third view, shaded by its normals."""
         surface = trace_mesh(vertices, faces, self.view, 2)
         return clay(surface, vertex_normals(vertices, faces), faces)[self.box]
+
+    def normals(self, refined: bool) -> NDArray[np.uint8]:
+        """Normals as colours, the mesh's or the refined ones."""
+        rotation = self.view.world_to_camera[:3, :3]
+        geometry, faces = self.result.geometry.vertices[0], self.result.model.faces
+        if refined:
+            return self.shown(lambda m: coloured(m.normal @ rotation.T))
+        surface = trace_mesh(geometry, faces, self.view, 2)
+        normal = (vertex_normals(geometry, faces)[faces[surface.face]] * surface.weights[..., None]).sum(axis=1)
+        return on_white(surface.image(coloured(normal @ rotation.T)))[self.box]
+
+    def apart(self) -> NDArray[np.uint8]:
+        """How far the mesh lies outside (red) or inside (blue) the scan; full colour at `FAR_MM`."""
+        vertices, faces = self.truth()
+        surface = trace_mesh(vertices, faces, self.view, 1)
+        corners = vertices[faces[surface.face]]
+        points = (corners * surface.weights[..., None]).sum(axis=1).astype(np.float64)
+        outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        fitted = trimesh.Trimesh(self.result.geometry.vertices[0], self.result.model.faces, process=False)
+        nearest = near(fitted, points)
+        outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-12)
+        signed = ((nearest - points) * outwards).sum(axis=1) * self.capture.unit_mm / FAR_MM
+        out, into = np.clip(signed, 0.0, 1.0), np.clip(-signed, 0.0, 1.0)
+        colour = 1.0 - np.stack([into, np.maximum(out, into), out], axis=1)
+        return on_white(surface.image(colour.astype(np.float32)))[self.box]
+
+    def marked(self) -> NDArray[np.uint8]:
+        """The first photograph with its landmarks."""
+        name = self.cameras[0]
+        frame, camera = self.capture.frame(name, 0), self.capture.camera(name)
+        image = cv2.resize(to_8_bit(frame.image), (self.view.width, self.view.height), interpolation=cv2.INTER_AREA)
+        for x, y in frame.landmarks * self.view.width / camera.width:
+            cv2.circle(image, (round(float(x)), round(float(y))), 2, (40, 220, 40), -1, cv2.LINE_AA)
+        return image[self.box]
 
 
 def around(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
@@ -139,6 +184,20 @@ def clay(surface: object, normals: NDArray, faces: NDArray) -> NDArray[np.uint8]
     return on_white(surface.image(np.repeat(shade[:, None], 3, axis=1)))
 
 
+def coloured(normal: NDArray) -> NDArray[np.float32]:
+    """Normals (N, 3) in camera space as linear colours."""
+    return ((0.5 + 0.5 * normal * [1, -1, -1]) ** 2.2).astype(np.float32)
+
+
+def near(mesh: trimesh.Trimesh, points: NDArray, candidates: int = 12) -> NDArray[np.float64]:
+    """The nearest points (N, 3) on a mesh, among the triangles with the nearest middles."""
+    index = cKDTree(mesh.triangles_center).query(points, candidates)[1]
+    given = mesh.triangles[index].reshape(-1, 3, 3), np.repeat(points, candidates, axis=0)
+    found = trimesh.triangles.closest_point(*given).reshape(-1, candidates, 3)
+    best = np.linalg.norm(found - points[:, None], axis=2).argmin(axis=1)
+    return found[np.arange(len(points)), best]
+
+
 def tile(image: NDArray, label: str = "", height: int = TILE) -> NDArray[np.uint8]:
     """An image at one height, with a label at its foot."""
     width = round(image.shape[1] * height / image.shape[0])
@@ -167,13 +226,12 @@ def page(rows: list[NDArray], path: Path) -> None:
 
 def strip(shown: Head) -> NDArray[np.uint8]:
     """Two photographs in; albedo, specular reflection, normals, mesh and scan, relit."""
-    rotation = shown.view.world_to_camera[:3, :3]
     pictures = {
         "in": shown.photograph(shown.cameras[0]),
         "in ": shown.photograph(shown.cameras[1]),
         "diffuse albedo": shown.shown(lambda m: m.diffuse),
         "specular albedo": shown.shown(lambda m: np.repeat(8.0 * m.specular[:, None], 3, axis=1)),
-        "normals": shown.shown(lambda m: (0.5 + 0.5 * (m.normal @ rotation.T) * [1, -1, -1]) ** 2.2),
+        "normals": shown.normals(refined=True),
         "mesh": shown.mesh(),
         "scan": shown.scan(),
         "relit": shown.lit("sunset"),
@@ -215,7 +273,30 @@ def sides(size: int) -> None:
     page(rows, IMAGES / "five_sides.jpg")
 
 
-PICTURES = {"hero": hero, "gallery": gallery, "light": light, "sides": sides}
+def methods(size: int) -> None:
+    """A strip for each step, and one for all of them."""
+    one = head("scan_city", size)
+    specular = one.shown(lambda m: np.repeat(8.0 * m.specular[:, None], 3, axis=1))
+    diffuse, start, mesh = one.shown(lambda m: m.diffuse), one.start(), one.mesh()
+    refined, marked = one.normals(refined=True), one.marked()
+    strips = {
+        "geometry": {"photograph, landmarks": marked, "model's fit": start, "scan": one.scan()},
+        "surface": {"model's fit": start, "surface": mesh, "scan": one.scan(), f"+-{FAR_MM:g} mm": one.apart()},
+        "reflectance": {
+            "held-out photograph": one.photograph(one.third), "full": one.lit(),
+            "diffuse albedo": diffuse, "specular albedo x 8": specular,
+        },
+        "normals": {"normals of the mesh": one.normals(refined=False), "refined normals": refined},
+        "pipeline": {
+            "1 landmarks": marked, "2 model's fit": start, "3 surface": mesh, "4 diffuse albedo": diffuse,
+            "5 specular albedo": specular, "6 normals": refined, "7 relit": one.lit("sunset"),
+        },
+    }  # fmt: skip
+    for name, pictures in strips.items():
+        page([row([tile(image, label) for label, image in pictures.items()])], IMAGES / f"{name}.jpg")
+
+
+PICTURES = {"hero": hero, "gallery": gallery, "light": light, "sides": sides, "methods": methods}
 
 
 def main() -> None:
