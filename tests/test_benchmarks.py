@@ -33,13 +33,16 @@ def test_tables_are_renewed_between_their_marks_alone(tmp_path):
     assert page.read_text() == "a\n<!-- one -->\n| new |\n<!-- /one -->\nb\n<!-- two -->\nkept\n<!-- /two -->\n"
 
 
-def test_every_quoted_table_has_figures_with_machine_and_commit():
+def test_every_quoted_table_has_figures_with_machine_of_one_commit():
     pages = [README, *(ROOT / "docs").glob("*.md")]
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
     quoted = {*re.findall(r"<!-- (\w+) -->\n", text), *re.findall(r"benchmarks/results/(\w+)\.(?:md|json)", text)}
+    commits = {}
     for name in quoted - {"given", "foreign_short"}:
         stored = json.loads((RESULTS / f"{name}.json").read_text())
         assert {"machine", "figures"} <= set(stored) and stored["machine"]["commit"], name
+        commits[name] = stored["machine"]["commit"]
+    assert len(set(commits.values())) == 1, commits
     written = {path.stem for path in RESULTS.glob("*.json")}
     assert written <= quoted | {"attacks", "endurance"}, "figures that no page quotes"
 
