@@ -66,6 +66,8 @@ def keep(notebook: nbformat.NotebookNode, path: Path) -> None:
     text = nbformat.writes(notebook)
     if len(text) > LARGEST:
         raise SystemExit(f"{path.name}: {len(text)} bytes with outputs, expected at most {LARGEST}")
+    if sys.prefix in text or str(HERE.parent) in text:
+        raise SystemExit(f"{path.name}: outputs name a folder of this machine, expected none")
     path.write_text(text + "\n", encoding="utf-8")
 
 

@@ -13,6 +13,7 @@ from memory_capture import make_capture
 from mifit.config import GeometryConfig, SurfaceConfig
 from mifit.core.camera import Camera
 from mifit.core.mesh import vertex_normals
+from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import skin_weights, with_eyes
 from mifit.render.gbuffer import SurfaceScene
@@ -23,7 +24,7 @@ from mifit.stages.geometry.parameters import exponential
 from mifit.stages.geometry.surfaces import Scenes, displaced
 from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surface
 from mifit.stages.surface.outline import joined
-from mifit.stages.surface.sweep import GLARE_DEVIATIONS, _without_glare
+from mifit.stages.surface.sweep import GLARE_DEVIATIONS, _precision, _without_glare
 from tests.morphable.intersections import intersections
 from tests.test_pipeline import without_eyes
 
@@ -270,6 +271,21 @@ def test_a_highlight_that_one_view_shows_counts_little_and_exposure_nothing():
     difference[:50] += 0.6
     weight = _without_glare(difference, valid, GLARE_DEVIATIONS)
     assert weight[:50].max() < 0.05 and weight[50:].min() > 0.5 and np.median(weight) > 0.9
+
+
+def test_offsets_that_scatter_and_lone_matches_are_less_precise_by_scatter():
+    """Three bands of a square: even offsets, offsets anywhere, and even ones of which a tenth matched."""
+    size = 60
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], np.float32)
+    texels = rasterize_uv(corners, np.array([[0, 1, 2], [0, 2, 3]]), size)
+    rng = np.random.default_rng(2)
+    band = np.minimum(texels.index // size // 20, 2)
+    steps = np.where(band == 1, rng.uniform(-3.0, 3.0, len(band)), 0.5).astype(np.float32)
+    matched = (band < 2) | (rng.uniform(size=len(band)) < 0.1)
+    precision = _precision(texels, np.where(matched, steps, np.float32(0.0)), matched, 1.0)
+    assert (precision[~matched] == 0).all() and (precision[matched] > 0).all()
+    even, anywhere, lone = (np.median(precision[matched & (band == b)]) for b in range(3))
+    assert even > 15 * anywhere and even > 15 * lone
 
 
 def test_an_outlier_counts_little():

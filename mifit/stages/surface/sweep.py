@@ -27,7 +27,7 @@ NOISE = 0.012
 FAR = 0.1
 """Correlation that the ends of the sweep must gain on its middle: little texture leaves the surface where it is."""
 NEAR = 7
-"""Side of the neighbourhood whose offsets are compared, texels."""
+"""Side of the neighbourhood whose offsets are compared, texels; it and the next two: chosen on Emily, scan_city."""
 FINEST = 0.3
 """Deviation of an offset at best, in steps of the sweep."""
 INDEPENDENT = 0.022
@@ -99,7 +99,7 @@ def sweep(
     texels : TexelMap
     steps : sequence of Posed
     offsets : (K,)
-        Evenly spaced, ascending, world units.
+        Evenly spaced, ascending, around 0, world units.
     window : int
         Texels along a side, odd.
     pairs : sequence of pairs of (int, int)
@@ -121,7 +121,10 @@ def sweep(
                 total += scores[0]
                 weight += scores[1]
     score = np.where(weight > 0, total / np.maximum(weight, 1e-6), np.float32(-1))
-    return _peak(texels, score, weight, offsets)
+    step = float(offsets[1] - offsets[0])
+    steps, matched, top = _peak(score, weight)
+    precision = _precision(texels, steps, matched, step)
+    return Found((steps * step).astype(np.float64), precision.astype(np.float64), top)
 
 
 @dataclass(frozen=True)
@@ -233,11 +236,10 @@ def _correlate(
     return out
 
 
-def _peak(texels: TexelMap, score: NDArray, weight: NDArray, offsets: NDArray) -> Found:
-    """Best offset by a parabola through the best layer and its neighbours, as precise as its neighbourhood agrees.
+def _peak(score: NDArray, weight: NDArray) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
+    """(N,) steps from the middle to the best offset, which texels match there, and their scores.
 
-    Offsets of windows that overlap are alike where they measure the surface, and scatter where they don't, however
-    well each of them matches: their variance around a texel is the variance of its offset.
+    By a parabola through the best layer and its neighbours.
     """
     layers, count = score.shape
     # Where all offsets match alike the middle is chosen.
@@ -248,17 +250,26 @@ def _peak(texels: TexelMap, score: NDArray, weight: NDArray, offsets: NDArray) -
     shift = np.clip(0.5 * (high - low) / np.maximum(2 * mid - low - high, 1e-6), -1.0, 1.0)
     top = mid + 0.25 * (high - low) * shift
     around = np.minimum(np.minimum(weight[inner - 1, column], weight[inner, column]), weight[inner + 1, column])
-    matched = ((best == inner) & (around > 0) & (top > LEAST_SCORE)).astype(np.float32)
-    steps = matched * (inner - (layers - 1) / 2 + shift).astype(np.float32)  # offsets in units of the step
+    matched = (best == inner) & (around > 0) & (top > LEAST_SCORE)
+    return matched * (inner - (layers - 1) / 2 + shift).astype(np.float32), matched, top
+
+
+def _precision(
+    texels: TexelMap, steps: NDArray[np.float32], matched: NDArray[np.bool_], step: float
+) -> NDArray[np.float32]:
+    """(N,) inverse variance of offsets, so many steps of a length each; 0 where nothing matched.
+
+    Offsets of windows that overlap are alike where they measure the surface, and scatter where they don't, however
+    well each of them matches: their variance around a texel is the variance of its offset.
+    """
 
     def near(values: NDArray) -> NDArray[np.float32]:
         """Mean over a texel's neighbourhood."""
         return texels.from_map(cv2.blur(texels.to_map(values), (NEAR, NEAR)))
 
-    count_near = np.maximum(near(matched), np.float32(1e-6))
-    mean = near(steps) / count_near
-    scatter = np.maximum(near(steps**2) / count_near - mean**2, 0.0) + (steps - mean) ** 2
-    share = count_near / np.maximum(near(np.ones_like(matched)), np.float32(1e-6))
-    step = float(offsets[1] - offsets[0])
-    precision = INDEPENDENT * matched * share**2 / ((FINEST**2 + scatter) * step**2)
-    return Found((steps * step).astype(np.float64), precision.astype(np.float64), top)
+    found = matched.astype(np.float32)
+    count = np.maximum(near(found), np.float32(1e-6))
+    mean = near(steps) / count
+    scatter = np.maximum(near(steps**2) / count - mean**2, 0.0) + (steps - mean) ** 2
+    share = count / np.maximum(near(np.ones_like(found)), np.float32(1e-6))
+    return INDEPENDENT * found * share**2 / ((FINEST**2 + scatter) * step**2)
