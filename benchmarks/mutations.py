@@ -170,7 +170,7 @@ MUTATIONS = (
       "tests/stages/test_find_surface.py"),
     M("offsets that scatter are as precise", "sweep._precision", "FINEST**2 + scatter", "FINEST**2",
       "tests/stages/test_find_surface.py -k scatter"),
-    M("a lone match is as precise", "sweep._precision", "found * share**2", "found",
+    M("a lone match is as precise", "sweep._precision", "share**2", "1.0",
       "tests/stages/test_find_surface.py -k scatter"),
     M("views across time by cameras, not by the head", "sweep.across_time",
       "normalize(image.camera.position - step.position.mean(axis=0)) @ rotation[k]",
