@@ -68,7 +68,7 @@ class CameraError:
 
 @dataclass(frozen=True)
 class CalibrationCheck:
-    """What matches say of a calibration.
+    """The test of a calibration by matches.
 
     Attributes
     ----------
