@@ -122,9 +122,9 @@ def sweep(
                 weight += scores[1]
     score = np.where(weight > 0, total / np.maximum(weight, 1e-6), np.float32(-1))
     step = float(offsets[1] - offsets[0])
-    steps, matched, top = _peak(score, weight)
-    precision = _precision(texels, steps, matched, step)
-    return Found((steps * step).astype(np.float64), precision.astype(np.float64), top)
+    at, matched, top = _peak(score, weight)
+    precision = _precision(texels, at, matched, step)
+    return Found((at * step).astype(np.float64), precision.astype(np.float64), top)
 
 
 @dataclass(frozen=True)
@@ -254,9 +254,7 @@ def _peak(score: NDArray, weight: NDArray) -> tuple[NDArray[np.float32], NDArray
     return matched * (inner - (layers - 1) / 2 + shift).astype(np.float32), matched, top
 
 
-def _precision(
-    texels: TexelMap, steps: NDArray[np.float32], matched: NDArray[np.bool_], step: float
-) -> NDArray[np.float32]:
+def _precision(texels: TexelMap, steps: NDArray[np.float32], matched: NDArray[np.bool_], step: float) -> NDArray:
     """(N,) inverse variance of offsets, so many steps of a length each; 0 where nothing matched.
 
     Offsets of windows that overlap are alike where they measure the surface, and scatter where they don't, however
