@@ -341,7 +341,15 @@ class ResidualConfig:
 
 @settings
 class FitConfig:
-    """All settings of ``mifit.fit``."""
+    """All settings of ``mifit.fit``.
+
+    Each part has its values, units and bounds in ``docs/settings.md``; InputError for a value out of bounds.
+
+    Examples
+    --------
+    >>> FitConfig(reflectance=ReflectanceConfig(texture_size=256)).reflectance.bands
+    10
+    """
 
     geometry: GeometryConfig = part(GeometryConfig)
     surface: SurfaceConfig = part(SurfaceConfig)

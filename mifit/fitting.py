@@ -158,7 +158,7 @@ def fit(
     watch: Callable[[Reconstruction], None] | None = None,
     tell: Callable[[Sequence[Diagnostic]], None] | None = None,
 ) -> Reconstruction:
-    """Recover geometry, reflectance, lighting and normals of a face from a capture.
+    """A face's geometry, reflectance, lighting and normals, recovered from a capture.
 
     Parameters
     ----------
@@ -271,7 +271,7 @@ def fit_into(
     force: bool = False,
     **options: Any,
 ) -> Reconstruction:
-    """Fit, and write the result folder; stages that end are kept in it, so that a killed run goes on.
+    """The result of a fit, written into its folder stage by stage, so that a killed run goes on.
 
     Parameters
     ----------

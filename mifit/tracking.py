@@ -74,7 +74,7 @@ def track(
     seed: int = 0,
     progress: Progress = silent,
 ) -> Iterator[TrackedFrame]:
-    """Follow a fitted face through further timesteps; yields each frame as soon as it is done.
+    """Frames of a fitted face at further timesteps, each yielded as soon as it is done.
 
     The caller may stop at any frame and go on later with the frames so far.
 

@@ -163,7 +163,10 @@ class Illumination:
         return np.concatenate([self.radiance, *(light.colour[None] for light in self.lights)])
 
     def with_unknowns(self, values: NDArray, ambient: float | None = None) -> Illumination:
-        """The same lights with other coefficients and colours (K, 3); inverse of `unknowns`."""
+        """The same lights with other coefficients and colours (K, 3); inverse of `unknowns`.
+
+        InputError for another shape.
+        """
         count = len(self.radiance)
         if np.shape(values) != (count + len(self.lights), 3):
             raise InputError(f"lighting: found shape {np.shape(values)}, expected {(count + len(self.lights), 3)}")

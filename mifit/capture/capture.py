@@ -199,7 +199,7 @@ class Capture:
         return dataclasses.replace(self.stored_camera(view.name), distortion=())
 
     def stored_camera(self, name: str) -> Camera:
-        """The calibrated camera of a view's images as they are on disk, with lens distortion."""
+        """The calibrated camera of a view's images as stored, with lens distortion; InputError where there is none."""
         view = self._view(name)
         if not view.calibrated:
             missing = "intrinsics (fl_x ...)" if view.intrinsics is None else "pose (transform_matrix)"
@@ -254,13 +254,19 @@ class Capture:
         return result.hexdigest()
 
     def with_estimate(self, cameras: Sequence[Camera]) -> Capture:
-        """The same capture with estimated cameras; whether it is `calibrated` stays as it is."""
+        """The same capture with estimated cameras; whether it is `calibrated` stays as it is.
+
+        TypeError for other objects.
+        """
         if not all(isinstance(camera, Camera) for camera in cameras):
             raise TypeError("with_estimate: cameras: found other objects, expected Camera")
         return dataclasses.replace(self, estimated={camera.name: camera for camera in cameras}, _cache=self._cache)
 
     def with_photometry(self, photometry: Photometry) -> Capture:
-        """The same capture with images divided by gains and exposures, in place of any that it has."""
+        """The same capture with images divided by gains and exposures, in place of any that it has.
+
+        TypeError for another object.
+        """
         if not isinstance(photometry, Photometry):
             raise TypeError(f"with_photometry: found {type(photometry).__name__}, expected Photometry")
         return dataclasses.replace(self, photometry=photometry, _cache=self._cache)

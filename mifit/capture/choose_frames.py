@@ -81,7 +81,7 @@ def choose_frames(
     beside: Sequence[int] = (),
     limits: FrameLimits = FrameLimits(),
 ) -> FrameChoice:
-    """Choose the timesteps of a capture that show most of a face.
+    """The timesteps of a capture that show most of a face.
 
     Frames that are blurred, show closed eyes, lack landmarks or whose views disagree are left out. Of the others the
     first is the one nearest to the middle of all poses, and each next one the farthest from those before it.

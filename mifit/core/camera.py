@@ -38,6 +38,18 @@ class Camera:
         Rigid transform from world to camera, OpenCV axes, in the capture's units.
     distortion : tuple of float
         ``(k1, k2, p1, p2)`` or OpenCV's longer forms; empty for an undistorted camera.
+
+    Raises
+    ------
+    InputError
+        A size, focal length or pose that no camera has.
+
+    Examples
+    --------
+    >>> camera = Camera.look_at(eye=(0, 0, 70), width=680, height=480)
+    >>> camera.project(np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0]])).round(1)
+    array([[340. , 240. ],
+           [340. , -35.5]])
     """
 
     name: str
@@ -174,7 +186,10 @@ class Camera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def resized(self, factor: float) -> Camera:
-        """This camera with an image of another size: ``factor`` pixels per pixel, to the nearest whole number."""
+        """This camera with an image of another size: ``factor`` pixels per pixel, to the nearest whole number.
+
+        InputError for a factor that leaves no image, or too large a one.
+        """
         if not 0 < factor * max(self.width, self.height) <= MAX_PIXELS:
             raise InputError(f"resized: found factor {factor}, expected one above 0 that leaves an image")
         width, height = (max(round(n * factor), 1) for n in (self.width, self.height))
@@ -182,11 +197,11 @@ class Camera:
         return replace(self, width=width, height=height, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y)
 
     def to_camera(self, points: NDArray) -> NDArray:
-        """World points (..., 3) -> camera points (..., 3)."""
+        """Camera points (..., 3) of world points (..., 3)."""
         return np.asarray(points) @ self.rotation.T + self.translation
 
     def project(self, points: NDArray) -> NDArray:
-        """World points (..., 3) -> ideal (undistorted) pixel coordinates (..., 2).
+        """Ideal (undistorted) pixel coordinates (..., 2) of world points (..., 3).
 
         A point on or behind the camera plane gives NaN.
         """
@@ -195,7 +210,10 @@ class Camera:
         return np.stack([self.fx * p[..., 0] / z + self.cx, self.fy * p[..., 1] / z + self.cy], axis=-1)
 
     def pixel_rays(self, pixels: NDArray) -> NDArray:
-        """Pixel coordinates (..., 2) -> unit world-space directions (..., 3) away from the camera."""
+        """Unit world-space directions (..., 3) away from the camera through ``pixels`` (..., 2).
+
+        InputError for another shape.
+        """
         pixels = np.asarray(pixels)
         if pixels.shape[-1:] != (2,):
             raise InputError(f"pixels: found shape {pixels.shape}, expected (..., 2)")

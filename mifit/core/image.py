@@ -48,13 +48,25 @@ class Image:
 
 
 def srgb_to_linear(values: ArrayLike) -> NDArray:
-    """SRGB-coded values (0..1) -> linear (IEC 61966-2-1), any shape; float32 stays float32."""
+    """Linear values of sRGB codes 0..1 (IEC 61966-2-1), any shape; float32 stays float32.
+
+    Examples
+    --------
+    >>> srgb_to_linear([0.0, 0.5, 1.0]).round(3)
+    array([0.   , 0.214, 1.   ])
+    """
     v = _as_float(values)
     return np.where(v <= 0.04045, v / 12.92, ((np.maximum(v, 0.0) + 0.055) / 1.055) ** 2.4).astype(v.dtype)
 
 
 def linear_to_srgb(values: ArrayLike) -> NDArray:
-    """Linear values -> sRGB-coded (IEC 61966-2-1), any shape; values above 1 stay above 1."""
+    """Codes of linear values in sRGB (IEC 61966-2-1), any shape; values above 1 stay above 1.
+
+    Examples
+    --------
+    >>> linear_to_srgb([0.0, 0.214, 1.0]).round(3)
+    array([0. , 0.5, 1. ])
+    """
     v = _as_float(values)
     return np.where(v <= 0.0031308, v * 12.92, 1.055 * np.maximum(v, 0.0) ** (1 / 2.4) - 0.055).astype(v.dtype)
 

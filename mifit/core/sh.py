@@ -192,6 +192,14 @@ class SHLighting:
     """Distant lighting as real spherical harmonics of radiance, world axes (conventions at the top of this module).
 
     ``coefficients`` (B*B, 3) are linear Rec. 709; InputError for another shape, or values that are not finite.
+
+    Examples
+    --------
+    A white sky all around: its irradiance is pi everywhere.
+
+    >>> sky = SHLighting.from_envmap(np.ones((32, 64, 3)), order=3)
+    >>> sky.irradiance([0.0, 1.0, 0.0]).round(2)
+    array([3.14, 3.14, 3.14])
     """
 
     coefficients: Array

@@ -46,7 +46,7 @@ def refine(
     seed: int = 0,
     progress: Progress = silent,
 ) -> Reconstruction:
-    """Find surface, maps, lighting and normals of a result anew, from further frames too.
+    """A result with surface, maps, lighting and normals found anew, from further frames too.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def refine(
     -------
     Reconstruction
         With the timesteps that were fitted jointly; tracked ones, which belong to the old surface and maps, are to be
-        tracked again. A fit in the model's span stays there. the reflectance's report (``"refined"``) says which
+        tracked again. A fit in the model's span stays there. The reflectance's report (``"refined"``) says which
         frames entered and which were left out, and why.
 
     Raises

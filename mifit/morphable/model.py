@@ -262,7 +262,7 @@ class MorphableModel:
         albedo: int | slice | None = None,
         region: NDArray[np.bool_] | None = None,
     ) -> MorphableModel:
-        """Return a model with fewer modes or a smaller photometric region.
+        """The model with fewer modes or a smaller photometric region.
 
         Parameters
         ----------
@@ -270,6 +270,11 @@ class MorphableModel:
             Modes to keep: a number of leading modes, or a slice; all by default.
         region : (F,) bool, optional
             Faces that may stay in ``face_mask``.
+
+        Raises
+        ------
+        InputError
+            A number below 0, or a region of another shape.
         """
 
         def modes(kept: int | slice | None, name: str) -> slice:

@@ -105,7 +105,7 @@ def install_hint() -> str:
 
 
 def set_variant(name: str = "auto") -> str:
-    """Activate a Mitsuba variant and return its name; the program calls this once, the library never does.
+    """Name of the Mitsuba variant that is now active; the program calls this once, the library never does.
 
     ``"auto"`` is ``cuda_ad_rgb`` where CUDA works, else ``llvm_ad_rgb``.
 

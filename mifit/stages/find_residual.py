@@ -45,7 +45,7 @@ def find_residual(
     seed: int = 0,
     progress: Progress = silent,
 ) -> ResidualEstimate:
-    """Find what the images of each timestep show beyond reflectance and light.
+    """What the images of each timestep hold beyond reflectance and light.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ def fit_geometry(
     seed: int = 0,
     progress: Progress = silent,
 ) -> GeometryEstimate:
-    """Fit identity, albedo, expression, pose, lighting and ambient to the images of a face.
+    """Identity, albedo, expression, pose, lighting and ambient of a face model, fitted to images.
 
     Parameters
     ----------

@@ -48,11 +48,11 @@ def infer_reflectance(
     seed: int = 0,
     progress: Progress = silent,
 ) -> ReflectanceEstimate:
-    """Recover diffuse and specular albedo maps and the lighting of a fitted face.
+    """Diffuse and specular albedo maps and the lighting of a fitted face.
 
-    All timesteps of the geometry and all named cameras enter; albedo and lighting are shared by them. The product
-    of albedo and lighting is all that images show, so the scale between the two is fixed by a convention: the mean
-    diffuse albedo over the seen texels and channels is stage 1's, which has the level of the morphable model's mean
+    All timesteps of the geometry and all named cameras enter; albedo and lighting are shared by them. Images hold
+    the product of albedo and lighting alone. A convention fixes the scale between the two: the mean
+    diffuse albedo over the visible texels and channels is stage 1's, which has the level of the morphable model's mean
     face. Texels that no image shows or no light reaches are filled from the mean face's albedo, in proportion to their
     surroundings, and have confidence 0.
 

@@ -58,7 +58,7 @@ def synthesize(  # noqa: PLR0913
     landmark_bias: float = 0.0,
     progress: Progress = silent,
 ) -> Path:
-    """Render a capture of an unseen subject, with ground truth beside it.
+    """Folder of a capture of an unseen subject, rendered with ground truth beside it.
 
     Cameras ``left``, ``right`` (20 degrees to either side) and ``third`` (above the middle) see a head that moves
     and changes its expression under a fixed environment. Skin has painted detail and microfacet lobes, images

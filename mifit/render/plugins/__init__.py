@@ -10,9 +10,9 @@ _CLASSES: dict[str, dict[str, type]] = {}
 
 
 def register_plugins() -> dict[str, type]:
-    """Register ``blinnphong``, ``shenv``, ``shdirect`` and ``pinhole`` with the current variant; harmless to repeat.
+    """Classes of ``blinnphong``, ``shenv``, ``shdirect`` and ``pinhole`` by name, registered with the current variant.
 
-    Returns the classes of this variant by name. VariantError where no variant is active.
+    Harmless to repeat. VariantError where no variant is active.
     """
     import mitsuba as mi
 

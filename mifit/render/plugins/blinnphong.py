@@ -35,8 +35,8 @@ def make() -> type:
         Otherwise $N = 1/\pi$: the paper's plain $C_s\,(n \cdot h)^m$ in the units of the diffuse term, which doesn't
         conserve energy.
 
-        With `fresnel`, $k$ below, the lobe is what fits of skin use: the one that a view along the normal has, carried
-        about the mirror direction $r$ of the view $v$ and rising as Schlick's approximation does,
+        With `fresnel`, $k$ below, the lobe is that of fits of skin. It has the shape of a view along the normal, is
+        carried about the mirror direction $r$ of the view $v$, and rises as Schlick's approximation does,
 
         $$f_s = C_s\, \big(1 + k\,(1 - h \cdot v)^5\big)\, N(m)\, \Big(\frac{1 + c}{2}\Big)^{m/2} c\;
         \frac{2}{n' \cdot l + n' \cdot v}, \qquad c = \max(r \cdot l, 0)$$

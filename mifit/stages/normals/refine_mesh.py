@@ -34,7 +34,7 @@ def refine_mesh(
     config: MeshConfig | None = None,
     progress: Progress = silent,
 ) -> MeshEstimate:
-    """Move the vertices of the face area so that the mesh takes the refined normals.
+    """Meshes whose vertices in the face area are moved so that they have the refined normals.
 
     Parameters
     ----------

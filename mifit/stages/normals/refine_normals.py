@@ -68,7 +68,7 @@ def refine_normals(
     seed: int = 0,
     progress: Progress = silent,
 ) -> NormalsEstimate:
-    """Refine the normals of every timestep of a fit, with reflectance and lighting held.
+    """Refined normals of every timestep of a fit, with reflectance and lighting held.
 
     Parameters
     ----------
