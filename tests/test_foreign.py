@@ -166,7 +166,10 @@ def test_tables_name_sets_blends_failures_and_the_worst_head():
     held_out["image-based, our mesh, cosine"] = figures(19.0)
     case = {
         "label": "a", "set": "locked", "held_out": held_out,
-        "fits": {"full": {"unconverged": ["geometry"]}, "refit": {"unconverged": []}},
+        "fits": {
+            "full": {"unconverged": ["geometry"], "seconds": {"geometry": 20.5, "normals": 2.6}},
+            "refit": {"unconverged": []},
+        },
         "mesh": {"full": {"median_mm": 0.5, "mean_mm": 1.25, "p90_mm": 3.0}},
         "relit": {"full, path": {"mean": 15.04}, "full, local": {"mean": 14.0}}, "fit_cpu": 12.3,
     }  # fmt: skip
@@ -175,9 +178,10 @@ def test_tables_name_sets_blends_failures_and_the_worst_head():
     text = foreign.markdown([case, worse, failed])
     assert "| b | development | failed: no / light |" in text and "full: geometry" in text
     assert "0.50 / 1.25 / 3.00" in text and "| 20.0 (nearest) |" in text and "15.0" in text
-    assert "locked, 2 rows: `full` over image-based rendering on its mesh -2.0 (w), -0.3 and +1.3 dB" in text
-    front = foreign.short([case])
-    assert "| a | locked | 21.3 | 20.0 (nearest) |" in front and "| 15.0 |" in front and front.count("15.0") == 1
+    assert "2 locked rows: worst -2.0 dB (w), median -0.3 dB, best +1.3 dB." in text
+    front = foreign.short([case, {**case, "set": "development", "label": "chose"}])
+    assert "| a | locked | 21.3 | 20.0 (nearest) |" in front and "| 15.0 | 23 |" in front and front.count("15.0") == 1
+    assert "chose" not in front
     rows = [line for line in text.splitlines() if line.startswith("|")]
     tables = [i for i, line in enumerate(rows) if line.startswith("| head")]
     for first, last in zip(tables, [*tables[1:], len(rows)], strict=True):
