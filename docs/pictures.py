@@ -1,9 +1,9 @@
 """The pictures of the pages, made from fits of heads whose licences allow it.
 
-    python docs/pictures.py [--size 512] [--only hero gallery light sides methods] [--keep]
+    python docs/pictures.py [--size 512] [--only hero gallery light sides table methods builtin film] [--keep]
 
-Fits the shared captures of the Perry-Smith scan (CC-BY 3.0) and of Digital Emily (MIT) into ``out/pictures``, and
-writes ``docs/images``. ``--keep`` takes the fits that are there. People's photographs stay out.
+Fits the shared captures of the Perry-Smith scan (CC-BY 3.0) and of Digital Emily (MIT), and heads as in Table 1, into
+``out/pictures``, and writes ``docs/images``. ``--keep`` takes the fits that are there. People's photographs stay out.
 """
 
 from __future__ import annotations
@@ -37,6 +37,13 @@ HEADS = {
     "scan_sun": ("left", "right", "third", (0, 1)), "emily": ("c3", "c4", "c2", (0,)),
 }  # fmt: skip
 """Two fitted cameras, a third one that isn't, and the timesteps."""
+MADE = {"table_0": "apartment", "table_2": "softbox", "table_4": "studio"}
+"""Heads as `benchmarks.table1` makes them, by their number, and their light; the built-in model is fitted to them."""
+EXPRESSIONS = (
+    ("jawOpen",), ("smile_L", "smile_R", "cheekSquint_L", "cheekSquint_R"),
+    ("frown_L", "frown_R", "browInnerUp_L", "browInnerUp_R"), ("pucker",),
+    ("browDown_L", "browDown_R", "sneer_L", "sneer_R"), ("blink_L",), ("cheekPuff_L", "cheekPuff_R"),
+)  # fmt: skip
 TILE = 240
 """Height of a picture in a row, pixels."""
 FAR_MM = 2.0
@@ -49,11 +56,11 @@ class Head:
     """A capture and its fit, seen by a third camera at the pictures' scale."""
 
     def __init__(self, name: str, size: int) -> None:
-        left, right, third, timesteps = HEADS[name]
+        left, right, third, timesteps = HEADS.get(name, ("left", "right", "third", (0, 1)))
         self.name, self.cameras, folder = name, (left, right), WORK / f"{name}_{size}"
-        self.capture = mifit.Capture.load(SHARED / "captures" / name)
+        self.capture = mifit.Capture.load(made(name) if name in MADE else SHARED / "captures" / name)
         if not (folder / "result.json").exists():
-            model = mifit.MorphableModel.load(str(ICT))
+            model = mifit.MorphableModel.load("builtin" if name in MADE else str(ICT))
             config = mifit.FitConfig(reflectance=mifit.ReflectanceConfig(texture_size=size))
             mifit.fit(self.capture, model, self.cameras, timesteps, config).save(folder)
         self.result = mifit.Reconstruction.load(folder)
@@ -87,9 +94,13 @@ class Head:
 
     def side(self, environment: str, yaw: float) -> NDArray[np.uint8]:
         """The head under an environment from so many degrees beside the front."""
-        view = self.result.orbit(yaw=yaw).resized(self.scale)
-        image = self.relit(environment).render(replace(view, fx=0.7 * view.fx, fy=0.7 * view.fy), 0)
+        image = self.relit(environment).render(self.beside(yaw), 0)
         return on_white(exposed(image))[around(image[..., 3] > 0)]
+
+    def beside(self, yaw: float) -> mifit.Camera:
+        """A camera that sees the whole head from so many degrees beside the front."""
+        view = self.result.orbit(yaw=yaw).resized(self.scale)
+        return replace(view, fx=0.7 * view.fx, fy=0.7 * view.fy)
 
     def scan(self) -> NDArray[np.uint8]:
         """The true mesh in the third view, shaded by its normals."""
@@ -113,8 +124,7 @@ class Head:
 
     def clay(self, vertices: NDArray, faces: NDArray) -> NDArray[np.uint8]:
         """A mesh in the third view, shaded by its normals."""
-        surface = trace_mesh(vertices, faces, self.view, 2)
-        return clay(surface, vertex_normals(vertices, faces), faces)[self.box]
+        return clay(vertices, faces, self.view)[self.box]
 
     def normals(self, refined: bool) -> NDArray[np.uint8]:
         """Normals as colours, the mesh's or the refined ones."""
@@ -157,6 +167,15 @@ def around(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
     return slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
 
 
+def made(name: str) -> Path:
+    """Folder of a head as in Table 1, path traced once."""
+    folder, seed = WORK / "captures" / name, int(name.rpartition("_")[2])
+    if not (folder / "transforms.json").exists():
+        light = SHARED / "hdri" / f"{MADE[name]}.hdr"
+        mifit.synthesize(folder, 1, 2, light, seed=100 + seed, tone=0.25 * seed, outside=0.5, landmark_bias=1.9)
+    return folder
+
+
 @cache
 def head(name: str, size: int) -> Head:
     """A head, fitted once."""
@@ -174,14 +193,17 @@ def on_white(image: NDArray) -> NDArray[np.uint8]:
     return to_8_bit(image[..., :3] * image[..., 3:] + (1.0 - image[..., 3:]))
 
 
-def clay(surface: object, normals: NDArray, faces: NDArray) -> NDArray[np.uint8]:
-    """Grey shading of a traced mesh by a light beside the camera."""
+def clay(vertices: NDArray, faces: NDArray, view: mifit.Camera, colours: NDArray | None = None) -> NDArray[np.uint8]:
+    """A mesh of grey clay, or of colours (V, 3), lit from beside the camera."""
+    surface = trace_mesh(vertices, faces, view, 2)
+    normals = vertex_normals(vertices, faces)
     normal = (normals[faces[surface.face]] * surface.weights[..., None]).sum(axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     light = surface.view + np.float32([0.3, 0.5, 0.0])
     light /= np.linalg.norm(light, axis=1, keepdims=True)
     shade = 0.08 + 0.6 * np.clip((normal * light).sum(axis=1), 0.0, 1.0)
-    return on_white(surface.image(np.repeat(shade[:, None], 3, axis=1)))
+    colour = np.ones((1, 3)) if colours is None else (colours[faces[surface.face]] * surface.weights[..., None]).sum(1)
+    return on_white(surface.image((shade[:, None] * colour).astype(np.float32)))
 
 
 def coloured(normal: NDArray) -> NDArray[np.float32]:
@@ -256,11 +278,16 @@ def gallery(size: int) -> None:
 
 
 def light(size: int, frames: int = 24) -> None:
-    """A light that turns about a head, as a small moving picture."""
+    """A light that turns about a head, from three sides, as a small moving picture."""
     one = head("scan_city", size)
     turns = [360.0 * k / frames for k in range(frames)]
     turned = one.result.relight(SHARED / "hdri" / "sunset.hdr", rotations=turns, exposure="auto")
-    images = [Image.fromarray(on_white(lit.render(one.view, 0, samples=1))[one.box]) for lit in turned]
+    views = [one.beside(yaw) for yaw in (-30, 0, 30)]
+    boxes = [around(one.result.render(view, 0, "pca", samples=1)[..., 3] > 0) for view in views]
+    images = [
+        Image.fromarray(row([tile(on_white(lit.render(v, 0))[box]) for v, box in zip(views, boxes, strict=True)]))
+        for lit in turned
+    ]
     path = IMAGES / "light.webp"
     images[0].save(path, save_all=True, append_images=images[1:], duration=90, loop=0, quality=70)
     print(f"wrote {path.relative_to(ROOT)}")
@@ -296,7 +323,74 @@ def methods(size: int) -> None:
         page([row([tile(image, label) for label, image in pictures.items()])], IMAGES / f"{name}.jpg")
 
 
-PICTURES = {"hero": hero, "gallery": gallery, "light": light, "sides": sides, "methods": methods}
+def table(size: int) -> None:
+    """Heads as in Table 1: photographs, maps, the held-out view, another light."""
+    rows = []
+    for one in (head(name, size) for name in MADE):
+        pictures = {
+            "in": one.photograph(one.cameras[0]),
+            "in ": one.photograph(one.cameras[1]),
+            "diffuse albedo": one.shown(lambda m: m.diffuse),
+            "specular albedo x 8": one.shown(lambda m: np.repeat(8.0 * m.specular[:, None], 3, axis=1)),
+            "held-out photograph": one.photograph(one.third),
+            "full": one.lit(),
+            "sunset": one.lit("sunset"),
+        }
+        rows.append(row([tile(image, label.strip()) for label, image in pictures.items()]))
+    page(rows, IMAGES / "table.jpg")
+
+
+def builtin(size: int) -> None:
+    """The built-in model: its mean from three sides, and expressions."""
+    model = mifit.MorphableModel.load("builtin")
+    colours = 1.8 * np.clip(model.albedo(), 0.0, 1.0)
+
+    def drawn(expression: NDArray | None, yaw: float) -> NDArray[np.uint8]:
+        vertices = model.shape(None, expression) * np.float32(model.unit_mm / 10.0)
+        angle, middle = np.radians(yaw), (vertices.max(axis=0) + vertices.min(axis=0)) / 2.0
+        eye = middle + 90.0 * np.array([np.sin(angle), 0.0, np.cos(angle)])
+        view = mifit.Camera.look_at(eye, middle, width=3 * TILE // 4, height=TILE, fov=15.0)
+        return tile(clay(vertices, model.faces, view, colours))
+
+    def unit(names: tuple[str, ...]) -> NDArray[np.float64]:
+        return 2.0 * np.isin(model.expression_names, names)
+
+    moved = [drawn(unit(names), 20.0) for names in EXPRESSIONS]
+    tiles = [drawn(None, 0.0), drawn(None, 45.0), drawn(None, 90.0), *moved]
+    page([row(tiles[:5]), row(tiles[5:])], IMAGES / "builtin.jpg")
+
+
+def film(size: int) -> None:
+    """How two phones stand before a face, from above."""
+    image = np.full((420, 760, 3), 255, np.uint8)
+    head, dark, grey, warm = (380, 110), (60, 60, 60), (170, 170, 170), (250, 190, 60)
+
+    def text(words: str, x: int, y: int) -> None:
+        width = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, 0.55, 1)[0][0]
+        cv2.putText(image, words, (x - width // 2, y), cv2.FONT_HERSHEY_SIMPLEX, 0.55, dark, 1, cv2.LINE_AA)
+
+    for side in (-1, 1):
+        angle = np.radians(20.0 * side)
+        away, across = np.array([np.sin(angle), np.cos(angle)]), np.array([np.cos(angle), -np.sin(angle)])
+        phone = head + 240.0 * away
+        cv2.line(image, head, tuple(phone.astype(int)), grey, 1, cv2.LINE_AA)
+        corners = [phone + 28 * i * across + (6 + 6 * j) * away for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        cv2.fillConvexPoly(image, np.round(corners).astype(np.int32), dark, cv2.LINE_AA)
+        text("left" if side < 0 else "right", round(phone[0]), round(phone[1]) + 40)
+        cv2.circle(image, (380 + 300 * side, 130), 26, warm, -1, cv2.LINE_AA)
+        text("soft light", 380 + 300 * side, 180)
+    cv2.ellipse(image, head, (150, 150), 90, -20, 20, grey, 1, cv2.LINE_AA)
+    text("30 to 50 degrees", 380, 290)
+    cv2.ellipse(image, head, (42, 54), 0, 0, 360, (225, 180, 150), -1, cv2.LINE_AA)
+    cv2.fillConvexPoly(image, np.int32([[371, 160], [389, 160], [380, 180]]), (225, 180, 150), cv2.LINE_AA)
+    Image.fromarray(image).save(IMAGES / "film.png", optimize=True)
+    print("wrote docs/images/film.png")
+
+
+PICTURES = {
+    "hero": hero, "gallery": gallery, "light": light, "sides": sides, "table": table, "methods": methods,
+    "builtin": builtin, "film": film,
+}  # fmt: skip
 
 
 def main() -> None:

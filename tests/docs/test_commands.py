@@ -104,7 +104,7 @@ def workspace(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     _film_a_board(folder / "filmed")
     shutil.copytree(head, folder / "scene")
     shutil.copytree(head, folder / "CAPTURE")
-    shutil.copy(ROOT / "scenes" / "relighting" / "studio.hdr", folder)
+    shutil.copytree(ROOT / "scenes" / "relighting", folder / "scenes" / "relighting")
     fit = ["fit", "CAPTURE", "--out", "RESULT", "--cameras", "left,right", "--timesteps", "0", "--quiet"]
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)

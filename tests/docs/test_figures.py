@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-METHOD = ("geometry", "surface", "reflectance", "normals", "paper")
-PAGES = [*(ROOT / "docs" / f"{name}.md" for name in METHOD), ROOT / "README.md"]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FIGURE = re.compile(
     r"(?<![\w.])(\d+(?:\.\d+)?)(?: to (\d+(?:\.\d+)?))?\s?(dB|mm|millimetres|degrees|°|seconds|s|ms|%)(?!\w)"
 )
