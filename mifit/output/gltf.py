@@ -26,6 +26,15 @@ if TYPE_CHECKING:
     from mifit.result import Reconstruction
 
 _KINDS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
+STEP = 1.0 / 32767
+"""Metres of a step of a morph target: 16 bits hold up to a metre either way (KHR_mesh_quantization)."""
+ARKIT = {
+    "blink": "eyeBlink", "squint": "eyeSquint", "sneer": "noseSneer", "smile": "mouthSmile", "frown": "mouthFrown",
+    "dimple": "mouthDimple", "stretch": "mouthStretch", "upperLipUp": "mouthUpperUp", "lowerLipDown": "mouthLowerDown",
+    "pucker": "mouthPucker", "funnel": "mouthFunnel", "rollUpper": "mouthRollUpper", "rollLower": "mouthRollLower",
+    "shrugLower": "mouthShrugLower",
+}  # fmt: skip
+"""ARKit's names of the built-in model's expressions, where they differ."""
 
 
 class _Buffer:
@@ -60,8 +69,8 @@ class _Buffer:
         return len(self.accessors) - 1
 
     def sparse(self, values: NDArray) -> int:
-        """Append an array (N, 3) of which only the rows that aren't 0 are stored; returns the accessor's index."""
-        array = np.ascontiguousarray(values, dtype="<f4")
+        """Append codes (N, 3) of `STEP` each, of which only the rows that aren't 0 are stored; the accessor's index."""
+        array = np.ascontiguousarray(values, dtype="<i2")
         rows = np.flatnonzero(array.any(axis=1))
         rows = rows if len(rows) else np.zeros(1, dtype=int)
         kind = np.dtype("<u2" if len(array) <= 2**16 else "<u4")
@@ -71,13 +80,15 @@ class _Buffer:
             "indices": {"bufferView": self.view(rows.astype(kind).tobytes()), "componentType": _KINDS[kind]},
             "values": {"bufferView": self.view(array[rows].tobytes())},
         }
-        self.accessors.append({"componentType": 5126, "count": len(array), "type": "VEC3", "sparse": stored} | bounds)
+        entry = {"componentType": 5122, "normalized": True, "count": len(array), "type": "VEC3", "sparse": stored}
+        self.accessors.append(entry | bounds)
         return len(self.accessors) - 1
 
 
 def shape_name(name: str) -> str:
-    """The name that ARKit has for a blend shape of ICT-FaceKit: ``mouthSmile_L`` is ``mouthSmileLeft``."""
-    return re.sub("_L$", "Left", re.sub("_R$", "Right", name))
+    """The name that ARKit has for a blend shape: ``mouthSmile_L`` is ``mouthSmileLeft``."""
+    stem, side = re.fullmatch("(.*?)(_[LR])?", name).groups()  # type: ignore[union-attr]
+    return ARKIT.get(stem, stem) + {"_L": "Left", "_R": "Right", None: ""}[side]
 
 
 def write_glb(
@@ -93,8 +104,9 @@ def write_glb(
     the fitted cameras stand beside it. Faces with a place in the atlas have the maps: base colour, tangent-space
     normals, and the specular albedo through KHR_materials_specular. glTF has GGX lobes, so the Blinn-Phong
     exponent m becomes alpha = sqrt(2 / (m + 2)), and roughness = sqrt(alpha). The other faces have vertex colours.
-    Expressions are morph targets that hold only the vertices that they move, with ARKit's names where the model has
-    its shapes and the timestep's coefficients as weights; a coefficient from 0 to a bound is a weight from 0 to 1.
+    Expressions are morph targets of 16 bits that hold only the vertices that they move, with ARKit's names where the
+    model has its shapes and the timestep's coefficients as weights; a coefficient from 0 to a bound is a weight from 0
+    to 1.
     Recovered lighting is in the scene's ``extras``: glTF has no spherical harmonics.
 
     ``timestep`` is by default the first that is animated, or else that was fitted; ``animate`` names timesteps to play
@@ -113,14 +125,15 @@ def write_glb(
     targets = (model.expression * (scale * metre * full)).astype(np.float32)
     # Targets leave out vertices that move by less than a tenth of a millimetre at full weight.
     targets *= (np.linalg.norm(targets, axis=1, keepdims=True) > 1e-4).astype(np.float32)
+    codes = np.clip(np.round(targets / STEP), -32767, 32767)
     # Base plus weighted targets is the fitted shape, to rounding.
-    base = posed - targets @ weights if len(weights) else posed
+    base = posed - STEP * (codes @ weights) if len(weights) else posed
 
     out = _Buffer()
     albedo = vertex_materials(result, skin=True)[:, :3]
     rest = {"name": "rest", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
     primitives = [
-        _primitive(out, part, base, shape.normals, targets, None if name == "face" else albedo)
+        _primitive(out, part, base, shape.normals, codes, None if name == "face" else albedo)
         for name, part in shape.parts().items()
     ]
     images, textures, skin = _skin(out, result, timestep, shape)
@@ -170,6 +183,8 @@ def write_glb(
     }
     if len(weights):
         names = [shape_name(name) for name in model.expression_names]
+        document |= {"extensionsRequired": ["KHR_mesh_quantization"]}
+        document["extensionsUsed"].append("KHR_mesh_quantization")
         document["meshes"][0] |= {"weights": weights.tolist(), "extras": {"targetNames": names}}
     if cameras:
         document["cameras"] = cameras
@@ -184,10 +199,13 @@ def _primitive(
     part: SplitMesh,
     base: NDArray,
     normals: NDArray,
-    targets: NDArray,
+    codes: NDArray,
     albedo: NDArray | None,
 ) -> Document:
-    """One primitive: with texture coordinates and tangents, or with vertex albedo (V, 3) where there are no maps."""
+    """One primitive: with texture coordinates and tangents, or with vertex albedo (V, 3) where there are no maps.
+
+    ``codes`` (V, 3, K) are the morph targets in steps.
+    """
     n = normals[part.origin]
     attributes = {
         "POSITION": out.accessor(base[part.origin], "<f4", bounds=True),
@@ -204,8 +222,8 @@ def _primitive(
         "indices": out.accessor(part.faces.ravel(), "<u2" if len(part.origin) <= 2**16 else "<u4", target=34963),
         "material": 0 if albedo is None else 1,
     }
-    if targets.shape[2]:
-        primitive["targets"] = [{"POSITION": out.sparse(targets[part.origin, :, k])} for k in range(targets.shape[2])]
+    if codes.shape[2]:
+        primitive["targets"] = [{"POSITION": out.sparse(codes[part.origin, :, k])} for k in range(codes.shape[2])]
     return primitive
 
 

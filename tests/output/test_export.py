@@ -40,9 +40,10 @@ def read_glb(path):
             kind = {5123: "<u2", 5125: "<u4"}[rows["componentType"]]
             index = np.frombuffer(binary, kind, count, views[0]["byteOffset"])
             assert (np.diff(index.astype(int)) > 0).all()
-            out[index] = np.frombuffer(binary, "<f4", 3 * count, views[1]["byteOffset"]).reshape(-1, 3)
+            assert a["componentType"] == 5122 and a["normalized"]
+            out[index] = np.frombuffer(binary, "<i2", 3 * count, views[1]["byteOffset"]).reshape(-1, 3)
             assert out.min(0).tolist() == a["min"] and out.max(0).tolist() == a["max"]
-            return out
+            return out / 32767
         view = document["bufferViews"][a["bufferView"]]
         kind = {5126: "<f4", 5125: "<u4", 5123: "<u2"}[a["componentType"]]
         width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[a["type"]]
@@ -116,7 +117,8 @@ def test_gltf_takes_the_fresnel_rise_over(ball, tmp_path):
 
 def test_gltf_names_the_extensions_it_uses(glb):
     document = read_glb(glb)[0]
-    assert document["extensionsUsed"] == ["KHR_materials_specular"]
+    assert document["extensionsUsed"] == ["KHR_materials_specular", "KHR_mesh_quantization"]
+    assert document["extensionsRequired"] == ["KHR_mesh_quantization"]
     assert [material["name"] for material in document["materials"]] == ["skin", "rest"]
 
 
@@ -213,7 +215,7 @@ def test_gltf_has_arkits_names_and_weights_and_leaves_out_what_stays_still(ball,
     model = replace(
         ball.model,
         expression=moved,
-        expression_names=("mouthSmile_L", "browInnerUp_R"),
+        expression_names=("smile_L", "browInnerUp_R"),
         expression_bounds=np.array([[0, 10 / 3], [0, 10 / 3]]),
     )
     geometry = replace(ball.geometry, expression=np.array([[1.0, 0.0], [10 / 3, 0.5]]))
