@@ -118,9 +118,9 @@ def light_level(brightness: NDArray[np.float32]) -> NDArray[np.float32]:
     size = min(len(brightness), LIGHT_TEXELS)
     small = cv2.resize(brightness, (size, size), interpolation=cv2.INTER_AREA)
     closed, inner = (np.ones((2 * round(0.5 * part * size) + 1,) * 2, np.uint8) for part in (FEATURE, BORDER))
-    level, last, step = cv2.dilate(small, closed), np.zeros(()), np.ones((3, 3), np.uint8)
-    while not np.array_equal(level, last):
-        last, level = level, np.maximum(cv2.erode(level, step), small)
+    level, step = cv2.dilate(small, closed), np.ones((3, 3), np.uint8)
+    while not np.array_equal(level, lower := np.maximum(cv2.erode(level, step), small)):
+        level = lower
     level = cv2.erode(level, inner)
     return np.asarray(cv2.resize(level, brightness.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
