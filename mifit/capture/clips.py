@@ -240,9 +240,9 @@ def aligned(
 
 
 def describe(moments: Sequence[Moments], starts: Sequence[Start]) -> list[str]:
-    """What is worth saying of clips that were put on one clock, in lines."""
+    """What is worth saying of clips that were put on one clock, in lines; ``starts`` are those that were found."""
     lines = []
-    for one, start in zip(moments[1:], starts[1:], strict=True):
+    for one, start in zip(moments[1:], starts[1:], strict=bool(starts)):
         if start.by == "none":
             lines.append(
                 f"{one.name}: warning: nothing in it moves or sounds as in {moments[0].name} "

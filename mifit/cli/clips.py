@@ -92,7 +92,7 @@ def _make(arguments: Namespace, paths: Sequence[Path], folder: Path) -> None:
         raise InputError(f"--board: found with --calibration {arguments.calibration}, expected one of the two")
     kinds: Document = {"videos": paths} if _are_videos(paths) else {"images": paths}
     sources = open_sources(kinds.get("videos", ()), kinds.get("images", ()))
-    starts = start_times(arguments, sources, arguments.offset, progress)
+    starts = start_times(arguments, sources, arguments.offset or "auto", progress)
     if arguments.board:
         kinds["transforms"] = _calibrated(arguments, sources, folder.with_name("calibration"), progress)
     elif arguments.calibration:
@@ -109,17 +109,18 @@ def _make(arguments: Namespace, paths: Sequence[Path], folder: Path) -> None:
 def start_times(
     arguments: Namespace, sources: Sequence[Source], offset: list[float] | str | None, progress: Progress
 ) -> list[float]:
-    """Seconds by which each video begins after the first: the ``offset`` given, or found and said on stderr."""
+    """Seconds by which each video begins after the first: the ``offset`` given, or where it is ``auto`` found.
+
+    What was found and rates that differ are said on stderr.
+    """
     from mifit.capture.clips import aligned, describe, synchronise
     from mifit.capture.sources import Video
 
     videos = [source for source in sources if isinstance(source, Video)]
     if len(videos) < 2:
         return []
-    if isinstance(offset, list):
-        return offset
-    starts = synchronise(videos, progress)
-    seconds = [start.seconds for start in starts]
+    starts = synchronise(videos, progress) if offset == "auto" else []
+    seconds = offset if isinstance(offset, list) else [start.seconds for start in starts]
     for line in describe(aligned(sources, seconds), starts):
         say(arguments, line)
     return seconds

@@ -24,7 +24,15 @@ if TYPE_CHECKING:
     from mifit.result import Reconstruction
 
 
-DEMO: Document = {"model": "builtin:coarse", "width": 340, "height": 240, "spp": 32, "timesteps": 3}
+DEMO: Document = {
+    "model": "builtin:coarse",
+    "width": 340,
+    "height": 240,
+    "spp": 32,
+    "timesteps": 3,
+    "tone": 0.2,
+    "portrait": True,
+}
 """Size of the capture that ``mifit demo`` makes: small enough for seconds, large enough to show a face."""
 
 

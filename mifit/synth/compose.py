@@ -56,6 +56,7 @@ def synthesize(  # noqa: PLR0913
     tone: float | None = None,
     outside: float = head.OUTSIDE,
     landmark_bias: float = 0.0,
+    portrait: bool = False,
     progress: Progress = silent,
 ) -> Path:
     """Folder of a capture of an unseen subject, rendered with ground truth beside it.
@@ -87,6 +88,8 @@ def synthesize(  # noqa: PLR0913
     landmark_bias : float
         Millimetres, standard deviation of each coordinate of a landmark's bias, see `head.draw_bias`; by default
         landmarks are true but for noise.
+    portrait : bool
+        Skin with few marks, and hair; by default subjects are bald and their skin has much to find.
     progress : Progress
 
     Returns
@@ -124,7 +127,9 @@ def synthesize(  # noqa: PLR0913
     map_size = 1024 if min(width / 680, height / 480) > 0.6 else 512
     for i in range(subjects):
         folder = out if subjects == 1 else out / f"subject_{i:02d}"
-        subject = _draw_subject(shape, SkinStyle.draw(seed + i, tone), timesteps, map_size, outside)
+        style = SkinStyle.draw(seed + i, tone)
+        style = style.portrait() if portrait else style
+        subject = _draw_subject(shape, style, timesteps, map_size, outside)
         subject = dataclasses.replace(subject, landmark_bias=landmark_bias)
         light = studio_environment(seed + i) if radiance is None else radiance
         start = i * (timesteps + 1)

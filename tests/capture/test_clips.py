@@ -81,6 +81,7 @@ def test_clips_without_sound_are_brought_into_step_by_motion(tmp_path: Path, rat
     text = "\n".join(describe(moments, starts))
     assert "right begins 0.41" in text and "after left, by motion" in text
     assert ("frames a second differ (left 25, right 30)" in text) == (rate != 25.0)
+    assert len(describe(moments, [])) == (rate != 25.0)
 
 
 def test_a_clap_is_heard(tmp_path: Path) -> None:
