@@ -16,7 +16,7 @@ from mifit.stages.geometry.points import corner_matrix
 
 BLEND = 0.05
 """Confidence at which a texel's own estimate counts as much as its surroundings'."""
-TYPICAL = 3e-3
+TYPICAL = 3e-4
 """Weight of the typical value of skin beside that of a texel of confidence 1: it decides far from what was seen."""
 STIFFNESS = 0.02
 """Of the membrane, beside texels of confidence 1."""
