@@ -36,6 +36,7 @@ def synth(arguments: Namespace) -> None:
         tone=arguments.tone,
         outside=arguments.outside,
         landmark_bias=arguments.landmark_bias,
+        portrait=arguments.portrait,
         progress=console_progress(arguments.quiet),
     )
     print(f"Capture: {arguments.out}")
@@ -43,7 +44,7 @@ def synth(arguments: Namespace) -> None:
 
 def _synth_scan(arguments: Namespace) -> None:
     """A capture of a scanned head."""
-    for name, default in (("subjects", 1), ("tone", None), ("landmark_bias", 0.0)):
+    for name, default in (("subjects", 1), ("tone", None), ("landmark_bias", 0.0), ("portrait", False)):
         if getattr(arguments, name) != default:
             option = name.replace("_", "-")
             raise InputError(f"--{option}: found with --head, whose shape and skin are the scan's; leave it out")
@@ -86,7 +87,7 @@ def import_(arguments: Namespace) -> None:
         "videos": arguments.video,
         "progress": console_progress(arguments.quiet),
     }
-    if arguments.video and arguments.offset:
+    if arguments.video:
         options["starts"] = start_times(
             arguments, open_sources(arguments.video, ()), arguments.offset, options["progress"]
         )
@@ -121,7 +122,7 @@ def calibrate(arguments: Namespace) -> None:
         return
     sources = open_sources(arguments.video, arguments.images, arguments.names)
     progress = console_progress(arguments.quiet)
-    starts = start_times(arguments, sources, arguments.offset, progress) if arguments.offset else []
+    starts = start_times(arguments, sources, arguments.offset, progress)
     calibration = calibrate_boards(aligned(sources, starts), board, arguments.units, progress)
     write_calibration(calibration, out, arguments.units)
     print(calibration.summary())

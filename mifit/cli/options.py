@@ -74,7 +74,7 @@ synth  captures.synth  path-traced captures with ground truth
     --height         16..=480         pixels (default: 480)
     --spp            1..=64           samples per pixel (default: 64)
     --tone           real             skin from 0, fair, to 1, deep; default: drawn for each subject
-    --portrait       flag             people with cropped hair and few marks on their skin
+    --portrait       flag             people with few marks on their skin, which shines less
     --outside        real=0.5         millimetres by which heads leave the model's span (default: 0.5)
     --landmark-bias  real=0.0         millimetres; a detector's is about 2 (default: 0)
     --head           path             a scanned head with texture coordinates (.glb, .obj, .ply), moved rigidly

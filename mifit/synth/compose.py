@@ -89,7 +89,7 @@ def synthesize(  # noqa: PLR0913
         Millimetres, standard deviation of each coordinate of a landmark's bias, see `head.draw_bias`; by default
         landmarks are true but for noise.
     portrait : bool
-        Skin with few marks, and hair; by default subjects are bald and their skin has much to find.
+        Skin with few marks, which shines less; by default skin has much to find.
     progress : Progress
 
     Returns

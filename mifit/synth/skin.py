@@ -22,8 +22,6 @@ from mifit.synth.procedural import smooth_noise
 FAIR = np.array([0.58, 0.385, 0.30])
 DEEP = np.array([0.16, 0.088, 0.058])
 """Linear reflectance of the ends of the range of skin tones that subjects are drawn from."""
-HAIRLINE = (0.0, 30.0, 50.0, 68.0, 85.0, 105.0, 125.0, 180.0), (50.0, 48.0, 34.0, -6.0, 12.0, 8.0, -65.0, -75.0)
-"""Degrees from the nose about the axis through the ears' height, and millimetres above the brows."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,8 @@ class SkinStyle:
     oil: float
     freckles: int
     moles: int
-    cropped: bool = False
+    brows: tuple[float, float] = (0.5, 6.0)
+    """How uneven they are, and half their width in millimetres."""
 
     @classmethod
     def draw(cls, seed: int, tone: float | None = None) -> SkinStyle:
@@ -83,8 +82,8 @@ class SkinStyle:
         )
 
     def portrait(self) -> SkinStyle:
-        """The same skin with fewer marks and less oil, and cropped hair on the scalp."""
-        return replace(self, oil=0.5 * self.oil, moles=0, stubble=0.5 * self.stubble, cropped=True)
+        """The same skin without moles, with less oil and stubble, and with finer brows."""
+        return replace(self, oil=0.5 * self.oil, moles=0, stubble=0.5 * self.stubble, brows=(0.15, 4.5))
 
 
 @dataclass(frozen=True)
@@ -153,10 +152,6 @@ def paint(
     albedo = albedo * (1 - 0.8 * dots[:, None]) + 0.8 * dots[:, None] * style.hair.astype(np.float32)
     oil = _oil(p, front, anatomy, style, lips, rng)
     roughness = 0.52 - 0.14 * oil + 0.05 * smooth_noise(p, 12.0, rng) + 0.1 * brows
-    if style.cropped:
-        hair = _scalp(p, anatomy, rng)
-        albedo += hair[:, None] * (style.hair.astype(np.float32) - albedo)
-        oil, roughness = oil * (1.0 - hair), roughness + 0.15 * hair
     bump = _relief(p, front, anatomy, style, lips, rng) + 0.25 * raised + 0.12 * brows * smooth_noise(p, 1.6, rng)
     return SkinMaps(
         albedo=_fill(texels, np.clip(albedo, 0.005, 0.9)),
@@ -184,7 +179,7 @@ def _paint_colour(
     lip_tone = style.tone * (0.82, 0.55, 0.60)
     albedo += lips[:, None] * (lip_tone.astype(np.float32) * (1 + pores[:, None]) - albedo)
     brows = np.zeros(len(p), dtype=np.float32)
-    rough, wide = (0.15, 4.5) if style.cropped else (0.5, 6.0)
+    rough, wide = style.brows
     strokes = np.clip(0.75 + rough * smooth_noise(p * (0.5, 1.0, 0.5), 1.8, rng), 0.0, 1.0)
     for line in ([17, 18, 19, 20, 21], [22, 23, 24, 25, 26]):
         near = anatomy.line_distance(p - np.array([0.0, -2.0, 0.0]), line)
@@ -222,17 +217,6 @@ def _beard(p: NDArray, front: NDArray, anatomy: Anatomy) -> NDArray[np.float32]:
     above = np.clip((p[:, 1] - marks[8, 1] + 25.0) / 15.0, 0.0, 1.0)
     cheek = np.clip((anatomy.line_distance(p, [33, 8]) - 62.0) / -12.0, 0.0, 1.0)
     return (below * above * cheek * np.sqrt(front)).astype(np.float32)
-
-
-def _scalp(p: NDArray, anatomy: Anatomy, rng: np.random.Generator) -> NDArray[np.float32]:
-    """How densely cropped hair covers the skin: above a line that runs from the forehead over the ears to the nape."""
-    marks = anatomy.landmarks
-    beside = p[:, 2] - marks[[0, 16], 2].mean()
-    angle = np.degrees(np.arctan2(np.abs(p[:, 0]), beside))
-    line = marks[[19, 24], 1].mean() + np.interp(angle, *HAIRLINE)
-    within = np.clip((p[:, 1] - line + 3.0 * smooth_noise(p, 9.0, rng)) / 9.0, 0.0, 1.0)
-    strands = np.clip(0.85 + 0.08 * smooth_noise(p * (1.0, 0.4, 1.0), 2.0, rng), 0.0, 1.0)
-    return (within * strands).astype(np.float32)
 
 
 def _oil(
