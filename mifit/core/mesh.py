@@ -23,8 +23,10 @@ def face_cross(vertices: NDArray, faces: NDArray) -> NDArray:
 
 def edges(faces: NDArray) -> tuple[NDArray, NDArray]:
     """Undirected edges (E, 2), each with its lower vertex first, and the number of faces at each (E,)."""
-    unique, count = np.unique(_sides(faces), axis=0, return_counts=True)
-    return unique, count
+    sides = _sides(faces).astype(np.int64)
+    base = int(sides.max(initial=0)) + 1
+    unique, count = np.unique(sides[:, 0] * base + sides[:, 1], return_counts=True)
+    return np.stack(np.divmod(unique, base), axis=1).astype(faces.dtype), count
 
 
 def _sides(faces: NDArray) -> NDArray:

@@ -167,7 +167,7 @@ def find_surface(
     result, closed_lips = close_openings(capture, model, result, cameras, lips)
     result, crossed = keep_walls(model, result)
     world = result.vertices.astype(np.float64)
-    residuals = sight.epipolar_residuals(views, pairs, result.timesteps, world, config.finest)
+    residuals = sight.epipolar_residuals(views, pairs, result.timesteps, world, config.finest + 1)
     likenesses = sight.likenesses(pairs, result.timesteps[0], world[0], config.finest + 1)
     seconds = time.perf_counter() - began
     moved = np.linalg.norm(rest.state.displacement, axis=1)[np.unique(model.faces[model.face_mask])] * model.unit_mm
