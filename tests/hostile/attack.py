@@ -61,7 +61,8 @@ def preload() -> None:
         getattr(mifit, name)
     PIL.Image.init()
     cv2.setNumThreads(1)
-    mifit.MorphableModel.load("builtin:coarse")
+    for name in ("builtin:coarse", "builtin"):  # a case's empty home has no copy of what is made in seconds
+        mifit.MorphableModel.load(name)
 
 
 def snapshot(folder: Path) -> dict[str, tuple]:
