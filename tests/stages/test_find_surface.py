@@ -57,8 +57,8 @@ def captured(model, displacement, **options):
     return make_capture(replace(model, mean=model.mean + displacement), [(0, 0, 0), (-6, 10, 3)], **options)
 
 
-def fitted_to(model, capture, cameras=BOTH):
-    return fit_geometry(capture, model, cameras, STEPS, QUICK)
+def fitted_to(model, capture, timesteps=STEPS):
+    return fit_geometry(capture, model, BOTH, timesteps, QUICK)
 
 
 def seen_vertices(model, capture):
@@ -91,6 +91,12 @@ def start(model, bumpy):
 
 
 @pytest.fixture(scope="module")
+def first(start):
+    """The start at its first timestep, where one is enough."""
+    return start.at(STEPS[:1])
+
+
+@pytest.fixture(scope="module")
 def found(model, bumpy, start):
     return find_surface(bumpy, model, start, BOTH)
 
@@ -105,12 +111,12 @@ def test_added_eyes_go_along_with_the_skin_and_leave_it_alone(model, bumpy, monk
     """Slivers of other pieces once made the skin less stiff: their bending counted as the skin's."""
     skin = without_eyes(model)
     whole, n = with_eyes(skin), skin.n_vertices
-    found = find_surface(bumpy, skin, fitted_to(skin, bumpy), BOTH, COARSE)
+    found = find_surface(bumpy, skin, fitted_to(skin, bumpy, STEPS[:1]), BOTH, COARSE)
     met = []
     monkeypatch.setattr(
         "mifit.stages.find_surface.Scenes", lambda faces, *rest: met.append(faces) or Scenes(faces, *rest)
     )
-    eyed = find_surface(bumpy, whole, fitted_to(whole, bumpy), BOTH, COARSE)
+    eyed = find_surface(bumpy, whole, fitted_to(whole, bumpy, STEPS[:1]), BOTH, COARSE)
     assert met[0].max() < n  # what balls mirror isn't matched at the lids
     moved = eyed.displacement
     for ball in eyeballs(whole):
@@ -136,12 +142,12 @@ def covered_wrongly(model, capture, estimate):
     return wrong
 
 
-def test_outlines_follow_the_images(model, bumpy, start, monkeypatch):
+def test_outlines_follow_the_images(model, bumpy, first, monkeypatch):
     """A head fitted 2 mm too narrow: matching alone doesn't see what turns away from both views."""
     inwards = -0.2 * vertex_normals(model.mean, model.faces)
     narrow = replace(model, mean=(model.mean + inwards).astype(np.float32))
-    vertices = start.vertices + inwards @ start.rotation.transpose(0, 2, 1)
-    fitted = replace(start, vertices=vertices.astype(np.float32))
+    vertices = first.vertices + inwards @ first.rotation.transpose(0, 2, 1)
+    fitted = replace(first, vertices=vertices.astype(np.float32))
     outlined = covered_wrongly(model, bumpy, find_surface(bumpy, narrow, fitted, BOTH, COARSE))
     monkeypatch.setattr("mifit.stages.find_surface.find_borders", lambda *_: joined([]))
     matched = covered_wrongly(model, bumpy, find_surface(bumpy, narrow, fitted, BOTH, COARSE))
@@ -156,26 +162,26 @@ def test_the_estimate_is_consistent_in_itself(model, found):
         np.testing.assert_allclose(found.vertices[k], expected, atol=1e-4)
 
 
-def test_the_skin_does_not_intersect_itself(model, bumpy, start):
+def test_the_skin_does_not_intersect_itself(model, bumpy, first):
     """Of the search alone: lips that are closed may fold behind their corners, where nothing shows."""
-    found = find_surface(bumpy, model, start, BOTH, replace(COARSE, close_lips=False))
+    found = find_surface(bumpy, model, first, BOTH, replace(COARSE, close_lips=False))
     eyes = np.concatenate(eyeballs(model))
     skin = model.faces[~np.isin(model.faces, eyes).any(1)]
-    before, after = (intersections(10.0 * g.vertices[0], skin) for g in (start, found))
+    before, after = (intersections(10.0 * g.vertices[0], skin) for g in (first, found))
     assert len(after) <= len(before)
 
 
 def test_a_head_that_the_model_spans_stays_right(model):
     capture = captured(model, np.zeros_like(model.mean), width=510, height=360)
-    start = fitted_to(model, capture)
+    start = fitted_to(model, capture, STEPS[:1])
     found = find_surface(capture, model, start, BOTH)
     assert off_mm(model, capture, found).mean() < max(off_mm(model, capture, start).mean(), 0.15)
 
 
-def test_where_nothing_is_seen_the_surface_stays(model, bumpy, start):
+def test_where_nothing_is_seen_the_surface_stays(model, bumpy, first):
     blank = bumpy.changed(lambda name, t, frame: replace(frame, image=np.full_like(frame.image, 0.3)))
-    found = find_surface(blank, model, start, BOTH)
-    np.testing.assert_allclose(found.vertices, start.vertices, atol=1e-3)
+    found = find_surface(blank, model, first, BOTH)
+    np.testing.assert_allclose(found.vertices, first.vertices, atol=1e-3)
 
 
 def test_one_view_says_so(model, bumpy, start):
@@ -185,8 +191,7 @@ def test_one_view_says_so(model, bumpy, start):
 
 
 def test_tracking_moves_the_displaced_surface(model, bumpy, found):
-    first = found.at((0,))
-    tracked = fit_pose_expression(bumpy, model, first, BOTH, 1, QUICK)
+    tracked = fit_pose_expression(bumpy, model, found.at((0,)), BOTH, 1, QUICK)
     np.testing.assert_array_equal(tracked.displacement, found.displacement)
     shape = displaced(model, tracked).shape(tracked.identity, tracked.expression[0])
     expected = tracked.scale * shape @ tracked.rotation[0].T + tracked.translation[0]
@@ -313,12 +318,12 @@ def test_an_outlier_counts_little():
 def test_biased_landmarks_bend_the_shape_less(model, bumpy):
     """Landmarks that are off the same way in every image: the surface that all views see sets them right."""
     before = after = 0.0
-    for seed in range(5, 9):  # the result of one set hangs on single landmarks
+    for seed in (5, 6):  # the result of one set hangs on single landmarks
         offset = 6.0 * np.random.default_rng(seed).normal(size=(68, 2))
         biased = bumpy.changed(lambda name, t, frame, by=offset: replace(frame, landmarks=frame.landmarks + by))
-        start = fitted_to(model, biased)
+        start = fitted_to(model, biased, STEPS[:1])
         before += off_mm(model, bumpy, start).mean()
-        after += off_mm(model, bumpy, find_surface(biased, model, start, BOTH)).mean()
+        after += off_mm(model, bumpy, find_surface(biased, model, start, BOTH, COARSE)).mean()
     assert after < 0.3 * before
 
 
@@ -328,13 +333,13 @@ def test_expressions_stay_within_their_bounds(model, found):
     assert (found.expression >= low - 1e-6).all() and (found.expression <= high + 1e-6).all()
 
 
-def test_each_level_is_swept_until_the_surface_rests(model, bumpy, start, found, monkeypatch):
+def test_each_level_is_swept_until_the_surface_rests(model, bumpy, first, found, monkeypatch):
     phase = found.report.details["phases"][-1]
     assert phase["outcome"] == "converged" and phase["levels"] == sorted(phase["levels"], reverse=True)
     assert set(phase["levels"]) == set(range(max(phase["levels"]) + 1))
     monkeypatch.setattr("mifit.stages.find_surface.SETTLED", 1e-9)  # never
     monkeypatch.setattr("mifit.stages.find_surface.MOST_SWEEPS", 3)
-    restless = find_surface(bumpy, model, start, BOTH, SurfaceConfig(finest=2)).report.details["phases"][-1]
+    restless = find_surface(bumpy, model, first, BOTH, SurfaceConfig(finest=2)).report.details["phases"][-1]
     assert restless["levels"] == [2, 2, 2] and restless["outcome"] == "max_iterations"
 
 
@@ -352,7 +357,7 @@ def test_views_are_compared_with_their_neighbours():
     assert pairs(*range(0, 175, 25)) == [(0, 1), (0, 2), (1, 2), (2, 3), (3, 4), (4, 5), (4, 6), (5, 6)]
 
 
-def test_a_camera_off_its_calibration_is_told_by_the_epipolar_lines(model, bumpy, start, found):
+def test_a_camera_off_its_calibration_is_told_by_the_epipolar_lines(model, bumpy, first, found):
     """Turned by 3 pixels of its image, half of which the surface can't follow."""
     assert found.report.details["phases"][-1]["epipolar_pixels"]["left, right"] < 0.3
     assert not any("epipolar" in one.text for one in found.report.warnings)
@@ -361,6 +366,6 @@ def test_a_camera_off_its_calibration_is_told_by_the_epipolar_lines(model, bumpy
     turn[:3, :3] = exponential(np.array([3.0 / right.fy, 0.0, 0.0]))
     turned = replace(right, world_to_camera=turn @ right.world_to_camera)
     off = replace(bumpy, cameras_by_name={**bumpy.cameras_by_name, "right": turned})
-    told = find_surface(off, model, start, BOTH, COARSE)
+    told = find_surface(off, model, first, BOTH, COARSE)
     assert 2.5 < told.report.details["phases"][-1]["epipolar_pixels"]["left, right"] < 3.5
     assert any("epipolar" in one.text for one in told.report.warnings)
