@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -41,11 +42,15 @@ LATE = {"result/reconstruction.py"}
 """Files whose functions may import what is above them: the methods of a result that show, read and write it."""
 
 FILES = {str(path.relative_to(PACKAGE)): path for path in sorted(PACKAGE.rglob("*.py"))}
-TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FILES.items()}
 MODULES = {
     ".".join(("mifit", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__"): name
     for name, path in FILES.items()
 }
+
+
+@functools.cache
+def tree_of(name: str) -> ast.Module:
+    return ast.parse(FILES[name].read_text(encoding="utf-8"))
 
 
 def imported_names(tree: ast.AST, types: bool = True, late: bool = True) -> set[str]:
@@ -95,7 +100,7 @@ def test_imports_go_one_way(name):
     rows = [row for row, parts in enumerate(LAYERS) if part in parts]
     assert len(rows) == 1, f"say in LAYERS where mifit.{part} stands"
     lower = set().union(*LAYERS[: rows[0]]) - NEVER.get(part, set())
-    parts = {module.split(".")[1] for module in imports_of(TREES[name], False, name not in LATE) if module != "mifit"}
+    parts = {module.split(".")[1] for module in imports_of(tree_of(name), False, name not in LATE) if module != "mifit"}
     assert parts <= lower | {part}
 
 
@@ -103,26 +108,26 @@ def test_imports_go_one_way(name):
 def test_mitsuba_and_drjit_are_imported_late_and_only_by_what_forms_images(name):
     kernels = {"mitsuba", "drjit"}
     late = part_of(name) in KERNELS
-    found = {n.split(".")[0] for n in imported_names(TREES[name])} & kernels
+    found = {n.split(".")[0] for n in imported_names(tree_of(name))} & kernels
     assert late or not found
-    for node in TREES[name].body:
+    for node in tree_of(name).body:
         if isinstance(node, (ast.Import, ast.ImportFrom)):
             assert not {n.split(".")[0] for n in imported_names(node)} & kernels
 
 
 def test_the_core_does_without_extras():
     """Commands load them when they are wanted, and `mifit.fit` for a capture without calibration."""
-    users = {part_of(name) for name in FILES if any(m.startswith("mifit.extras") for m in imports_of(TREES[name]))}
+    users = {part_of(name) for name in FILES if any(m.startswith("mifit.extras") for m in imports_of(tree_of(name)))}
     assert users <= {"extras", "cli", "fitting"}
-    for name, tree in TREES.items():
-        top = [node for node in tree.body if isinstance(node, (ast.Import, ast.ImportFrom))]
+    for name in FILES:
+        top = [node for node in tree_of(name).body if isinstance(node, (ast.Import, ast.ImportFrom))]
         early = {found for node in top for found in imports_of(ast.Module([node], []))}
         assert part_of(name) == "extras" or not any(module.startswith("mifit.extras") for module in early)
 
 
 def test_no_modules_import_one_another():
     """Not even for types: what two modules say about one another belongs in a third."""
-    reach = {module: imports_of(TREES[name], late=name not in LATE) - {module} for module, name in MODULES.items()}
+    reach = {module: imports_of(tree_of(name), late=name not in LATE) - {module} for module, name in MODULES.items()}
     changed = True
     while changed:
         changed = False

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
 
 from mifit.core.files import Document, replacing
 
@@ -52,6 +51,8 @@ def _settings(row: Document) -> Document:
 
 def interval(values: Sequence[float]) -> tuple[float, float | None]:
     """Mean, and half the width of its 95 % confidence interval; None for one value."""
+    from scipy import stats  # takes as long to import as all else of an experiment
+
     half = float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values)) if len(values) > 1 else None
     return float(np.mean(values)), half
 
