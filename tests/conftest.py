@@ -7,14 +7,16 @@ import os
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from mifit.core.process import set_threads, threads
 from tests.variant import VARIANT
 
 LONGEST = (
-    "tests/docs/test_commands.py", "tests/stages/test_find_surface.py", "tests/extras/test_boards.py",
-    "tests/test_experiment_page.py", "tests/stages/test_fit_geometry.py", "tests/test_experiment.py",
-    "tests/test_foreign.py", "tests/hostile/test_promises.py", "tests/test_resume.py",
+    "tests/output/test_scenes_for_experiments.py", "tests/checks/test_wrong_captures.py",
+    "tests/docs/test_commands.py", "tests/render/test_shdirect.py", "tests/stages/test_fit_geometry.py",
+    "tests/test_experiment.py", "tests/hostile/test_promises.py", "tests/checks/test_fits.py", "tests/test_resume.py",
+    "tests/stages/test_find_surface.py", "tests/extras/test_boards.py", "tests/checks/test_odd_captures.py",
 )  # fmt: skip
 """Files that take longest, in that order: with two processes they go first, or one would work on after the other."""
 SHARED = Path(__file__).resolve().parents[2] / "shared"
@@ -85,9 +87,17 @@ def compile_for(cpu: str, width: int) -> None:
 
 @pytest.fixture(scope="session")
 def tiny_capture(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A path-traced capture of the built-in model: cameras left, right and third, three timesteps, 200 x 150."""
+    """A path-traced capture of the built-in model: cameras left, right and third, three timesteps, 200 x 150.
+
+    Made once for all of xdist's workers: nothing may change it.
+    """
     from mifit.synth import synthesize
 
-    folder = tmp_path_factory.mktemp("tiny") / "capture"
-    synthesize(folder, timesteps=3, model="builtin:coarse", width=200, height=150, spp=12, seed=3)
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "tiny" / "capture"
+    with FileLock(folder.parent.with_suffix(".lock")):
+        if not folder.exists():
+            part = folder.with_name("part")
+            synthesize(part, timesteps=3, model="builtin:coarse", width=200, height=150, spp=12, seed=3)
+            part.rename(folder)
     return folder

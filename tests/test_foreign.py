@@ -210,7 +210,7 @@ def test_the_independent_scorer_finds_the_same_figures(tmp_path, monkeypatch, ca
     capture, model = mifit.Capture.load(case.path), mifit.MorphableModel.load("builtin:coarse")
     config = foreign.replace_size(mifit.FitConfig(), 64)
     maps = replace(config.reflectance, shading="prefiltered", bands=4, exponent=40)
-    config = replace(config, reflectance=maps)
+    config = replace(config, reflectance=maps, surface=mifit.SurfaceConfig(finest=2))
     result = mifit.fit(capture, model, case.fitted, case.timesteps, config, until="reflectance")
     replace(result, model_source="builtin:coarse").save(tmp_path / "result")
 

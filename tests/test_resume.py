@@ -14,7 +14,17 @@ import pytest
 
 from mifit.core.image import read_image
 
-CONFIG = '[reflectance]\ntexture_size = 64\nshading = "prefiltered"\nexponent = 100\n'
+CONFIG = """
+[geometry]
+rounds = 1
+[surface]
+finest = 2
+[reflectance]
+texture_size = 32
+shading = "prefiltered"
+bands = 4
+exponent = 100
+"""
 
 
 def mifit(*arguments):

@@ -80,7 +80,8 @@ def test_doctor_examines_a_capture(name, code, verdict, shared, tmp_path, capsys
 def said_of(folder, cameras):
     """What is said of a fit of a capture's first timestep, besides notes."""
     model = MorphableModel.load("builtin:coarse")
-    found = mifit.fit(Capture.load(folder), model, cameras, (0,), until="geometry")
+    config = mifit.FitConfig(surface=mifit.SurfaceConfig(finest=1))
+    found = mifit.fit(Capture.load(folder), model, cameras, (0,), config, until="geometry")
     return [(one.code, one.text) for one in found.diagnostics if one.severity != "note"]
 
 

@@ -55,6 +55,8 @@ UNKNOWABLE = {
     "lens left out", "two people",
 }  # fmt: skip
 """What no image shows; docs/limits.md says why, and what it costs."""
+MOMENTS = {"one late": 5, "timestep repeated": 2}
+"""Timesteps that a mistake needs to be seen, where one is too few."""
 SAID = {
     "inches": "lengths of the cameras are in inches, the capture says one is 10 mm; multiply the translations by 2.54",
     "feet": "multiply the translations by 30.48",
@@ -84,8 +86,7 @@ def findings(capture: Capture, model: MorphableModel, cameras=PAIR):
 def test_what_is_wrong_is_named(name, shared, model, tmp_path):
     if name == "landmarks shifted" and not available()["mediapipe"]:
         pytest.skip("the networks that find landmarks are not here: mifit doctor --install landmarks")
-    late = name == "one late"
-    capture = Capture.load(make(name, shared / "captures/soft", tmp_path, timesteps=5 if late else 2))
+    capture = Capture.load(make(name, shared / "captures/soft", tmp_path, timesteps=MOMENTS.get(name, 1)))
     found = findings(capture, model)
     assert (found[0].code, found[0].camera) == NAMED[name], [one.text for one in found]
     assert SAID.get(name, "") in found[0].text

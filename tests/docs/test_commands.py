@@ -29,7 +29,7 @@ PAGES += [ROOT / "scenes" / "README.md", *sorted((ROOT / "scenes").glob("*/exper
 COMMAND = re.compile(r"^(?:#\s+|\s*)((?:mifit|make|python -m|pip install|\.venv/bin/\S+) .*?)(?:\s{2,}#.*)?$")
 SMALL = {
     "geometry.rounds": 1, "geometry.pixels": 300,
-    "geometry.max_iterations": 5, "surface.finest": 2, "normals.max_iterations": 3,
+    "geometry.max_iterations": 5, "surface.enabled": "false", "normals.max_iterations": 3,
     "reflectance.texture_size": 32, "reflectance.bands": 4, "reflectance.shading": '"prefiltered"',
     "reflectance.exponent": 50, "reflectance.max_iterations": 3,
 }  # fmt: skip

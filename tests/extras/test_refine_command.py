@@ -10,6 +10,8 @@ import pytest
 from mifit.cli import main
 
 CONFIG = """
+[surface]
+finest = 2
 [reflectance]
 texture_size = 64
 shading = "prefiltered"

@@ -24,6 +24,8 @@ COARSE = ("--model", "builtin:coarse", "--quiet")
 CONFIG = """
 [geometry]
 rounds = 1
+[surface]
+enabled = false
 [reflectance]
 texture_size = 32
 shading = "prefiltered"
