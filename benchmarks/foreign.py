@@ -231,9 +231,7 @@ SURFACE: Columns = {
     "albedo dB, scaled / as it is": lambda c: " / ".join(
         _figure(c, 1, "surface", "full", key) for key in ("albedo_psnr", "albedo_psnr_unscaled")
     ),
-    "specular map corr.": lambda c: _figure(c, 2, "surface", "full", "specular_correlation"),
     "unconverged": _unconverged,
-    "cpu s of all fits": lambda c: _figure(c, 0, "fit_cpu"),
 }
 RELIT: Columns = {
     f"{title}, {how}": lambda c, row=row, how=how: _figure(c, 1, "relit", f"{row}, {how}", "mean")
@@ -307,8 +305,7 @@ def markdown(cases: Sequence[dict[str, Any]], run: Mapping[str, Any] | None = No
         spread(cases),
         "",
         "Held-out views: PSNR in dB of 8-bit sRGB over skin, the same pixels in every column but the last. Skin is the",
-        "hull of the landmarks without eyes and inner mouth, where a fitted view sees the scan. Image-based rendering",
-        "is the best of three blends, which is named:",
+        "hull of the landmarks without eyes and inner mouth, where a fitted view sees the scan:",
         "",
         *_table(cases, HELD_OUT),
     ]
@@ -343,8 +340,8 @@ def short(cases: Sequence[dict[str, Any]]) -> str:
 def cases_of(arguments: argparse.Namespace) -> tuple[list[Case], list[str]]:
     """The cases asked for, and why others are left out."""
     known = heads.OWN if arguments.own else heads.FOREIGN
-    cases: list[Case] = []
-    for name in arguments.captures or dict.fromkeys(case.capture for case in known):
+    cases = [] if arguments.captures else list(known)
+    for name in arguments.captures or ():
         found = [case for case in (*known, *heads.OWN, *heads.FOREIGN) if case.capture == name]
         if not found and not (arguments.cameras and arguments.held_out):
             raise SystemExit(f"--captures {name}: no known capture; name --cameras and --held-out for a folder")
