@@ -340,7 +340,7 @@ def short(cases: Sequence[dict[str, Any]]) -> str:
 def cases_of(arguments: argparse.Namespace) -> tuple[list[Case], list[str]]:
     """The cases asked for, and why others are left out."""
     known = heads.OWN if arguments.own else heads.FOREIGN
-    cases = [] if arguments.captures else list(known)
+    cases: list[Case] = [] if arguments.captures else list(known)
     for name in arguments.captures or ():
         found = [case for case in (*known, *heads.OWN, *heads.FOREIGN) if case.capture == name]
         if not found and not (arguments.cameras and arguments.held_out):
