@@ -242,7 +242,7 @@ def aligned(
 def describe(moments: Sequence[Moments], starts: Sequence[Start]) -> list[str]:
     """What is worth saying of clips that were put on one clock, in lines; ``starts`` are those that were found."""
     lines = []
-    for one, start in zip(moments[1:], starts[1:], strict=bool(starts)):
+    for one, start in zip(moments[1:], starts[1:], strict=False):
         if start.by == "none":
             lines.append(
                 f"{one.name}: warning: nothing in it moves or sounds as in {moments[0].name} "

@@ -70,15 +70,6 @@ def test_a_dark_feature_is_no_want_of_light():
     assert (known[:, :75] > 0.98).all() and (known[:, 80:] == 0).all()
 
 
-def test_a_dark_bay_of_a_shadow_is_shadow():
-    """As narrow as a feature, but open towards the dark."""
-    brightness = np.full((100, 100), 0.3, np.float32)
-    brightness[:, 80:] = 0.01
-    brightness[40:44, 60:] = 0.01
-    known = light_known(light_level(brightness), 0.015)
-    assert (known[41:43, 62:] == 0).all() and (known[:, :58] > 0.98).all() and (known[10, :75] > 0.98).all()
-
-
 def test_the_error_of_the_light_is_what_darkens_dim_skin(half_seen):
     """An error of a tenth of the light on bright skin: dim skin is estimated too dark, and the image counts less."""
     model, texels, _, _, seen = half_seen

@@ -39,8 +39,6 @@ FEATURE = 0.06
 """Extent of the widest dark feature of a face, relative to the map: brows."""
 BORDER = 0.03
 """Width of the border of a shadow, relative to the map."""
-LIGHT_TEXELS = 256
-"""Most texels along a side of the map of the light's level: a few across its narrowest shadow."""
 FEW = 200
 """Texels below which a spread isn't measured."""
 
@@ -111,18 +109,13 @@ def separate_shading(
 def light_level(brightness: NDArray[np.float32]) -> NDArray[np.float32]:
     """(S, S) how bright the light on texels is, from the brightness (S, S) of their images.
 
-    Light changes over larger distances than brows and nostrils do: what is dark over less than `FEATURE`, and bright
-    all around, is itself dark in the light of its surroundings (a closing by reconstruction); a dark bay of a wider
-    shadow is part of the shadow. Near the border of a shadow it is as dark as inside.
+    Light changes over larger distances than brows and nostrils do: what is dark over less than `FEATURE` is itself dark
+    in the light of its surroundings. Near the border of a shadow it is as dark as inside.
     """
-    size = min(len(brightness), LIGHT_TEXELS)
-    small = cv2.resize(brightness, (size, size), interpolation=cv2.INTER_AREA)
-    closed, inner = (np.ones((2 * round(0.5 * part * size) + 1,) * 2, np.uint8) for part in (FEATURE, BORDER))
-    level, step = cv2.dilate(small, closed), np.ones((3, 3), np.uint8)
-    while not np.array_equal(level, lower := np.maximum(cv2.erode(level, step), small)):
-        level = lower
-    level = cv2.erode(level, inner)
-    return np.asarray(cv2.resize(level, brightness.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+    closed, inner = (
+        np.ones((2 * round(0.5 * part * len(brightness)) + 1,) * 2, np.uint8) for part in (FEATURE, BORDER)
+    )
+    return np.asarray(cv2.erode(cv2.morphologyEx(brightness, cv2.MORPH_CLOSE, closed), inner), np.float32)
 
 
 def light_error(model: MorphableModel, texels: TexelMap, maps: NDArray, confidence: NDArray, level: NDArray) -> float:
