@@ -16,6 +16,7 @@ from mifit.errors import InputError
 from mifit.output.evaluate import rgba_8_bit
 from mifit.output.export import export
 from mifit.output.figures import overlay
+from mifit.output.gltf import STEP
 from mifit.output.views import (
     write_moving_pictures,
     write_overlay,
@@ -106,7 +107,9 @@ def test_animation_moves_every_vertex_to_where_it_was_tracked(backwards, ball, t
     for k in range(2):
         turn = Rotation.from_quat(values["rotation"][k]).as_matrix()
         world = (base + values["weights"][k] * target) @ turn.T + values["translation"][k]
-        np.testing.assert_allclose(world, ball.geometry.vertices[k][part.origin] / 100, atol=1e-6)
+        # The timestep at rest is exact; another is off by the rounding of the targets, half a step at full weight.
+        rounding = 0.5 * STEP * np.abs(values["weights"][k] - document["meshes"][0]["weights"]).sum()
+        np.testing.assert_allclose(world, ball.geometry.vertices[k][part.origin] / 100, atol=1e-6 + rounding)
     assert np.sum(values["rotation"][0] * values["rotation"][1]) > 0
     scene = trimesh.load(tmp_path / "a.glb")
     assert sum(len(g.faces) for g in scene.geometry.values()) == len(ball.model.faces)
