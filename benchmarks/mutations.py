@@ -175,8 +175,6 @@ MUTATIONS = (
     M("views across time by cameras, not by the head", "sweep.across_time",
       "normalize(image.camera.position - step.position.mean(axis=0)) @ rotation[k]",
       "normalize(image.camera.position - step.position.mean(axis=0))", "tests/stages/test_align_timesteps.py"),
-    M("walls kept at the best timestep", "thin_walls.keep_walls", "np.min(left, axis=0)", "np.max(left, axis=0)",
-      "tests/stages/test_thin_walls.py"),
     M("eyeballs off the backs of faces", "eyes._depth_outside", "(det > 0)", "(det < 0)", "tests/stages/test_eyes.py"),
     M("details moved against the head's turn", "refine_mesh.MeshRefiner.refine", "rotation.T",
       "rotation", "tests/stages/test_refine_mesh.py"),

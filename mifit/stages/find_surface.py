@@ -40,7 +40,6 @@ from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surf
 from mifit.stages.surface.epipolar import epipolar_residual, likeness
 from mifit.stages.surface.outline import REACH, Borders, find_borders, joined
 from mifit.stages.surface.sweep import Found, Posed, across_time, sweep
-from mifit.stages.surface.thin_walls import keep_walls
 from mifit.stages.surface.views import Resolution, pose_texels, texture_size
 
 if TYPE_CHECKING:
@@ -55,8 +54,8 @@ STEP_PIXELS = 0.7
 """Parallax between neighbouring offsets of a sweep, pixels of the level."""
 FAR_LAYERS, LAYERS = 6, 4
 """Offsets to either side in a level's first sweep, and in those after it."""
-WINDOW = 11
-"""Side of the windows that are compared, texels; a texel is about a pixel of the level."""
+WINDOW = 5
+"""Side of the windows that are compared, cells of two by two texels; a texel is about a pixel of the level."""
 COARSEST = 3
 """Times that the images are halved at most."""
 LARGEST_MAP = 1024
@@ -70,8 +69,6 @@ INDEPENDENT = 0.1
 """Part of the landmarks that count as measured on their own: neighbours are off alike."""
 OUTLIER_DEVIATIONS = 4.0
 """Distance from the surface, in deviations, where a landmark counts as an outlier."""
-THIN = 2
-"""Every so many texels along rows and columns are measurements: windows overlap, so that nothing is lost."""
 FORGET_MM = 150.0
 """Wavelength above which displacements fall back to the model where nothing is measured."""
 CONTACT_MM = 1.5
@@ -162,10 +159,9 @@ def find_surface(
             rest = search.settle(rest, level, SWEEPS_OF_LIDS)
     progress("find surface", len(rest.levels), len(rest.levels))
 
-    # Closed mouths and eyes, and thin walls that the displacement crossed.
+    # Closed mouths and eyes.
     result = close_again(model, rest.state.estimate(geometry, model), closed, lids)
     result, closed_lips = close_openings(capture, model, result, cameras, lips)
-    result, crossed = keep_walls(model, result)
     world = result.vertices.astype(np.float64)
     residuals = sight.epipolar_residuals(views, pairs, result.timesteps, world, config.finest + 1)
     likenesses = sight.likenesses(pairs, result.timesteps[0], world[0], config.finest + 1)
@@ -181,7 +177,6 @@ def find_surface(
         "epipolar_pixels": residuals,
         "likeness": likenesses,
         "openings": closed | closed_lips,
-        "walls_crossed": crossed,
         "seconds": seconds,
     }
     warnings = epipolar_warnings(residuals) + likeness_warnings(likenesses)
@@ -383,11 +378,12 @@ class Sight:
     reach: float
     finest: int
 
-    def texels(self, vertices: NDArray, level: int) -> TexelMap:
-        """Texels of a surface (V, 3) that are about as large as a level's pixels."""
+    def texels(self, vertices: NDArray, level: int) -> tuple[TexelMap, TexelMap]:
+        """Texels of a surface (V, 3) that are about as large as a level's pixels, and cells twice as wide."""
         model = self.model
-        size = texture_size(model, vertices, self.pixel * 2.0**level, LARGEST_MAP)
-        return rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+        cells = texture_size(model, vertices, 2.0 * self.pixel * 2.0**level, LARGEST_MAP // 2)
+        whole, half = (rasterize_uv(model.uv, model.faces_uv, n, model.face_mask) for n in (2 * cells, cells))
+        return whole, half
 
     def posed(self, timestep: int, vertices: NDArray, texels: TexelMap, level: int) -> Posed:
         """Texels of one timestep's surface (V, 3), and the views of them."""
@@ -396,12 +392,14 @@ class Sight:
         return pose_texels(self.capture, *given)
 
     def borders(self, timestep: int, vertices: NDArray, level: int) -> Borders:
-        """Outlines of one timestep's surface in all views."""
+        """Outlines of one timestep's surface (V, 3) in all views, along the silhouettes of the one last posed."""
         factor = 2.0 * 0.5**level  # where a pixel mixes skin and background the border is doubtful
         if level > self.finest:
             factor = REACH * self.pixel / self.reach
-        scene = self.scenes.at(timestep, vertices)
-        return find_borders(self.capture, scene, self.cameras, timestep, min(factor, 1.0))
+        scene = self.scenes.last(timestep)
+        found = find_borders(self.capture, scene, self.cameras, timestep, min(factor, 1.0))
+        moved = interpolate(vertices - scene.vertices, scene.faces, found.face, found.weights)
+        return replace(found, offset=found.offset - (moved * found.normal).sum(axis=1))
 
     def epipolar_residuals(
         self,
@@ -412,17 +410,17 @@ class Sight:
         level: int,
     ) -> dict[str, float | None]:
         """Median distance from one another's epipolar lines for each pair of views, pixels of the images."""
-        texels = self.texels(world[0], level)
+        texels, cells = self.texels(world[0], level)
         posed = [self.posed(timesteps[k], world[k], texels, level) for k in sorted({0, len(world) - 1})]
         found: dict[str, float | None] = {}
         for a, b in pairs:
-            residual = epipolar_residual(texels, posed, views, (a, b), self.pixel * 2.0**level, WINDOW)
+            residual = epipolar_residual(texels, cells, posed, views, (a, b), self.pixel * 2.0**level, WINDOW)
             found[f"{self.cameras[a]}, {self.cameras[b]}"] = None if residual is None else residual * 2.0**level
         return found
 
     def likenesses(self, pairs: Sequence, timestep: int, vertices: NDArray, level: int) -> dict[str, float | None]:
         """Correlation of what each pair of views shows on one timestep's surface (V, 3)."""
-        posed = self.posed(timestep, vertices, self.texels(vertices, level), level)
+        posed = self.posed(timestep, vertices, self.texels(vertices, level)[0], level)
         return {f"{self.cameras[a]}, {self.cameras[b]}": likeness(posed, (a, b)) for a, b in pairs}
 
 
@@ -460,7 +458,7 @@ class Search:
         state, factor = rest.state, None
         for number in range(most):
             world = state.world(model)
-            texels = sight.texels(world[0], level)
+            texels, cells = sight.texels(world[0], level)
             posed = [sight.posed(t, at, texels, level) for t, at in zip(state.timesteps, world, strict=True)]
             further: Sequence = ()
             if len(posed) > 1:
@@ -477,14 +475,14 @@ class Search:
             )
             half = LAYERS if number else FAR_LAYERS
             joint = [((k, a), (k, b)) for k in range(len(posed)) for a, b in self.pairs]
-            found = sweep(texels, posed, step * np.arange(-half, half + 1), WINDOW, [*joint, *further])
+            found = sweep(texels, cells, posed, step * np.arange(-half, half + 1), WINDOW, [*joint, *further])
             if not (found.precision > 0).any():
                 break
 
             # Object space, all timesteps alike: the surface that explains offsets, outlines and landmarks.
             marks = self.landmarks.at(world, state.rotation)
             robust = ROBUST_STEPS * step * max(4.0 * 0.5**number, 1.0)
-            rows = measurements(state, model, texels, posed, found, borders, marks, robust)
+            rows = measurements(state, model, cells, world, found, borders, marks, robust)
             if skin.weights is not None:
                 rows = replace(rows, points=rows.points @ skin.weights)
             mean = state.expression.mean(axis=0)
@@ -498,7 +496,7 @@ class Search:
             state = replace(state, identity=identity, expression=expression, displacement=skin.spread(moved_by))
             state = self.motion.of_head(state, rigid)
 
-            measured = np.unique(model.faces[texels.face[found.precision > 0]])
+            measured = np.unique(model.faces[cells.face[found.precision > 0]])
             moved = along_normals(state.world(model) - world, world, model.faces, measured)
             outcome = Outcome.CONVERGED if moved < SETTLED * step else Outcome.MAX_ITERATIONS
             rest = Rest(state, (*rest.levels, level), float((found.precision > 0).mean()), moved, outcome)
@@ -520,32 +518,27 @@ class Search:
 def measurements(
     state: State,
     model: MorphableModel,
-    texels: TexelMap,
-    posed: Sequence[Posed],
+    cells: TexelMap,
+    world: NDArray,
     found: Found,
     borders: Borders,
     marks: Measurements,
     robust: float,
 ) -> Measurements:
     """Offsets that a sweep found, outlines and landmarks, all in object space."""
-    some, scale = thinned(texels), state.scale
-    normals = np.mean([one.normal[some] @ r for one, r in zip(posed, state.rotation, strict=True)], axis=0)
-    face = np.concatenate([texels.face[some], borders.face])
-    weights = np.concatenate([texels.weights[some], borders.weights])
+    scale = state.scale
+    of_vertices = [vertex_normals(at, model.faces) @ r for at, r in zip(world, state.rotation, strict=True)]
+    normals = interpolate(np.mean(of_vertices, axis=0), model.faces, cells.face, cells.weights)
+    face = np.concatenate([cells.face, borders.face])
+    weights = np.concatenate([cells.weights, borders.weights])
     points = sp.vstack([corner_matrix(model.faces, face, weights, model.n_vertices), marks.points]).tocsr()
     return Measurements(
         points,
         np.concatenate([normalize(normals), borders.normal, marks.normals]),
-        np.concatenate([found.offset[some], borders.offset, marks.offsets]) / scale,
-        np.concatenate([found.precision[some] * THIN**2, borders.precision, marks.precision]) * scale**2,
+        np.concatenate([found.offset, borders.offset, marks.offsets]) / scale,
+        np.concatenate([found.precision, borders.precision, marks.precision]) * scale**2,
         np.concatenate([np.full(len(face), robust), marks.robust]) / scale,
     )
-
-
-def thinned(texels: TexelMap) -> NDArray[np.intp]:
-    """Every `THIN`-th texel along rows and columns."""
-    row, column = np.divmod(texels.index, texels.size)
-    return np.flatnonzero((row % THIN == 0) & (column % THIN == 0))
 
 
 def moved_with(model: MorphableModel, texels: TexelMap, posed: Sequence[Posed], moved: NDArray) -> list[Posed]:

@@ -61,6 +61,10 @@ class Scenes:
             scene.update(vertices)
         return scene
 
+    def last(self, timestep: int) -> SurfaceScene:
+        """The scene of a timestep that `at` gave last."""
+        return self._scenes[timestep]
+
     def _moved(self, before: NDArray, after: NDArray) -> bool:
         way = after[self._watched] - before[self._watched]
         return bool(np.einsum("vc,vc->v", way, way).max(initial=0.0) > self._slack**2)

@@ -19,13 +19,14 @@ from mifit.stages.surface.sweep import Posed, sweep
 FARTHEST = 4
 """Pixels that are searched to either side."""
 FEWEST = 200
-"""Texels that must match for a residual to be told."""
+"""Cells that must match for a residual to be told."""
 FACING = 0.4
 """Cosine of the angle of view above which views are compared as they are."""
 
 
 def epipolar_residual(
     texels: TexelMap,
+    cells: TexelMap,
     steps: Sequence[Posed],
     cameras: Sequence[Camera],
     pair: tuple[int, int],
@@ -36,7 +37,7 @@ def epipolar_residual(
 
     Parameters
     ----------
-    texels : TexelMap
+    texels, cells : TexelMap
     steps : sequence of Posed
         Texels where the views agree best, per timestep.
     cameras : sequence of Camera
@@ -49,7 +50,7 @@ def epipolar_residual(
     Returns
     -------
     float or None
-        None where too few texels match, or they do only beyond ``FARTHEST``.
+        None where too few cells match, or they do only beyond ``FARTHEST``.
     """
     a, b = pair
     moved = []
@@ -59,7 +60,7 @@ def epipolar_residual(
         shift[b] = normalize(across)
         moved.append(replace(step, shift=shift))
     pairs = [((k, pair[0]), (k, pair[1])) for k in range(len(moved))]
-    found = sweep(texels, moved, pixel * np.arange(-FARTHEST, FARTHEST + 1), window, pairs)
+    found = sweep(texels, cells, moved, pixel * np.arange(-FARTHEST, FARTHEST + 1), window, pairs)
     used = found.precision > 0
     if used.sum() < FEWEST:
         return None

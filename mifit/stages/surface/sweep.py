@@ -2,7 +2,8 @@
 
 Every texel of the surface is moved by a few offsets along its normal; each view is sampled there, and windows of
 texels are compared between views. Windows live on the surface, so that they are foreshortened in every image as the
-surface is, and one score per texel and offset sums all pairs of views of all timesteps.
+surface is, and one score per cell and offset sums all pairs of views of all timesteps. A cell is two texels wide:
+windows overlap so far that a score at every texel adds nothing.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.image import box
 from mifit.core.mesh import normalize
 from mifit.core.metrics import median_deviation
 from mifit.core.process import threads
@@ -26,12 +28,12 @@ NOISE = 0.012
 """Standard deviation of a feature that is noise: windows with less contrast say nothing."""
 FAR = 0.1
 """Correlation that the ends of the sweep must gain on its middle: little texture leaves the surface where it is."""
-NEAR = 7
-"""Side of the neighbourhood whose offsets are compared, texels; it and the next two: chosen on Emily, scan_city."""
+NEAR = 3
+"""Side of the neighbourhood whose offsets are compared, cells; it and the next two: chosen on Emily, scan_city."""
 FINEST = 0.3
 """Deviation of an offset at best, in steps of the sweep."""
-INDEPENDENT = 0.022
-"""Part of the texels whose offsets count as measured on their own: windows overlap, and their errors are alike."""
+INDEPENDENT = 0.088
+"""Part of the cells whose offsets count as measured on their own: windows overlap, and their errors are alike."""
 GLARE = 0.1
 """Least difference in log brightness between two views at which a match counts a quarter."""
 GLARE_DEVIATIONS = 3.5
@@ -40,8 +42,6 @@ LEAST_APART, BEST_APART, FARTHEST_APART = 5.0, 25.0, 50.0
 """Angle between views of different timesteps that are compared, degrees."""
 MOST_PAIRS = 12
 """Of views of different timesteps."""
-ROWS = 32
-"""Of a map that are worked on at a time: what they need stays in a core's cache."""
 LEAST_SCORE = 0.4
 """Correlation below which a texel counts as not matched."""
 
@@ -72,7 +72,7 @@ class Posed:
 
 @dataclass(frozen=True)
 class Found:
-    """Offsets along the normals.
+    """Offsets of cells along the normals.
 
     Attributes
     ----------
@@ -90,31 +90,41 @@ class Found:
 
 
 def sweep(
-    texels: TexelMap, steps: Sequence[Posed], offsets: NDArray, window: int, pairs: Sequence[tuple[View, View]]
+    texels: TexelMap,
+    cells: TexelMap,
+    steps: Sequence[Posed],
+    offsets: NDArray,
+    window: int,
+    pairs: Sequence[tuple[View, View]],
 ) -> Found:
-    """Find each texel's offset.
+    """Find each cell's offset.
 
     Parameters
     ----------
     texels : TexelMap
+        Where views are sampled.
+    cells : TexelMap
+        Map of half the side, whose offsets are found.
     steps : sequence of Posed
+        At the texels.
     offsets : (K,)
         Evenly spaced, ascending, around 0, world units.
     window : int
-        Texels along a side, odd.
+        Cells along a side, odd.
     pairs : sequence of pairs of (int, int)
         Views to compare, each named by its step and its place in it.
     """
-    count, layers = len(texels.index), len(offsets)
+    count, layers = len(cells.index), len(offsets)
     total, weight = np.zeros((2, layers, count), np.float32)
     named = list(dict.fromkeys(view for pair in pairs for view in pair))
     with ThreadPoolExecutor(threads()) as pool:
-        shown = dict(zip(named, pool.map(lambda view: _shown(steps[view[0]], view[1], offsets), named), strict=True))
+        shown = dict(
+            zip(named, pool.map(lambda view: _Shown.of(texels, steps[view[0]], view[1], offsets), named), strict=True)
+        )
 
         def compared(pair: tuple[View, View]) -> tuple[NDArray, NDArray] | None:
-            seen = [steps[k].seen[i] for k, i in pair]
             deviations = GLARE_DEVIATIONS if pair[0][0] == pair[1][0] else 0.0
-            return _compared(texels, [shown[view] for view in pair], np.sqrt(seen[0] * seen[1]), window, deviations)
+            return _compared(cells, shown[pair[0]], shown[pair[1]], window, deviations)
 
         for scores in pool.map(compared, pairs):
             if scores is not None:
@@ -123,53 +133,82 @@ def sweep(
     score = np.where(weight > 0, total / np.maximum(weight, 1e-6), np.float32(-1))
     step = float(offsets[1] - offsets[0])
     at, matched, top = _peak(score, weight)
-    precision = _precision(texels, at, matched, step)
+    precision = _precision(cells, at, matched, step)
     return Found((at * step).astype(np.float64), precision.astype(np.float64), top)
 
 
 @dataclass(frozen=True)
 class _Shown:
-    """One view of the texels: feature (K, N) at each offset, whether the image shows it, and log brightness (N,)."""
+    """One view of the texels, as maps.
+
+    Attributes
+    ----------
+    feature : (K, S, S) float32
+        At each offset; 0 where the image doesn't show it.
+    valid : (K, S, S) float32
+        1 where it does, else 0.
+    bright : (S, S) float32
+        Log brightness at the middle offset.
+    seen : (S, S) float32
+        `Posed.seen`.
+    """
 
     feature: NDArray[np.float32]
-    valid: NDArray[np.bool_]
+    valid: NDArray[np.float32]
     bright: NDArray[np.float32]
+    seen: NDArray[np.float32]
 
-
-def _shown(step: Posed, view: int, offsets: NDArray) -> _Shown:
-    """What a view shows of texels moved by offsets, of those that it sees."""
-    way = step.normal if step.shift is None else step.shift[view]
-    rows = np.flatnonzero(step.seen[view] > 0)
-    if way[rows].any():
-        at = step.images[view].sample(step.position[rows], way[rows], offsets)  # (K, n, 3)
-    else:  # a view whose texels stay shows the same at every offset
-        still = step.images[view].sample(step.position[rows], way[rows], np.zeros(1))
-        at = np.broadcast_to(still, (len(offsets), *still.shape[1:]))
-    feature = np.zeros((len(offsets), len(step.position)), np.float32)
-    valid, bright = np.zeros(feature.shape, bool), np.zeros(feature.shape[1], np.float32)
-    feature[:, rows], bright[rows] = at[..., 0], at[len(offsets) // 2, :, 2]
-    valid[:, rows] = at[..., 1] > 0.99
-    return _Shown(feature, valid, bright)
+    @classmethod
+    def of(cls, texels: TexelMap, step: Posed, view: int, offsets: NDArray) -> _Shown:
+        """What a view shows of texels moved by offsets, of those that it sees."""
+        way = step.normal if step.shift is None else step.shift[view]
+        rows = np.flatnonzero(step.seen[view] > 0)
+        size, layers = texels.size, len(offsets)
+        still = not way[rows].any()  # a view whose texels stay shows the same at every offset
+        at = step.images[view].sample(step.position[rows], way[rows], np.zeros(1) if still else offsets)  # (K, n, 3)
+        maps, where = np.zeros((2, len(at), size * size), np.float32), texels.index[rows]
+        for k, one in enumerate(at):
+            known = one[:, 1] > 0.99
+            maps[0, k, where], maps[1, k, where] = np.where(known, one[:, 0], 0.0), known
+        bright, seen = np.zeros((2, size * size), np.float32)
+        bright[where], seen[where] = at[len(at) // 2, :, 2], step.seen[view, rows]
+        feature, valid = (np.broadcast_to(m.reshape(-1, size, size), (layers, size, size)) for m in maps)
+        return cls(feature, valid, bright.reshape(size, size), seen.reshape(size, size))
 
 
 def _compared(
-    texels: TexelMap, views: Sequence[_Shown], trust: NDArray, window: int, deviations: float
+    cells: TexelMap, one: _Shown, other: _Shown, window: int, deviations: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
     """(K, N) correlation of two views times its weight, and that (K, N); None where nothing is seen in both."""
-    one, other = views
-    valid = one.valid & other.valid & (trust > 0)
-    if not valid.any():
+    both = (one.seen > 0) & (other.seen > 0)
+    if not both.any():
         return None
-    trust = trust * _without_glare(one.bright - other.bright, valid[len(valid) // 2], deviations)
-    scores, weights = np.zeros((2, *one.feature.shape), np.float32)
-    for k, shown in enumerate(valid):
-        if shown.any():
-            mask = texels.to_map(shown.astype(np.float32))
-            inside = cv2.blur(mask, (window, window))
-            weights[k] = np.where(shown & (texels.from_map(inside) > 0.5), trust, np.float32(0))
-            correlation = _correlate(texels, mask, inside, one.feature[k], other.feature[k], window)
-            scores[k] = weights[k] * texels.from_map(correlation)
-    return scores, weights
+    part = _even(box(both, window))
+    trust = np.sqrt(one.seen[part] * other.seen[part])
+    middle = len(one.valid) // 2
+    shown = (one.valid[middle][part] * other.valid[middle][part]) > 0
+    trust *= _without_glare(one.bright[part] - other.bright[part], shown & (trust > 0), deviations)
+    trust, size = _pooled(trust), cells.size
+    scores, weights = np.zeros((2, len(one.feature), size, size), np.float32)
+    cell = tuple(slice(side.start // 2, side.stop // 2) for side in part)
+    for k in range(len(one.feature)):
+        mask = one.valid[k][part] * other.valid[k][part]
+        found, known = _correlate(mask, one.feature[k][part], other.feature[k][part], window)
+        weights[k][cell] = np.where(known, trust, np.float32(0))
+        scores[k][cell] = weights[k][cell] * found
+    return tuple(m.reshape(len(m), -1)[:, cells.index] for m in (scores, weights))  # type: ignore[return-value]
+
+
+def _even(part: tuple[slice, slice]) -> tuple[slice, slice]:
+    """Rows and columns that hold whole cells."""
+    rows, columns = (slice(side.start & ~1, (side.stop + 1) & ~1) for side in part)
+    return rows, columns
+
+
+def _pooled(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(S, S) texels as the means of (S / 2, S / 2) cells."""
+    height, width = values.shape
+    return np.asarray(cv2.resize(values, (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def across_time(steps: Sequence[Posed], rotation: NDArray) -> list[tuple[View, View]]:
@@ -207,33 +246,27 @@ def _without_glare(difference: NDArray, valid: NDArray, deviations: float) -> ND
     what it mirrors. Light on a head that turns moves over its skin as a highlight does.
     """
     if not valid.any():
-        return np.ones(len(difference), np.float32)
+        return np.ones(difference.shape, np.float32)
     difference = difference - np.median(difference[valid])
     spread = median_deviation(difference[valid]) if deviations else 0.0
     return (1.0 / (1.0 + (difference / max(GLARE, deviations * spread)) ** 2) ** 2).astype(np.float32)
 
 
 def _correlate(
-    texels: TexelMap, mask: NDArray, inside: NDArray, a: NDArray, b: NDArray, window: int
-) -> NDArray[np.float32]:
-    """Correlation of two textures in windows, towards 0 where the contrast is noise."""
-    x, y = texels.to_map(a) * mask, texels.to_map(b) * mask
-    sums = [cv2.blur(values, (window, window)) for values in (x, y, x * x, y * y, x * y)]
-    out = np.empty_like(x)
-    for start in range(0, len(x), ROWS):
-        rows = slice(start, start + ROWS)
-        n = np.maximum(inside[rows], np.float32(1e-6))
-        mx, my, vx, vy, xy = (values[rows] / n for values in sums)
-        vx -= mx * mx
-        vy -= my * my
-        for variance in (vx, vy):
-            np.maximum(variance, 0, out=variance)
-            variance += NOISE**2
-        vx *= vy
-        mx *= my
-        xy -= mx
-        np.divide(xy, np.sqrt(vx, out=vx), out=out[rows])
-    return out
+    mask: NDArray[np.float32], a: NDArray[np.float32], b: NDArray[np.float32], window: int
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Correlation of two textures (S, S) in windows of cells, and where half of a window and of its cell is shown.
+
+    Towards 0 where the contrast is noise.
+    """
+    x, y = a * mask, b * mask
+    shown = _pooled(mask)
+    inside = cv2.blur(shown, (window, window))
+    n = np.maximum(inside, np.float32(1e-6))
+    mx, my, xx, yy, xy = (cv2.blur(_pooled(v), (window, window)) / n for v in (x, y, x * x, y * y, x * y))
+    vx, vy = np.maximum(xx - mx * mx, 0) + NOISE**2, np.maximum(yy - my * my, 0) + NOISE**2
+    found: NDArray = (xy - mx * my) / np.sqrt(vx * vy)
+    return found, (shown > 0.5) & (inside > 0.5)
 
 
 def _peak(score: NDArray, weight: NDArray) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
@@ -254,16 +287,16 @@ def _peak(score: NDArray, weight: NDArray) -> tuple[NDArray[np.float32], NDArray
     return matched * (inner - (layers - 1) / 2 + shift).astype(np.float32), matched, top
 
 
-def _precision(texels: TexelMap, steps: NDArray[np.float32], matched: NDArray[np.bool_], step: float) -> NDArray:
-    """(N,) inverse variance of offsets, so many steps of a length each; 0 where nothing matched.
+def _precision(cells: TexelMap, steps: NDArray[np.float32], matched: NDArray[np.bool_], step: float) -> NDArray:
+    """(N,) inverse variance of cells' offsets, so many steps of a length each; 0 where nothing matched.
 
     Offsets of windows that overlap are alike where they measure the surface, and scatter where they don't, however
-    well each of them matches: their variance around a texel is the variance of its offset.
+    well each of them matches: their variance around a cell is the variance of its offset.
     """
 
     def near(values: NDArray) -> NDArray[np.float32]:
-        """Mean over a texel's neighbourhood."""
-        return texels.from_map(cv2.blur(texels.to_map(values), (NEAR, NEAR)))
+        """Mean over a cell's neighbourhood."""
+        return cells.from_map(cv2.blur(cells.to_map(values), (NEAR, NEAR)))
 
     found = matched.astype(np.float32)
     count = np.maximum(near(found), np.float32(1e-6))
