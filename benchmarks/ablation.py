@@ -36,6 +36,7 @@ from mifit.core.process import one_blas_thread
 from mifit.errors import MifitError
 from mifit.output.truth import relit_truths, true_passes
 from mifit.progress import silent
+from mifit.stages.surface.outline import Borders
 
 SEED, SIZE, LIGHTS = 0, 256, 2
 BASE = "base"
@@ -96,10 +97,26 @@ def _prior_alone(colour: Any, weight: Any, wrong: Any, *rest: Any) -> Any:
     return (1.0 - wrong).astype(np.float32)
 
 
+def _no_borders(*given: Any) -> Borders:
+    """In place of `find_surface.find_borders`: no outline in any image."""
+    none = np.zeros((0, 3))
+    return Borders(np.zeros(0, np.intp), none, none, none, np.zeros(0), np.zeros(0))
+
+
+FIND, INFER = "mifit.stages.find_surface", "mifit.stages.infer_reflectance"
 PARTS = (
     Part(BASE),
     Part("surface: off", {"surface.enabled": False}),
+    Part("surface: outlines", patches={f"{FIND}.find_borders": _no_borders}, step="surface"),
+    Part("surface: thin walls", patches={f"{FIND}.keep_walls": lambda model, fit: (fit, 0)}, step="surface"),
     Part("surface: lids and lips closed", {"surface.close_lids": False, "surface.close_lips": False}),
+    Part(
+        "surface: timesteps aligned",
+        patches={f"{FIND}.align_timesteps": lambda model, fit, texels, posed: fit},
+        step="surface",
+    ),
+    Part("surface: pairs across time", patches={f"{FIND}.across_time": lambda posed, turned: ()}, step="surface"),
+    Part("stage 1: eyes that are added", {"geometry.eyes": False}),
     Part("stage 1: images (landmarks alone)", {"geometry.rounds": 0}),
     Part("stage 1: albedo prior of skin's contrast", {"geometry.albedo_prior": 1.0}),
     Part(
@@ -119,8 +136,14 @@ PARTS = (
     ),
     Part("stage 2: robust weights and what needs them", {"reflectance.robust": False}),
     Part("stage 2: residual shading", {"reflectance.residual_shading": False}),
+    Part(
+        "stage 2: filling of what no light reached",
+        patches={f"{INFER}.light_known": lambda *given: 1.0},
+        step="reflectance",
+    ),
     Part("stage 2: difference term", {"reflectance.specular_difference_weight": 0.0}),
     Part("stage 3: off", without=("normals", "mesh", "residual")),
+    Part("stage 3: mesh", without=("mesh",)),
     Part("residual", {"residual.enabled": False}),
     Part("photometry: gains and exposures", {"photometry.enabled": False}, photometry=True),
 )
@@ -149,7 +172,7 @@ class Fits:
 
     def __init__(self, case: Case) -> None:
         self.case, self.capture = case, Capture.load(case.path)
-        self.model = fitting.fitted_model(MorphableModel.load(case.model), FitConfig())
+        self.model = MorphableModel.load(case.model)
         self._digest = self.capture.digest(case.fitted, case.timesteps)
         self._kept: dict[str, tuple[Any, float]] = {}
 
@@ -157,7 +180,8 @@ class Fits:
     def fit(self, part: Part, size: int) -> tuple[Reconstruction, float]:
         """A result without the part, and the processor seconds of all its steps."""
         config = part.config(size)
-        source = fitting.Source(self.capture, self._digest, self.model, self.case.fitted, self.case.timesteps, SEED)
+        model = fitting.fitted_model(self.model, config)
+        source = fitting.Source(self.capture, self._digest, model, self.case.fitted, self.case.timesteps, SEED)
         listed = [step for step in fitting.steps(config) if step.name not in part.without]
         keys, touched, spent = fitting.keys(listed, source), False, 0.0
         found: dict[Any, Any] = {}
@@ -171,7 +195,7 @@ class Fits:
             found[step.part], seconds = self._kept[key]
             spent += seconds
         result = Reconstruction(
-            model=self.model,
+            model=model,
             **found,
             config={**dataclasses.asdict(config), "seed": SEED},
             cameras=tuple(self.capture.camera(name) for name in self.case.fitted),
