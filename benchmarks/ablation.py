@@ -117,7 +117,6 @@ PARTS = (
     ),
     Part("surface: pairs across time", patches={f"{FIND}.across_time": lambda posed, turned: ()}, step="surface"),
     Part("stage 1: eyes that are added", {"geometry.eyes": False}),
-    Part("stage 1: images (landmarks alone)", {"geometry.rounds": 0}),
     Part("stage 1: albedo prior of skin's contrast", {"geometry.albedo_prior": 1.0}),
     Part(
         "light: compact lights",
