@@ -163,8 +163,8 @@ def find_surface(
     result = close_again(model, rest.state.estimate(geometry, model), closed, lids)
     result, closed_lips = close_openings(capture, model, result, cameras, lips)
     world = result.vertices.astype(np.float64)
-    residuals = sight.epipolar_residuals(views, pairs, result.timesteps, world, config.finest + 1)
-    likenesses = sight.likenesses(pairs, result.timesteps[0], world[0], config.finest + 1)
+    residuals = sight.epipolar_residuals(views, pairs, result.timesteps, world, max(config.finest, 1))
+    likenesses = sight.likenesses(pairs, result.timesteps[0], world[0], max(config.finest, 1))
     seconds = time.perf_counter() - began
     moved = np.linalg.norm(rest.state.displacement, axis=1)[np.unique(model.faces[model.face_mask])] * model.unit_mm
     phase = {
