@@ -36,7 +36,7 @@ from mifit.core.process import one_blas_thread
 from mifit.errors import MifitError
 from mifit.output.truth import relit_truths, true_passes
 from mifit.progress import silent
-from mifit.stages.surface.outline import Borders
+from mifit.stages.surface.outline import joined
 
 SEED, SIZE, LIGHTS = 0, 256, 2
 BASE = "base"
@@ -97,17 +97,11 @@ def _prior_alone(colour: Any, weight: Any, wrong: Any, *rest: Any) -> Any:
     return (1.0 - wrong).astype(np.float32)
 
 
-def _no_borders(*given: Any) -> Borders:
-    """In place of `find_surface.find_borders`: no outline in any image."""
-    none = np.zeros((0, 3))
-    return Borders(np.zeros(0, np.intp), none, none, none, np.zeros(0), np.zeros(0))
-
-
 FIND, INFER = "mifit.stages.find_surface", "mifit.stages.infer_reflectance"
 PARTS = (
     Part(BASE),
     Part("surface: off", {"surface.enabled": False}),
-    Part("surface: outlines", patches={f"{FIND}.find_borders": _no_borders}, step="surface"),
+    Part("surface: outlines", patches={f"{FIND}.find_borders": lambda *given: joined([])}, step="surface"),
     Part("surface: thin walls", patches={f"{FIND}.keep_walls": lambda model, fit: (fit, 0)}, step="surface"),
     Part("surface: lids and lips closed", {"surface.close_lids": False, "surface.close_lips": False}),
     Part(

@@ -104,9 +104,9 @@ def write_glb(
     the fitted cameras stand beside it. Faces with a place in the atlas have the maps: base colour, tangent-space
     normals, and the specular albedo through KHR_materials_specular. glTF has GGX lobes, so the Blinn-Phong
     exponent m becomes alpha = sqrt(2 / (m + 2)), and roughness = sqrt(alpha). The other faces have vertex colours.
-    Expressions are morph targets of 16 bits, right to 0.015 mm, that hold only the vertices that they move, with
-    ARKit's names where the model has its shapes and the timestep's coefficients as weights; a coefficient from 0 to a
-    bound is a weight from 0 to 1.
+    Expressions are morph targets in steps of 0.03 mm. They hold only the vertices that move by a tenth of a millimetre
+    or more. The timestep's coefficients are the weights; a coefficient from 0 to a bound is a weight from 0 to 1.
+    Targets have ARKit's names where the model has its shapes.
     Recovered lighting is in the scene's ``extras``: glTF has no spherical harmonics.
 
     ``timestep`` is by default the first that is animated, or else that was fitted; ``animate`` names timesteps to play

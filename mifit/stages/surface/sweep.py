@@ -2,8 +2,8 @@
 
 Every texel of the surface is moved by a few offsets along its normal; each view is sampled there, and windows of
 texels are compared between views. Windows live on the surface, so that they are foreshortened in every image as the
-surface is, and one score per cell and offset sums all pairs of views of all timesteps. A cell is two texels wide:
-windows overlap so far that a score at every texel adds nothing.
+surface is, and one score per cell and offset sums all pairs of views of all timesteps. A cell is two by two
+texels: windows overlap so far that a score at every texel adds nothing.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ LEAST_APART, BEST_APART, FARTHEST_APART = 5.0, 25.0, 50.0
 MOST_PAIRS = 12
 """Of views of different timesteps."""
 LEAST_SCORE = 0.4
-"""Correlation below which a texel counts as not matched."""
+"""Correlation below which a cell counts as not matched."""
 
 View = tuple[int, int]
 
