@@ -40,8 +40,8 @@ GLARE_DEVIATIONS = 3.5
 """The same in units of the differences' deviation over the face, where that is more; for views of one timestep."""
 LEAST_APART, BEST_APART, FARTHEST_APART = 5.0, 25.0, 50.0
 """Angle between views of different timesteps that are compared, degrees."""
-MOST_PAIRS = 12
-"""Of views of different timesteps."""
+MOST_PAIRS = 6
+"""Of views of different timesteps; chosen on scan_city."""
 LEAST_SCORE = 0.4
 """Correlation below which a cell counts as not matched."""
 
