@@ -22,6 +22,8 @@ from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.images import blind_warnings, facial_pixels
 from mifit.stages.geometry.landmarks import (
     FEWEST_LANDMARKS,
+    LandmarkFit,
+    LandmarkView,
     State,
     fit_landmarks,
     initial_state,
@@ -30,6 +32,7 @@ from mifit.stages.geometry.landmarks import (
     world_vertices,
 )
 from mifit.stages.geometry.parameters import Frames, Layout
+from mifit.stages.geometry.place_head import place_head
 from mifit.stages.geometry.rendering import refine_by_rendering
 from mifit.stages.geometry.summary import Journal, pack
 from mifit.stages.geometry.surfaces import displaced
@@ -89,9 +92,16 @@ def fit_geometry(
     layout = Layout(len(timesteps), model.n_identity, model.n_expression, log_scale=int(config.scale_deviation > 0.0))
     config = replace(config, landmark_noise=_landmark_noise(capture, cameras, timesteps, config))
     views = landmark_views(capture, model, cameras, timesteps, config.landmark_noise)
-    state = initial_state(model, views, len(timesteps), layout, model.unit_mm / capture.unit_mm)
-    start = fit_landmarks(model, views, state, config.landmark_noise, priors_of(config))
+
+    def by_landmarks(some: tuple[LandmarkView, ...]) -> LandmarkFit:
+        state = initial_state(model, some, len(timesteps), layout, model.unit_mm / capture.unit_mm)
+        return fit_landmarks(model, some, state, config.landmark_noise, priors_of(config))
+
+    start, left_out = place_head(capture, model, cameras, timesteps[0], by_landmarks(views), by_landmarks)
     journal.phase("landmarks", _usable(start.solution, "landmarks"))
+    for name in left_out:
+        text = f"camera {name}: its landmarks contradict what all views show; they are left out"
+        journal.warn(Diagnostic("landmarks-left-out", text, camera=name))
     state, world = start.state, world_vertices(model, start.state)
     seen = capture, model, cameras, timesteps
     pixels = facial_pixels(*seen, world, config.pixels, seed)
