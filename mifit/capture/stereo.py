@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mifit.capture.lens import opencv_matrix
 from mifit.capture.transforms import View, nearest_rotation
-from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
+from mifit.core.camera import OPENGL_FROM_OPENCV, Camera, rigid
 from mifit.core.files import read_text, replacing
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.errors import InputError
@@ -57,10 +57,8 @@ def read_stereo(path: str | Path, names: Sequence[str], sizes: Sequence[tuple[in
     _check_size(found, sizes, path)
     rotation = nearest_rotation(_matrix(found, ("R",), path, (3, 3)), f"{path}: R")
     translation = _matrix(found, ("T",), path, (3, 1)).ravel()
-    second = np.eye(4)
-    second[:3, :3], second[:3, 3] = rotation, translation
     views = []
-    for i, pose in enumerate((np.eye(4), second)):
+    for i, pose in enumerate((np.eye(4), rigid(rotation, translation))):
         matrix = _matrix(found, _MATRICES[i], path, (3, 3))
         fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
         if not (fx > 0 and fy > 0):

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
+from mifit.core.camera import OPENGL_FROM_OPENCV, Camera, inverse, rigid
 from mifit.core.files import Document, read_text, write_text
 from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_NUMBER, MAX_PIXELS
 from mifit.errors import InputError
@@ -158,7 +158,7 @@ def write_transforms(path: str | Path, views: Iterable[View], shots: Iterable[Sh
             coefficients = (*view.distortion, 0.0, 0.0, 0.0, 0.0)[: max(len(view.distortion), 4)]
             entry |= dict(zip(DISTORTION_KEYS, coefficients, strict=False))
         if view.world_to_camera is not None:
-            entry["transform_matrix"] = _camera_to_world(view.world_to_camera).tolist()
+            entry["transform_matrix"] = (inverse(view.world_to_camera) @ OPENGL_FROM_OPENCV).tolist()
         if view.gain != (1.0, 1.0, 1.0):
             entry["gain"] = list(view.gain)
         frames.append(entry)
@@ -196,13 +196,6 @@ def update_frames(path: str | Path, changes: Mapping[tuple[str, int], Mapping[st
 
 def _relative(file: Path, folder: Path) -> str:
     return file.relative_to(folder).as_posix()
-
-
-def _camera_to_world(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    inverse = np.eye(4)
-    inverse[:3, :3] = world_to_camera[:3, :3].T
-    inverse[:3, 3] = -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
-    return inverse @ OPENGL_FROM_OPENCV
 
 
 def _load(path: Path) -> Document:
@@ -360,16 +353,8 @@ def _world_to_camera(entry: _Entry) -> NDArray[np.float64]:
         raise InputError(f"{key}: found a NaN or infinite value or a huge one, expected numbers within {MAX_NUMBER:g}")
     if not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
         raise InputError(f"{key}: found last row {matrix[3].tolist()}, expected [0, 0, 0, 1]")
-    return invert_pose(matrix @ OPENGL_FROM_OPENCV, key)
-
-
-def invert_pose(camera_to_world: NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    """Invert a rigid (4, 4) transform; InputError when its rotation is singular, left-handed or not a rotation."""
-    rotation = nearest_rotation(camera_to_world[:3, :3], where)
-    inverse = np.eye(4)
-    inverse[:3, :3] = rotation.T
-    inverse[:3, 3] = -rotation.T @ camera_to_world[:3, 3]
-    return inverse
+    camera_to_world = matrix @ OPENGL_FROM_OPENCV
+    return inverse(rigid(nearest_rotation(camera_to_world[:3, :3], key), camera_to_world[:3, 3]))
 
 
 def nearest_rotation(matrix: NDArray[np.float64], where: str) -> NDArray[np.float64]:

@@ -106,11 +106,9 @@ class Camera:
         if not min(lengths) > 1e-9 * max(1.0, *np.abs(start)):
             raise InputError(f"look_at: found eye {eye!r}, target {target!r}, up {up!r}, expected a view")
         forward, right = forward / lengths[0], right / lengths[1]
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-        pose[:3, 3] = -pose[:3, :3] @ start
+        turn = np.stack([right, np.cross(forward, right), forward])
         focal = 0.5 * width / math.tan(math.radians(0.5 * fov))
-        return cls(name, width, height, focal, focal, 0.5 * width, 0.5 * height, pose)
+        return cls(name, width, height, focal, focal, 0.5 * width, 0.5 * height, rigid(turn, -turn @ start))
 
     def orbit(
         self,
@@ -152,9 +150,8 @@ class Camera:
         away = turn @ (self.position - centre)
         if distance is not None:
             away *= distance / np.linalg.norm(away)
-        pose = np.eye(4)
-        pose[:3, :3] = self.rotation @ turn.T
-        pose[:3, 3] = -pose[:3, :3] @ (centre + away)
+        rotation = self.rotation @ turn.T
+        pose = rigid(rotation, -rotation @ (centre + away))
         return replace(self, name=name or f"{self.name}{yaw:+g}{pitch:+g}", world_to_camera=pose)
 
     @property
@@ -175,10 +172,7 @@ class Camera:
     @property
     def camera_to_world_opengl(self) -> NDArray[np.float64]:
         """(4, 4) camera-to-world matrix with OpenGL axes: nerfstudio's ``transform_matrix``."""
-        inverse = np.eye(4)
-        inverse[:3, :3] = self.rotation.T
-        inverse[:3, 3] = self.position
-        return inverse @ OPENGL_FROM_OPENCV
+        return inverse(self.world_to_camera) @ OPENGL_FROM_OPENCV
 
     @property
     def matrix(self) -> NDArray[np.float64]:
@@ -226,6 +220,20 @@ class Camera:
         """(H, W, 2) coordinates of all pixel centres."""
         y, x = np.mgrid[0 : self.height, 0 : self.width]
         return np.stack([x + 0.5, y + 0.5], axis=-1)
+
+
+def rigid(rotation: ArrayLike, shift: ArrayLike = 0.0) -> NDArray[np.float64]:
+    """(..., 4, 4) transforms that turn by rotations (..., 3, 3) and then move by shifts (..., 3)."""
+    turn = np.asarray(rotation, dtype=np.float64)
+    out = np.zeros((*turn.shape[:-2], 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = turn, shift, 1.0
+    return out
+
+
+def inverse(pose: NDArray) -> NDArray[np.float64]:
+    """(4, 4) the inverse of a rigid transform (4, 4)."""
+    turn = pose[:3, :3].T
+    return rigid(turn, -turn @ pose[:3, 3])
 
 
 def _about(axis: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:

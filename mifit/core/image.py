@@ -309,6 +309,14 @@ def check_environment(name: str | Path, image: NDArray[np.float32]) -> NDArray[n
     return image
 
 
+def reduced(environment: NDArray, rows: int = 512) -> NDArray[np.float32]:
+    """A lat-long image of at most so many rows: finer light makes no difference on skin."""
+    height, width = environment.shape[:2]
+    if height > rows:
+        environment = cv2.resize(environment, (round(width * rows / height), rows), interpolation=cv2.INTER_AREA)
+    return np.asarray(environment, np.float32)
+
+
 def write_image(path: str | Path, linear: ArrayLike) -> None:
     """Write linear colour, (H, W), (H, W, 1), (H, W, 3) or with alpha (H, W, 4), to a file, whole or not at all.
 
@@ -371,7 +379,6 @@ def box(mask: NDArray[np.bool_], margin: int = 0) -> tuple[slice, slice]:
     ends = []
     for axis, size in enumerate(mask.shape):
         inside = np.flatnonzero(mask.any(axis=1 - axis))
-        ends.append(
-            slice(max(inside[0] - margin, 0), min(inside[-1] + margin + 1, size)) if len(inside) else slice(size)
-        )
+        first, last = (int(inside[0]), int(inside[-1])) if len(inside) else (0, size - 1)
+        ends.append(slice(max(first - margin, 0), min(last + margin + 1, size)))
     return ends[0], ends[1]

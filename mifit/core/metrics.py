@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d, gaussian_filter
 
-from mifit.core.image import srgb_to_linear
+from mifit.core.image import box, srgb_to_linear
 from mifit.errors import InputError
 
 Image = NDArray
@@ -90,11 +90,8 @@ def flip(
     """
     a, b, region = _checked(image, reference, mask)
     margin = len(_support(_widest(pixels_per_degree))) // 2  # no filter reaches further
-    box = tuple(
-        slice(max(inside[0] - margin, 0), inside[-1] + margin + 1)
-        for inside in (np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0)))
-    )
-    return float(flip_map(a[box] / peak, b[box] / peak, pixels_per_degree)[region[box]].mean())
+    near = box(region, margin)
+    return float(flip_map(a[near] / peak, b[near] / peak, pixels_per_degree)[region[near]].mean())
 
 
 def flip_map(image: Image, reference: Image, pixels_per_degree: float = 3840 * math.pi / 180) -> NDArray[np.float64]:

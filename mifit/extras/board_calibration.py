@@ -20,12 +20,11 @@ from scipy.optimize import least_squares
 from mifit.capture.sources import Source
 from mifit.capture.stereo import write_stereo
 from mifit.capture.transforms import UNITS_MM, Shot, View, write_transforms
-from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
+from mifit.core.camera import OPENGL_FROM_OPENCV, Camera, rigid
 from mifit.core.files import file_name, write_text
-from mifit.core.image import decode_image, to_8_bit
 from mifit.errors import InputError
 from mifit.extras.board_camera import ALIKE, CONTRADICTS, SETTINGS, Watched, calibrate_one, look
-from mifit.extras.boards import Board
+from mifit.extras.boards import Board, grey_image
 from mifit.progress import Progress, silent
 
 LENS, POSE = 9, 6
@@ -114,8 +113,7 @@ def recognise(board: Board, source: Source) -> Board:
     boards = [board, *board.of_other_dictionaries()]
     points = np.zeros(len(boards), int)
     for _, content in source.files(range(0, source.length, max(source.length // 12, 1))):
-        codes = to_8_bit(decode_image(content, source.name).pixels)
-        grey = np.asarray(cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY), np.uint8)
+        grey = grey_image(content, source.name)
         points += [len(one.find(grey)) for one in boards]
         if points.max() >= RECOGNISED:
             break
@@ -166,9 +164,7 @@ def _relative_poses(watched: Sequence[Watched], board: Board) -> tuple[list[NDAr
                 f"at least {SETTINGS.least_shared}; show it to both at once, and check that the videos are synchronised"
             )
         turn, shift, error = _pair(watched[a], watched[b], board)
-        between = np.eye(4)
-        between[:3, :3], between[:3, 3] = turn, shift
-        poses[b] = between @ poses[a]
+        poses[b] = rigid(turn, shift) @ poses[a]
         errors[f"{watched[a].name}, {watched[b].name}"] = error
         if error > SETTINGS.most_error:
             raise InputError(
@@ -280,9 +276,7 @@ def adjust(
     for c, f, found in blocks:
         if not boards[f].any():
             _, turn, shift = cv2.solvePnP(points[found.ids], found.pixels - 0.5, watched[c].matrix, lenses[c][4:])
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-            boards[f] = _vector(np.linalg.inv(poses[c]) @ pose)
+            boards[f] = _vector(np.linalg.inv(poses[c]) @ rigid(cv2.Rodrigues(turn)[0], shift.ravel()))
     first = LENS * count - POSE  # where the first camera's pose would stand, which doesn't move
     start = np.concatenate([*lenses, *(_vector(p) for p in poses[1:]), boards.ravel()])
     scale = np.concatenate(
@@ -367,6 +361,4 @@ def _vector(pose: NDArray) -> NDArray[np.float64]:
 
 
 def _matrix(vector: NDArray) -> NDArray[np.float64]:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(np.ascontiguousarray(vector[:3]))[0], vector[3:]
-    return pose
+    return rigid(cv2.Rodrigues(np.ascontiguousarray(vector[:3]))[0], vector[3:])

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.capture.sources import Source
-from mifit.core.image import decode_image, to_8_bit
 from mifit.errors import InputError
-from mifit.extras.boards import Board, BoardPoints, edge_width
+from mifit.extras.boards import Board, BoardPoints, edge_width, grey_image
 from mifit.progress import Progress
 
 ALIKE = "like other frames"
@@ -126,8 +125,7 @@ def look(
     for k, (_, content) in enumerate(source.files(range(0, source.length, every))):
         progress("Looking for the board", done + k, total)
         i = k * every
-        codes = to_8_bit(decode_image(content, f"{source.name}: frame {i}").pixels)
-        grey = np.asarray(cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        grey = grey_image(content, f"{source.name}: frame {i}")
         seen = board.find(grey)
         wanted = max(6, round(SETTINGS.least_part * len(board.points)))
         if len(seen) >= wanted:

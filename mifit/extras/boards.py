@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.files import replacing
+from mifit.core.image import decode_image, to_8_bit
 from mifit.errors import InputError
 
 DICTIONARY = "DICT_5X5_250"
@@ -159,6 +160,12 @@ class Board:
         pixels = cv2.cornerSubPix(grey, pixels, (window, window), (-1, -1), criteria)
         order = np.argsort(ids.ravel())
         return BoardPoints(ids.ravel().astype(np.int64)[order], pixels.reshape(-1, 2).astype(np.float64)[order] + 0.5)
+
+
+def grey_image(content: bytes, where: str) -> NDArray[np.uint8]:
+    """(H, W) 8-bit grey of an image file's content; ``where`` is for messages."""
+    codes = to_8_bit(decode_image(content, where).pixels)
+    return np.asarray(cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
 def _spacing(pixels: NDArray) -> float:

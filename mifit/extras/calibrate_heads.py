@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from mifit.capture.capture import Capture
 from mifit.capture.landmark_files import COUNT, MIN_VISIBLE
 from mifit.capture.transforms import View, update_frames
-from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
+from mifit.core.camera import OPENGL_FROM_OPENCV, Camera, rigid
 from mifit.errors import InputError
 
 FOCAL_PRIOR = (1.8, 0.7)
@@ -181,9 +181,7 @@ def _pnp(points: NDArray, pixels: NDArray, matrix: NDArray) -> NDArray[np.float6
     if not ok:
         raise InputError("landmarks: no pose of a head explains them; check their order (iBUG-68)")
     rotation, translation = cv2.solvePnPRefineLM(points, pixels, matrix, np.zeros(4), rotation, translation)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
-    return pose
+    return rigid(cv2.Rodrigues(rotation)[0], translation.ravel())
 
 
 def _focals(problem: _Problem) -> int:
@@ -199,8 +197,7 @@ def _unpack(x: NDArray, problem: _Problem) -> tuple[NDArray, NDArray, NDArray, N
     focal = problem.known.copy()
     focal[free] = np.exp(x[:n]) * problem.side[free]
     values = x[n : n + 6 * (count - 1 + steps)].reshape(-1, 6)
-    poses = np.tile(np.eye(4), (len(values), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_rotvec(values[:, :3]).as_matrix(), values[:, 3:]
+    poses = rigid(Rotation.from_rotvec(values[:, :3]).as_matrix(), values[:, 3:])
     cameras = np.concatenate([np.eye(4)[None], poses[: count - 1]])
     return focal, cameras, poses[count - 1 :], x[n + values.size :]
 
@@ -300,8 +297,7 @@ def resect_camera(
 
     start = np.concatenate([turn.ravel(), shift.ravel(), [0.0]])
     x = least_squares(residuals, start, loss="soft_l1", x_scale="jac", max_nfev=200).x
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(x[:3]).as_matrix(), x[3:6]
+    pose = rigid(Rotation.from_rotvec(x[:3]).as_matrix(), x[3:6])
     error = float(np.sqrt(np.mean(np.sum(off(x)[weights == 1.0] ** 2, axis=1))))
     return Camera(view.name, view.width, view.height, zoom(x) * fx, zoom(x) * fy, cx, cy, pose), error
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.capture import Capture
+from mifit.core.camera import rigid
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.files import Document
@@ -133,8 +134,7 @@ def check_calibration(
         return CalibrationCheck(len(tracks.texel))
     head = (geometry.vertices[0] - geometry.translation[0]) @ geometry.rotation[0]
     points, modes = points_of(tracks, texels, model, head)
-    heads = np.tile(np.eye(4), (len(geometry.timesteps), 1, 1))
-    heads[:, :3, :3], heads[:, :3, 3] = geometry.rotation, geometry.translation
+    heads = rigid(geometry.rotation, geometry.translation)
     focal, poses = np.array([focal_of(view) for view in views]), np.array([view.world_to_camera for view in views])
     start = Bundle(focal, poses, heads, points, geometry.expression - geometry.expression[0])
     return explain_matches(start, sightings_of(tracks, views), geometry.scale * modes, cameras, progress)

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from mifit.capture.importer import Material, Selection, import_material, match_views, sources_of
 from mifit.capture.sources import ImageFiles
 from mifit.capture.transforms import View
+from mifit.core.camera import rigid
 from mifit.core.files import read_text
 from mifit.core.image import SUFFIXES
 from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_NUMBER, MAX_PIXELS
@@ -126,9 +127,7 @@ def read_colmap(folder: str | Path) -> tuple[Photo, ...]:
         length = float(np.linalg.norm(pose[:4]))
         if abs(length - 1.0) > 1e-3:
             raise InputError(f"{where}: found a quaternion of length {length:.4g}, expected 1")
-        matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_quat([*pose[1:4], pose[0]]).as_matrix()
-        matrix[:3, 3] = pose[4:]
+        matrix = rigid(Rotation.from_quat([*pose[1:4], pose[0]]).as_matrix(), pose[4:])
         columns, rows, intrinsics, distortion = cameras[key]
         photos.append(Photo(name, View(view_name(name), columns, rows, intrinsics, distortion, matrix)))
     if not photos:

@@ -29,13 +29,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mifit.core.camera import Camera
+from mifit.core.camera import Camera, inverse, rigid
 from mifit.core.image import to_8_bit
-from mifit.core.mesh import normalize
 from mifit.errors import InputError
 from mifit.output.deferred import render_local
 from mifit.output.relight import relit
-from mifit.output.views import on_backdrop, orbit_camera
+from mifit.output.views import face_middle, on_backdrop, orbit_camera, vertical
 from mifit.result import METHODS, Method, Reconstruction
 
 if TYPE_CHECKING:
@@ -103,11 +102,6 @@ def under(result: Reconstruction, turn: float, environment: Path | None) -> Reco
     return result.with_illumination(illumination)
 
 
-def vertical(result: Reconstruction) -> NDArray[np.float64]:
-    """(3,) unit vector: up in the mean of the fitted cameras."""
-    return normalize(-np.mean([c.rotation[1] for c in result.cameras], axis=0))
-
-
 def browser_camera(wxyz: NDArray, position: NDArray, fov: float, aspect: float, rows: int) -> Camera:
     """The camera of a browser window.
 
@@ -127,9 +121,7 @@ def browser_camera(wxyz: NDArray, position: NDArray, fov: float, aspect: float, 
     if len(numbers) != 9 or not (within.all() and np.any(wxyz) and 1e-3 < fov < np.pi and aspect > 0):
         raise InputError(f"camera: found {numbers.tolist()}, expected a rotation, a position, an angle and an aspect")
     columns = int(np.clip(rows * min(aspect, 8.0), 16, 8 * rows).round())
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix().T
-    pose[:3, 3] = -pose[:3, :3] @ position
+    pose = inverse(rigid(Rotation.from_quat(np.roll(wxyz, -1)).as_matrix(), position))
     focal = 0.5 * rows / np.tan(0.5 * fov)
     return Camera("browser", columns, rows, focal, focal, columns / 2, rows / 2, pose)
 
@@ -227,8 +219,7 @@ class LiveView:
         check_address(host, port)
         self._start = orbit_camera(result, result.timesteps[0], 0.0)
         self._up = vertical(result)
-        face = result.geometry.vertices[0][np.unique(result.model.faces[result.model.face_mask])]
-        self._centre = 0.5 * (face.min(0) + face.max(0)).astype(np.float64)
+        self._centre = face_middle(result, 0)
         self._steps = sorted(result.timesteps)
         self._picture = Picture(result)
         self._shown = Shown(result.methods[-1], self._steps[0])

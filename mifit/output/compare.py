@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
-from mifit.core.image import linear_to_srgb, srgb_to_linear
+from mifit.core.image import box, linear_to_srgb, srgb_to_linear
 from mifit.core.metrics import flip, psnr_from_rmse, ssim
 from mifit.core.sh import LUMINANCE
 from mifit.errors import InputError
@@ -82,8 +82,8 @@ class Errors:
             return {}
         a, b = image[region].astype(np.float64), photograph[region].astype(np.float64)
         means = ((a - b) ** 2).mean(), (matched_difference(a, b) ** 2).mean()
-        box = _around(region)
-        pair = image[box], photograph[box], region[box]
+        near = box(region, 48)  # wider than any window of a measure
+        pair = image[near], photograph[near], region[near]
         sums = count * np.array([*means, ssim(*pair), flip(*pair)])
         self._sums += sums
         self.pixels += count
@@ -100,14 +100,6 @@ def _figures(sums: NDArray, pixels: int) -> dict[str, float]:
     psnr, psnr_matched = psnr_from_rmse(rmse), psnr_from_rmse(math.sqrt(matched))
     figures = {"psnr": psnr, "psnr_matched": psnr_matched, "rmse": rmse, "ssim": likeness, "flip": flipped}
     return {**figures, "pixels": pixels}
-
-
-def _around(region: Region) -> tuple[slice, slice]:
-    """The region's box with a margin wider than any window of a measure."""
-    margin = 48
-    sides = [np.flatnonzero(region.any(axis=axis)) for axis in (1, 0)]
-    low = [max(int(side[0]) - margin, 0) for side in sides]
-    return slice(low[0], int(sides[0][-1]) + margin + 1), slice(low[1], int(sides[1][-1]) + margin + 1)
 
 
 def matched_difference(codes: NDArray, photograph: NDArray) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
 from mifit.core.estimate import Label
-from mifit.core.image import encode_png, to_8_bit
+from mifit.core.image import box, encode_png, to_8_bit
 from mifit.core.sh import SHLighting
 
 HEAT_LIMIT = 40.0
@@ -44,13 +44,10 @@ def png_uri(image: NDArray[np.uint8]) -> str:
 
 def bounding_box(mask: NDArray[np.bool_], margin: float = 0.12) -> tuple[slice, slice]:
     """Rows and columns around the pixels of a mask, with a margin relative to its size."""
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if not len(rows):
-        return slice(None), slice(None)
     out = []
-    for index, size in ((rows, mask.shape[0]), (columns, mask.shape[1])):
-        pad = round(margin * (index[-1] - index[0]))
-        out.append(slice(max(int(index[0]) - pad, 0), min(int(index[-1]) + pad + 1, size)))
+    for side, size in zip(box(mask), mask.shape, strict=True):
+        pad = round(margin * (side.stop - 1 - side.start))
+        out.append(slice(max(side.start - pad, 0), min(side.stop + pad, size)))
     return out[0], out[1]
 
 

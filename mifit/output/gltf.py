@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import mifit
+from mifit.core.camera import Camera, rigid
 from mifit.core.files import Document, replacing
 from mifit.core.image import encode_png, to_8_bit
 from mifit.core.mesh import SplitMesh, tangents
 from mifit.output.surface import Shape, shape_of, surface_maps, vertex_materials
 
 if TYPE_CHECKING:
-    from mifit.core.camera import Camera
     from mifit.core.estimate import GeometryEstimate
     from mifit.result import Reconstruction
 
@@ -149,9 +149,7 @@ def write_glb(
         rows = [result.index(t) for t in animate]
         animations.append(_animation(out, geometry, rows, np.subtract(animate, animate[0]) / fps, metre, full))
     else:
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, geometry.translation[i] * metre
-        head["matrix"] = pose.T.ravel().tolist()
+        head["matrix"] = rigid(rotation, geometry.translation[i] * metre).T.ravel().tolist()
     nodes: list[Document] = [head]
     cameras: list[Document] = []
     for camera in result.cameras:

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -16,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from mifit.appearance.environment import illumination_of
 from mifit.appearance.illumination import Illumination
 from mifit.core.files import Document, file_name, write_text
-from mifit.core.image import check_environment, read_environment, to_8_bit, write_image
+from mifit.core.image import check_environment, read_environment, reduced, to_8_bit, write_image
 from mifit.core.metrics import psnr, rmse
 from mifit.core.sh import LUMINANCE, SHLighting
 from mifit.errors import InputError
@@ -89,15 +88,10 @@ def _level(lighting: SHLighting) -> float:
 
 
 def _environment(source: str | Path | NDArray) -> NDArray[np.float32]:
-    """A lat-long image of linear radiance, checked, of at most 512 rows: finer light makes no difference on skin."""
+    """A lat-long image of linear radiance, checked and `reduced`."""
     if isinstance(source, (str, Path)):
-        image = read_environment(source)
-    else:
-        image = check_environment("environment", np.asarray(source, np.float32))
-    if image.shape[0] > 512:
-        width = round(image.shape[1] * 512 / image.shape[0])
-        image = np.asarray(cv2.resize(image, (width, 512), interpolation=cv2.INTER_AREA), np.float32)
-    return image
+        return reduced(read_environment(source))
+    return reduced(check_environment("environment", np.asarray(source, np.float32)))
 
 
 def _rotation(value: float | NDArray) -> NDArray[np.float64]:

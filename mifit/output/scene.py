@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mifit.core.arrays import write_ply
 from mifit.core.calls import whole
-from mifit.core.camera import Camera
+from mifit.core.camera import Camera, rigid
 from mifit.core.files import Document, write_text
 from mifit.core.image import write_image
 from mifit.core.limits import MAX_COUNT
@@ -233,9 +233,7 @@ def scene_description(
     if result.environment is not None:
         scene["light"] = {"type": "envmap", "filename": f"{files}/environment.exr"}
         if result.environment_rotation is not None:
-            pose = np.eye(4)
-            pose[:3, :3] = result.environment_rotation
-            scene["light"]["to_world"] = pose
+            scene["light"]["to_world"] = rigid(result.environment_rotation)
     else:
         rows = result.illumination.radiance
         text = ",  ".join(" ".join(f"{x:.9g}" for x in row) for row in rows)

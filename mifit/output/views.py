@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
 from mifit.core.files import file_name, replacing
-from mifit.core.image import to_8_bit, write_image
+from mifit.core.image import box, to_8_bit, write_image
 from mifit.core.mesh import normalize
 from mifit.core.process import decoding
 from mifit.errors import InputError, MifitError
@@ -40,11 +40,9 @@ def orbit_camera(
     """
     if not result.cameras:
         raise InputError("this result has no cameras, so there is no image size to render at; give one to render()")
-    model, i = result.model, result.index(timestep)
+    i = result.index(timestep)
     first = result.cameras[0]
-    vertices = result.geometry.vertices[i][np.unique(model.faces[model.face_mask])]
-    centre = 0.5 * (vertices.min(0) + vertices.max(0)).astype(np.float64)
-    up = normalize(-np.mean([c.rotation[1] for c in result.cameras], axis=0))
+    centre, up = face_middle(result, i), vertical(result)
     front = result.geometry.rotation[i][:, 2]
     front = normalize(front - (front @ up) * up)
     reach = float(np.mean([np.linalg.norm(c.position - centre) for c in result.cameras]))
@@ -53,6 +51,18 @@ def orbit_camera(
     camera = replace(first, world_to_camera=facing.world_to_camera, distortion=(), cx=cx, cy=cy)
     name = f"orbit{degrees:+g}" + (f"{pitch:+g}" if pitch else "")
     return camera.orbit(degrees, pitch, centre, up, distance, name)
+
+
+def vertical(result: Reconstruction) -> NDArray[np.float64]:
+    """(3,) unit vector: up in the mean of the fitted cameras."""
+    return normalize(-np.mean([c.rotation[1] for c in result.cameras], axis=0))
+
+
+def face_middle(result: Reconstruction, index: int) -> NDArray[np.float64]:
+    """(3,) middle of the face area's box at a position among the timesteps, world space."""
+    model = result.model
+    vertices = result.geometry.vertices[index][np.unique(model.faces[model.face_mask])]
+    return 0.5 * (vertices.min(0) + vertices.max(0)).astype(np.float64)
 
 
 def write_turntable(
@@ -141,11 +151,10 @@ def on_backdrop(image: NDArray) -> NDArray:
 def sheet(rows: Sequence[Sequence[NDArray]]) -> NDArray:
     """Images with coverage in rows, cropped to what any of them covers, on grey."""
     covered = np.any([image[..., 3] > 0 for row in rows for image in row], axis=0)
-    used_rows, used_columns = np.flatnonzero(covered.any(1)), np.flatnonzero(covered.any(0))
-    if not len(used_rows):
+    if not covered.any():
         raise InputError("no view shows the head; choose angles or a camera from which it is visible")
-    box = slice(used_rows[0], used_rows[-1] + 1), slice(used_columns[0], used_columns[-1] + 1)
-    return np.concatenate([np.concatenate([on_backdrop(image[box]) for image in row], axis=1) for row in rows])
+    shown = box(covered)
+    return np.concatenate([np.concatenate([on_backdrop(image[shown]) for image in row], axis=1) for row in rows])
 
 
 def check_moving(path: str | Path) -> None:

@@ -21,7 +21,7 @@ from mifit.capture.transforms import Shot, View, write_transforms
 from mifit.core.arrays import write_ply
 from mifit.core.camera import Camera
 from mifit.core.files import replacing, write_text
-from mifit.core.image import linear_to_srgb, read_image, write_image
+from mifit.core.image import linear_to_srgb, read_image, reduced, write_image
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
 from mifit.progress import Progress, silent
@@ -234,7 +234,7 @@ def synthesize_scan(
         halves = {name: value.astype(np.float16) for name, value in maps.items()}
         np.savez_compressed(temporary, **halves)  # type: ignore[arg-type]
     for i, (name, light) in enumerate(relit.items()):
-        light = _reduced(light)
+        light = reduced(light)
         image = PathTracer({"head": material}, light).render([surface(poses[0])], cameras[-1:], spp, seed=seed + i)[0]
         relit_exposure[name] = exposure_of(image)
         write_image(out / "truth" / f"relit_{name}.exr", image[..., :3])
@@ -244,11 +244,3 @@ def synthesize_scan(
     write_text(out / "truth" / "meta.json", json.dumps(note, indent=1) + "\n")
     write_transforms(out / "transforms.json", [View.of(camera) for camera in cameras], shots, "cm")
     return out
-
-
-def _reduced(environment: NDArray) -> NDArray[np.float32]:
-    height, width = environment.shape[:2]
-    if height <= 512:
-        return environment.astype(np.float32)
-    size = (round(width * 512 / height), 512)
-    return cv2.resize(environment, size, interpolation=cv2.INTER_AREA).astype(np.float32)
