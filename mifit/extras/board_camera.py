@@ -6,6 +6,7 @@ Technique for Camera Calibration", 2000, as OpenCV implements it with radial and
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 import cv2
@@ -178,10 +179,8 @@ def calibrate_one(
 
 
 def _too_few(source: Source, board: Board, count: int, left_out: dict[int, str]) -> str:
-    reasons: dict[str, int] = {}
-    for text in left_out.values():
-        reasons[text.split(":")[0]] = reasons.get(text.split(":")[0], 0) + 1
-    told = ", ".join(f"{n} {reason}" for reason, n in sorted(reasons.items(), key=lambda item: -item[1]))
+    reasons = Counter(text.split(":")[0] for text in left_out.values())
+    told = ", ".join(f"{n} {reason}" for reason, n in reasons.most_common())
     return (
         f"{source.name}: found {count} frames that can be used of {count + len(left_out)} ({told or 'none else'}), "
         f"expected at least {SETTINGS.least_frames} with the whole board, sharp, not mirrored; looked for "

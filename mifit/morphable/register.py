@@ -39,7 +39,6 @@ def register(
     faces: NDArray,
     landmarks: NDArray | None = None,
     iterations: int = 20,
-    seed: int = 0,
 ) -> Registration:
     """Fit identity and pose to a surface.
 
@@ -56,15 +55,13 @@ def register(
     landmarks : (68,) int, optional
         Target vertices of the iBUG points. Without them the pose starts from the tips of the noses.
     iterations : int
-    seed : int
-        Chooses the vertices that are compared.
     """
     unit = model.unit_mm
     mean, basis = unit * model.mean.astype(np.float64), model.identity
     target_normals = vertex_normals(vertices, faces)
     tree = cKDTree(vertices)
     on_face = np.unique(model.faces[model.face_mask])
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     sample = np.sort(rng.choice(on_face, min(4000, len(on_face)), replace=False))
     sample_basis = unit * basis[sample].astype(np.float64)
     lm = model.landmarks

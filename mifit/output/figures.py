@@ -133,7 +133,7 @@ def lighting_balls(lighting: SHLighting, size: int = 160) -> tuple[NDArray[np.ui
     return out[0], out[1]
 
 
-def energy_plot(energies: Mapping[str, Sequence[float]], width: int = 640, height: int = 260) -> str:
+def energy_plot(energies: Mapping[str, Sequence[float]]) -> str:
     """Curves of named energies over iterations, as inline SVG with a logarithmic axis.
 
     Values that are not positive and finite leave a gap. An empty string when there is nothing to draw.
@@ -149,7 +149,7 @@ def energy_plot(energies: Mapping[str, Sequence[float]], width: int = 640, heigh
     low, high = math.floor(math.log10(min(known))), math.ceil(math.log10(max(known)))
     high = max(high, low + 1)
     last = max(len(values) for values in curves.values()) - 1
-    left, right, top, bottom = 52, 12, 12, 30
+    width, height, left, right, top, bottom = 640, 260, 52, 12, 12, 30
 
     def at(i: float, exponent: float) -> tuple[float, float]:
         x = left + (width - left - right) * i / last

@@ -91,7 +91,7 @@ class PathTracer:
         scene = mi.load_dict(content)
         images = []
         for i, camera in enumerate(cameras):
-            view = make_sensor(camera, spp, "multijitter")
+            view = make_sensor(camera, spp)
             start = dr.opaque(mi.UInt32, (seed * 1000 + i) % 2**32)  # a literal would compile a kernel per seed
             image = mi.render(scene, sensor=view, integrator=self._integrator, spp=spp, seed=start)
             images.append(np.array(image, dtype=np.float32))

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 
-def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str = "multijitter") -> Document:
+def sensor_description(camera: Camera, spp: int | Parameter = 16) -> Document:
     """The sensor of an undistorted camera, as a plain dictionary (`render.description`).
 
-    Square pixels give Mitsuba's ``perspective``, others mifit's ``pinhole``. ``sampler`` is the plugin that draws
-    ``spp`` samples per pixel. InputError for a camera with lens distortion.
+    Square pixels give Mitsuba's ``perspective``, others mifit's ``pinhole``. ``spp`` samples are drawn per pixel.
+    InputError for a camera with lens distortion.
     """
     if any(camera.distortion):
         raise InputError(f"camera {camera.name}: found lens distortion, expected an undistorted camera")
@@ -49,15 +49,15 @@ def sensor_description(camera: Camera, spp: int | Parameter = 16, sampler: str =
             "component_format": "float32",
             "rfilter": {"type": "box"},
         },
-        "sampler": {"type": sampler, "sample_count": spp},
+        "sampler": {"type": "multijitter", "sample_count": spp},
     }
 
 
-def make_sensor(camera: Camera, spp: int = 16, sampler: str = "multijitter") -> mi.Sensor:
+def make_sensor(camera: Camera, spp: int = 16) -> mi.Sensor:
     """The loaded ``mi.Sensor`` of `sensor_description`; InputError as there."""
     import mitsuba as mi
 
     from mifit.render.plugins import register_plugins
 
     register_plugins()
-    return mi.load_dict(to_mitsuba(sensor_description(camera, spp, sampler)))
+    return mi.load_dict(to_mitsuba(sensor_description(camera, spp)))

@@ -132,8 +132,7 @@ def synthesize(  # noqa: PLR0913
         subject = _draw_subject(shape, style, timesteps, map_size, outside)
         subject = dataclasses.replace(subject, landmark_bias=landmark_bias)
         light = studio_environment(seed + i) if radiance is None else radiance
-        start = i * (timesteps + 1)
-        advance = partial(_advance, progress, start, total)
+        advance = partial(_advance, progress, i * (timesteps + 1), total)
         _write_capture(folder, subject, cameras, light, spp, advance)
     return out
 

@@ -17,24 +17,15 @@ _VERSION = 1
 
 
 def save_model(model: MorphableModel, path: str | Path) -> None:
-    """Write a model; loading it gives back every array bit for bit.
-
-    Raises
-    ------
-    InputError
-        The path does not end in ``.npz`` or cannot be written.
-    """
+    """Write a model; loading it gives back every array bit for bit. InputError where the path isn't ``.npz``."""
     if Path(path).suffix != ".npz":
         raise InputError(f"{path}: found suffix '{Path(path).suffix}', expected .npz")
     arrays = {f.name: np.asarray(getattr(model, f.name)) for f in fields(model) if f.name != "symmetry"}
     if model.symmetry is not None:
         arrays["symmetry"] = model.symmetry
     arrays[FORMAT_KEY] = np.asarray(_VERSION)
-    try:
-        with replacing(path) as temporary:
-            np.savez(temporary, **arrays)  # type: ignore[arg-type]
-    except OSError as error:
-        raise InputError(f"{path}: cannot write: {error}") from None
+    with replacing(path) as temporary:
+        np.savez(temporary, **arrays)  # type: ignore[arg-type]
 
 
 def load_own(path: Path) -> MorphableModel:
