@@ -6,6 +6,7 @@ import argparse
 import importlib
 import re
 from argparse import Namespace
+from functools import partial
 
 import mifit
 from mifit.cli.arguments import READERS, Parser, whole
@@ -264,19 +265,14 @@ def build_parser() -> argparse.ArgumentParser:
             p = _command(commands, group, text_of_group, common)
             actions = p.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=Parser)
         p = _command(actions, action, text, common) if action and actions else _command(commands, name, text, common)
-        p.set_defaults(run=_Run(function))
+        p.set_defaults(run=partial(_run, *function.split(".")))
         _add(p, lines)
     return parser
 
 
-class _Run:
-    """A command, whose module is loaded when it runs."""
-
-    def __init__(self, function: str) -> None:
-        self._module, self._name = function.split(".")
-
-    def __call__(self, arguments: Namespace) -> int | None:
-        return getattr(importlib.import_module(f"mifit.cli.{self._module}"), self._name)(arguments)
+def _run(module: str, name: str, arguments: Namespace) -> int | None:
+    """Run a command, whose module is loaded now."""
+    return getattr(importlib.import_module(f"mifit.cli.{module}"), name)(arguments)
 
 
 def _command(

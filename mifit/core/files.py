@@ -220,7 +220,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     check_overwriting(path)
-    temporary = _part(path)
+    temporary = path.with_name(f".{path.stem}.{_MACHINE}-{os.getpid()}.part{path.suffix}")
     with _room(path, temporary):
         path.parent.mkdir(parents=True, exist_ok=True)
         remove_abandoned(path.parent)
@@ -319,7 +319,3 @@ def _runs(process: int) -> bool:
     except OSError:  # another user's
         return True
     return True
-
-
-def _part(path: Path) -> Path:
-    return path.with_name(f".{path.stem}.{_MACHINE}-{os.getpid()}.part{path.suffix}")

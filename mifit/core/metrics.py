@@ -109,13 +109,13 @@ _XYZ = np.array(  # of linear Rec. 709
         [0.0193308187155918, 0.119194779794626, 0.9505321522496607],
     ]
 )
-_NORMALIZED_XYZ = _XYZ / _XYZ.sum(axis=1, keepdims=True)  # 1, 1, 1 for white
+_XYZ /= _XYZ.sum(axis=1, keepdims=True)  # 1, 1, 1 for white
 
 
 def _opponent(srgb: NDArray) -> NDArray[np.float64]:
     """SRGB 0..1 -> YCxCz, linear opponent colours."""
     rgb = srgb if srgb.ndim == 3 else np.repeat(srgb[..., None], 3, axis=-1)
-    x, y, z = np.moveaxis(srgb_to_linear(np.clip(rgb, 0.0, 1.0)) @ _NORMALIZED_XYZ.T, -1, 0)
+    x, y, z = np.moveaxis(srgb_to_linear(np.clip(rgb, 0.0, 1.0)) @ _XYZ.T, -1, 0)
     return np.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], axis=-1)
 
 
@@ -132,12 +132,12 @@ def _blurred(opponent: NDArray, pixels_per_degree: float) -> NDArray[np.float64]
         out[..., c] /= total
     y = (out[..., 0] + 16.0) / 116.0
     xyz = np.stack([y + out[..., 1] / 500.0, y, y - out[..., 2] / 200.0], axis=-1)
-    return np.clip(xyz @ np.linalg.inv(_NORMALIZED_XYZ).T, 0.0, 1.0)
+    return np.clip(xyz @ np.linalg.inv(_XYZ).T, 0.0, 1.0)
 
 
 def _hunt_lab(linear: NDArray) -> NDArray[np.float64]:
     """Linear RGB -> CIELAB whose colourfulness grows with lightness, as the eye's does (Hunt)."""
-    t, d = linear @ _NORMALIZED_XYZ.T, 6.0 / 29.0
+    t, d = linear @ _XYZ.T, 6.0 / 29.0
     fx, fy, fz = np.moveaxis(np.where(t > d**3, np.cbrt(t), t / (3.0 * d**2) + 4.0 / 29.0), -1, 0)
     lightness = 116.0 * fy - 16.0
     return np.stack([lightness, 5.0 * lightness * (fx - fy), 2.0 * lightness * (fy - fz)], axis=-1)

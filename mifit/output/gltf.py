@@ -150,11 +150,7 @@ def write_glb(
         animations.append(_animation(out, geometry, rows, np.subtract(animate, animate[0]) / fps, metre, full))
     else:
         head["matrix"] = rigid(rotation, geometry.translation[i] * metre).T.ravel().tolist()
-    nodes: list[Document] = [head]
-    cameras: list[Document] = []
-    for camera in result.cameras:
-        nodes.append(_camera_node(camera, len(cameras), metre))
-        cameras.append(_camera(camera))
+    nodes = [head, *(_camera_node(camera, k, metre) for k, camera in enumerate(result.cameras))]
     document: Document = {
         "asset": {"version": "2.0", "generator": f"mifit {mifit.__version__}"},
         "extensionsUsed": list(skin["extensions"]),
@@ -184,8 +180,8 @@ def write_glb(
         document |= {"extensionsRequired": ["KHR_mesh_quantization"]}
         document["extensionsUsed"].append("KHR_mesh_quantization")
         document["meshes"][0] |= {"weights": weights.tolist(), "extras": {"targetNames": names}}
-    if cameras:
-        document["cameras"] = cameras
+    if result.cameras:
+        document["cameras"] = [_camera(camera) for camera in result.cameras]
     if animations:
         document["animations"] = animations
     document["buffers"] = [{"byteLength": len(out.data)}]

@@ -91,7 +91,7 @@ def surface_maps(result: Reconstruction, timestep: int, skin: bool = False) -> S
     model, geometry = result.model, result.geometry
     reflectance = result.reflectance
     size = 512 if reflectance is None else reflectance.diffuse.shape[0]
-    texels, nearest = _shown_texels(result, size)
+    texels, nearest = _texels(model, size, _whole(result))
     corners = (model.faces, texels.face, texels.weights)
     if reflectance is None:
         diffuse = texels.to_map(np.clip(interpolate(geometry.vertex_albedo, *corners), 0, 1).astype(np.float32))
@@ -120,8 +120,9 @@ def vertex_materials(result: Reconstruction, skin: bool = False) -> NDArray[np.f
     expected = np.column_stack([albedo, np.zeros(len(albedo))])
     if reflectance is None:
         return np.clip(expected, 0.0, 1.0).astype(np.float32)
-    known, uv, continued = _continuation(model, _whole(result))
-    _, nearest = _shown_texels(result, len(reflectance.diffuse))
+    whole = _whole(result)
+    known, uv, continued = _continuation(model, whole)
+    _, nearest = _texels(model, len(reflectance.diffuse), whole)
     diffuse = reflectance.diffuse if skin else reflectance.lit_diffuse
     values = _padded(np.concatenate([diffuse, reflectance.specular[..., None]], axis=2), nearest)
     offset = sample_map(values, uv) - expected[known]
@@ -133,10 +134,6 @@ def vertex_materials(result: Reconstruction, skin: bool = False) -> NDArray[np.f
 def _padded(values: NDArray, nearest: NDArray[np.intp]) -> NDArray:
     """A map (S, S, ...) whose texels repeat those at ``nearest``."""
     return values.reshape(-1, *values.shape[2:]).take(nearest, axis=0)
-
-
-def _shown_texels(result: Reconstruction, size: int) -> tuple[TexelMap, NDArray[np.intp]]:
-    return _texels(result.model, size, _whole(result))
 
 
 def _whole(result: Reconstruction) -> bool:

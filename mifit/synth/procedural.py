@@ -6,21 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from mifit.core.sh import latlong_directions
 
-def studio_environment(seed: int = 0, height: int = 128) -> NDArray[np.float32]:
-    """Lat-long radiance of a studio, (height, 2 * height, 3), linear.
 
-    Mitsuba's ``envmap`` layout: row 0 is up (+y), the centre of the top-left pixel lies half a pixel in.
+def studio_environment(seed: int = 0) -> NDArray[np.float32]:
+    """Lat-long radiance of a studio, (128, 256, 3), linear; axes as in `core.sh`.
+
     A gradient from warm floor to cool ceiling, a large key softbox on one side in front, a dimmer fill on the
     other, and a rim light behind; places and colours vary with the seed.
     """
     rng = np.random.default_rng([seed, 7])
-    width = 2 * height
-    theta = (np.arange(height) + 0.5) * np.pi / height
-    phi = (np.arange(width) + 0.5) * 2 * np.pi / width
-    sin_theta, cos_theta = np.sin(theta)[:, None], np.cos(theta)[:, None]
-    # Mitsuba: u = 0 looks along -z ... direction = (sin phi sin theta, cos theta, -cos phi sin theta)
-    direction = np.stack(np.broadcast_arrays(np.sin(phi) * sin_theta, cos_theta, -np.cos(phi) * sin_theta), axis=-1)
+    direction = latlong_directions(128, 256)
     up = 0.5 + 0.5 * direction[..., 1:2]
     image = 0.10 * ((1 - up) * np.array([1.1, 0.95, 0.8]) + up * np.array([0.8, 0.95, 1.15]))
     side = rng.choice([-1.0, 1.0])

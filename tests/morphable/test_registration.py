@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mifit.morphable import MorphableModel, describe
+from mifit.cli.setup import model_info, notices
+from mifit.morphable import MorphableModel
 from mifit.morphable.register import register, rigid_between
 from mifit.morphable.topology import EYES_AND_MOUTH, IBUG_MIRROR
 from mifit.morphable.unwrap import unwrap
@@ -89,8 +90,8 @@ def test_landmark_maps():
 
 
 def test_info_names_what_is_odd(coarse):
-    text = describe.model_info(coarse)
+    text = model_info(coarse)
     assert "identity          160 modes" in text and "77 bounded" in text and coarse.digest in text
     assert "notice" not in text
     odd = dataclasses.replace(coarse, faces=np.r_[coarse.faces[:-1], [[5, 5, 6]]])
-    assert describe.notices(odd)[0].startswith("1 faces of the mean have no area")
+    assert notices(odd)[0].startswith("1 faces of the mean have no area")

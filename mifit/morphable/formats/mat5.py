@@ -35,7 +35,7 @@ def is_mat5(path: Path) -> bool:
 
 def mat_names(path: Path) -> list[str]:
     """Names of the numeric arrays in the file."""
-    return [name for name, _ in _matrices(path, names_only=True)]
+    return [name for name, _ in _matrices(path)]
 
 
 def read_mat(path: Path, keys: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, NDArray]:
@@ -59,9 +59,7 @@ def read_mat(path: Path, keys: tuple[str, ...], optional: tuple[str, ...] = ()) 
     return out
 
 
-def _matrices(
-    path: Path, wanted: tuple[str, ...] = (), names_only: bool = False
-) -> Iterator[tuple[str, NDArray | None]]:
+def _matrices(path: Path, wanted: tuple[str, ...] = ()) -> Iterator[tuple[str, NDArray | None]]:
     """Yield (name, array) of each numeric matrix; the array is None when it isn't wanted."""
     with opened(path, MAX_MODEL_BYTES, "MATLAB file") as (f, size):
         budget = min(MAX_MODEL_BYTES, MAX_UNPACKING * size + UNPACKING_SLACK)
@@ -79,7 +77,7 @@ def _matrices(
                 raw = f.read(length)
                 body = _inflate(path, raw, 4096)
                 header = _header(path, body[8:]) if len(body) >= 8 else None
-                if header and not names_only and header[0] in wanted:
+                if header and header[0] in wanted:
                     need = 8 + struct.unpack("<I", body[4:8])[0]
                     if need > budget:
                         raise InputError(f"{path}: {header[0]} claims {need} bytes unpacked, expected at most {budget}")
@@ -90,7 +88,7 @@ def _matrices(
             elif kind == 14:  # a matrix
                 body = f.read(min(length, 4096))
                 header = _header(path, body)
-                if header and not names_only and header[0] in wanted:
+                if header and header[0] in wanted:
                     yield header[0], _array(path, body + f.read(length - len(body)), header)
                 elif header:
                     yield header[0], None
