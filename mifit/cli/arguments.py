@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from mifit.core.diagnostics import Diagnostic, worst_first
-from mifit.core.files import check_overwriting, overwriting
+from mifit.core.files import Document, check_overwriting, overwriting
 from mifit.core.limits import MAX_COUNT, MAX_NUMBER
 from mifit.errors import InputError
 
@@ -73,6 +73,11 @@ def check_empty(folder: Path, force: bool = False) -> None:
     """Refuse to write into a folder with something in it, or a file in its place, unless ``force``."""
     if folder.exists() and not force and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: is there already and not empty; --force writes into it, or name another folder")
+
+
+def given(arguments: Namespace, *names: str) -> Document:
+    """The arguments of these names, to hand on to a function whose parameters are called alike."""
+    return {name: getattr(arguments, name) for name in names}
 
 
 def use_variant(arguments: Namespace) -> str:

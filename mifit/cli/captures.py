@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 from pathlib import Path
 
-from mifit.cli.arguments import check_empty, use_variant
+from mifit.cli.arguments import check_empty, given, use_variant
 from mifit.cli.clips import start_times
 from mifit.cli.console import console_progress
 from mifit.errors import InputError
@@ -23,23 +23,10 @@ def synth(arguments: Namespace) -> None:
     use_variant(arguments)
     from mifit.synth import synthesize
 
-    synthesize(
-        arguments.out,
-        subjects=arguments.subjects,
-        timesteps=arguments.timesteps,
-        env=arguments.env,
-        model=arguments.model,
-        seed=arguments.seed,
-        width=arguments.width,
-        height=arguments.height,
-        spp=arguments.spp,
-        tone=arguments.tone,
-        outside=arguments.outside,
-        landmark_bias=arguments.landmark_bias,
-        portrait=arguments.portrait,
-        progress=console_progress(arguments.quiet),
-    )
-    print(f"Capture: {arguments.out}")
+    options = given(arguments, "subjects", "timesteps", "env", "model", "seed", "width", "height", "spp")
+    subject = given(arguments, "tone", "outside", "landmark_bias", "portrait")
+    synthesize(out, **options, **subject, progress=console_progress(arguments.quiet))
+    print(f"Capture: {out}")
 
 
 def _synth_scan(arguments: Namespace) -> None:
@@ -77,20 +64,17 @@ def import_(arguments: Namespace) -> None:
     from mifit.capture.sources import open_sources
     from mifit.extras.colmap import import_colmap
 
-    sources = {name: getattr(arguments, name) for name in ("calibration", "transforms", "colmap")}
-    given = [name for name, path in sources.items() if path is not None]
-    if len(given) > 1:
-        raise InputError(f"found more than one of {', '.join(given)}, expected one")
+    sources = given(arguments, "calibration", "transforms", "colmap")
+    named = [name for name, path in sources.items() if path is not None]
+    if len(named) > 1:
+        raise InputError(f"found more than one of {', '.join(named)}, expected one")
     if arguments.photos is not None and arguments.colmap is None:
         raise InputError("--photos: found without a model to go with, expected --colmap")
-    options = {name: getattr(arguments, name) for name in ("images", "every", "start", "count", "trim", "units")} | {
-        "videos": arguments.video,
-        "progress": console_progress(arguments.quiet),
-    }
+    progress = console_progress(arguments.quiet)
+    options = given(arguments, "images", "every", "start", "count", "trim", "units")
+    options |= {"videos": arguments.video, "progress": progress}
     if arguments.video:
-        options["starts"] = start_times(
-            arguments, open_sources(arguments.video, ()), arguments.offset, options["progress"]
-        )
+        options["starts"] = start_times(arguments, open_sources(arguments.video, ()), arguments.offset, progress)
     if arguments.colmap is not None:
         import_colmap(arguments.colmap, arguments.out, photos=arguments.photos, **options)
     else:

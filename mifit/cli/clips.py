@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mifit.cli.arguments import say
+from mifit.cli.arguments import given, say
 from mifit.cli.console import console_progress
 from mifit.core.files import Document, read_text, write_text
 from mifit.core.limits import MAX_DOCUMENT_BYTES
@@ -76,8 +76,7 @@ def _origin(arguments: Namespace) -> Document:
             raise InputError(f"{path}: no such clip, folder of frames, photograph or calibration")
         inside = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
         known[str(path.absolute())] = [[p.name, p.stat().st_size, p.stat().st_mtime_ns] for p in inside]
-    options = {name: getattr(arguments, name) for name in ("pattern", "offset", "every")}
-    options["trim"] = str(arguments.trim)
+    options = given(arguments, "pattern", "offset", "every") | {"trim": str(arguments.trim)}
     return {"files": known, "clips": len(arguments.capture), **options}
 
 

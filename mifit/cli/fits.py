@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mifit.cli.arguments import say, tell, use_variant
+from mifit.cli.arguments import given, say, tell, use_variant
 from mifit.cli.clips import capture_of
 from mifit.cli.console import console_progress
 from mifit.cli.results import judge
@@ -123,14 +123,10 @@ def fit(arguments: Namespace) -> int:
         out,
         capture,
         model,
-        cameras=arguments.cameras,
+        **given(arguments, "cameras", "until", "seed", "resume", "force"),
         timesteps=timesteps,
         config=config,
-        until=arguments.until,
-        seed=arguments.seed,
         progress=progress,
-        resume=arguments.resume,
-        force=arguments.force,
         tell=tell_now,
     )
     with replacing_files(out, force=arguments.force) as new:
@@ -182,8 +178,7 @@ def track(arguments: Namespace) -> int:
         capture,
         timesteps,
         config=from_mapping(NormalsConfig, result.config.get("normals", {}), "result.json: config: normals"),
-        seed=arguments.seed,
-        resume=arguments.resume,
+        **given(arguments, "seed", "resume"),
         progress=progress,
     )
     with replacing_files(arguments.result) as new:
@@ -214,13 +209,5 @@ def run(arguments: Namespace) -> None:
     """Run an experiment or a sweep."""
     from mifit.experiments import run_experiment
 
-    summary = run_experiment(
-        arguments.experiment,
-        overrides=arguments.overrides,
-        out=arguments.out,
-        dask=arguments.dask,
-        variant=arguments.variant,
-        seed=arguments.seed,
-        progress=console_progress(arguments.quiet),
-    )
-    print(summary)
+    options = given(arguments, "overrides", "out", "dask", "variant", "seed")
+    print(run_experiment(arguments.experiment, **options, progress=console_progress(arguments.quiet)))

@@ -7,7 +7,7 @@ import sys
 from argparse import Namespace
 from typing import TYPE_CHECKING
 
-from mifit.cli.arguments import say, tell, use_variant, writes
+from mifit.cli.arguments import given, say, tell, use_variant, writes
 from mifit.cli.console import console_progress
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.files import write_text
@@ -45,12 +45,9 @@ def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> int
     found = evaluate(
         result,
         capture,
-        arguments.camera,
-        timesteps=arguments.timesteps,
-        region=arguments.region,
+        **given(arguments, "camera", "timesteps", "region", "passes"),
         progress=console_progress(arguments.quiet),
         baseline=True,
-        passes=arguments.passes,
         watch=lambda one: shown.append(one) if len(shown) < SHOWN_TIMESTEPS else None,
     )
     said = list(result.diagnostics)
@@ -108,8 +105,7 @@ def render(arguments: Namespace) -> None:
     import mifit
     from mifit.core.image import write_image
 
-    turned = {name: getattr(arguments, name) for name in ("yaw", "pitch", "distance")}
-    turned = {name: value for name, value in turned.items() if value is not None}
+    turned = {k: v for k, v in given(arguments, "yaw", "pitch", "distance").items() if v is not None}
     if arguments.camera and turned:
         raise InputError(f"--camera {arguments.camera}: found --{next(iter(turned))} beside it, expected one of both")
     result = mifit.Reconstruction.load(arguments.result)
@@ -178,20 +174,10 @@ def relight(arguments: Namespace) -> None:
     if arguments.size:
         cameras = [camera.resized(arguments.size / camera.width) for camera in cameras]
     turns = arguments.turn or 1
-    found = write_relit(
-        result,
-        arguments.env,
-        arguments.out,
-        cameras,
-        [arguments.rotate + 360.0 * k / turns for k in range(turns)],
-        arguments.exposure,
-        arguments.video,
-        arguments.fps,
-        arguments.integrator,
-        check=arguments.check,
-        seed=arguments.seed,
-        progress=console_progress(arguments.quiet),
-    )
+    rotations = [arguments.rotate + 360.0 * k / turns for k in range(turns)]
+    options = given(arguments, "exposure", "video", "fps", "integrator", "check", "seed")
+    progress = console_progress(arguments.quiet)
+    found = write_relit(result, arguments.env, arguments.out, cameras, rotations, progress=progress, **options)
     say(
         arguments,
         f"Exposure: {found['exposure']:.3g} times the file's own radiance; "
@@ -211,14 +197,6 @@ def export(arguments: Namespace) -> None:
     result = _result_and_variant(arguments)
     from mifit.output.export import export
 
-    export(
-        result,
-        arguments.format,
-        arguments.out,
-        arguments.timestep,
-        mesh=arguments.mesh,
-        animate=arguments.animate,
-        fps=arguments.fps,
-        units=arguments.units,
-    )
+    options = given(arguments, "timestep", "mesh", "animate", "fps", "units")
+    export(result, arguments.format, arguments.out, **options)
     print(f"Export: {arguments.out}")

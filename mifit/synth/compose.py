@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from collections.abc import Callable
@@ -129,8 +128,7 @@ def synthesize(  # noqa: PLR0913
         folder = out if subjects == 1 else out / f"subject_{i:02d}"
         style = SkinStyle.draw(seed + i, tone)
         style = style.portrait() if portrait else style
-        subject = _draw_subject(shape, style, timesteps, map_size, outside)
-        subject = dataclasses.replace(subject, landmark_bias=landmark_bias)
+        subject = _draw_subject(shape, style, timesteps, map_size, outside, landmark_bias)
         light = studio_environment(seed + i) if radiance is None else radiance
         advance = partial(_advance, progress, i * (timesteps + 1), total)
         _write_capture(folder, subject, cameras, light, spp, advance)
@@ -173,7 +171,9 @@ class _Subject:
     landmark_bias: float
 
 
-def _draw_subject(model: MorphableModel, style: SkinStyle, timesteps: int, map_size: int, outside: float) -> _Subject:
+def _draw_subject(
+    model: MorphableModel, style: SkinStyle, timesteps: int, map_size: int, outside: float, landmark_bias: float
+) -> _Subject:
     seed = style.seed
     scale = model.unit_mm / 10.0  # the world is in centimetres
     mean_mm = model.mean.astype(np.float64) * model.unit_mm
@@ -198,7 +198,7 @@ def _draw_subject(model: MorphableModel, style: SkinStyle, timesteps: int, map_s
     rims = [] if "eye0" in parts else openings(model)[0]
     eyes = [head.eye_centre(neutral[rim] * model.unit_mm) / model.unit_mm for rim in rims]
     poses = head.draw_motion(model, timesteps, seed, scale, centre)
-    return _Subject(model, seed, neutral, poses, scale, skin, parts, eyes, 0.0)
+    return _Subject(model, seed, neutral, poses, scale, skin, parts, eyes, landmark_bias)
 
 
 def _write_capture(
