@@ -8,7 +8,6 @@ of the top level serve all frames that lack them. Added here: ``landmark_path``,
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Iterable, Mapping
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera, inverse, rigid
-from mifit.core.files import Document, read_text, write_text
+from mifit.core.files import Document, read_json, write_json
 from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_NUMBER, MAX_PIXELS
 from mifit.errors import InputError
 
@@ -163,7 +162,7 @@ def write_transforms(path: str | Path, views: Iterable[View], shots: Iterable[Sh
             entry["gain"] = list(view.gain)
         frames.append(entry)
     document = {"camera_model": "OPENCV", "units": units, "frames": frames}
-    write_text(path, json.dumps(document, indent=1) + "\n")
+    write_json(path, document)
 
 
 def update_frames(path: str | Path, changes: Mapping[tuple[str, int], Mapping[str, object]]) -> None:
@@ -191,7 +190,7 @@ def update_frames(path: str | Path, changes: Mapping[tuple[str, int], Mapping[st
                 frame.pop(key, None)
             else:
                 frame[key] = value
-    write_text(path, json.dumps(document, indent=1) + "\n")
+    write_json(path, document)
 
 
 def _relative(file: Path, folder: Path) -> str:
@@ -199,12 +198,7 @@ def _relative(file: Path, folder: Path) -> str:
 
 
 def _load(path: Path) -> Document:
-    try:
-        document = json.loads(read_text(path, MAX_DOCUMENT_BYTES, "file of a capture"))
-    except InputError:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not a readable JSON file: {error}") from None
+    document = read_json(path, MAX_DOCUMENT_BYTES, "file of a capture")
     if not isinstance(document, dict):
         raise InputError(f"{path}: found {_short(document)}, expected an object with a list 'frames'")
     return document

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from argparse import Namespace
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from mifit.cli.arguments import given, say
 from mifit.cli.console import console_progress
-from mifit.core.files import Document, read_text, write_text
+from mifit.core.files import Document, read_json, write_json
 from mifit.core.limits import MAX_DOCUMENT_BYTES
 from mifit.errors import InputError
 
@@ -51,7 +50,7 @@ def capture_of(arguments: Namespace) -> Path:
     origin = _origin(arguments)
     if os.path.lexists(folder):
         file = folder / ORIGIN
-        if file.is_file() and json.loads(read_text(file, MAX_DOCUMENT_BYTES)) == origin:
+        if file.is_file() and read_json(file, MAX_DOCUMENT_BYTES) == origin:
             say(arguments, f"Capture: {folder}, as an earlier run made it of these clips")
             return folder
         if not arguments.force:
@@ -60,7 +59,7 @@ def capture_of(arguments: Namespace) -> Path:
 
     def make(made: Path) -> None:
         _make(arguments, paths, made)
-        write_text(made / ORIGIN, json.dumps(origin, indent=1) + "\n")
+        write_json(made / ORIGIN, origin)
 
     add_folder(out, folder.name, make, arguments.force)
     say(arguments, f"Capture: {folder}")

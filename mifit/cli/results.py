@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from argparse import Namespace
 from typing import TYPE_CHECKING
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING
 from mifit.cli.arguments import given, say, tell, use_variant, writes
 from mifit.cli.console import console_progress
 from mifit.core.diagnostics import Diagnostic
-from mifit.core.files import write_text
+from mifit.core.files import write_json
 from mifit.errors import InputError
 
 if TYPE_CHECKING:
@@ -57,7 +56,7 @@ def judge(arguments: Namespace, result: Reconstruction, capture: Capture) -> int
     code = tell(arguments, said)
     if arguments.json:
         asked = {key: value for key, value in found.items() if key != "baseline" or arguments.baseline}
-        write_text(arguments.json, json.dumps(asked, indent=2) + "\n")
+        write_json(arguments.json, asked, indent=2)
     print(f"camera {found['camera']}, timesteps {found['timesteps']}, {found['region_pixels']} pixels")
     _print_measures(found["methods"])
     if arguments.baseline:
@@ -95,7 +94,7 @@ def score(arguments: Namespace) -> None:
         text = f"{arguments.images / name}: its name says nothing that is scored; left out"
         print(f"mifit: warning: {text}", file=sys.stderr)
     if arguments.json:
-        write_text(arguments.json, json.dumps(found, indent=2) + "\n")
+        write_json(arguments.json, found, indent=2)
     print(summary(found))
 
 

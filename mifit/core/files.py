@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import functools
 import hashlib
+import json
 import os
 import platform
 import re
@@ -12,7 +13,7 @@ import shutil
 import stat
 import sys
 import unicodedata
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
@@ -277,6 +278,20 @@ def cache_folder() -> Path:
         name = "MIFIT_CACHE" if named else "XDG_CACHE_HOME"
         raise InputError(f"{name}: found {named or base!r}, expected an absolute path")
     return folder
+
+
+def read_json(path: str | Path, limit: int, what: str = "file") -> Any:
+    """Content of a JSON file of at most ``limit`` bytes; InputError as `opened` raises it, or when it is no JSON."""
+    text = read_text(path, limit, what)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not readable as JSON: {error}") from None
+
+
+def write_json(path: str | Path, document: Mapping[str, object], **options: Any) -> None:
+    """Write a JSON file whole or not at all; ``options`` are those of ``json.dumps``."""
+    write_text(path, json.dumps(document, **{"indent": 1, **options}) + "\n")
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -8,7 +8,6 @@ processes of this machine or through a Dask cluster, by the same function. docs/
 from __future__ import annotations
 
 import dataclasses
-import json
 import multiprocessing
 import os
 import platform
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 
 import mifit
 from mifit import cache
-from mifit.core.files import FULL, Document, file_name, read_text, write_text
+from mifit.core.files import FULL, Document, file_name, read_json, read_text, write_json, write_text
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.core.process import no_chatter, set_decoding_context
 from mifit.errors import InputError, MifitError
@@ -87,8 +86,8 @@ def run_experiment(
 def finished(folder: Path, run: Run) -> Document | None:
     """The record of a run that ended well, or None."""
     try:
-        record = json.loads(read_text(folder / "run.json", MAX_SETTINGS_BYTES))
-    except (ValueError, RecursionError):  # InputError too
+        record = read_json(folder / "run.json", MAX_SETTINGS_BYTES)
+    except InputError:
         return None
     return record if isinstance(record, dict) and record.get("digest") == run.digest else None
 
@@ -164,7 +163,7 @@ def execute(run: Run, folder: str, experiment_folder: str, variant: str) -> None
         },
         "machine": f"{platform.machine()}, {os.cpu_count()} processors",
     }
-    write_text(where / "run.json", json.dumps(record, indent=1) + "\n")
+    write_json(where / "run.json", record)
 
 
 def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: str) -> dict[str, float]:
@@ -194,7 +193,7 @@ def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: 
         result.save(folder / "result")
     if e.evaluate:
         evaluation = evaluate(result, capture, e.evaluate.camera, e.evaluate.timesteps, e.evaluate.region)
-        write_text(folder / "evaluation.json", json.dumps(evaluation, indent=1) + "\n")
+        write_json(folder / "evaluation.json", evaluation)
         for method, figures in evaluation["methods"].items():
             metrics |= {f"psnr_{method}": figures["psnr"], f"rmse_{method}": figures["rmse"]}
     if e.relight:
@@ -259,7 +258,7 @@ def _summary(plan: Plan, folder: Path) -> str:
             rows.append({"run": run.folder, "swept": run.swept, "metrics": record["metrics"]})
     groups = over_subjects(rows)
     document = {"name": plan.name, "runs": rows, "over_subjects": [dataclasses.asdict(group) for group in groups]}
-    write_text(folder / "summary.json", json.dumps(document, indent=1) + "\n")
+    write_json(folder / "summary.json", document)
     draw(folder / "plots", rows, groups)
     lines = [f"# {plan.name}: {len(rows)} of {len(plan.runs)} runs", "", *runs_table(rows), *subjects_table(groups)]
     return "\n".join(lines)

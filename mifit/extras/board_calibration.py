@@ -7,7 +7,6 @@ see, and in the end everything together (`adjust`).
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,7 @@ from mifit.capture.sources import Source
 from mifit.capture.stereo import write_stereo
 from mifit.capture.transforms import UNITS_MM, Shot, View, write_transforms
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera, rigid
-from mifit.core.files import file_name, write_text
+from mifit.core.files import file_name, write_json
 from mifit.errors import InputError
 from mifit.extras.board_camera import ALIKE, CONTRADICTS, SETTINGS, Watched, calibrate_one, look
 from mifit.extras.boards import Board, grey_image
@@ -142,7 +141,7 @@ def write_calibration(calibration: BoardCalibration, folder: str | Path, units: 
         "pairs": calibration.pair_errors,
         "warnings": list(calibration.warnings),
     }
-    write_text(folder / "calibration.json", json.dumps(document, indent=1) + "\n")
+    write_json(folder / "calibration.json", document)
     if len(calibration.cameras) == 2:
         write_stereo(folder / "stereo.yml", *calibration.cameras)
     shots = [Shot(c.name, 0, folder / "images" / file_name(c.name) / "0000.png") for c in calibration.cameras]

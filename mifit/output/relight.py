@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mifit.appearance.environment import illumination_of
 from mifit.appearance.illumination import Illumination
-from mifit.core.files import Document, file_name, write_text
+from mifit.core.files import Document, file_name, write_json
 from mifit.core.image import check_environment, read_environment, reduced, to_8_bit, write_image
 from mifit.core.metrics import psnr, rmse
 from mifit.core.sh import LUMINANCE, SHLighting
@@ -202,7 +201,7 @@ def write_relit(
     }
     if check:
         figures["check"] = _check(lits[0], views[0].resized(0.25), timestep, seed)
-    write_text(folder / "relight.json", json.dumps(figures, indent=1) + "\n")
+    write_json(folder / "relight.json", figures)
     return figures
 
 

@@ -18,10 +18,9 @@ undistorted photographs. Relit views and passes are compared after one factor pe
 from __future__ import annotations
 
 import re
-from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,9 +96,9 @@ def score(
     cameras = capture.cameras[:2] if fitted is None else tuple(fitted)
     for name in cameras:
         capture.camera(name)
-    found = _Files.of(folder, capture)
+    found = _files(folder, capture)
     out: Document = {"capture": Path(capture.path).name, "fitted": list(cameras)}
-    jobs = len(found.views) + len(found.relit) + len(found.passes) + len(found.meshes)
+    jobs = sum(len(files) for kind, files in found.items() if kind != "ignored")
     if not jobs:
         example = next((c for c in capture.cameras if c not in cameras), capture.cameras[-1])
         raise InputError(
@@ -108,60 +107,46 @@ def score(
         )
     progress("Scoring", 0, jobs)
     truth = _Truths(capture, cameras, model)
-    if found.views:
-        out["views"] = _views(found.views, truth)
-    if found.relit:
-        out["relit"] = _relit(found.relit, capture)
-    if found.passes:
-        out["passes"] = {camera: _passes(paths, camera, capture) for camera, paths in found.passes.items()}
-    if found.meshes:
-        out["meshes"] = _meshes(found.meshes, truth)
-    out["ignored"] = found.ignored
+    if found["views"]:
+        out["views"] = _views(found["views"], truth)
+    if found["relit"]:
+        out["relit"] = _relit(found["relit"], capture)
+    if found["passes"]:
+        of = dict.fromkeys(camera for camera, _ in found["passes"])
+        out["passes"] = {camera: _passes(found["passes"], camera, capture) for camera in of}
+    if found["meshes"]:
+        out["meshes"] = _meshes(found["meshes"], truth)
+    out["ignored"] = list(found["ignored"])
     progress("Scoring", jobs, jobs)
     return out
 
 
-class _Files:
-    """The files of a folder by what their names mean."""
+def _files(folder: Path, capture: Capture) -> dict[str, dict[Any, Path]]:
+    """The files of a folder by kind and by what their names mean; two files of one meaning are an error."""
+    found: dict[str, dict[Any, Path]] = {kind: {} for kind in ("views", "relit", "passes", "meshes", "ignored")}
+    for path in sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")):
+        kind, key = _meaning(path, capture)
+        if key in found[kind]:
+            raise InputError(f"{path}: {found[kind][key].name} means the same; expected one of the two")
+        found[kind][key] = path
+    return found
 
-    def __init__(self) -> None:
-        self.views: dict[tuple[str, int], Path] = {}
-        self.relit: dict[str, Path] = {}
-        self.passes: dict[str, dict[str, Path]] = defaultdict(dict)
-        self.meshes: dict[int, Path] = {}
-        self.ignored: list[str] = []
 
-    @classmethod
-    def of(cls, folder: Path, capture: Capture) -> _Files:
-        """Read the names; two files of one meaning are an error."""
-        found = cls()
-        for path in sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")):
-            place = found._place(path, capture)
-            if place is None:
-                found.ignored.append(path.name)
-                continue
-            group, key = place
-            if key in group:
-                raise InputError(f"{path}: {group[key].name} means the same; expected one of the two")
-            group[key] = path
-        return found
-
-    def _place(self, path: Path, capture: Capture) -> tuple[dict, object] | None:
-        stem, suffix = path.stem, path.suffix.lower()
-        if suffix in MESHES:
-            known = stem.isdigit() and int(stem) in capture.timesteps
-            return (self.meshes, int(stem)) if known else None
-        if suffix not in SUFFIXES:
-            return None
+def _meaning(path: Path, capture: Capture) -> tuple[str, object]:
+    """Kind and key of a file: camera and timestep, environment, camera and pass, or timestep; else its name alone."""
+    stem, suffix = path.stem, path.suffix.lower()
+    if suffix in MESHES and stem.isdigit() and int(stem) in capture.timesteps:
+        return "meshes", int(stem)
+    if suffix in SUFFIXES:
         view = re.fullmatch(r"(.+)_(\d{4,})", stem)
         if view and view[1] in capture.cameras and int(view[2]) in capture.timesteps:
-            return self.views, (view[1], int(view[2]))
+            return "views", (view[1], int(view[2]))
         kind, _, name = stem.partition("_")
         if kind == "relit" and name:
-            return self.relit, name
+            return "relit", name
         if kind in ("diffuse", "specular") and name in capture.cameras:
-            return self.passes[name], kind
-        return None
+            return "passes", (name, kind)
+    return "ignored", path.name
 
 
 class _Truths:
@@ -228,7 +213,8 @@ def _relit(files: dict[str, Path], capture: Capture) -> dict[str, float]:
     return {**out, "mean": float(np.mean(list(out.values())))}
 
 
-def _passes(paths: dict[str, Path], camera: str, capture: Capture) -> dict[str, float]:
+def _passes(files: dict[tuple[str, str], Path], camera: str, capture: Capture) -> dict[str, float]:
+    paths = {kind: path for (name, kind), path in files.items() if name == camera}
     missing = next((kind for kind in ("diffuse", "specular") if kind not in paths), None)
     if missing is not None:
         there = next(iter(paths.values()))

@@ -14,7 +14,6 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,9 +25,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mifit.core.arrays import read_npz
-from mifit.core.files import read_bytes
+from mifit.core.files import read_bytes, read_json
 from mifit.core.image import read_image
-from mifit.core.limits import MAX_MODEL_BYTES
+from mifit.core.limits import MAX_MODEL_BYTES, MAX_SETTINGS_BYTES
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.errors import InputError
 from mifit.morphable.openings import leading_faces
@@ -229,7 +228,7 @@ def _meta(folder: Path) -> dict:
     if not path.exists():
         return {}
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = read_json(path, MAX_SETTINGS_BYTES)
         if isinstance(found, dict) and float(found.get("exposure", 1.0)) > 0:
             return found
     except (OSError, ValueError, TypeError):

@@ -10,7 +10,6 @@ it, and touches nothing outside.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import shutil
 import stat
@@ -18,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
-from mifit.core.files import at_place, check_no_links, overwriting, read_text, write_text
+from mifit.core.files import at_place, check_no_links, overwriting, read_json, write_json
 from mifit.core.limits import MAX_DOCUMENT_BYTES
 from mifit.errors import InputError
 
@@ -58,7 +57,7 @@ def claim(folder: Path, force: bool = False) -> None:
     check_ours(folder, force)
     (folder / MARK).mkdir(parents=True, exist_ok=True)
     if not (folder / MARK / _FILES).exists():
-        write_text(folder / MARK / _FILES, "{}\n")
+        write_json(folder / MARK / _FILES, {})
 
 
 @contextmanager
@@ -127,8 +126,8 @@ def unchanging(folder: Path) -> Iterator[None]:
 def written(folder: Path) -> dict[str, str]:
     """Files that mifit wrote, relative to the folder, with the digests of what it wrote."""
     try:
-        known = json.loads(read_text(folder / MARK / _FILES, MAX_DOCUMENT_BYTES))
-    except (InputError, ValueError, RecursionError):
+        known = read_json(folder / MARK / _FILES, MAX_DOCUMENT_BYTES)
+    except InputError:
         return {}
     return {str(k): str(v) for k, v in known.items()} if isinstance(known, dict) else {}
 
@@ -149,7 +148,7 @@ def files_in(folder: Path) -> list[str]:
 def remember(folder: Path, names: Iterable[str]) -> None:
     """Add files of a claimed folder to those that mifit wrote."""
     known = written(folder) | {name: _digest(folder / name) for name in names}
-    write_text(folder / MARK / _FILES, json.dumps(known, indent=1, sort_keys=True) + "\n")
+    write_json(folder / MARK / _FILES, known, sort_keys=True)
 
 
 def remove_written(folder: Path, names: Iterable[str]) -> None:
@@ -215,7 +214,7 @@ def replacing_files(folder: Path, only: bool = False, force: bool = False) -> It
             yield new
             made = {p.relative_to(new).as_posix(): _digest(p) for p in sorted(new.rglob("*")) if p.is_file()}
             stale = [name for name in written(folder) if only and name not in made]
-            write_text(folder / MARK / _COMMIT, json.dumps({"made": made, "stale": stale}))
+            write_json(folder / MARK / _COMMIT, {"made": made, "stale": stale})
         except BaseException:
             _remove_new(folder)
             raise
@@ -241,10 +240,10 @@ def _finish(folder: Path) -> None:
     for place in (folder / MARK / _NEW, folder / MARK / _COMMIT, folder / MARK / _FILES):
         check_no_links(folder, place)
     try:
-        commit = json.loads(read_text(folder / MARK / _COMMIT, MAX_DOCUMENT_BYTES))
+        commit = read_json(folder / MARK / _COMMIT, MAX_DOCUMENT_BYTES)
         made = {str(name): str(digest) for name, digest in commit["made"].items() if _inside(name)}
         stale = [str(name) for name in commit["stale"]]
-    except (InputError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+    except (ValueError, TypeError, KeyError, AttributeError):  # InputError is a ValueError
         made, stale = {}, []
     for name in sorted(made, key=lambda name: name == "result.json"):  # which names the others: last
         with suppress(FileNotFoundError), at_place(folder, f"{MARK}/{_NEW}/{name}") as (source, source_at):
@@ -253,7 +252,7 @@ def _finish(folder: Path) -> None:
                     os.replace(source, target, src_dir_fd=source_at, dst_dir_fd=target_at)
     remove_written(folder, stale)
     known = {k: v for k, v in written(folder).items() if k not in stale} | made
-    write_text(folder / MARK / _FILES, json.dumps(known, indent=1, sort_keys=True) + "\n")
+    write_json(folder / MARK / _FILES, known, sort_keys=True)
     _remove_new(folder)
     (folder / MARK / _COMMIT).unlink()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 from collections.abc import Sequence
@@ -26,7 +25,7 @@ from mifit.core.estimate import (
     Report,
     ResidualEstimate,
 )
-from mifit.core.files import Document, read_text
+from mifit.core.files import Document, read_json
 from mifit.core.image import read_image, to_8_bit
 from mifit.core.limits import MAX_DOCUMENT_BYTES, MAX_LIGHTS, MAX_NUMBER, MAX_PIXELS
 from mifit.core.mesh import SplitMesh, split_at_seams
@@ -109,17 +108,12 @@ def read_document(folder: Path) -> Document:
     path = folder / "result.json"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a result that `mifit fit` wrote")
-    try:
-        if not path.exists():
-            raise InputError(
-                f"{path}: missing, so {folder} is no result or an unfinished one; "
-                "name a folder that `mifit fit` wrote, or finish it with --resume"
-            )
-        document = json.loads(read_text(path, MAX_DOCUMENT_BYTES, "result"))
-    except InputError:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error}); fit again") from None
+    if not path.exists():
+        raise InputError(
+            f"{path}: missing, so {folder} is no result or an unfinished one; "
+            "name a folder that `mifit fit` wrote, or finish it with --resume"
+        )
+    document = read_json(path, MAX_DOCUMENT_BYTES, "result")
     version = document.get("format_version") if isinstance(document, dict) else None
     if version != FORMAT_VERSION:
         raise InputError(

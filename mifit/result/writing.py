@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from functools import partial
@@ -12,7 +11,7 @@ import numpy as np
 
 import mifit
 from mifit.core.arrays import write_ply
-from mifit.core.files import Document, file_name, write_bytes, write_text
+from mifit.core.files import Document, file_name, write_bytes, write_json
 from mifit.core.image import encode_png, write_image
 from mifit.core.mesh import split_at_seams, tangent_space_map, vertex_normals
 from mifit.core.process import on_all_cores
@@ -60,7 +59,7 @@ def add_timestep(result: Reconstruction, folder: Path, timestep: int) -> None:
 
 
 def _write_document(result: Reconstruction, folder: Path) -> None:
-    write_text(folder / "result.json", json.dumps(_document(result), indent=1, allow_nan=False) + "\n")
+    write_json(folder / "result.json", _document(result), allow_nan=False)
 
 
 def _write_timestep(result: Reconstruction, folder: Path, timestep: int) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from mifit.capture.landmark_files import write_landmarks
 from mifit.capture.transforms import MIN_SIDE, Shot, View, write_transforms
 from mifit.core.calls import whole
 from mifit.core.camera import Camera
-from mifit.core.files import replacing, write_text
+from mifit.core.files import replacing, write_json
 from mifit.core.image import read_environment, write_image
 from mifit.core.limits import MAX_COUNT, MAX_PIXELS, MAX_SEED
 from mifit.core.mesh import SplitMesh, split_at_seams, vertex_normals
@@ -250,7 +249,7 @@ def _write_capture(
             )
         advance(t + 2)
     note: dict[str, object] = {"seed": subject.seed, "exposure": exposure, "spp": spp, "model": subject.model.name}
-    write_text(folder / "truth" / "scene.json", json.dumps(note, indent=1) + "\n")
+    write_json(folder / "truth" / "scene.json", note)
     write_image(folder / "truth" / "environment.exr", environment)
     write_transforms(folder / "transforms.json", [View.of(camera) for camera in cameras], shots, "cm")
 

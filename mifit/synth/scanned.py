@@ -6,7 +6,6 @@ of such a capture is evidence where its own kind of heads is a test.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from mifit.capture.transforms import Shot, View, write_transforms
 from mifit.core.arrays import write_ply
 from mifit.core.camera import Camera
-from mifit.core.files import replacing, write_text
+from mifit.core.files import replacing, write_json
 from mifit.core.image import linear_to_srgb, read_image, reduced, write_image
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
@@ -241,6 +240,6 @@ def synthesize_scan(
         write_image(out / "truth" / f"environment_{name}.exr", light)
         progress("Rendering", timesteps + i + 1, total)
     note = {"exposure": exposure, "relit_exposure": relit_exposure, "seed": seed, "spp": spp}
-    write_text(out / "truth" / "meta.json", json.dumps(note, indent=1) + "\n")
+    write_json(out / "truth" / "meta.json", note)
     write_transforms(out / "transforms.json", [View.of(camera) for camera in cameras], shots, "cm")
     return out

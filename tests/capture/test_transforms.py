@@ -80,14 +80,14 @@ def test_duplicate_and_missing_timesteps(document) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "not a readable JSON file"),
+        ("", "not readable as JSON"),
         ("[1, 2]", r"found \[1, 2\], expected an object"),
         ("{}", "frames: found nothing, expected a list of at least one image"),
         ('{"frames": []}', "expected a list of at least one image"),
         ('{"frames": [3]}', r"frames\[0\]: found 3, expected an object"),
         ('{"frames": [{}], "units": "furlong"}', "units: found 'furlong', expected one of mm, cm"),
         ('{"frames": [{}], "camera_model": "OPENCV_FISHEYE"}', "camera_model: found 'OPENCV_FISHEYE'"),
-        ("[" * 100000, "not a readable JSON file"),
+        ("[" * 100000, "not readable as JSON"),
         ('{"frames": [{"file_path": "a\\u0000b"}]}', "file_path"),
     ],
 )
