@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mifit.capture.landmark_files import COUNT, Landmarks, read_landmarks
 from mifit.capture.lens import Undistortion, undistort_points
-from mifit.capture.transforms import UNITS_MM, Shot, Transforms, View, read_transforms
+from mifit.capture.transforms import UNITS_MM, Shot, View, read_transforms
 from mifit.core.camera import Camera
 from mifit.core.files import file_digest, note_read
 from mifit.core.image import load_image
@@ -150,15 +150,11 @@ class Capture:
         path = Path(path)
         if not path.exists():
             raise InputError(f"{path}: no such folder; expected a capture folder with a transforms.json")
-        file = path / "transforms.json" if path.is_dir() else path
-        return cls.of(file.parent, read_transforms(file), cache_bytes)
-
-    @classmethod
-    def of(cls, path: Path, transforms: Transforms, cache_bytes: int = CACHE_BYTES) -> Capture:
-        """Make a capture of checked content."""
+        place = path / "transforms.json" if path.is_dir() else path
+        transforms = read_transforms(place)
         note_read(file for shot in transforms.shots for file in (shot.image, shot.landmarks, shot.mask) if file)
         return cls(
-            path,
+            place.parent,
             {view.name: view for view in transforms.views},
             {(shot.camera, shot.timestep): shot for shot in transforms.shots},
             transforms.units,

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.capture.outliers import fundamental_matrix
+from mifit.capture.outliers import fundamental_matrix, line_distances
 from mifit.core.calls import checked, whole
 from mifit.errors import InputError
 
@@ -157,23 +157,14 @@ def _eye_opening(points: NDArray) -> NDArray[np.float64]:
         return np.asarray(np.ma.masked_invalid(np.maximum(*ratios)).mean(0).filled(np.nan), dtype=np.float64)
 
 
-def _epipolar(
-    capture: Capture, first: str, second: str, a: NDArray, b: NDArray
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Unit normals (T, 68, 2) of the lines in the second view, and the signed distances (T, 68) of its landmarks."""
-    matrix = fundamental_matrix(capture.camera(first), capture.camera(second))
-    line = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=2) @ matrix.T
-    length = np.maximum(np.linalg.norm(line[..., :2], axis=2), 1e-12)
-    return line[..., :2] / length[..., None], ((line[..., :2] * b).sum(-1) + line[..., 2]) / length
-
-
 def _disagreement(capture: Capture, cameras: Sequence[str], points: NDArray) -> NDArray[np.float64]:
     """(T,) largest over the views of the median distance of landmarks from the first view's lines; 0 where unknown."""
     found = np.zeros(points.shape[1])
     if not capture.calibrated:
         return found
     for k in range(1, len(cameras)):
-        _, distance = _epipolar(capture, cameras[0], cameras[k], points[0], points[k])
+        matrix = fundamental_matrix(capture.camera(cameras[0]), capture.camera(cameras[k]))
+        distance = line_distances(matrix, points[0], points[k])
         distance -= np.nan_to_num(np.nanmedian(distance, axis=0)) if np.isfinite(distance).any() else 0.0
         for i, row in enumerate(np.abs(distance)):
             if np.isfinite(row).any():

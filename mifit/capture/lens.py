@@ -20,15 +20,10 @@ def opencv_matrix(camera: Camera) -> NDArray[np.float64]:
     return matrix
 
 
-def is_distorted(camera: Camera) -> bool:
-    """Whether any distortion coefficient differs from zero."""
-    return any(k != 0.0 for k in camera.distortion)
-
-
 def undistort_points(camera: Camera, pixels: NDArray) -> NDArray[np.float64]:
     """Pixel coordinates (N, 2) in the image as stored -> in the undistorted image of the same intrinsics."""
     pixels = np.asarray(pixels, dtype=np.float64)
-    if not is_distorted(camera) or len(pixels) == 0:
+    if not any(camera.distortion) or len(pixels) == 0:
         return pixels.copy()
     matrix = opencv_matrix(camera)
     found = cv2.undistortPoints(

@@ -43,13 +43,7 @@ def epipolar_outliers(first: NDArray, second: NDArray, cameras: tuple[Camera, Ca
     ``first`` and ``second`` (T, 68, 2) are undistorted landmarks of the two cameras; NaN where there are none.
     """
     matrix = fundamental_matrix(*cameras)
-    a, b = _homogeneous(first), _homogeneous(second)
-    line_b, line_a = a @ matrix.T, b @ matrix
-    value = np.abs(np.einsum("tnk,tnk->tn", line_b, b))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        distance = np.maximum(
-            value / np.linalg.norm(line_b[..., :2], axis=2), value / np.linalg.norm(line_a[..., :2], axis=2)
-        )
+    distance = np.abs([line_distances(matrix, first, second), line_distances(matrix.T, second, first)]).max(axis=0)
     return _beyond(distance, 0.02 * np.fmax(_widths(first), _widths(second)))
 
 
@@ -61,8 +55,11 @@ def fundamental_matrix(first: Camera, second: Camera) -> NDArray[np.float64]:
     return np.asarray(np.linalg.inv(second.matrix).T @ cross @ relative[:3, :3] @ np.linalg.inv(first.matrix))
 
 
-def _homogeneous(points: NDArray) -> NDArray[np.float64]:
-    return np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=2)
+def line_distances(matrix: NDArray, first: NDArray, second: NDArray) -> NDArray[np.float64]:
+    """(T, N) signed distances of a view's pixels (T, N, 2) from the lines of another view's by `fundamental_matrix`."""
+    line = np.concatenate([first, np.ones((*first.shape[:2], 1))], axis=2) @ matrix.T
+    length = np.maximum(np.linalg.norm(line[..., :2], axis=2), 1e-12)
+    return ((line[..., :2] * second).sum(-1) + line[..., 2]) / length
 
 
 def _widths(points: NDArray) -> NDArray[np.float64]:

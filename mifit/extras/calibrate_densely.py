@@ -111,7 +111,9 @@ def calibrate_densely(
         return _left(start, cameras, "one camera can't tell expressions from perspective, expected two")
     if images < FEWEST_IMAGES:
         return _left(start, cameras, f"{images} images can't tell more, expected {FEWEST_IMAGES}")
-    vertices = _vertices(start, model)
+    unit = model.unit_mm / capture.unit_mm
+    neutral = model.mean + model.identity[..., : len(start.shape)].astype(np.float64) @ start.shape
+    vertices = unit * neutral  # of the head that landmarks gave, head's frame
     world = [vertices @ pose[:3, :3].T + pose[:3, 3] for pose in OPENGL_FROM_OPENCV @ start.heads]
     views = [capture.camera(name) for name in cameras]
     tracks, texels = follow_head(capture, model, views, timesteps, world, progress)
@@ -120,7 +122,7 @@ def calibrate_densely(
         return _left(start, cameras, f"{count}, expected {FEWEST_TRACKS}; add timesteps where the head turns")
     seen = sightings_of(tracks, views)
     points, modes = points_of(tracks, texels, model, vertices)
-    adjusted, focals = _adjust(start, views, unknown, seen, points, modes * (model.unit_mm / capture.unit_mm))
+    adjusted, focals = _adjust(start, views, unknown, seen, points, modes * unit)
     deviation = float(adjusted.deviations[:focals].max())
     if deviation > LARGEST_DEVIATION:
         found = f"matches give it to {_percent(deviation)} only"
@@ -140,13 +142,6 @@ def _left(start: HeadCalibration, cameras: Sequence[str], why: str) -> DenseCali
 
 def _percent(deviation: float) -> str:
     return f"{100 * deviation:.1f} %" if math.isfinite(deviation) else "no precision"
-
-
-def _vertices(start: HeadCalibration, model: MorphableModel) -> NDArray[np.float64]:
-    """(V, 3) the head that landmarks gave, head's frame, the capture's unit."""
-    modes = len(start.shape)
-    shape = model.mean.astype(np.float64) + model.identity[..., :modes].astype(np.float64) @ start.shape
-    return shape * (model.unit_mm / start.capture.unit_mm)
 
 
 def _adjust(

@@ -79,7 +79,8 @@ def refine(
     wanted = capture.timesteps if timesteps is None else tuple(timesteps)
     if unknown := [t for t in wanted if t not in capture.timesteps]:
         raise InputError(f"timestep {unknown[0]}: not in the capture; it has {', '.join(map(str, capture.timesteps))}")
-    config = settings_of(result)
+    stored = {key: value for key, value in result.config.items() if key != "seed"}
+    config = from_mapping(FitConfig, stored, "result.json: config")
     model, names = result.model, [camera.name for camera in result.cameras]
     plain, capture = capture.with_fitted(result.cameras), result.seen(capture)
     fitted = result.fitted
@@ -111,11 +112,6 @@ def refine(
         given = capture, model, home, reflectance, normals, names
         residual = find_residual(*given, config.residual, seed=seed, progress=progress)
     return replace(result, geometry=home, reflectance=reflectance, normals=normals, mesh=mesh, residual=residual)
-
-
-def settings_of(result: Reconstruction) -> FitConfig:
-    """The settings that a result was fitted with."""
-    return from_mapping(FitConfig, {k: v for k, v in result.config.items() if k != "seed"}, "result.json: config")
 
 
 def _followed(

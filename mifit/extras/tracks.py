@@ -133,7 +133,8 @@ def sightings_of(tracks: Tracks, views: Sequence[Camera]) -> Sightings:
     focal, pixel = (np.array([value(v) for v in views]) for value in (focal_of, lambda v: (v.fx, v.fy)))
     centre = np.array([(view.cx, view.cy) for view in views])
     pixels = (tracks.pixels - centre[camera]) * (focal[:, None] / pixel)[camera]
-    return Sightings(pixels, tracks.point, camera, step, 0.3 * image_scale(views))
+    longest = max(max(view.width, view.height) for view in views)
+    return Sightings(pixels, tracks.point, camera, step, 0.3 * max(longest / MATCH_SIDE, 1.0))
 
 
 def points_of(
@@ -149,11 +150,6 @@ def points_of(
 def focal_of(view: Camera) -> float:
     """Focal length in pixels made square."""
     return math.sqrt(view.fx * view.fy)
-
-
-def image_scale(views: Sequence[Camera]) -> float:
-    """What lengths in pixels are to be multiplied by for images larger than `MATCH_SIDE`."""
-    return max(max(max(view.width, view.height) for view in views) / MATCH_SIDE, 1.0)
 
 
 def _detail(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -24,7 +24,6 @@ from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 from mifit.render.visible import VisibleSurface, occluding_mesh, trace_mesh
 
 if TYPE_CHECKING:
-    from mifit.morphable import MorphableModel
     from mifit.result import Method, Reconstruction
 
 
@@ -142,14 +141,9 @@ def _with_residual(
     residual = None if result.residual is None else result.residual.at(timestep)
     if residual is None or method != "full":
         return colour
-    inside = mapped_faces(result)[surface.face, None]
-    return np.where(inside, np.maximum(colour + _look_up(result.model, surface, residual), 0), colour)
-
-
-def _look_up(model: MorphableModel, surface: VisibleSurface, image: NDArray) -> NDArray:
-    """A map at the samples; where the model has no maps any of its values will do."""
-    uv = interpolate(model.uv, model.faces_uv, surface.face, surface.weights)
-    return sample_map(image, np.clip(uv, 0.0, 1.0))
+    inside, model = mapped_faces(result)[surface.face, None], result.model
+    uv = np.clip(interpolate(model.uv, model.faces_uv, surface.face, surface.weights), 0.0, 1.0)
+    return np.where(inside, np.maximum(colour + sample_map(residual, uv), 0), colour)
 
 
 def _mesh_normals(result: Reconstruction, surface: VisibleSurface, timestep: int) -> NDArray:

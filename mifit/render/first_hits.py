@@ -16,14 +16,6 @@ KEPT_RAYS = 2**22
 """Rays whose hits are kept at most, a dozen views of 680 x 480: a gigabyte."""
 
 
-def _buffers_of(mesh: mi.Mesh) -> list[mi.Float]:
-    """What a point on a mesh is made of: positions, faces, normals and UVs, as far as there are any."""
-    import mitsuba as mi
-
-    parameters = mi.traverse(mesh)
-    return [parameters[key] for key in MESH_BUFFERS if key in parameters]
-
-
 def _number_of(pointer: mi.ShapePtr) -> int:
     """The number by which kernels know a shape or a sensor."""
     import drjit as dr
@@ -62,7 +54,8 @@ class FirstHits:
             return None, scene.ray_intersect(ray, active)
         with dr.suspend_grad():
             still = mi.Ray3f(dr.detach(ray))
-            buffers = [value for shape in shapes for value in _buffers_of(shape)]
+            meshes = [mi.traverse(shape) for shape in shapes]
+            buffers = [mesh[key] for mesh in meshes for key in MESH_BUFFERS if key in mesh]
             moved = (*(_number_of(mi.ShapePtr(shape)) for shape in shapes), *(buffer.index for buffer in buffers))
             name = _number_of(mi.SensorPtr(self.sensor)), dr.width(still.d)
             kept = self.kept.get(name)

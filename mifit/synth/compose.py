@@ -212,7 +212,10 @@ def _write_capture(
     advance(0)
     tracer = PathTracer(_materials(subject), environment)
     exposure = _exposure(tracer, subject, cameras[0])
-    _write_maps(folder / "truth" / "maps.npz", subject.skin["face"])
+    maps = subject.skin["face"]
+    halves = {name: getattr(maps, name).astype(np.float16) for name in ("albedo", "specular", "roughness", "bump")}
+    with replacing(folder / "truth" / "maps.npz") as temporary:
+        np.savez_compressed(temporary, cover=maps.cover, **halves)  # type: ignore[arg-type]
     with replacing(folder / "truth" / "mesh.npz") as temporary:
         np.savez_compressed(temporary, faces=subject.model.faces, face_mask=subject.model.face_mask)
     visibility = SurfaceScene(subject.neutral, subject.model.faces)
@@ -311,9 +314,3 @@ def expose(radiance: NDArray, rng: np.random.Generator) -> NDArray[np.float32]:
     signal = np.clip(radiance, 0.0, None)
     noisy = signal + rng.standard_normal(signal.shape) * np.sqrt(signal / FULL_WELL + READ_NOISE**2)
     return np.clip(noisy, 0.0, 1.0).astype(np.float32)
-
-
-def _write_maps(path: Path, maps: SkinMaps) -> None:
-    halves = {name: getattr(maps, name).astype(np.float16) for name in ("albedo", "specular", "roughness", "bump")}
-    with replacing(path) as temporary:
-        np.savez_compressed(temporary, cover=maps.cover, **halves)  # type: ignore[arg-type]

@@ -148,59 +148,45 @@ def make() -> type:
             above = front & (mi.Frame3f.cos_theta(wo) > 0.0) & (cosine > 0.0)
             return above, above & facing & (dr.dot(si.wi, n) > 0.0), cosine
 
-        def _value(
+        def _both(
             self,
             ctx: mi.BSDFContext,
             si: mi.SurfaceInteraction3f,
             wo: mi.Vector3f,
             parameters: tuple[mi.Color3f, ...],
             active: mi.Bool,
-        ) -> mi.Spectrum:
+        ) -> tuple[mi.Spectrum, mi.Float]:
+            """The value times the cosine, and the density of wo when it is sampled."""
             diffuse, specular, exponent, fresnel, n = parameters
             wi = si.wi
             reflects, shines, cosine = self._reflects(si, wo, n)
+            lobe, density = self._lobe(wi, wo, n, exponent, fresnel)
             value = mi.Spectrum(0.0)
             if ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
                 factor = normalization(exponent) if self.normalized else dr.inv_pi
                 albedo = self.at_angle(diffuse, specular, fresnel, dr.dot(wi, self._half(wi, wo)))
-                lobe, _ = self._lobe(wi, wo, n, exponent, fresnel)
                 value += dr.select(shines, albedo * (factor * lobe), 0.0)
             if ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1):
                 value += diffuse * dr.inv_pi
-            return dr.select(active & reflects, value * cosine, 0.0)
-
-        def _density(
-            self,
-            ctx: mi.BSDFContext,
-            si: mi.SurfaceInteraction3f,
-            wo: mi.Vector3f,
-            parameters: tuple[mi.Color3f, ...],
-            active: mi.Bool,
-        ) -> mi.Float:
-            _, _, exponent, fresnel, n = parameters
-            reflects, shines, cosine = self._reflects(si, wo, n)
-            p = self._specular_probability(ctx, si.wi, parameters)
-            lobe = dr.select(shines, self._lobe(si.wi, wo, n, exponent, fresnel)[1], 0.0)
-            return dr.select(active & reflects, dr.lerp(cosine * dr.inv_pi, lobe, p), 0.0)
+            p = self._specular_probability(ctx, wi, parameters)
+            density = dr.lerp(cosine * dr.inv_pi, dr.select(shines, density, 0.0), p)
+            lit = active & reflects
+            return dr.select(lit, value * cosine, 0.0), dr.select(lit, density, 0.0)
 
         def eval(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
         ) -> mi.Spectrum:
-            return self._value(ctx, si, wo, self.parameters(si, active), active)
+            return self.eval_pdf(ctx, si, wo, active)[0]
 
         def pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
         ) -> mi.Float:
-            return self._density(ctx, si, wo, self.parameters(si, active), active)
+            return self.eval_pdf(ctx, si, wo, active)[1]
 
         def eval_pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
         ) -> tuple[mi.Spectrum, mi.Float]:
-            parameters = self.parameters(si, active)
-            return (
-                self._value(ctx, si, wo, parameters, active),
-                self._density(ctx, si, wo, parameters, active),
-            )
+            return self._both(ctx, si, wo, self.parameters(si, active), active)
 
         def sample(
             self,
@@ -239,8 +225,8 @@ def make() -> type:
                 mi.UInt32(+mi.BSDFFlags.GlossyReflection),
                 mi.UInt32(+mi.BSDFFlags.DiffuseReflection),
             )
-            bs.pdf = dr.detach(self._density(ctx, si, bs.wo, parameters, active))
-            value = self._value(ctx, si, bs.wo, parameters, active)
+            value, density = self._both(ctx, si, bs.wo, parameters, active)
+            bs.pdf = dr.detach(density)
             valid = active & (bs.pdf > 0.0)
             return bs, dr.select(valid, value / dr.select(valid, bs.pdf, 1.0), 0.0)
 
