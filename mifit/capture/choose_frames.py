@@ -7,18 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.capture.capture import Capture
 from mifit.capture.outliers import fundamental_matrix, line_distances
 from mifit.core.calls import checked, whole
 from mifit.errors import InputError
-
-if TYPE_CHECKING:
-    from mifit.capture import Capture
 
 RIGID = (27, 28, 29, 30, 33, 36, 39, 42, 45)
 """Landmarks that expressions move least: the ridge and base of the nose, the corners of the eyes."""

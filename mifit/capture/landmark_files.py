@@ -67,8 +67,8 @@ def read_landmarks(path: str | Path) -> Landmarks:
     if not 0 <= deviation <= MAX_LANDMARK_NOISE:
         most = f"{MAX_LANDMARK_NOISE:g}"
         raise InputError(f"{path}: deviation: found {deviation}, expected a number of pixels from 0 to {most}")
-    _check_spread(path, points[visible & np.isfinite(points).all(axis=1)])
     finite = np.asarray(np.isfinite(points).all(axis=1), dtype=bool)
+    _check_spread(path, points[visible & finite])
     return Landmarks(np.where(finite[:, None], points, 0.0), visible & finite, deviation)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 from pathlib import Path
 
+import mifit
 from mifit.cli.arguments import check_empty, given, use_variant
 from mifit.cli.clips import start_times
 from mifit.cli.console import console_progress
@@ -44,17 +45,9 @@ def _synth_scan(arguments: Namespace) -> None:
     environment = read_environment(arguments.env) if arguments.env else studio_environment(arguments.seed)
     relit = {path.stem: read_environment(path) for path in arguments.relit or ()}
     use_variant(arguments)
-    synthesize_scan(
-        arguments.out,
-        head,
-        place_cameras(arguments.width, arguments.height),
-        environment,
-        relit,
-        arguments.timesteps,
-        arguments.seed,
-        arguments.spp,
-        console_progress(arguments.quiet),
-    )
+    cameras, progress = place_cameras(arguments.width, arguments.height), console_progress(arguments.quiet)
+    options = given(arguments, "timesteps", "seed", "spp")
+    synthesize_scan(arguments.out, head, cameras, environment, relit, **options, progress=progress)
     print(f"Capture: {arguments.out}; it has no landmarks yet: mifit landmarks {arguments.out}")
 
 
@@ -114,7 +107,6 @@ def calibrate(arguments: Namespace) -> None:
 
 
 def _calibrate_from_heads(arguments: Namespace) -> None:
-    import mifit
     from mifit.extras.calibrate_densely import calibrate_capture
     from mifit.extras.calibrate_heads import calibrate_others, write_cameras
     from mifit.fitting import choose, choose_timesteps

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import mifit
 from mifit.cli.arguments import given, say, tell, use_variant
 from mifit.cli.clips import capture_of
 from mifit.cli.console import console_progress
@@ -57,7 +58,6 @@ def demo(arguments: Namespace) -> None:
 
 def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> None:
     """Fit two cameras of the demo's capture, judge by the third; a picture of the first step comes at once."""
-    import mifit
     from mifit.core.image import encode_png
     from mifit.fitting import fit_into
     from mifit.output.views import beside
@@ -84,7 +84,6 @@ def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> No
 
 def fit(arguments: Namespace) -> int:
     """Run the stages and write the result folder."""
-    import mifit
     from mifit.result.ownership import check_ours, replacing_files
 
     out: Path = arguments.out
@@ -151,7 +150,6 @@ def _chosen(arguments: Namespace, capture: Capture, count: int) -> FrameChoice:
 
 def track(arguments: Namespace) -> int:
     """Extend a result by further timesteps."""
-    import mifit
     from mifit.fitting import choose
     from mifit.result.ownership import finish, replacing_files
 

@@ -6,6 +6,7 @@ import sys
 from argparse import Namespace
 from typing import TYPE_CHECKING
 
+import mifit
 from mifit.cli.arguments import given, say, tell, use_variant, writes
 from mifit.cli.console import console_progress
 from mifit.core.diagnostics import Diagnostic
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 @writes("json")
 def evaluate(arguments: Namespace) -> int:
     """Error on a held-out view: a table on stdout, JSON on request, the report renewed."""
-    import mifit
-
     result = mifit.Reconstruction.load(arguments.result)
     capture = mifit.Capture.load(arguments.capture)
     use_variant(arguments)
@@ -81,8 +80,6 @@ def _print_measures(methods: dict[str, dict[str, float]]) -> None:
 @writes("json")
 def score(arguments: Namespace) -> None:
     """Score any program's images and meshes, in plain files, against a capture's truth."""
-    import mifit
-
     capture = mifit.Capture.load(arguments.capture)
     model = None if arguments.model is None else mifit.MorphableModel.load(arguments.model)
     use_variant(arguments)
@@ -101,7 +98,6 @@ def score(arguments: Namespace) -> None:
 @writes("out", outside="capture")
 def render(arguments: Namespace) -> None:
     """Render one timestep from a camera of the capture."""
-    import mifit
     from mifit.core.image import write_image
 
     turned = {k: v for k, v in given(arguments, "yaw", "pitch", "distance").items() if v is not None}
@@ -123,8 +119,6 @@ def render(arguments: Namespace) -> None:
 
 
 def _result_and_variant(arguments: Namespace) -> Reconstruction:
-    import mifit
-
     result = mifit.Reconstruction.load(arguments.result)
     use_variant(arguments)
     return result

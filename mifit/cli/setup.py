@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+import mifit
 from mifit.cli.arguments import tell, use_variant, writes
 from mifit.cli.console import console_progress
 from mifit.core.diagnostics import worst_first
@@ -44,7 +45,6 @@ def doctor(arguments: Namespace) -> int:
 
 def _examine(arguments: Namespace) -> int:
     """Print how well each camera agrees with the others, what is wrong, and what would explain it; exit code 0 or 3."""
-    import mifit
     from mifit.fitting import choose, choose_timesteps
     from mifit.stages.checks.capture_checks import check_capture, landmark_offsets
 
@@ -89,7 +89,6 @@ def _examine(arguments: Namespace) -> int:
 @writes("out")
 def model(arguments: Namespace) -> None:
     """Inspect, convert or fetch a morphable model."""
-    import mifit
     from mifit.extras.fetch_model import ADDRESS, fetch_ict
     from mifit.morphable.openings import with_eyes
 

@@ -25,12 +25,18 @@ from numpy.typing import NDArray
 import mifit
 from mifit import cache
 from mifit.core.files import FULL, Document, file_name, read_json, read_text, write_json, write_text
+from mifit.core.image import write_image
 from mifit.core.limits import MAX_SETTINGS_BYTES
+from mifit.core.metrics import psnr, rmse
 from mifit.core.process import no_chatter, set_decoding_context
 from mifit.errors import InputError, MifitError
 from mifit.experiments.plan import Experiment, Plan, Run, SynthRun, load_plan
 from mifit.experiments.tables import draw, over_subjects, runs_table, subjects_table
+from mifit.output.evaluate import evaluate
+from mifit.output.relight import write_relit
+from mifit.output.report import write_report
 from mifit.progress import Progress, silent
+from mifit.render.scene import render_scene
 from mifit.render.variant import set_fitting_variant
 
 
@@ -168,10 +174,6 @@ def execute(run: Run, folder: str, experiment_folder: str, variant: str) -> None
 
 def _execute_fit(e: Experiment, folder: Path, experiment_folder: Path, variant: str) -> dict[str, float]:
     """Fit, evaluate and relight; returns the figures of the table."""
-    from mifit.output.evaluate import evaluate
-    from mifit.output.relight import write_relit
-    from mifit.output.report import write_report
-
     fit = e.fit
     assert fit is not None
     source = fit.capture or _synthetic_capture(fit.synth, experiment_folder, variant)  # type: ignore[arg-type]
@@ -219,10 +221,6 @@ class _Reference:
 
 def _execute_render(e: Experiment, folder: Path, experiment_folder: Path, variant: str) -> dict[str, float]:
     """Render a scene and compare it with its reference; returns the figures of the table."""
-    from mifit.core.image import write_image
-    from mifit.core.metrics import psnr, rmse
-    from mifit.render.scene import render_scene
-
     run = e.render
     assert run is not None
     render_scene(run.scene, run.parameters, spp=1, seed=run.seed)  # compiles, so that the time below is steady

@@ -10,21 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.capture import Capture
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
 from mifit.core.process import one_blas_thread
 from mifit.extras.bundle import AdjustedBundle, Bundle, Freedom, Sightings, adjust_bundle
 from mifit.extras.calibrate_heads import FOCAL_PRIOR, HeadCalibration, calibrate_heads
 from mifit.extras.tracks import FEWEST_IMAGES, focal_of, follow_head, points_of, sightings_of
+from mifit.morphable import MorphableModel
 from mifit.progress import Progress, silent
-
-if TYPE_CHECKING:
-    from mifit.capture import Capture
-    from mifit.morphable import MorphableModel
 
 FEWEST_TRACKS = 200
 MOST_TIMESTEPS = 6

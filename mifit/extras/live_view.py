@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from mifit.core.arrays import Recent
 from mifit.core.camera import Camera, inverse, rigid
 from mifit.core.image import to_8_bit
 from mifit.errors import InputError
@@ -80,14 +81,13 @@ class Picture:
 
     def __init__(self, result: Reconstruction) -> None:
         self.result = result
-        self._lit: tuple[tuple[float, Path | None], Reconstruction] = ((0.0, None), result)
+        self._lit = Recent[Reconstruction](1)
 
     def render(self, shown: Shown, camera: Camera) -> NDArray[np.uint8]:
         """(H, W, 3) 8-bit sRGB; raises InputError for an environment that can't be read."""
         key = (shown.turn, shown.environment)
-        if self._lit[0] != key:
-            self._lit = (key, under(self.result, *key))
-        image = render_local(self._lit[1], camera, shown.timestep, shown.method, 1)
+        lit = self._lit.get(key, lambda: under(self.result, *key))
+        image = render_local(lit, camera, shown.timestep, shown.method, 1)
         return to_8_bit(on_backdrop(image))
 
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mifit.capture import Capture
 from mifit.capture.choose_frames import choose_frames
 from mifit.config import FitConfig, from_mapping
 from mifit.core.calls import checked
@@ -20,6 +20,7 @@ from mifit.core.estimate import GeometryEstimate
 from mifit.core.process import one_blas_thread
 from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
+from mifit.result import Reconstruction
 from mifit.stages.eyes import behind_lids
 from mifit.stages.find_residual import find_residual
 from mifit.stages.find_surface import find_surface
@@ -28,10 +29,6 @@ from mifit.stages.normals.refine_mesh import refine_mesh
 from mifit.stages.normals.refine_normals import refine_normals
 from mifit.stages.photometry import find_photometry
 from mifit.tracking import Follower
-
-if TYPE_CHECKING:
-    from mifit.capture import Capture
-    from mifit.result import Reconstruction
 
 MOST = 16
 """Frames that enter, fitted ones included."""

@@ -10,24 +10,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.capture import Frame
+from mifit.capture import Capture, Frame
 from mifit.core.camera import Camera
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import TexelMap, bilinear, rasterize_uv
 from mifit.extras.bundle import Sightings
+from mifit.morphable import MorphableModel
 from mifit.progress import Progress, silent
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.surface.views import shows_surface, texture_size
-
-if TYPE_CHECKING:
-    from mifit.capture import Capture
-    from mifit.morphable import MorphableModel
 
 FEWEST_IMAGES = 3
 """Images that must show a point: two can't contradict one another but across epipolar lines."""

@@ -7,7 +7,6 @@ optimisers share.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +21,7 @@ from mifit.core.sh import basis
 from mifit.core.uv import sample_map
 from mifit.output.surface import mapped_faces, surface_maps, vertex_materials
 from mifit.render.visible import VisibleSurface, occluding_mesh, trace_mesh
-
-if TYPE_CHECKING:
-    from mifit.result import Method, Reconstruction
+from mifit.result import Method, Reconstruction
 
 
 def visible_surface(result: Reconstruction, camera: Camera, timestep: int, oversampling: int = 2) -> VisibleSurface:

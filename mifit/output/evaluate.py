@@ -6,12 +6,13 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
+from mifit.capture import Capture
 from mifit.core.calls import checked
 from mifit.core.camera import Camera
 from mifit.core.files import Document
@@ -23,10 +24,7 @@ from mifit.output.truth import landmarks_of, true_mesh, true_passes
 from mifit.progress import Progress, silent
 from mifit.render.image_based import BLENDS, image_based
 from mifit.render.visible import trace_mesh
-
-if TYPE_CHECKING:
-    from mifit.capture import Capture
-    from mifit.result import Method, Reconstruction
+from mifit.result import Method, Reconstruction
 
 Region = Literal["face", "skin", "truth"]
 

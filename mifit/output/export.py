@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -15,11 +15,10 @@ from mifit.core.files import check_overwriting, write_bytes, write_text
 from mifit.core.image import encode_png, to_8_bit, write_image
 from mifit.errors import InputError
 from mifit.output.gltf import write_glb
+from mifit.output.scene import write_scene
 from mifit.output.surface import shape_of, surface_maps, vertex_materials
 from mifit.output.usd import write_usdz
-
-if TYPE_CHECKING:
-    from mifit.result import Reconstruction
+from mifit.result import Reconstruction
 
 Format = Literal["glb", "obj", "ply", "usd", "mitsuba"]
 SUFFIXES = {"glb": ".glb", "obj": ".obj", "ply": ".ply", "usd": ".usdz", "mitsuba": ".xml"}
@@ -98,8 +97,6 @@ def export(
     elif format == "usd":
         write_usdz(result, path, timestep)
     else:
-        from mifit.output.scene import write_scene
-
         write_scene(result, path, timestep)
 
 

@@ -8,7 +8,6 @@ import re
 import struct
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +15,12 @@ from scipy.spatial.transform import Rotation
 
 import mifit
 from mifit.core.camera import Camera, rigid
+from mifit.core.estimate import GeometryEstimate
 from mifit.core.files import Document, replacing
 from mifit.core.image import encode_png, to_8_bit
 from mifit.core.mesh import SplitMesh, tangents
 from mifit.output.surface import Shape, shape_of, surface_maps, vertex_materials
-
-if TYPE_CHECKING:
-    from mifit.core.estimate import GeometryEstimate
-    from mifit.result import Reconstruction
+from mifit.result import Reconstruction
 
 _KINDS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
 STEP = 1.0 / 32767

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mifit.appearance.environment import illumination_of
 from mifit.appearance.illumination import Illumination
+from mifit.core.camera import Camera
 from mifit.core.files import Document, file_name, write_json
 from mifit.core.image import check_environment, read_environment, reduced, to_8_bit, write_image
 from mifit.core.metrics import psnr, rmse
@@ -23,9 +24,6 @@ from mifit.output.scene import render_view
 from mifit.output.views import check_moving, sheet, write_moving
 from mifit.progress import Progress, silent
 from mifit.result import Reconstruction
-
-if TYPE_CHECKING:
-    from mifit.core.camera import Camera
 
 AGREEMENT = 30.0
 """PSNR in dB between fast and path-traced views below which a person is warned. Five measured environments gave 31.6 to

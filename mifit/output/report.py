@@ -7,12 +7,12 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 import mifit
+from mifit.capture import Capture
 from mifit.core.files import Document, write_text
 from mifit.core.image import to_8_bit
 from mifit.output.evaluate import Comparison, compare, face_area, rgba_8_bit
@@ -32,10 +32,7 @@ from mifit.output.figures import (
 )
 from mifit.output.scene import render_view
 from mifit.output.viewer import viewer_data
-
-if TYPE_CHECKING:
-    from mifit.capture import Capture
-    from mifit.result import Reconstruction
+from mifit.result import Reconstruction
 
 NAMES = {"pca": "Stage 1 (PCA)", "diffuse": "Diffuse only", "full": "Full"}
 STAGES = {

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +27,10 @@ from mifit.errors import InputError
 from mifit.output.deferred import render_local, visible_surface
 from mifit.output.surface import Shape, mapped_faces, shape_of, surface_maps, vertex_materials
 from mifit.render.description import Parameter, to_mitsuba, to_xml
+from mifit.render.scene import load_scene, render_scene
 from mifit.render.sensor import sensor_description
 from mifit.render.variant import check_active_variant
-from mifit.result import METHODS
-
-if TYPE_CHECKING:
-    from mifit.result import Method, Reconstruction
+from mifit.result import METHODS, Method, Reconstruction
 
 Skin = Callable[[Mapping[str, Document]], Mapping[str, object]]
 """Makes a BSDF's dictionary of those of the maps' textures."""
@@ -101,8 +99,6 @@ def render_path(
     result: Reconstruction, camera: Camera, timestep: int, method: Method, samples: int, seed: int
 ) -> NDArray[np.float32]:
     """Path trace one view through the scene file; see `Reconstruction.render`."""
-    from mifit.render.scene import render_scene
-
     with tempfile.TemporaryDirectory(prefix="mifit-scene-") as folder:
         path = Path(folder) / "scene.xml"
         write_scene(result, path, timestep, [camera], method)
@@ -171,8 +167,6 @@ def load_result_scene(
     skin: Skin | None,
 ) -> Any:
     """A loaded ``mi.Scene`` of one timestep; see `Reconstruction.scene`."""
-    from mifit.render.scene import load_scene
-
     check_active_variant()
     check_shown(result, timestep, method)
     whole(samples, 1, "samples", MAX_COUNT)

@@ -20,14 +20,16 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.capture import Capture
 from mifit.core.files import Document
 from mifit.core.image import SUFFIXES, read_image, to_8_bit
 from mifit.errors import InputError
+from mifit.morphable import MorphableModel
 from mifit.output.compare import (
     Errors,
     face_region,
@@ -50,10 +52,6 @@ from mifit.output.truth import (
 )
 from mifit.progress import Progress, silent
 from mifit.render.image_based import image_based
-
-if TYPE_CHECKING:
-    from mifit.capture import Capture
-    from mifit.morphable import MorphableModel
 
 MESHES = (".ply", ".obj")
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
@@ -27,10 +26,8 @@ from mifit.core.mesh import (
 )
 from mifit.core.mesh_solve import membrane
 from mifit.core.uv import TexelMap, rasterize_uv, sample_map
-
-if TYPE_CHECKING:
-    from mifit.morphable import MorphableModel
-    from mifit.result import Reconstruction
+from mifit.morphable import MorphableModel
+from mifit.result import Reconstruction
 
 
 @dataclass(frozen=True)

@@ -17,26 +17,23 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mifit.capture import Capture
 from mifit.core.arrays import read_npz
 from mifit.core.files import read_bytes, read_json
 from mifit.core.image import read_image
 from mifit.core.limits import MAX_MODEL_BYTES, MAX_SETTINGS_BYTES
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.errors import InputError
+from mifit.morphable import MorphableModel
 from mifit.morphable.openings import leading_faces
 from mifit.output.compare import face_region
 from mifit.render.gbuffer import SurfaceScene
-
-if TYPE_CHECKING:
-    from mifit.capture import Capture
-    from mifit.morphable import MorphableModel
 
 
 @dataclass(frozen=True)

@@ -6,20 +6,18 @@ import math
 import re
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.core.camera import Camera
 from mifit.core.files import replacing, write_bytes
 from mifit.core.image import encode_png, to_8_bit
 from mifit.core.mesh import SplitMesh
 from mifit.errors import InputError
 from mifit.output.surface import shape_of, surface_maps, vertex_materials
-
-if TYPE_CHECKING:
-    from mifit.core.camera import Camera
-    from mifit.result import Reconstruction
+from mifit.result import Reconstruction
 
 APERTURE = 36.0
 """Width of a sensor in USD's unit of focal lengths."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +13,7 @@ from mifit.core.image import to_8_bit
 from mifit.core.sh import SHLighting, bands, cosine_coefficients
 from mifit.output.figures import jpeg_uri, png_uri
 from mifit.output.surface import shape_of, surface_maps, vertex_materials
-
-if TYPE_CHECKING:
-    from mifit.result import Reconstruction
+from mifit.result import Reconstruction
 
 
 def viewer_data(result: Reconstruction, timestep: int) -> str:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.capture import Capture
 from mifit.core.camera import Camera
 from mifit.core.files import file_name, replacing
 from mifit.core.image import box, to_8_bit, write_image
@@ -22,10 +23,7 @@ from mifit.output.figures import overlay
 from mifit.output.gltf import write_glb
 from mifit.output.scene import render_view
 from mifit.progress import Progress, silent
-
-if TYPE_CHECKING:
-    from mifit.capture import Capture
-    from mifit.result import Method, Reconstruction
+from mifit.result import Method, Reconstruction
 
 CODECS = ("vp09", "mp4v")
 """Video codecs by preference: browsers play VP9; every OpenCV can write MPEG-4."""
@@ -184,8 +182,6 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
     Odd sizes lose their last row or column: video codecs halve the resolution of colour. InputError for a rate that
     isn't positive, another suffix or no frame; MifitError where OpenCV has no codec.
     """
-    import cv2
-
     path = Path(path)
     if path.suffix.lower() != ".mp4":
         raise InputError(f"{path}: found suffix {path.suffix!r}, expected '.mp4'")
@@ -217,8 +213,6 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
 
 def _is_playable(path: Path, count: int) -> bool:
     """Whether a video holds ``count`` frames that can be read back."""
-    import cv2
-
     with decoding():
         reader = cv2.VideoCapture(str(path))
         try:

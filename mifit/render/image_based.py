@@ -14,18 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.capture import Capture
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross, interpolate, normalize
 from mifit.core.uv import bilinear
 from mifit.render.visible import occluding_mesh, trace_mesh
-
-if TYPE_CHECKING:
-    from mifit.capture import Capture
 
 Blend = Literal["cosine", "nearest", "angle"]
 BLENDS: tuple[Blend, ...] = ("cosine", "nearest", "angle")

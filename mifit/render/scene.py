@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,21 +32,17 @@ def load_scene(source: str | Path | Mapping[str, object], **parameters: object) 
 
     register_plugins()
     if isinstance(source, Mapping):
-        where = "scene dictionary"
+        where, load = "scene dictionary", partial(mi.load_dict, dict(source))
     else:
-        where = str(source)
-        path = Path(source)
-        if not path.is_file():
+        where, suffix = str(source), Path(source).suffix
+        if not Path(source).is_file():
             raise InputError(f"{where}: no such scene file")
-        if path.suffix.lower() != ".xml":
-            raise InputError(f"{where}: found a file of the kind '{path.suffix}', expected a scene in XML")
+        if suffix.lower() != ".xml":
+            raise InputError(f"{where}: found a file of the kind '{suffix}', expected a scene in XML")
+        load = partial(mi.load_file, where, **{name: str(value) for name, value in parameters.items()})
     try:
         # Not in parallel: plugins written in Python are built one at a time in any case.
-        if isinstance(source, Mapping):
-            scene = mi.load_dict(dict(source), parallel=False, optimize=False)
-        else:
-            values = {name: str(value) for name, value in parameters.items()}
-            scene = mi.load_file(str(source), parallel=False, optimize=False, **values)
+        scene = load(parallel=False, optimize=False)
     except (RuntimeError, ValueError, TypeError) as error:
         raise InputError(f"{where}: {_one_line(str(error))}") from error
     if not isinstance(scene, mi.Scene):
