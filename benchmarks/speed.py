@@ -145,7 +145,7 @@ def render(reduced: bool) -> Figures:
     import mitsuba as mi
 
     from mifit.render.gbuffer import make_mesh
-    from mifit.render.sensor import make_sensor
+    from mifit.render.scene import make_sensor
 
     mifit.register_plugins()
     model = data()[1]

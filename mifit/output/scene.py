@@ -27,8 +27,7 @@ from mifit.errors import InputError
 from mifit.output.deferred import render_local, visible_surface
 from mifit.output.surface import Shape, mapped_faces, shape_of, surface_maps, vertex_materials
 from mifit.render.description import Parameter, to_mitsuba, to_xml
-from mifit.render.scene import load_scene, render_scene
-from mifit.render.sensor import sensor_description
+from mifit.render.scene import load_scene, render_scene, sensor_description
 from mifit.render.variant import check_active_variant
 from mifit.result import METHODS, Method, Reconstruction
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mifit.core.camera import Camera
 from mifit.core.files import Document
 from mifit.render.gbuffer import make_mesh
-from mifit.render.sensor import make_sensor
+from mifit.render.scene import make_sensor
 
 
 @dataclass(frozen=True)

@@ -217,7 +217,7 @@ def test_a_lens_polynomial_that_folds_over_is_invalid_there() -> None:
 def test_a_rendered_point_lands_where_the_camera_projects_it(variant: str, fy: float) -> None:
     import mitsuba as mi
 
-    from mifit.render.sensor import make_sensor
+    from mifit.render.scene import make_sensor
 
     pose = make_camera("a", 12.0).world_to_camera
     camera = Camera("a", 340, 240, 700.0, fy, 240.3, 72.9, pose)  # the centre is off by 70 and 47 pixels
@@ -232,7 +232,7 @@ def test_a_rendered_point_lands_where_the_camera_projects_it(variant: str, fy: f
 
 
 def test_the_sensor_refuses_a_lens(variant: str) -> None:
-    from mifit.render.sensor import make_sensor
+    from mifit.render.scene import make_sensor
 
     with pytest.raises(InputError, match="lens distortion"):
         make_sensor(make_camera("a", 0.0, LENSES[1]))

@@ -23,8 +23,7 @@ from mifit.output.export import export
 from mifit.output.relight import write_relit
 from mifit.output.scene import write_scene
 from mifit.output.surface import surface_maps
-from mifit.render.scene import render_scene
-from mifit.render.sensor import make_sensor
+from mifit.render.scene import make_sensor, render_scene
 from tests.output.conftest import ball_camera
 from tests.output.test_views import smooth_environment
 
