@@ -148,8 +148,6 @@ def import_material(
 
 def sources_of(videos: Sequence[str | Path], images: Sequence[str | Path]) -> list[Source]:
     """One camera for each video or folder of images; none for none."""
-    if videos and images:
-        raise InputError("found videos and folders of images, expected one kind")
     return open_sources(videos, images) if videos or images else []
 
 

@@ -148,7 +148,7 @@ def open_sources(
         Both or none of them, a file or folder that can't be read, or names that don't tell the cameras apart.
     """
     if bool(videos) == bool(images):
-        raise InputError("expected videos or folders of images, one kind")
+        raise InputError(f"found {'videos and' if videos else 'no videos and no'} folders of images, expected one kind")
     paths = [Path(v) for v in videos or images]
     folders = not videos and not all(path.is_file() for path in paths)
     if names is None:

@@ -88,8 +88,8 @@ def _make(arguments: Namespace, paths: Sequence[Path], folder: Path) -> None:
     progress = console_progress(arguments.quiet)
     if arguments.calibration and arguments.board:
         raise InputError(f"--board: found with --calibration {arguments.calibration}, expected one of the two")
-    kinds: Document = {"videos": paths} if _are_videos(paths) else {"images": paths}
-    sources = open_sources(kinds.get("videos", ()), kinds.get("images", ()))
+    kinds = _kinds(paths)
+    sources = open_sources(**kinds)
     starts = start_times(arguments, sources, arguments.offset or "auto", progress)
     if arguments.board:
         kinds["transforms"] = _calibrated(arguments, sources, folder.with_name("calibration"), progress)
@@ -134,8 +134,7 @@ def _calibrated(arguments: Namespace, sources: Sequence[Source], folder: Path, p
     names = [source.name for source in sources]
     if len(arguments.board) != len(names):
         raise InputError(f"--board: found {len(arguments.board)} clips, expected {len(names)}, one for each camera")
-    kind = {"videos": arguments.board} if _are_videos(arguments.board) else {"images": arguments.board}
-    shown = open_sources(kind.get("videos", ()), kind.get("images", ()), names)
+    shown = open_sources(**_kinds(arguments.board), names=names)
     moments = aligned(shown, start_times(arguments, shown, "auto", progress))
     found = calibrate_boards(moments, Board.parse(arguments.pattern), "cm", progress)
     shutil.rmtree(folder, ignore_errors=True)
@@ -144,8 +143,9 @@ def _calibrated(arguments: Namespace, sources: Sequence[Source], folder: Path, p
     return folder / "transforms.json"
 
 
-def _are_videos(paths: Sequence[Path]) -> bool:
-    """Whether paths are videos; else they are folders of frames, or photographs."""
+def _kinds(paths: Sequence[Path]) -> Document:
+    """The paths as videos, or as images where they are folders of frames or photographs."""
     from mifit.core.image import SUFFIXES
 
-    return not any(path.is_dir() or path.suffix.lower() in SUFFIXES for path in paths)
+    frames = any(path.is_dir() or path.suffix.lower() in SUFFIXES for path in paths)
+    return {"videos": () if frames else paths, "images": paths if frames else ()}

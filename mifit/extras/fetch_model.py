@@ -18,7 +18,8 @@ from mifit.progress import Progress, silent
 
 COMMIT = "da5f95a607f5e6b37755b38d3385d7f2853732e5"
 ADDRESS = f"https://raw.githubusercontent.com/ICT-VGL/ICT-FaceKit/{COMMIT}/FaceXModel"
-INDEX, NEUTRAL, IDENTITIES = "vertex_indices.json", "generic_neutral_mesh.obj", 100
+INDEX, NEUTRAL = "vertex_indices.json", "generic_neutral_mesh.obj"
+IDENTITIES = 100
 DIGEST = "8fc28905c645862e4162769898a01620bf2589538795190ccd530f86da1b115e"
 """SHA-256 over a line ``NAME SHA-256`` of each file, in the order of `wanted`."""
 MAX_BYTES = 2**23

@@ -31,8 +31,6 @@ from mifit.synth import head
 from mifit.synth.procedural import studio_environment
 from mifit.synth.skin import SkinMaps, SkinStyle, paint
 
-DISTANCE = 72.0
-"""Centimetres from the cameras to the head."""
 MOST_MM = 20.0
 """Of what moves a head or a landmark away from the model."""
 FULL_WELL = 12000.0
@@ -138,15 +136,13 @@ def _advance(progress: Progress, start: int, total: int, done: int) -> None:
     progress("Rendering", start + done, total)
 
 
-def place_cameras(width: int, height: int, distance: float = DISTANCE) -> list[Camera]:
-    """Cameras left, right (20 degrees off) and third (above the middle), in centimetres, looking at the origin."""
+def place_cameras(width: int, height: int, distance: float = 72.0) -> list[Camera]:
+    """Cameras left, right (20 degrees off) and third (above the middle), so many centimetres from the origin."""
     places = (("left", -20.0, 0.0), ("right", 20.0, 0.0), ("third", 3.0, 9.0))
     return [camera_at(name, width, height, azimuth, elevation, distance) for name, azimuth, elevation in places]
 
 
-def camera_at(
-    name: str, width: int, height: int, azimuth: float, elevation: float, distance: float = DISTANCE
-) -> Camera:
+def camera_at(name: str, width: int, height: int, azimuth: float, elevation: float, distance: float = 72.0) -> Camera:
     """A camera that looks at the origin from degrees to the right of and above the nose."""
     focal = 1530.0 * min(width / 680, height / 480)
     a, e = math.radians(azimuth), math.radians(elevation)

@@ -23,12 +23,8 @@ def register_plugins() -> dict[str, type]:
     if variant is None:
         raise VariantError("no Mitsuba variant is active; call mifit.set_variant() first")
     if variant not in _CLASSES:
-        made = {
-            "blinnphong": blinnphong.make(),
-            "shenv": shenv.make(),
-            "shdirect": shdirect.make(),
-            "pinhole": pinhole.make(),
-        }
+        plugins = {"blinnphong": blinnphong, "shenv": shenv, "shdirect": shdirect, "pinhole": pinhole}
+        made = {name: plugin.make() for name, plugin in plugins.items()}
         mi.register_bsdf("blinnphong", made["blinnphong"])
         mi.register_emitter("shenv", made["shenv"])
         mi.register_integrator("shdirect", made["shdirect"])
