@@ -182,7 +182,7 @@ def load_plan(path: str | Path, overrides: Sequence[str] = (), seed: int = 0) ->
         raise InputError(f"{path}: jobs: found {jobs!r}, expected a whole number from 1 to 1024")
     document.setdefault("name", path.stem)
     points = []
-    for swept in _points(_with_captures(sweep, path), str(path)):
+    for swept in _points(sweep, path):
         point = copy.deepcopy(document)
         where = f"{path}: sweep {swept}" if swept else str(path)
         for key, value in swept.items():
@@ -224,8 +224,11 @@ def _assign(table: dict, key: str, value: object, where: str) -> None:
         table.pop(other, None)
 
 
-def _points(sweep: object, where: str) -> Iterator[Document]:
-    """The points of a sweep: the product of ``grid``'s lists, or the tables of ``list``; one point without a sweep."""
+def _points(sweep: object, where: Path) -> Iterator[Document]:
+    """The points of a sweep: the product of ``grid``'s lists, or the tables of ``list``; one point without a sweep.
+
+    A folder of captures stands for the list of them.
+    """
     if not isinstance(sweep, dict) or set(sweep) - {"grid", "list"} or len(sweep) > 1:
         raise InputError(f"{where}: sweep: found {sweep!r}, expected one table 'grid' or one list 'list'")
     points = sweep.get("list", [{}])
@@ -233,6 +236,13 @@ def _points(sweep: object, where: str) -> Iterator[Document]:
     if not isinstance(grid, dict):
         raise InputError(f"{where}: sweep.grid: found {grid!r}, expected a table of lists")
     grid = dict(_flatten(grid))
+    if isinstance(folder := grid.get("fit.capture"), str):
+        found = sorted(path.parent.name for path in (where.parent / folder).glob("*/transforms.json"))
+        if not found:
+            raise InputError(
+                f"{where}: sweep.grid: fit.capture: found no capture in {folder!r}, expected folders of them"
+            )
+        grid["fit.capture"] = [os.path.join(folder, name) for name in found]
     for key, values in grid.items():
         if not isinstance(values, list) or not values:
             raise InputError(f"{where}: sweep.grid: {key}: found {values!r}, expected a list of values")
@@ -243,20 +253,6 @@ def _points(sweep: object, where: str) -> Iterator[Document]:
         raise InputError(f"{where}: sweep: found {count} runs, expected at most {MAX_COUNT}; split the sweep")
     for point, values in itertools.product(points, itertools.product(*grid.values())):
         yield dict(_flatten(point)) | dict(zip(grid, values, strict=True))
-
-
-def _with_captures(sweep: object, path: Path) -> object:
-    """A sweep in whose grid a folder of captures stands for the list of them."""
-    if not isinstance(sweep, dict) or not isinstance(sweep.get("grid"), dict):
-        return sweep
-    grid = dict(_flatten(sweep["grid"]))
-    key, folder = "fit.capture", grid.get("fit.capture")
-    if isinstance(folder, str):
-        found = sorted(p.parent.name for p in (path.parent / folder).glob("*/transforms.json"))
-        if not found:
-            raise InputError(f"{path}: sweep.grid: {key}: found no capture in {folder!r}, expected folders of them")
-        grid[key] = [os.path.join(folder, name) for name in found]
-    return {**sweep, "grid": grid}
 
 
 def _flatten(table: dict, prefix: str = "") -> Iterator[tuple[str, object]]:
