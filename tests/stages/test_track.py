@@ -253,20 +253,20 @@ def test_a_killed_run_resumes_to_the_same_result(scene, fit_truth, saved, tmp_pa
         pass
 
     count = [0]
-    document, write = folder_module.write_text, tracking.add_timestep
+    document, write = folder_module.write_json, tracking.add_timestep
 
-    def die(*arguments):
+    def die(*arguments, **options):
         if count[0] == killed_after:
             raise Killed
         count[0] += 1
-        return (write if moment == "before" else document)(*arguments)
+        return (write if moment == "before" else document)(*arguments, **options)
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
         # before: no file of the frame; between: its maps are there, result.json doesn't name it yet
         if moment == "before":
             patch.setattr(tracking, "add_timestep", die)
         else:
-            patch.setattr(folder_module, "write_text", die)
+            patch.setattr(folder_module, "write_json", die)
         tracking.track_into(saved, reload(saved), scene, (1, 2), CONFIG)
     assert len(reload(saved).timesteps) == 1 + killed_after
     tracking.track_into(saved, reload(saved), scene, (1, 2), CONFIG, resume=True)
