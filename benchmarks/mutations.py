@@ -184,8 +184,8 @@ MUTATIONS = (
       "tests/stages/test_fill.py"),
     M("factors of images that noise explains", "photometry.Solution.sure",
       "np.abs(self.value) > SURE * self.deviation", "True", "tests/stages/test_photometry.py"),
-    M("residual shading with sides exchanged", "residual_shading.separate_shading", "0.5 * (level - opposite)",
-      "0.5 * (opposite - level)", "tests/stages/test_residual_shading.py"),
+    M("either half shows the other's skin", "fill.bilateral_change", "(total + beyond)", "(2.0 * beyond)",
+      "tests/stages/test_fill.py"),
     M("normals smoothed by a tenth", "refine_normals.frame_problem", "0.5 * config.laplacian_weight / STEPS",
       "0.05 * config.laplacian_weight / STEPS", "tests/stages/test_refine_normals.py tests/test_paper.py"),
     # Calibration.

@@ -292,7 +292,7 @@ class ReflectanceConfig:
     )
     residual_shading: bool = flag(
         True,
-        "part from the albedo what varies more than skin does, which another light doesn't show; with robust alone",
+        "skin is alike on both halves; what else images show is the capture's own light's; with robust alone",
     )
     max_iterations: int = number(30, "Gauss-Newton iterations of the lighting", source="limit", least=1, most=10_000)
 

@@ -153,7 +153,7 @@ class ReflectanceEstimate:
         What each image of the fit shows (`core.estimate.Label`); empty where that wasn't looked for.
     labelled : tuple of (camera, timestep)
         Of which image each of ``labels`` is.
-    residual_shading : (S, S) float32 or None
+    residual_shading : (S, S, 3) float32 or None
         Factor of the diffuse light of the capture that mesh and lighting don't explain: relief finer than the mesh,
         edges of shadows. None where nothing was parted from the albedo, and under any other light.
     specular_confidence : (S, S) float32 or None
@@ -176,7 +176,7 @@ class ReflectanceEstimate:
     @property
     def lit_diffuse(self) -> NDArray:
         """(S, S, 3) what the diffuse light of this illumination is multiplied by: albedo times residual shading."""
-        return self.diffuse if self.residual_shading is None else self.diffuse * self.residual_shading[..., None]
+        return self.diffuse if self.residual_shading is None else self.diffuse * self.residual_shading
 
     def label(self, camera: str, timestep: int) -> NDArray | None:
         """The labels of one image; None where there are none."""

@@ -284,9 +284,9 @@ def _reflectance(folder: Path, document: Document) -> ReflectanceEstimate | None
     diffuse = _read_map(folder / "maps" / "diffuse.exr", 3)
     labels = _labels(folder, document)
 
-    def optional(name: str) -> NDArray[np.float32] | None:
+    def optional(name: str, channels: int) -> NDArray[np.float32] | None:
         path = folder / "maps" / f"{name}.exr"
-        return _read_map(path, 1, len(diffuse)) if path.exists() else None
+        return _read_map(path, channels, len(diffuse)) if path.exists() else None
 
     return ReflectanceEstimate(
         diffuse=diffuse,
@@ -298,8 +298,8 @@ def _reflectance(folder: Path, document: Document) -> ReflectanceEstimate | None
         report=_report(document, "reflectance"),
         labels=tuple(labels.values()),
         labelled=tuple(labels),
-        residual_shading=optional("residual_shading"),
-        specular_confidence=optional("specular_confidence"),
+        residual_shading=optional("residual_shading", 3),
+        specular_confidence=optional("specular_confidence", 1),
     )
 
 

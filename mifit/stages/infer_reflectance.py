@@ -14,7 +14,6 @@ from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report, hidden
 from mifit.core.mesh import interpolate
 from mifit.core.process import one_blas_thread
-from mifit.core.sh import LUMINANCE
 from mifit.errors import ConvergenceError
 from mifit.optim import Outcome
 from mifit.progress import Progress, silent
@@ -22,8 +21,8 @@ from mifit.sampling.observations import Surface
 from mifit.stages.reflectance.als import find_forward, fit_als
 from mifit.stages.reflectance.fill import blend_unseen
 from mifit.stages.reflectance.forward import Forward
+from mifit.stages.reflectance.light_error import light_error, light_known, light_level
 from mifit.stages.reflectance.paper_energy import energies, fit_paper
-from mifit.stages.reflectance.residual_shading import light_error, light_known, light_level, separate_shading
 from mifit.stages.segment import segment
 
 if TYPE_CHECKING:
@@ -125,19 +124,16 @@ def infer_reflectance(
         light = illumination.unknowns, illumination.ambient
         terms = energies(surface, forward, *light, solved.maps, albedo, config)
         details["objective"] = {**terms, "total": sum(terms.values())}
-    diffuse, residual_shading = filled.diffuse, None
+    residual_shading = None
     if first is not None and config.residual_shading:
-        # What no light reached is as dark as it was seen under the capture's own light, and skin under any other.
+        # Skin under any light; what the images show beside it belongs to the capture's own.
         level = surface.texels.from_map(light_level(surface.texels.to_map(surface.brightness())))
         lit = light_known(level, light_error(model, surface.texels, solved.maps, quality, level))
         filled = blend_unseen(model, surface.texels, solved.maps, quality, solved.observability, lit)
-        parted = separate_shading(model, surface.texels, filled.diffuse, filled.confidence)
-        shade = (shown.diffuse @ LUMINANCE) / np.maximum(filled.diffuse @ LUMINANCE, 1e-3)
-        diffuse = parted.skin
-        residual_shading = (parted.residual_shading * np.where(surface.texels.mask, shade, 1.0)).astype(np.float32)
-        details["spread"] = {"symmetric": parted.symmetric, "sided": parted.sided}
+        factor = shown.diffuse / np.maximum(filled.diffuse, 1e-3)
+        residual_shading = np.where(surface.texels.mask[..., None], factor, 1.0).astype(np.float32)
     return ReflectanceEstimate(
-        diffuse=diffuse,
+        diffuse=filled.diffuse,
         residual_shading=residual_shading,
         specular=filled.specular,
         confidence=filled.confidence,

@@ -18,8 +18,8 @@ def parted(variant):
     """A result with smooth skin and residual shading, and one with their product as albedo."""
     whole = ball_result()
     found = whole.reflectance.diffuse
-    residual_shading = np.linspace(0.6, 1.2, len(found), dtype=np.float32)[:, None].repeat(len(found), axis=1)
-    skin = replace(whole.reflectance, diffuse=found / residual_shading[..., None], residual_shading=residual_shading)
+    residual_shading = np.linspace(0.6, 1.2, len(found), dtype=np.float32)[:, None, None] * np.ones_like(found)
+    skin = replace(whole.reflectance, diffuse=found / residual_shading, residual_shading=residual_shading)
     return replace(whole, reflectance=skin), whole
 
 

@@ -9,7 +9,7 @@ from mifit.core.mesh import interpolate
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
 from mifit.stages.reflectance.fill import blend_unseen
-from mifit.stages.reflectance.residual_shading import light_error, light_known, light_level
+from mifit.stages.reflectance.light_error import light_error, light_known, light_level
 
 
 @pytest.fixture(scope="module")
@@ -96,3 +96,26 @@ def test_a_mark_on_one_side_is_not_painted_onto_the_other(half_seen):
     sure = np.ones(len(truth), np.float32)
     found = texels.from_map(blend_unseen(model, texels, texels.to_map(marked), sure, sure).diffuse)
     np.testing.assert_allclose(found, marked[:, :3], atol=0.03)
+
+
+def test_the_lit_half_decides_what_skin_is(half_seen):
+    """Light that is wrong on one half changes its colour: the other half, where there is more light, knows better."""
+    model, texels, truth, _, seen = half_seen
+    tinted = np.where(seen[:, None], truth, truth * (0.9, 0.6, 0.5, 1.0)).astype(np.float32)
+    sure, lit = np.ones(len(truth), np.float32), np.where(seen, 1.0, 0.5)
+    found = texels.from_map(blend_unseen(model, texels, texels.to_map(tinted), sure, sure, lit).diffuse)
+    inside = np.abs(interpolate(model.mean, model.faces, texels.face, texels.weights)[:, 0] * model.unit_mm) > 5.0
+    error, before = (np.abs(v - truth[:, :3])[~seen & inside].mean() for v in (found, tinted[:, :3]))
+    assert error < 0.25 * before
+    np.testing.assert_allclose(found[seen & inside], truth[seen & inside, :3], atol=0.03)
+
+
+def test_a_fine_mark_stays_on_its_side(half_seen):
+    model, texels, truth, _, seen = half_seen
+    dots = np.flatnonzero(seen)[::37]
+    marked = truth.copy()
+    marked[dots, :3] *= 0.6
+    sure = np.ones(len(truth), np.float32)
+    found = texels.from_map(blend_unseen(model, texels, texels.to_map(marked), sure, sure, sure).diffuse)
+    assert np.median(found[dots] / truth[dots, :3]) < 0.7
+    np.testing.assert_allclose(found[~seen], truth[~seen, :3], atol=0.05)

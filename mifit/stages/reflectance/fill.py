@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +17,8 @@ from mifit.stages.geometry.points import corner_matrix
 
 BLEND = 0.05
 """Confidence at which a texel's own estimate counts as much as its surroundings'."""
+ALIKE = 0.01
+"""Distance over which skin is alike on both halves of a face, relative to the map: chosen on scan_city."""
 TYPICAL = 3e-4
 """Weight of the typical value of skin beside that of a texel of confidence 1: it decides far from what was seen."""
 STIFFNESS = 0.02
@@ -45,7 +48,7 @@ def blend_unseen(
     maps: NDArray,
     confidence: NDArray,
     observability: NDArray,
-    lit: NDArray | float = 1.0,
+    lit: NDArray | None = None,
 ) -> Filled:
     """Replace texels that were hardly seen by the mean face's albedo times a factor that continues the seen ones.
 
@@ -63,18 +66,24 @@ def blend_unseen(
     observability : (N,)
         How far images determine the specular albedo, 0..1: not at all for a well visible texel in deep shade, or where
         no lobe points at a light.
-    lit : (N,)
-        Share of the images in the diffuse albedo where visibility is full (`residual_shading.light_known`).
+    lit : (N,), optional
+        Share of the images in the diffuse albedo where visibility is full (`light_error.light_known`). With it the
+        albedo is skin's under any light: both halves share what they show (`bilateral_change`). Without it the albedo
+        stays as the capture's own light shows it.
     """
     expected = np.maximum(interpolate(model.mean_albedo, model.faces, texels.face, texels.weights), DARKEST)
     found = texels.from_map(maps).astype(np.float64)
     found[:, :3] = np.log(np.maximum(found[:, :3], DARKEST) / expected)
-    confidence, lit = (np.asarray(x, dtype=np.float64) for x in (confidence, lit))
+    confidence = np.asarray(confidence, dtype=np.float64)
+    share = np.ones_like(confidence) if lit is None else np.asarray(lit, dtype=np.float64)
     # Variances add: that of visibility, and that of the light, both in units of `BLEND`'s texel.
-    variance = 1.0 / np.maximum(confidence, 1e-9) + (1.0 / np.maximum(lit, 1e-9) - 1.0) / BLEND
-    known, confidence = np.where(confidence * lit > 0, 1.0 / variance, 0.0), confidence * lit
+    variance = 1.0 / np.maximum(confidence, 1e-9) + (1.0 / np.maximum(share, 1e-9) - 1.0) / BLEND
+    confidence = confidence * share
+    known = np.where(confidence > 0, 1.0 / variance, 0.0)
     if model.symmetry is not None:
         opposite = mirrored_coordinates(model, texels)
+        if lit is not None:
+            found[:, :3] += bilateral_change(texels, found[:, :3], known, opposite)
         there = sample_map(texels.to_map(known.astype(np.float32)), opposite)
         values = sample_map(texels.to_map((found * known[:, None]).astype(np.float32)), opposite)
         taken = there * (1.0 - np.clip(known / BLEND, 0.0, 1.0))
@@ -92,6 +101,21 @@ def blend_unseen(
     image = texels.to_map(np.clip(blended, 0.0, 1.0).astype(np.float32))
     both = (texels.to_map(np.asarray(x, np.float32)) for x in (confidence, confidence * observability))
     return Filled(image[..., :3], image[..., 3], *both)
+
+
+def bilateral_change(texels: TexelMap, values: NDArray, known: NDArray, opposite: NDArray) -> NDArray[np.float64]:
+    """(N, C) what takes values of texels to the mean of both halves, each as far as it is ``known`` (N,).
+
+    Skin is alike on both over distances of `ALIKE` and more, while light comes from one side; finer marks stay.
+    """
+
+    def smooth(of: NDArray) -> NDArray:
+        return texels.from_map(cv2.GaussianBlur(texels.to_map(of.astype(np.float32)), (0, 0), ALIKE * texels.size))
+
+    density, total = smooth(known), smooth(known[:, None] * values)
+    there, beyond = (sample_map(texels.to_map(of), opposite) for of in (density, total))
+    both = (total + beyond) / np.maximum(density + there, 1e-12)[:, None]
+    return np.asarray(np.where((density > 1e-9)[:, None], both - total / np.maximum(density, 1e-12)[:, None], 0.0))
 
 
 def mirrored_coordinates(model: MorphableModel, texels: TexelMap) -> NDArray[np.float64]:
