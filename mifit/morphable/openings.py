@@ -167,6 +167,13 @@ def _pieces(model: MorphableModel, eyes: Sequence[NDArray], mouth: NDArray | Non
     return pieces
 
 
+def skin_faces(model: MorphableModel) -> NDArray[np.bool_]:
+    """(F,) faces of the model's own skin, without eyes and what else was added to it."""
+    weights = skin_weights(model)
+    own = None if weights is None else leading_faces(model, weights.shape[1])
+    return np.ones(len(model.faces), bool) if own is None else own
+
+
 def leading_faces(model: MorphableModel, count: int) -> NDArray[np.bool_] | None:
     """(F,) faces of the first ``count`` vertices, where those are the model or what it was before it got eyes.
 

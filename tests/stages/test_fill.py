@@ -8,6 +8,7 @@ import pytest
 from mifit.core.mesh import interpolate
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
+from mifit.morphable.openings import eyeballs
 from mifit.stages.reflectance.fill import blend_unseen
 from mifit.stages.reflectance.light_error import light_error, light_known, light_level
 
@@ -119,3 +120,18 @@ def test_a_fine_mark_stays_on_its_side(half_seen):
     found = texels.from_map(blend_unseen(model, texels, texels.to_map(marked), sure, sure, sure).diffuse)
     assert np.median(found[dots] / truth[dots, :3]) < 0.7
     np.testing.assert_allclose(found[~seen], truth[~seen, :3], atol=0.05)
+
+
+def test_eyes_keep_what_each_of_them_shows():
+    """An iris is dark without want of light, and two need not be alike."""
+    model = MorphableModel.load("builtin:coarse")
+    texels = rasterize_uv(model.uv, model.faces_uv, 128, model.mapped)
+    left, right = (np.isin(model.faces, ball).all(axis=1)[texels.face] for ball in eyeballs(model))
+    assert left.sum() > 20 < right.sum()
+    found = np.full((len(texels.face), 4), 0.4, np.float32)
+    found[left, :3], found[right, :3] = (0.1, 0.2, 0.5), (0.3, 0.2, 0.1)
+    sure = np.ones(len(found), np.float32)
+    lit = np.where(left | right, 0.0, 1.0)
+    shown = texels.from_map(blend_unseen(model, texels, texels.to_map(found), sure, sure, lit).diffuse)
+    for eye in (left, right):
+        np.testing.assert_allclose(np.median(shown[eye], axis=0), np.median(found[eye, :3], axis=0), atol=0.03)

@@ -12,6 +12,7 @@ from mifit.core.mesh import interpolate
 from mifit.core.mesh_solve import membrane
 from mifit.core.uv import TexelMap, sample_map
 from mifit.morphable import MorphableModel
+from mifit.morphable.openings import skin_faces
 from mifit.sampling.visibility import DARKEST
 from mifit.stages.geometry.points import corner_matrix
 
@@ -75,7 +76,9 @@ def blend_unseen(
     found = texels.from_map(maps).astype(np.float64)
     found[:, :3] = np.log(np.maximum(found[:, :3], DARKEST) / expected)
     confidence = np.asarray(confidence, dtype=np.float64)
-    share = np.ones_like(confidence) if lit is None else np.asarray(lit, dtype=np.float64)
+    # Eyes are no skin: their light is as it is found, and neither is like the other.
+    skin = skin_faces(model)[texels.face]
+    share = np.ones_like(confidence) if lit is None else np.where(skin, lit, 1.0)
     # Variances add: that of visibility, and that of the light, both in units of `BLEND`'s texel.
     variance = 1.0 / np.maximum(confidence, 1e-9) + (1.0 / np.maximum(share, 1e-9) - 1.0) / BLEND
     confidence = confidence * share
@@ -83,7 +86,7 @@ def blend_unseen(
     if model.symmetry is not None:
         opposite = mirrored_coordinates(model, texels)
         if lit is not None:
-            found[:, :3] += bilateral_change(texels, found[:, :3], known, opposite)
+            found[:, :3] += skin[:, None] * bilateral_change(texels, found[:, :3], known, opposite)
         there = sample_map(texels.to_map(known.astype(np.float32)), opposite)
         values = sample_map(texels.to_map((found * known[:, None]).astype(np.float32)), opposite)
         taken = there * (1.0 - np.clip(known / BLEND, 0.0, 1.0))
