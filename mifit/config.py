@@ -292,7 +292,7 @@ class ReflectanceConfig:
     )
     residual_shading: bool = flag(
         True,
-        "skin is alike on both halves; what else images show is the capture's own light's; with robust alone",
+        "both halves of the face share their skin; the rest belongs to the capture's light; with robust alone",
     )
     max_iterations: int = number(30, "Gauss-Newton iterations of the lighting", source="limit", least=1, most=10_000)
 

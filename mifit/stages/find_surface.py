@@ -28,7 +28,7 @@ from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.metrics import median_deviation
 from mifit.core.process import one_blas_thread
 from mifit.core.uv import TexelMap, rasterize_uv
-from mifit.morphable.openings import skin_faces, skin_weights
+from mifit.morphable.openings import leading_faces, skin_weights
 from mifit.morphable.topology import INNER
 from mifit.optim import Outcome
 from mifit.progress import Progress, silent
@@ -215,7 +215,7 @@ class Skin:
         """Of a model with eyes that were added to it, or without."""
         weights = skin_weights(model)
         count = model.n_vertices if weights is None else weights.shape[1]
-        return cls(count, weights, model.faces[skin_faces(model)])
+        return cls(count, weights, model.faces[leading_faces(model, count)])
 
     def spread(self, displacement: NDArray) -> NDArray[np.float64]:
         """(V, 3) displacement of all vertices by that of the skin."""

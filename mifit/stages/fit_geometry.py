@@ -97,7 +97,7 @@ def fit_geometry(
         state = initial_state(model, some, len(timesteps), layout, model.unit_mm / capture.unit_mm)
         return fit_landmarks(model, some, state, config.landmark_noise, priors_of(config))
 
-    start, left_out = place_head(capture, model, cameras, timesteps[0], by_landmarks(views), by_landmarks)
+    start, left_out = place_head(capture, model, cameras, timesteps[0], by_landmarks(views), by_landmarks, progress)
     journal.phase("landmarks", _usable(start.solution, "landmarks"))
     for name in left_out:
         text = f"camera {name}: its landmarks contradict what all views show; they are left out"

@@ -16,31 +16,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.capture import Capture
+from mifit.core.camera import Camera
 from mifit.core.metrics import median_deviation
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
+from mifit.progress import Progress
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.geometry.landmarks import LandmarkFit, LandmarkView, State, coordinate_deviation, world_vertices
 from mifit.stages.geometry.parameters import Frames
+from mifit.stages.surface.band import DARKEST
 from mifit.stages.surface.epipolar import likeness
 from mifit.stages.surface.views import LARGEST_TEXTURE, Resolution, pose_texels, texture_size
 
 STEP = 0.01
 """Between the logarithms of sizes that are tried: what views show agrees within a hundredth of the right one."""
 SIZES = np.exp(STEP * np.arange(-40, 41))
-"""Sizes of a head, by the model's."""
-SPREAD = 0.15
-"""Standard deviation of the logarithm of that size: people differ by 0.05, what scans and files call a unit by more."""
+"""Sizes of a head, by the model's: what scans and files call a unit differs by more than people do."""
+MOST_VIEWS = 3
+"""Views that are compared with the one that has landmarks."""
 STANDS_OUT = 4.0
 """Standard deviations by which the evidence for a size stands out; below it the head stays where the model's size has
-it. For the development scan from the front and both sides it is 6 to 7, and below 3 for the best wrong size."""
+it. For scan_city's head from the front and both sides it is 6 to 7, and below 3 for the best wrong size."""
 CONTRADICTS = 0.025
 """Deviation of landmarks from a fit, as part of their extent, that errors of detector and model don't reach: 0.002 to
-0.017 on development heads."""
+0.017 on the shared captures."""
 PIXEL_MM = 3.3
 """Length of a pixel at the face in images that are compared: a surface that isn't fitted yet is off by as much."""
-DARKEST = 4e-3
-"""Added to linear colours before the logarithm."""
+BLUR = 2.0
+"""Pixels around the outline over which either side's colours are averaged."""
 
 
 def place_head(
@@ -50,10 +53,12 @@ def place_head(
     timestep: int,
     start: LandmarkFit,
     fit: Callable[[tuple[LandmarkView, ...]], LandmarkFit],
+    progress: Progress,
 ) -> tuple[LandmarkFit, tuple[str, ...]]:
-    """The fit by landmarks where what all views show agrees, and the cameras whose landmarks contradict it.
+    """The fit by landmarks where what all views show agrees, and the camera whose landmarks contradict it, if any.
 
-    The fit as it is where two or more cameras have landmarks that agree, and where no view tells.
+    The fit as it is where the landmarks of cameras agree, where three or more have some, so that most decide, and where
+    no view shows which size is right.
 
     Parameters
     ----------
@@ -64,23 +69,22 @@ def place_head(
         By the landmarks of all cameras.
     fit : function
         From the landmarks of some of them to such a fit.
+    progress : Progress
     """
-    views = {name: tuple(v for v in start.views if v.camera.name == name) for name in cameras}
-    views = {name: own for name, own in views.items() if own}
-    if len(cameras) == 1 or (len(views) > 1 and not _contradicts(start.state, start.views)):
+    views = {name: tuple(view for view in start.views if view.camera.name == name) for name in cameras}
+    marked = [name for name, own in views.items() if own]
+    if len(cameras) == 1 or len(marked) > 2 or (len(marked) == 2 and not _contradicts(start.state, start.views)):
         return start, ()
-    best, most = start, STANDS_OUT
+    best, most, left_out = start, STANDS_OUT, tuple[str, ...]()
     steps = {view.step for view in start.views}
-    for name, own in views.items():
-        if {view.step for view in own} != steps:
-            continue
-        alone = fit(own) if len(views) > 1 else start
-        state, evidence = _placed(capture, model, (name, *(c for c in cameras if c != name)), timestep, alone.state)
+    for name in (name for name in marked if {view.step for view in views[name]} == steps):
+        alone = fit(views[name]) if len(marked) == 2 else start
+        others = [other for other in cameras if other != name][:MOST_VIEWS]
+        state, evidence = _placed(capture, model, (name, *others), timestep, alone.state, progress)
         if evidence > most:
             best, most = replace(alone, state=state), evidence
-    left_out = tuple(name for name, own in views.items() if best is not start and _contradicts(best.state, own))
-    kept = tuple(view for name, own in views.items() if name not in left_out for view in own)
-    return (fit(kept) if left_out and len(views) - len(left_out) > 1 else best), left_out
+            left_out = tuple(other for other in marked if other != name)
+    return best, left_out
 
 
 def _contradicts(state: State, views: tuple[LandmarkView, ...]) -> bool:
@@ -90,7 +94,7 @@ def _contradicts(state: State, views: tuple[LandmarkView, ...]) -> bool:
 
 
 def _placed(
-    capture: Capture, model: MorphableModel, names: Sequence[str], timestep: int, state: State
+    capture: Capture, model: MorphableModel, names: Sequence[str], timestep: int, state: State, progress: Progress
 ) -> tuple[State, float]:
     """A state scaled about the first camera so that the other views agree best, and by how much that stands out."""
     centre, world = capture.camera(names[0]).position, world_vertices(model, state)[0]
@@ -98,14 +102,9 @@ def _placed(
     factor = min(1.0, pixel * capture.unit_mm / PIXEL_MM)
     side = texture_size(model, world, 0.5 * pixel / factor, LARGEST_TEXTURE)
     texels = rasterize_uv(model.uv, model.faces_uv, side, model.face_mask)
-    small = [capture.camera(name).resized(factor) for name in names[1:]]
-    images = [capture.frame(camera.name, timestep).image for camera in small]
-    sizes = [(camera.width, camera.height) for camera in small]
-    logs = [
-        np.log(cv2.resize(image, size, interpolation=cv2.INTER_AREA) + DARKEST)
-        for image, size in zip(images, sizes, strict=True)
-    ]
     scene = SurfaceScene(world, model.faces)
+    small = [capture.camera(name).resized(factor) for name in names[1:]]
+    logs = [_log_image(camera, capture.frame(camera.name, timestep).image) for camera in small]
 
     def evidence(size: float) -> list[float]:
         """Of each other view how much its skin is the first view's, and how far the outline stands out."""
@@ -116,16 +115,24 @@ def _placed(
         edges = [outline_contrast(scene.gbuffer(camera).mask, log) for camera, log in zip(small, logs, strict=True)]
         return [np.nan if value is None else value for value in (*alike, *edges)]
 
-    found = np.array([evidence(size) for size in SIZES])
-    found = found[:, np.isfinite(found).sum(axis=0) > len(SIZES) // 4]
+    found = np.empty((len(SIZES), 2 * len(small)))
+    for k, size in enumerate(SIZES):
+        progress("Placing the head", k, len(SIZES))
+        found[k] = evidence(size)
+    found = found[:, np.isfinite(found).mean(axis=0) > 0.25]
     if not found.size:
         return state, 0.0
     spread = [max(median_deviation(column[np.isfinite(column)]), 1e-6) for column in found.T]
     total = np.nansum((found - np.nanmedian(found, axis=0)) / spread, axis=1) / np.sqrt(found.shape[1])
-    best = int(np.argmax(total - 0.5 * (np.log(SIZES) / SPREAD) ** 2))
+    best = int(np.argmax(total))
     low, peak, high = total[np.clip([best - 1, best, best + 1], 0, len(SIZES) - 1)]
     size = SIZES[best] * np.exp(STEP * 0.5 * (high - low) / max(2.0 * peak - low - high, 1e-6))
     return _scaled(state, float(size), centre), float(peak)
+
+
+def _log_image(camera: Camera, image: NDArray) -> NDArray[np.float32]:
+    """Logarithm of a linear image at a smaller camera's size."""
+    return np.log(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA) + np.float32(DARKEST))
 
 
 def outline_contrast(mask: NDArray[np.bool_], log: NDArray) -> float | None:
@@ -134,10 +141,10 @@ def outline_contrast(mask: NDArray[np.bool_], log: NDArray) -> float | None:
     Where the image ends there is none.
     """
     shown, wide = mask.astype(np.uint8), np.ones((5, 5), np.uint8)
-    rings = (shown - cv2.erode(shown, wide)).astype(np.float32), (cv2.dilate(shown, wide) - shown).astype(np.float32)
-    weights = [cv2.GaussianBlur(ring, (0, 0), 2.0) for ring in rings]
+    rings = [ring.astype(np.float32) for ring in (shown - cv2.erode(shown, wide), cv2.dilate(shown, wide) - shown)]
+    weights = [cv2.GaussianBlur(ring, (0, 0), BLUR) for ring in rings]
     inside, outside = (
-        cv2.GaussianBlur(log * ring[..., None], (0, 0), 2.0) / np.maximum(weight, 1e-6)[..., None]
+        cv2.GaussianBlur(log * ring[..., None], (0, 0), BLUR) / np.maximum(weight, 1e-6)[..., None]
         for ring, weight in zip(rings, weights, strict=True)
     )
     edge = (rings[0] + rings[1] > 0) & (np.minimum(*weights) > 0.05)

@@ -1,4 +1,4 @@
-"""What to show where no image looked or no light came: the mean face in proportion to the skin that was seen."""
+"""Skin where no image looked or no light came: like the other half of the face, or the mean face in proportion."""
 
 from __future__ import annotations
 
@@ -78,17 +78,16 @@ def blend_unseen(
     confidence = np.asarray(confidence, dtype=np.float64)
     # Eyes are no skin: their light is as it is found, and neither is like the other.
     skin = skin_faces(model)[texels.face]
-    share = np.ones_like(confidence) if lit is None else np.where(skin, lit, 1.0)
+    light = np.ones_like(confidence) if lit is None else np.where(skin, lit, 1.0)
     # Variances add: that of visibility, and that of the light, both in units of `BLEND`'s texel.
-    variance = 1.0 / np.maximum(confidence, 1e-9) + (1.0 / np.maximum(share, 1e-9) - 1.0) / BLEND
-    confidence = confidence * share
+    variance = 1.0 / np.maximum(confidence, 1e-9) + (1.0 / np.maximum(light, 1e-9) - 1.0) / BLEND
+    confidence = confidence * light
     known = np.where(confidence > 0, 1.0 / variance, 0.0)
     if model.symmetry is not None:
         opposite = mirrored_coordinates(model, texels)
         if lit is not None:
-            found[:, :3] += skin[:, None] * bilateral_change(texels, found[:, :3], known, opposite)
-        there = sample_map(texels.to_map(known.astype(np.float32)), opposite)
-        values = sample_map(texels.to_map((found * known[:, None]).astype(np.float32)), opposite)
+            found[:, :3] += skin[:, None] * bilateral_change(texels, found[:, :3], skin * known, opposite)
+        there, values = (_across(texels, of, opposite) for of in (known, found * known[:, None]))
         taken = there * (1.0 - np.clip(known / BLEND, 0.0, 1.0))
         total = np.maximum(known + taken, 1e-12)[:, None]
         found = (known[:, None] * found + (taken / np.maximum(there, 1e-12))[:, None] * values) / total
@@ -110,23 +109,32 @@ def bilateral_change(texels: TexelMap, values: NDArray, known: NDArray, opposite
     """(N, C) what takes values of texels to the mean of both halves, each as far as it is ``known`` (N,).
 
     Skin is alike on both over distances of `ALIKE` and more, while light comes from one side; finer marks stay.
+    ``opposite`` are the `mirrored_coordinates`.
     """
 
     def smooth(of: NDArray) -> NDArray:
         return texels.from_map(cv2.GaussianBlur(texels.to_map(of.astype(np.float32)), (0, 0), ALIKE * texels.size))
 
     density, total = smooth(known), smooth(known[:, None] * values)
-    there, beyond = (sample_map(texels.to_map(of), opposite) for of in (density, total))
+    there, beyond = (_across(texels, of, opposite) for of in (density, total))
     both = (total + beyond) / np.maximum(density + there, 1e-12)[:, None]
     return np.asarray(np.where((density > 1e-9)[:, None], both - total / np.maximum(density, 1e-12)[:, None], 0.0))
 
 
 def mirrored_coordinates(model: MorphableModel, texels: TexelMap) -> NDArray[np.float64]:
-    """(N, 2) texture coordinates of the point opposite to each texel on the other half of the face.
+    """(N, 2) texture coordinates of the point opposite to each texel on the other half of the face; NaN outside it.
 
     The model has to say which vertices are opposite to one another.
     """
     inside = model.face_mask
-    of_vertex = np.zeros((len(model.mean), 2))
+    of_vertex = np.full((len(model.mean), 2), np.nan)
     of_vertex[model.faces[inside].ravel()] = model.uv[model.faces_uv[inside].ravel()]
     return interpolate(of_vertex[model.symmetry], model.faces, texels.face, texels.weights)
+
+
+def _across(texels: TexelMap, values: NDArray, opposite: NDArray) -> NDArray[np.float64]:
+    """Values (N, ...) at the opposite points of texels; 0 where there are none."""
+    there = np.isfinite(opposite).all(axis=1)
+    out = np.zeros(values.shape)
+    out[there] = sample_map(texels.to_map(values.astype(np.float32)), opposite[there])
+    return out
