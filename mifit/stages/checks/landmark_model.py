@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,12 @@ class FaceStatistics:
     shared: NDArray[np.float64]
     local: NDArray[np.float64]
     unit_mm: float
+
+    @cached_property
+    def inner(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Of the points inside the face: mean (51, 3), identities (51, 3, K) and expressions (51, 3, K)."""
+        shared, local = (np.ascontiguousarray(np.moveaxis(m[:, INNER], 0, 2)) for m in (self.shared, self.local))
+        return self.mean[INNER], shared, local
 
     @classmethod
     def of(cls, model: MorphableModel, unit_mm: float) -> FaceStatistics:
@@ -140,24 +147,26 @@ def explain(shots: Sequence[Shot], face: FaceStatistics, shifted: str | None = N
     for k in range(len(steps)):
         prior[free + k * local : free + k * local + len(face.local)] = 1.0
 
+    rows = [free + shot.step * local + np.arange(local) for shot in shots]
+    places = [np.r_[np.arange(free), own] for own in rows]
+    blocks = [np.ix_(at, at) for at in places]
+
     def look(x: NDArray, poses: list[tuple[NDArray, NDArray]]) -> tuple[float, NDArray, NDArray, list[NDArray]]:
         """Energy, gradient, curvature, and residuals (51, 2) of each shot."""
         energy, gradient, curvature = 0.5 * float((prior * x) @ x), prior * x, np.diag(prior)
         residuals = []
-        for shot in shots:
-            rows = free + shot.step * local + np.arange(local)
-            residual, jacobian = _project(shot, face, x[:free], x[rows], poses[shot.step], shifted)
+        for shot, own, at, block in zip(shots, rows, places, blocks, strict=True):
+            residual, jacobian = _project(shot, face, x[:free], x[own], poses[shot.step], shifted)
             squared = (residual**2).sum(1) / (2 * noise**2)
             seen = np.isfinite(squared)
             behind = ~seen & np.isfinite(shot.pixels[INNER]).all(1)
             energy += 1.5 * float(np.log1p(squared[seen]).sum()) + BEHIND * float(behind.sum())
             weight = np.where(seen, 1.5 / (1 + np.where(seen, squared, 0)), 0.0) / noise**2
             flat = np.repeat(weight, 2)
-            at = np.r_[np.arange(free), rows]
             residual = np.where(seen[:, None], residual, 0.0)
             jacobian = np.where(seen[:, None, None], jacobian, 0.0).reshape(-1, len(at))
             gradient[at] += jacobian.T @ (flat * residual.ravel())
-            curvature[np.ix_(at, at)] += (jacobian.T * flat) @ jacobian
+            curvature[block] += (jacobian.T * flat) @ jacobian
             residuals.append(np.where(seen[:, None], residual, np.nan))
         return energy, gradient, curvature, residuals
 
@@ -225,9 +234,10 @@ def _project(
 ) -> tuple[NDArray, NDArray]:
     """Residuals (51, 2) in pixels and their derivatives (51, 2, n) by shared unknowns and the timestep's own."""
     count, camera = len(face.shared), shot.camera
+    mean, identities, expressions = face.inner
     size = float(np.exp(np.clip(shared[count], -30, 30)))
-    shape = face.mean + np.tensordot(shared[:count], face.shared, 1) + np.tensordot(own[:-6], face.local, 1)
-    turned = size * shape[INNER] @ pose[0].T
+    shape = mean + identities @ shared[:count] + expressions @ own[:-6]
+    turned = size * shape @ pose[0].T
     seen = camera.to_camera(turned + pose[1])
     depth = np.where(seen[:, 2] > 1e-9, seen[:, 2], np.nan)
     ideal = seen[:, :2] / depth[:, None]
@@ -236,18 +246,15 @@ def _project(
     slope[:, 0, 0], slope[:, 1, 1] = camera.fx / depth, camera.fy / depth
     slope[:, :, 2] = -ideal * focal / depth[:, None]
     by_world = slope @ camera.rotation
+    by_object = by_world @ (size * pose[0])
     pixels = ideal * focal + (camera.cx, camera.cy)
-
-    def by_modes(modes: NDArray) -> NDArray:
-        return np.einsum("nij,knj->nik", by_world, size * modes[:, INNER] @ pose[0].T)
-
-    columns = [by_modes(face.shared), (by_world @ turned[..., None])]
+    columns = [by_object @ identities, by_world @ turned[..., None]]
     if shifted is not None:
         mine = float(shifted == camera.name)
         pixels = pixels + mine * shared[count + 1 :]
         columns.append(np.broadcast_to(mine * np.eye(2), (len(INNER), 2, 2)))
     cross = np.zeros((len(INNER), 3, 3))
     for k, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):
-        cross[:, a, b], cross[:, b, a] = -turned[:, k], turned[:, k]
-    columns += [by_modes(face.local), by_world @ -cross, by_world]
+        cross[:, a, b], cross[:, b, a] = turned[:, k], -turned[:, k]
+    columns += [by_object @ expressions, by_world @ cross, by_world]
     return pixels - shot.pixels[INNER], np.concatenate(columns, axis=2)
