@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.capture import Capture
-from mifit.core.camera import Camera
+from mifit.core.camera import Camera, rigid
 from mifit.core.metrics import median_deviation
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
@@ -26,7 +26,7 @@ from mifit.stages.geometry.landmarks import LandmarkFit, LandmarkView, State, co
 from mifit.stages.geometry.parameters import Frames
 from mifit.stages.surface.band import DARKEST
 from mifit.stages.surface.epipolar import likeness
-from mifit.stages.surface.views import LARGEST_TEXTURE, Resolution, pose_texels, texture_size
+from mifit.stages.surface.views import LARGEST_TEXTURE, Resolution, pose_views, texture_size
 
 STEP = 0.01
 """Between the logarithms of sizes that are tried: what views show agrees within a hundredth of the right one."""
@@ -103,16 +103,24 @@ def _placed(
     side = texture_size(model, world, 0.5 * pixel / factor, LARGEST_TEXTURE)
     texels = rasterize_uv(model.uv, model.faces_uv, side, model.face_mask)
     scene = SurfaceScene(world, model.faces)
-    small = [capture.camera(name).resized(factor) for name in names[1:]]
-    logs = [_log_image(camera, capture.frame(camera.name, timestep).image) for camera in small]
+    views = [(capture.camera(name), capture.frame(name, timestep)) for name in names]
+    small = [camera.resized(factor) for camera, _ in views[1:]]
+    logs = [_log_image(camera, frame.image) for camera, (_, frame) in zip(small, views[1:], strict=True)]
 
     def evidence(size: float) -> list[float]:
-        """Of each other view how much its skin is the first view's, and how far the outline stands out."""
-        vertices = centre + size * (world - centre)
-        scene.update(vertices)
-        posed = pose_texels(capture, scene, vertices, model.faces, texels, names, timestep, factor)
+        """Of each other view how much its skin is the first view's, and how far the outline stands out.
+
+        The head stays and the cameras are nearer to the first one instead, or farther: the images are the same, and
+        what rays are traced against is built once.
+        """
+        posed = pose_views(
+            scene, world, model.faces, texels, [(_nearer(c, centre, size), frame) for c, frame in views], factor
+        )
         alike = [likeness(posed, (0, k)) for k in range(1, len(names))]
-        edges = [outline_contrast(scene.gbuffer(camera).mask, log) for camera, log in zip(small, logs, strict=True)]
+        edges = [
+            outline_contrast(scene.gbuffer(_nearer(camera, centre, size)).mask, log)
+            for camera, log in zip(small, logs, strict=True)
+        ]
         return [np.nan if value is None else value for value in (*alike, *edges)]
 
     found = np.empty((len(SIZES), 2 * len(small)))
@@ -128,6 +136,12 @@ def _placed(
     low, peak, high = total[np.clip([best - 1, best, best + 1], 0, len(SIZES) - 1)]
     size = SIZES[best] * np.exp(STEP * 0.5 * (high - low) / max(2.0 * peak - low - high, 1e-6))
     return _scaled(state, float(size), centre), float(peak)
+
+
+def _nearer(camera: Camera, centre: NDArray, factor: float) -> Camera:
+    """The camera, its distance from a centre (3,) divided by a factor."""
+    position = centre + (camera.position - centre) / factor
+    return replace(camera, world_to_camera=rigid(camera.rotation, -camera.rotation @ position))
 
 
 def _log_image(camera: Camera, image: NDArray) -> NDArray[np.float32]:

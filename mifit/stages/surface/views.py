@@ -19,7 +19,7 @@ from mifit.stages.surface.band import feature_image
 from mifit.stages.surface.sweep import Posed
 
 if TYPE_CHECKING:
-    from mifit.capture import Capture
+    from mifit.capture import Capture, Frame
     from mifit.morphable import MorphableModel
 
 GRAZING_COSINE = 0.2  # beyond about 78 degrees a pixel covers too much surface to compare it
@@ -43,11 +43,23 @@ def pose_texels(
 
     ``factor`` is the level's pixels per pixel of the image.
     """
+    views = [(capture.camera(name), capture.frame(name, timestep)) for name in cameras]
+    return pose_views(scene, vertices, faces, texels, views, factor)
+
+
+def pose_views(
+    scene: SurfaceScene,
+    vertices: NDArray,
+    faces: NDArray,
+    texels: TexelMap,
+    views: Sequence[tuple[Camera, Frame]],
+    factor: float,
+) -> Posed:
+    """`pose_texels` of cameras that may stand elsewhere than in the capture, and what they show."""
     position = interpolate(vertices, faces, texels.face, texels.weights)
     normal = normalize(interpolate(vertex_normals(vertices, faces), faces, texels.face, texels.weights))
-    shown, seen = [], np.zeros((len(cameras), len(position)), np.float32)
-    for row, name in enumerate(cameras):  # rays take all cores by themselves
-        camera, frame = capture.camera(name), capture.frame(name, timestep)
+    shown, seen = [], np.zeros((len(views), len(position)), np.float32)
+    for row, (camera, frame) in enumerate(views):  # rays take all cores by themselves
         shown.append((camera, frame.image, frame.valid & ~frame.clipped & shows_surface(scene, camera)))
         cosine = (normalize(camera.position - position) * normal).sum(1)
         towards = np.flatnonzero(cosine > GRAZING_COSINE)
