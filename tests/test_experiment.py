@@ -15,6 +15,7 @@ import pytest
 
 from mifit.errors import InputError, MifitError
 from mifit.experiments import finished, load_plan, run_experiment
+from tests.here import run_here
 from tests.variant import VARIANT
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
@@ -231,6 +232,9 @@ rounds = 1
 texture_size = 32
 shading = "prefiltered"
 bands = 4
+max_iterations = 3
+[fit.normals]
+max_iterations = 3
 [evaluate]
 camera = "third"
 [outputs]
@@ -242,7 +246,7 @@ result = false
 
 
 @pytest.mark.slow
-def test_a_study_over_a_folder_of_captures_shares_stages_and_gives_intervals(variant, tmp_path):
+def test_a_study_over_a_folder_of_captures_shares_stages_and_gives_intervals(variant, tmp_path, monkeypatch):
     from scipy import stats
 
     from mifit.synth import synthesize
@@ -252,6 +256,7 @@ def test_a_study_over_a_folder_of_captures_shares_stages_and_gives_intervals(var
         synthesize(folder, timesteps=1, model="builtin:coarse", width=120, height=90, spp=2, seed=seed)
     path = tmp_path / "study.toml"
     path.write_text(FITS)
+    run_here(monkeypatch)
     text = run_experiment(path, out=tmp_path / "out", variant=VARIANT)
     kept = [p.name.partition("_")[0] for p in (tmp_path / "out" / "stages").glob("*.npz")]
     counts = {"geometry": 2, "photometry": 2, "reflectance": 4, "normals": 4, "mesh": 4, "residual": 4}

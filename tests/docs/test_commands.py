@@ -22,6 +22,7 @@ from mifit.extras.boards import Board
 from mifit.output.views import write_video
 from tests.extras.board_video import Studio, pair, poses
 from tests.extras.photogrammetry import write_colmap
+from tests.here import run_here
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -144,6 +145,7 @@ def once() -> list[tuple[str, str]]:
 @pytest.mark.parametrize("page", sorted({page for page, command in once() if command.startswith("mifit ")}))
 def test_documented_commands_run(page: str, workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(workspace)
+    run_here(monkeypatch)
     for _, command in (c for c in once() if c[0] == page):
         words = shlex.split(command)[1:]
         if not command.startswith("mifit ") or words[0] in NOT_HERE or {"--install", "fetch"} & {*words}:
