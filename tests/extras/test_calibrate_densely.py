@@ -84,13 +84,14 @@ def test_one_camera_leaves_the_landmarks_value_and_says_so(model, uncalibrated) 
 def test_many_sightings_are_thinned_by_whole_tracks(model, uncalibrated, monkeypatch) -> None:
     from mifit.extras import tracks
 
-    found = []
+    given, found = [], []
     follow = tracks.follow_points
-    monkeypatch.setattr("mifit.extras.tracks.follow_points", lambda images: found.append(follow(images)))
+    monkeypatch.setattr("mifit.extras.tracks.follow_points", given.append)
+    with pytest.raises(AttributeError):  # nothing is handed on
+        calibrate_capture(uncalibrated, model, BOTH, (0, 1, 2))
     for most in (10**6, 3000):
         monkeypatch.setattr(tracks, "MOST_SIGHTINGS", most)
-        with pytest.raises(AttributeError):  # nothing is handed on
-            calibrate_capture(uncalibrated, model, BOTH, (0, 1, 2))
+        found.append(follow(*given))
     whole, thinned = found
     assert len(whole.point) > 3000 >= 0.5 * len(thinned.point) and len(thinned.point) < 0.7 * len(whole.point)
     assert np.bincount(thinned.point).min() >= 3
