@@ -10,13 +10,18 @@ import pytest
 from mifit.cli import main
 
 CONFIG = """
+[geometry]
+rounds = 1
 [surface]
-finest = 2
+finest = 3
 [reflectance]
-texture_size = 64
+texture_size = 32
 shading = "prefiltered"
 bands = 4
 exponent = 100
+max_iterations = 5
+[normals]
+max_iterations = 5
 """
 
 
