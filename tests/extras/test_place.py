@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -49,17 +52,34 @@ def relative(first: Camera, second: Camera) -> np.ndarray:
     return second.world_to_camera @ np.linalg.inv(first.world_to_camera)
 
 
-def test_cameras_are_written_into_the_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    truth = write_photos(tmp_path, ("left", "right", "third"))
-    before = json.loads((tmp_path / "transforms.json").read_text())
-    assert main(["calibrate", str(tmp_path), "--model", "builtin:coarse"]) == 0
-    said = capsys.readouterr().out
-    assert "left: decided" in said and "third: placed" in said
-    after = json.loads((tmp_path / "transforms.json").read_text())
+@dataclass(frozen=True)
+class Placed:
+    """A capture of three cameras that was calibrated: the true ones, the file as it was, and what the command said."""
+
+    folder: Path
+    truth: dict[str, Camera]
+    before: dict
+    said: str
+
+
+@pytest.fixture(scope="module")
+def placed(tmp_path_factory: pytest.TempPathFactory) -> Placed:
+    folder = tmp_path_factory.mktemp("placed") / "three"
+    truth = write_photos(folder, ("left", "right", "third"))
+    before, said = json.loads((folder / "transforms.json").read_text()), io.StringIO()
+    with contextlib.redirect_stdout(said):
+        assert main(["calibrate", str(folder), "--model", "builtin:coarse"]) == 0
+    return Placed(folder, truth, before, said.getvalue())
+
+
+def test_cameras_are_written_into_the_capture(placed: Placed, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, truth, before = placed.folder, placed.truth, placed.before
+    assert "left: decided" in placed.said and "third: placed" in placed.said
+    after = json.loads((folder / "transforms.json").read_text())
     assert after["studio"] == "ours"
     for old, new in zip(before["frames"], after["frames"], strict=True):
         assert old.items() <= new.items() and set(new) - set(old) == {"fl_x", "fl_y", "cx", "cy", "transform_matrix"}
-    capture = Capture.load(tmp_path)
+    capture = Capture.load(folder)
     assert capture.calibrated
     found = {name: capture.camera(name) for name in truth}
     for name in ("right", "third"):
@@ -67,15 +87,14 @@ def test_cameras_are_written_into_the_capture(tmp_path: Path, capsys: pytest.Cap
         assert np.degrees(Rotation.from_matrix(off).magnitude()) < 2.0, name
     for name, camera in truth.items():
         assert found[name].fx == pytest.approx(camera.fx, rel=0.1)
-    assert main(["calibrate", str(tmp_path), "--model", "builtin:coarse"]) == 2
+    assert main(["calibrate", str(folder), "--model", "builtin:coarse"]) == 2
     assert "is calibrated already" in capsys.readouterr().err
 
 
-def test_a_held_out_camera_moves_no_other(tmp_path: Path) -> None:
-    for folder, names in (("two", ("left", "right")), ("three", ("left", "right", "third"))):
-        write_photos(tmp_path / folder, names)
-        assert main(["calibrate", str(tmp_path / folder), "--model", "builtin:coarse"]) == 0
-    two, three = (Capture.load(tmp_path / folder) for folder in ("two", "three"))
+def test_a_held_out_camera_moves_no_other(placed: Placed, tmp_path: Path) -> None:
+    write_photos(tmp_path / "two", ("left", "right"))
+    assert main(["calibrate", str(tmp_path / "two"), "--model", "builtin:coarse"]) == 0
+    two, three = (Capture.load(folder) for folder in (tmp_path / "two", placed.folder))
     for name in ("left", "right"):
         np.testing.assert_array_equal(two.camera(name).world_to_camera, three.camera(name).world_to_camera)
         assert two.camera(name).fx == three.camera(name).fx
