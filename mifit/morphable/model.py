@@ -352,7 +352,7 @@ class MorphableModel:
         Parameters
         ----------
         path : str or Path
-            ``"builtin"`` (about 30 000 vertices), ``"builtin:coarse"`` (about 7 000), ``"auto"`` (the model that
+            ``"builtin"`` (about 15 000 vertices), ``"builtin:coarse"`` (about 9 000), ``"auto"`` (the model that
             ``mifit model fetch ict`` has fetched, else ``"builtin"``), or a file or folder of a known format,
             recognised by content; with ``+eyes`` behind it eyes are added.
         kind : str, optional

@@ -29,15 +29,15 @@ def coarse() -> MorphableModel:
 
 @pytest.fixture(scope="module")
 def template():
-    return make_template(2)
+    return make_template(1.0, 2)
 
 
 def test_sizes(coarse):
     assert 8500 < coarse.n_vertices < 10_000
     assert (coarse.n_identity, coarse.n_expression, coarse.n_albedo) == (160, 77, 100)
-    full = make_template()
-    assert 28_000 < len(full.vertices) < 32_000
-    assert 57_000 < len(full.faces) < 62_000
+    full = make_template(head.DENSITY)
+    assert 12_500 < len(full.vertices) < 14_500
+    assert 25_000 < len(full.faces) < 29_000
     assert coarse.unit_mm == 10
 
 

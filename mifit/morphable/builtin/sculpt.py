@@ -48,8 +48,6 @@ _LID = 1.9  # thickness
 CANTHI = (15.6, 46.4)
 MOUTH_HALF = 25.5
 
-ROWS = int(_SLICES[:, 8].sum()) + 1
-
 
 def _knots() -> tuple[NDArray, CubicSpline]:
     """Positions of the slices along the loft, and the spline through them."""
@@ -68,11 +66,14 @@ def _spread(positions: NDArray, lines: NDArray) -> NDArray:
     return PchipInterpolator(count, positions)(np.arange(int(count[-1]) + 1))
 
 
-def grid_lines() -> tuple[NDArray, NDArray, int, int]:
-    """Loft positions of the rows, column angles in radians (0 .. pi), and the rows of the eye and mouth slits."""
-    rows = _spread(_KNOTS, _SLICES[:, 8])
-    columns = np.radians(_spread(_COLUMNS[:, 0], _COLUMNS[:, 1]))
-    count = np.concatenate([[0], np.cumsum(_SLICES[:-1, 8])]).astype(int)
+def grid_lines(density: float) -> tuple[NDArray, NDArray, int, int]:
+    """Loft positions of the rows, column angles in radians (0 .. pi), and the rows of the eye and mouth slits.
+
+    ``density`` is the part of the lines that are drawn.
+    """
+    across, around = (np.round(density * lines).astype(int) for lines in (_SLICES[:, 8], _COLUMNS[:, 1]))
+    rows, columns = _spread(_KNOTS, across), np.radians(_spread(_COLUMNS[:, 0], around))
+    count = np.concatenate([[0], np.cumsum(across)])
     return rows, columns, int(count[6]), int(count[9])  # the slices of eye and mouth
 
 

@@ -50,9 +50,9 @@ class Template:
     mouth_row: int
 
 
-def make_template(step: int = 1) -> Template:
-    """Build the head; ``step`` 2 keeps every second row and column."""
-    upper, lower, eye_row, mouth_row, corners = _half_surfaces()
+def make_template(density: float, step: int = 1) -> Template:
+    """Build the head with a part of the lines that are drawn; ``step`` 2 keeps every second row and column."""
+    upper, lower, eye_row, mouth_row, corners = _half_surfaces(density)
     upper, lower = upper[::step, ::step], lower[::step, ::step]
     eye_row, mouth_row = eye_row // step, mouth_row // step
     inner, outer, corner = (c // step for c in corners)
@@ -111,9 +111,9 @@ def make_template(step: int = 1) -> Template:
     )
 
 
-def _half_surfaces() -> tuple[NDArray, NDArray, int, int, tuple[int, int, int]]:
+def _half_surfaces(density: float) -> tuple[NDArray, NDArray, int, int, tuple[int, int, int]]:
     """Points (rows, angles, 3) of the half at x >= 0, above and below the slits, and where the slits are."""
-    rows, angles, eye_row, mouth_row = sculpt.grid_lines()
+    rows, angles, eye_row, mouth_row = sculpt.grid_lines(density)
     corners = sculpt.opening_columns(angles, rows, eye_row, mouth_row)
     angle, position = np.meshgrid(angles, rows)
     plain = sculpt.loft(angle, position)
@@ -122,14 +122,20 @@ def _half_surfaces() -> tuple[NDArray, NDArray, int, int, tuple[int, int, int]]:
     for above in (True, False):
         over_eye = row <= eye_row if above else row < eye_row
         over_mouth = row <= mouth_row if above else row < mouth_row
-        warped = sculpt.loft(angle, _warp(plain, position, eye_row, mouth_row, corners, over_eye))
+        warped = sculpt.loft(angle, _warp(plain, position, eye_row, mouth_row, corners, over_eye, density))
         points = sculpt.lips(sculpt.lids(sculpt.features(warped), np.broadcast_to(over_eye, angle.shape)), over_mouth)
-        out.append(sculpt.ears(_roll(points, eye_row, mouth_row, corners, over_eye, over_mouth)))
+        out.append(sculpt.ears(_roll(points, eye_row, mouth_row, corners, over_eye, over_mouth, density)))
     return out[0], out[1], eye_row, mouth_row, corners
 
 
 def _warp(
-    plain: NDArray, position: NDArray, eye_row: int, mouth_row: int, corners: tuple[int, int, int], over: NDArray
+    plain: NDArray,
+    position: NDArray,
+    eye_row: int,
+    mouth_row: int,
+    corners: tuple[int, int, int],
+    over: NDArray,
+    density: float,
 ) -> NDArray:
     """Slide grid rows along the loft so that the slits lie on the lids' margins and on the mouth's line."""
     x, y = plain[..., 0], plain[..., 1]
@@ -145,7 +151,7 @@ def _warp(
     height = sculpt.mouth_line(x[mouth_row]) - y[mouth_row]
     y_new += fade * height * np.clip(1 - np.abs(y - y[mouth_row]) / 22.0, 0, 1) ** 2
     out = position.copy()
-    span = slice(eye_row - 40, mouth_row + 24)
+    span = slice(eye_row - int(40 * density), mouth_row + int(24 * density))
     for k in np.flatnonzero(front):
         out[span, k] = np.interp(-y_new[span, k], -y[span, k], position[span, k])
     return out
@@ -158,6 +164,7 @@ def _roll(
     corners: tuple[int, int, int],
     over_eye: NDArray,
     over_mouth: NDArray,
+    density: float,
 ) -> NDArray:
     """Turn the margins of lids and lips inwards, which gives them thickness."""
     inner, outer, corner = corners
@@ -168,13 +175,11 @@ def _roll(
     out = points.copy()
     x = np.abs(points[..., 0])
     middle = np.sin(np.pi * np.clip((column - inner) / (outer - inner), 0, 1)) ** 0.5
-    for depth, distance in ((2.2, 0), (0.4, 1)):
-        here = at_eye & (np.abs(row - eye_row) == distance)
-        out[..., 2] -= np.where(here, depth * middle, 0.0)
+    depth = np.interp(np.abs(row - eye_row) / density, (0, 1, 2), (2.2, 0.4, 0.0))
+    out[..., 2] -= np.where(at_eye, depth * middle, 0.0)
     taper = np.clip(1 - (x / sculpt.MOUTH_HALF) ** 2, 0, 1) ** 0.5
-    for depth, distance in ((6.0, 0), (2.2, 1), (0.5, 2)):
-        here = at_mouth & (np.abs(row - mouth_row) == distance)
-        out[..., 2] -= np.where(here, depth * taper, 0.0)
+    depth = np.interp(np.abs(row - mouth_row) / density, (0, 1, 2, 3), (6.0, 2.2, 0.5, 0.0))
+    out[..., 2] -= np.where(at_mouth, depth * taper, 0.0)
     gap = np.where(at_mouth & (row == mouth_row), 0.15 * taper, 0.0)
     out[..., 1] += np.where(over_mouth, gap, -gap)
     return out
