@@ -54,7 +54,7 @@ class TexelMap:
         return out.reshape(self.size, self.size)
 
 
-_maps = Recent[TexelMap](4)  # stages read the same few
+_maps = Recent[TexelMap](8)  # stages read the same few
 
 
 def rasterize_uv(uv: NDArray, faces_uv: NDArray, size: int, face_mask: NDArray | None = None) -> TexelMap:

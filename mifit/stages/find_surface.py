@@ -140,7 +140,7 @@ def find_surface(
     )
     scenes = Scenes(skin.faces, np.unique(model.faces[model.face_mask]), SLACK * resolution.pixel)
     reach = config.reach / capture.unit_mm
-    sight = Sight(capture, model, tuple(cameras), scenes, resolution.pixel, reach, config.finest)
+    sight = Sight(capture, model, tuple(cameras), scenes, world[0], resolution.pixel, reach, config.finest)
     landmarks = Landmarks.of(capture, model, cameras, geometry)
     search = Search(
         geometry, model, pairs, skin, prior, motion, landmarks, sight, level_step, config.stiffness, progress
@@ -366,22 +366,23 @@ class Motion:
 class Sight:
     """The views of the surface at the levels of the image pyramid.
 
-    ``pixel`` is the world length of a pixel of level 0 at the face, ``reach`` how far borders are looked for, world
-    length, at all levels but the finest.
+    ``start`` (V, 3) is the first timestep's surface before all sweeps, ``pixel`` the world length of a pixel of level 0
+    at the face, ``reach`` how far borders are looked for, world length, at all levels but the finest.
     """
 
     capture: Capture
     model: MorphableModel
     cameras: tuple[str, ...]
     scenes: Scenes
+    start: NDArray[np.float64]
     pixel: float
     reach: float
     finest: int
 
-    def texels(self, vertices: NDArray, level: int) -> tuple[TexelMap, TexelMap]:
-        """Texels of a surface (V, 3) that are about as large as a level's pixels, and cells twice as wide."""
+    def texels(self, level: int) -> tuple[TexelMap, TexelMap]:
+        """Texels that are about as large as a level's pixels, and cells twice as wide."""
         model = self.model
-        cells = texture_size(model, vertices, 2.0 * self.pixel * 2.0**level, LARGEST_MAP // 2)
+        cells = texture_size(model, self.start, 2.0 * self.pixel * 2.0**level, LARGEST_MAP // 2)
         whole, half = (rasterize_uv(model.uv, model.faces_uv, n, model.face_mask) for n in (2 * cells, cells))
         return whole, half
 
@@ -410,7 +411,7 @@ class Sight:
         level: int,
     ) -> dict[str, float | None]:
         """Median distance from one another's epipolar lines for each pair of views, pixels of the images."""
-        texels, cells = self.texels(world[0], level)
+        texels, cells = self.texels(level)
         posed = [self.posed(timesteps[k], world[k], texels, level) for k in sorted({0, len(world) - 1})]
         found: dict[str, float | None] = {}
         for a, b in pairs:
@@ -420,7 +421,7 @@ class Sight:
 
     def likenesses(self, pairs: Sequence, timestep: int, vertices: NDArray, level: int) -> dict[str, float | None]:
         """Correlation of what each pair of views shows on one timestep's surface (V, 3)."""
-        posed = self.posed(timestep, vertices, self.texels(vertices, level)[0], level)
+        posed = self.posed(timestep, vertices, self.texels(level)[0], level)
         return {f"{self.cameras[a]}, {self.cameras[b]}": likeness(posed, (a, b)) for a, b in pairs}
 
 
@@ -458,7 +459,7 @@ class Search:
         state, factor = rest.state, None
         for number in range(most):
             world = state.world(model)
-            texels, cells = sight.texels(world[0], level)
+            texels, cells = sight.texels(level)
             posed = [sight.posed(t, at, texels, level) for t, at in zip(state.timesteps, world, strict=True)]
             further: Sequence = ()
             if len(posed) > 1:
