@@ -37,16 +37,21 @@ def on_device(kind: Jit, values: NDArray) -> Jit:
     return kind(*map(aligned, np.asarray(values).T))
 
 
-def stored(values: list[Jit], count: int) -> NDArray[np.float32]:
-    """Floats, of width N or 1, computed in one kernel -> (N, number of values)."""
+def columns(values: list[Jit], count: int) -> NDArray[np.float32]:
+    """Floats, of width N or 1, computed in one kernel -> (number of values, N)."""
     import drjit as dr
     import mitsuba as mi
 
     if not count:
-        return np.zeros((0, len(values)), np.float32)
+        return np.zeros((len(values), 0), np.float32)
     floats = [mi.Float(value) for value in values]
     dr.eval(floats)
-    return np.stack([np.broadcast_to(np.array(f, dtype=np.float32), (count,)) for f in floats], axis=1)
+    return np.stack([np.broadcast_to(np.array(f, dtype=np.float32), (count,)) for f in floats])
+
+
+def stored(values: list[Jit], count: int) -> NDArray[np.float32]:
+    """Floats, of width N or 1, computed in one kernel -> (N, number of values)."""
+    return np.ascontiguousarray(columns(values, count).T)
 
 
 def expect(values: ArrayLike, shape: tuple[int, ...], name: str) -> NDArray[np.float32]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mifit.appearance.arrays import Jit, aligned, expect, on_device, stored
+from mifit.appearance.arrays import Jit, aligned, columns, expect, on_device, stored
 from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.kernels import PreparedLobe, light_transfer, prepare
 from mifit.appearance.lobe import Lobe
@@ -146,28 +146,81 @@ class BentShading:
         self._scene = _Scene(appearance, base, view, occlusion)
         self._shade = self._scene.shader() if self._scene.count else None
 
-    def __call__(
-        self, normals: ArrayLike, turns: Sequence[ArrayLike] = ()
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], list[tuple[NDArray[np.float32], NDArray[np.float32]]]]:
-        """Diffuse and specular radiance (N, 3) at unit albedo, and the derivatives of both along each turn (N, 3)."""
-        import drjit as dr
+    def __call__(self, normals: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Diffuse and specular radiance (N, 3) at unit albedo."""
         import mitsuba as mi
 
         scene, shape = self._scene, (self._scene.count, 3)
         if self._shade is None:
-            empty = np.zeros((0, 3), np.float32)
-            return empty, empty, [(empty, empty) for _ in turns]
-        n = on_device(mi.Vector3f, expect(normals, shape, "normals"))
-        slopes = []
+            return np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        return scene.store(self._shade(on_device(mi.Vector3f, expect(normals, shape, "normals")), scene.v))
+
+
+class BentImage:
+    """The image of points by their normals, with all else held.
+
+    Parameters
+    ----------
+    appearance, base, view, occlusion
+        As for `BentShading`.
+    albedos : (N, 3), (N,)
+        Diffuse and specular.
+    rotation : (3, 3)
+        From the space of the normals that are given later to world space.
+    """
+
+    def __init__(
+        self,
+        appearance: Appearance,
+        base: ArrayLike,
+        view: ArrayLike,
+        occlusion: Occlusion,
+        albedos: tuple[NDArray, NDArray],
+        rotation: NDArray,
+    ) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        self._scene = _Scene(appearance, base, view, occlusion)
+        self._shade = self._scene.shader() if self._scene.count else None
+        self._albedo = on_device(mi.Color3f, expect(albedos[0], (self._scene.count, 3), "albedo"))
+        self._specular = mi.Float(aligned(expect(albedos[1], (self._scene.count,), "specular albedo")))
+        self._rotation = [mi.Vector3f(*map(float, row)) for row in rotation]
+        self._ambient = dr.opaque(mi.Float, float(appearance.illumination.ambient))
+        dr.make_opaque(self._rotation)
+
+    def __call__(
+        self, normals: ArrayLike, turns: Sequence[ArrayLike] = ()
+    ) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
+        """The image (N, 3), and its derivatives along each turn (N, 3) of the normals: all in one kernel."""
+        import drjit as dr
+        import mitsuba as mi
+
+        count = self._scene.count
+        if self._shade is None:
+            return np.zeros((0, 3), np.float32), [np.zeros((0, 3), np.float32) for _ in turns]
+
+        def world(vectors: ArrayLike, name: str) -> Jit:
+            given = on_device(mi.Vector3f, expect(vectors, (count, 3), name))
+            return mi.Vector3f(*(dr.dot(row, given) for row in self._rotation))
+
+        n = world(normals, "normals")
+        values = list(self._image(n))
         for turn in turns:
             along = dr.opaque(mi.Float, 0.0)
             dr.enable_grad(along)
-            shaded = self._shade(n + along * on_device(mi.Vector3f, expect(turn, shape, "turn")), scene.v)
+            image = self._image(n + along * world(turn, "turn"))
             dr.set_grad(along, 1.0)
             dr.enqueue(dr.ADMode.Forward, along)
             dr.traverse(dr.ADMode.Forward)
-            slopes.append(scene.store((dr.grad(shaded[0]), dr.grad(shaded[1]))))
-        return *scene.store(self._shade(n, scene.v)), slopes
+            values += list(dr.grad(image))
+        image, *slopes = columns(values, count).reshape(-1, 3, count)
+        return image.T, [slope.T for slope in slopes]
+
+    def _image(self, n: Jit) -> Jit:
+        assert self._shade is not None
+        diffuse, specular = self._shade(n, self._scene.v)
+        return form_image(self._ambient, self._albedo, diffuse, self._specular, specular)
 
 
 class _Scene:

@@ -134,7 +134,7 @@ def bend(normals: NDArray, tangents: NDArray, offsets: NDArray) -> NDArray:
     """Normals n(x) from base normals (N, 3), tangents (N, 2, 3) and offsets (N, 2)."""
     q = 0.5 * offsets
     square = (q**2).sum(1, keepdims=True)
-    bent = 2.0 * np.einsum("na,nac->nc", q, tangents) + (1.0 - square) * normals
+    bent = 2.0 * (q[:, :1] * tangents[:, 0] + q[:, 1:] * tangents[:, 1]) + (1.0 - square) * normals
     return bent / (1.0 + square)
 
 

@@ -114,7 +114,7 @@ def shade_methods(
         points = MeshPoints(surface.points, base, surface.face, surface.weights)
         mesh = occluding_mesh(vertices, model.faces)
         given = base, surface.view, appearance.trace(mesh, points)
-        diffuse, specular_light, _ = BentShading(appearance, *given)(material.normal)
+        diffuse, specular_light = BentShading(appearance, *given)(material.normal)
         measured = result.environment if appearance.lobe.fresnel is not None else None
         if measured is not None:
             illumination = appearance.illumination

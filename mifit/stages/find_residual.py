@@ -115,10 +115,10 @@ def _difference(
     The weight is the probability that the image shows the point: 1 for a view that does for sure, however it sees it.
     """
     rows, seen, images = texel_images(surface, reflectance, seed)
-    normal = seen.normal[:, 0]
+    normal = seen.normal[:, 0] @ rotation
     if refined is not None:
         known = np.any(refined[rows] != 0, axis=1)
-        normal = np.where(known[:, None], normalize(refined[rows] @ rotation.T), normal).astype(np.float32)
+        normal = np.where(known[:, None], normalize(refined[rows]), normal)
     difference = seen.colour - np.stack([image(normal)[0] for image in images], axis=1)
     weight = np.where(seen.measured > 0, seen.inlier, np.float32(0.0)).astype(np.float32)
     return rows, np.where(weight[..., None] > 0, difference, np.float32(0.0)), weight

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +25,7 @@ import scipy.sparse.linalg as ssl
 from numpy.typing import NDArray
 
 from mifit.appearance import models
-from mifit.appearance.formation import Appearance, BentShading, form_image
+from mifit.appearance.formation import Appearance, BentImage
 from mifit.appearance.occlusion import MeshPoints
 from mifit.config import NormalsConfig
 from mifit.core.calls import checked
@@ -174,28 +174,20 @@ def texel_images(
 ) -> tuple[NDArray[np.intp], Observations, list[TexelImage]]:
     """Texels (n,) that images of a surface's one timestep measure, what these show, and the model's image of each.
 
-    What stage 2 found in front of the face is left out.
+    Images are those of normals in object space. What stage 2 found in front of the face is left out.
     """
     surface, texels = surface.without_hidden(reflectance), surface.texels
     every = surface.observe(np.arange(len(texels.index)))
     rows = np.flatnonzero((every.measured > 0).any(1))
     seen = every.take(rows)
-    diffuse, specular = (texels.from_map(m)[rows] for m in (reflectance.lit_diffuse, reflectance.specular))
+    albedos = texels.from_map(reflectance.lit_diffuse)[rows], texels.from_map(reflectance.specular)[rows]
     appearance = Appearance(models.get(reflectance.shading_model), reflectance.illumination, reflectance.lobe)
-    base, ambient = seen.normal[:, 0], np.float32(reflectance.illumination.ambient)
+    base = seen.normal[:, 0]
     points = MeshPoints(seen.point[:, 0], base, seen.face, seen.barycentric)
     occlusion = appearance.trace(surface.meshes[0], points, seed)
-
-    def image_of(shading: BentShading) -> TexelImage:
-        def image(normals: NDArray, turns: Sequence[NDArray] = ()) -> tuple[NDArray, list[NDArray]]:
-            d, s, slopes = shading(normals, turns)
-            along = [form_image(0.0, diffuse, dd, specular[:, None], ds) for dd, ds in slopes]
-            return form_image(ambient, diffuse, d, specular[:, None], s), along
-
-        return image
-
+    fixed = albedos, surface.geometry.rotation[0]
     views = range(len(seen.step))
-    return rows, seen, [image_of(BentShading(appearance, base, seen.view[:, j], occlusion)) for j in views]
+    return rows, seen, [BentImage(appearance, base, seen.view[:, j], occlusion, *fixed) for j in views]
 
 
 def frame_problem(
@@ -216,14 +208,12 @@ def frame_problem(
     if not len(rows):
         return None, rows, base
 
-    def turned(image: TexelImage) -> TexelImage:
-        return lambda normals, turns=(): image(normals @ rotation.T, [turn @ rotation.T for turn in turns])
-
-    views = [NormalView(seen.colour[:, j], seen.measured[:, j], turned(image)) for j, image in enumerate(images)]
+    views = [NormalView(seen.colour[:, j], seen.measured[:, j], image) for j, image in enumerate(images)]
     patch = TexelMap(texels.size, texels.index[rows], texels.face[rows], texels.weights[rows])
+    # Single precision: it is that of the images.
     problem = NormalProblem(
-        base[rows],
-        tangent_plane(base[rows]),
+        base[rows].astype(np.float32),
+        tangent_plane(base[rows]).astype(np.float32),
         texel_neighbours(patch),
         views,
         0.5 * config.laplacian_weight / STEPS,
@@ -275,58 +265,69 @@ class NormalProblem:
         magnitude_weight: float,
         prior: NDArray | None = None,
     ) -> None:
-        self.normals, self.tangents, self.views = normals, tangents, views
-        self.laplacian = graph_laplacian(neighbours)
+        # Columns are contiguous: all that follows goes through them one by one.
+        self.normals, self.tangents = np.asfortranarray(normals), np.asfortranarray(tangents)
+        self.views = [
+            replace(view, colour=np.where((view.weight > 0)[:, None], view.colour, 0.0).astype(view.colour.dtype, "F"))
+            for view in views
+        ]
+        self.laplacian = graph_laplacian(neighbours).astype(self.normals.dtype)
         self.w1, self.w2 = laplacian_weight, magnitude_weight
-        self.prior = np.zeros_like(normals) if prior is None else bend(normals, tangents, prior) - normals
+        self.prior = 0.0 if prior is None else bend(self.normals, self.tangents, prior) - self.normals
+
+    def _offsets(self, x: NDArray) -> NDArray:
+        return x.reshape(-1, 2).astype(self.normals.dtype, "F")
 
     def energies(self, x: NDArray) -> dict[str, float]:
         """Energy per term."""
-        n = bend(self.normals, self.tangents, x.reshape(-1, 2))
+        n = bend(self.normals, self.tangents, self._offsets(x))
         data = 0.0
         for view in self.views:
-            rows = view.weight > 0
-            residual = (view.colour - view.shade(n)[0])[rows].astype(np.float64)
-            data += float((view.weight[rows] * (residual**2).sum(1)).sum())
+            residual = view.colour - view.shade(n)[0]
+            data += float(np.sum(view.weight * dot(residual, residual), dtype=np.float64))
         delta = n - self.normals
-        rough = np.sqrt((self.laplacian @ delta) ** 2 + L1_FLOOR**2).sum() if self.w1 else 0.0
-        magnitude = ((delta - self.prior) ** 2).sum()
-        return {"data": data, "laplacian": float(self.w1 * rough), "magnitude": float(self.w2 * magnitude)}
+        rough = magnitude = 0.0
+        if self.w1:
+            rough = float(np.sqrt((self.laplacian @ delta) ** 2 + L1_FLOOR**2).sum(dtype=np.float64))
+        if self.w2:
+            magnitude = float(((delta - self.prior) ** 2).sum(dtype=np.float64))
+        return {"data": data, "laplacian": self.w1 * rough, "magnitude": self.w2 * magnitude}
 
     def linearize(self, x: NDArray) -> NormalSystem:
         """Gradient and blocks at x."""
-        offsets = x.reshape(-1, 2)
+        offsets = self._offsets(x)
         n = bend(self.normals, self.tangents, offsets)
         turns = bend_jacobian(self.normals, self.tangents, offsets)
-        gradient, blocks = np.zeros((len(n), 2)), np.zeros((len(n), 2, 2))
-        for view in self.views:
-            image, slopes = view.shade(n, [turns[:, 0], turns[:, 1]])
-            rows = (view.weight > 0)[:, None]
-            residual = np.where(rows, view.colour - image, 0.0)
-            columns = np.where(rows[..., None], np.stack(slopes, axis=1), 0.0)
-            weighted = view.weight[:, None, None] * columns
-            gradient -= np.einsum("nac,nc->na", weighted, residual)
-            blocks += np.einsum("nac,nbc->nab", weighted, columns)
+        first, second = turns[:, 0], turns[:, 1]
         delta = n - self.normals
-        blocks += self.w2 * np.einsum("nac,nbc->nab", turns, turns)
         pull, stiffness = self.w2 * (delta - self.prior), np.zeros_like(delta)
         if self.w1:
             # w |c| <= w / 2 (c^2 / |c0| + |c0|): the majorant's Hessian is w / |c0|.
             curvature = self.laplacian @ delta
             stiffness = 0.5 * self.w1 / np.sqrt(curvature**2 + L1_FLOOR**2)
             pull = pull + self.laplacian @ (stiffness * curvature)
-        gradient += np.einsum("nac,nc->na", turns, pull)
-        return NormalSystem(gradient.ravel(), blocks, turns, stiffness, self.laplacian)
+        gradient = [dot(first, pull), dot(second, pull)]
+        blocks = [self.w2 * dot(first, first), self.w2 * dot(first, second), self.w2 * dot(second, second)]
+        for view in self.views:
+            image, (along, across) = view.shade(n, [first, second])
+            residual = view.colour - image
+            for i, slope in enumerate((along, across)):
+                gradient[i] -= view.weight * dot(slope, residual)
+            for i, product in enumerate((dot(along, along), dot(along, across), dot(across, across))):
+                blocks[i] += view.weight * product
+        flat = np.stack(gradient, axis=1, dtype=np.float64).ravel()
+        return NormalSystem(flat, np.stack(blocks), turns, stiffness, self.laplacian)
 
 
 @dataclass
 class NormalSystem:
-    """Normal equations: a 2 x 2 block per texel, and the Laplacian that ties neighbours.
+    """Normal equations: a symmetric 2 x 2 block per texel, and the Laplacian that ties neighbours.
 
     Attributes
     ----------
     gradient : (2 N,)
-    blocks : (N, 2, 2)
+    blocks : (3, N)
+        First, mixed and second entry of each block.
     turns : (N, 2, 3)
         Derivatives of the normals by the offsets.
     stiffness : (N, 3)
@@ -336,38 +337,50 @@ class NormalSystem:
     """
 
     gradient: NDArray[np.float64]
-    blocks: NDArray[np.float64]
-    turns: NDArray[np.float64]
-    stiffness: NDArray[np.float64]
+    blocks: NDArray
+    turns: NDArray
+    stiffness: NDArray
     laplacian: sp.csr_matrix
 
-    def product(self, step: NDArray) -> NDArray[np.float64]:
+    def product(self, step: NDArray) -> NDArray:
         """H times a vector (2 N,)."""
-        offsets = step.reshape(-1, 2)
-        out = np.einsum("nab,nb->na", self.blocks, offsets)
+        p, q = step.astype(self.turns.dtype).reshape(-1, 2).T
+        (a, b, c), first, second = self.blocks, self.turns[:, 0], self.turns[:, 1]
+        along, across = a * p + b * q, b * p + c * q
         if self.stiffness.any():
-            bent = self.laplacian @ np.einsum("nac,na->nc", self.turns, offsets)
-            out += np.einsum("nac,nc->na", self.turns, self.laplacian @ (self.stiffness * bent))
-        return out.ravel()
+            bent = self.laplacian @ (first * p[:, None] + second * q[:, None])
+            pull = self.laplacian @ (self.stiffness * bent)
+            along, across = along + dot(first, pull), across + dot(second, pull)
+        return np.stack([along, across], axis=1).ravel()
 
     def solve(self, damping: float, frozen: NDArray[np.bool_], gradient: NDArray | None = None) -> NDArray[np.float64]:
         """Damped step by conjugate gradients, preconditioned by the diagonal blocks of the whole matrix."""
         around = self.laplacian.power(2) @ self.stiffness  # the diagonal of L S L
-        own = self.blocks + np.einsum("nac,nbc->nab", self.turns * around[:, None], self.turns)
-        lift = damping * np.einsum("naa->na", self.blocks) + 1e-12
-        own[:, [0, 1], [0, 1]] += lift
-        inverse, free, size = np.linalg.inv(own), ~frozen, len(frozen)
+        first, second = self.turns[:, 0], self.turns[:, 1]
+        lift = damping * self.blocks[[0, 2]] + 1e-12
+        a = self.blocks[0] + lift[0] + dot(around * first, first)
+        b = self.blocks[1] + dot(around * first, second)
+        c = self.blocks[2] + lift[1] + dot(around * second, second)
+        determinant = a * c - b * b
+        lifts, free, size = lift.T.ravel(), ~frozen, len(frozen)
 
         def apply(step: NDArray) -> NDArray:
             moved = np.where(free, step, 0.0)
-            return np.where(free, self.product(moved) + lift.ravel() * moved, step)
+            return np.where(free, self.product(moved) + lifts * moved, step)
 
         def precondition(right: NDArray) -> NDArray:
-            return np.where(free, np.einsum("nab,nb->na", inverse, right.reshape(-1, 2)).ravel(), right)
+            p, q = right.reshape(-1, 2).T
+            solved = np.stack([c * p - b * q, a * q - b * p], axis=1) / determinant[:, None]
+            return np.where(free, solved.ravel(), right)
 
-        right = np.where(free, -(self.gradient if gradient is None else gradient), 0.0)
-        matrix, near = (ssl.LinearOperator((size, size), each) for each in (apply, precondition))
-        return np.asarray(ssl.cg(matrix, right, rtol=SOLVED, maxiter=60, M=near)[0])
+        right = np.where(free, -(self.gradient if gradient is None else gradient), 0.0).astype(self.turns.dtype)
+        matrix, near = (ssl.LinearOperator((size, size), each, dtype=right.dtype) for each in (apply, precondition))
+        return np.asarray(ssl.cg(matrix, right, rtol=SOLVED, maxiter=60, M=near)[0], np.float64)
+
+
+def dot(a: NDArray, b: NDArray) -> NDArray:
+    """(N,) products of vectors (N, 3)."""
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
 def graph_laplacian(neighbours: NDArray) -> sp.csr_matrix:
