@@ -52,19 +52,19 @@ NEIGHBOURS = 2
 """Views that each view is compared with, those whose directions are nearest."""
 STEP_PIXELS = 0.7
 """Parallax between neighbouring offsets of a sweep, pixels of the level."""
-FAR_LAYERS, LAYERS = 6, 4
-"""Offsets to either side in a level's first sweep, and in those after it."""
+LAYERS = (6, 4, 2)
+"""Offsets to either side in each sweep of a level."""
+ROBUST_STEPS = ((2.8, 1.4), (1.4, 0.7), (0.7,))
+"""Distance from the surface, in steps, where an offset counts as an outlier: each time that a sweep's are weighted."""
 WINDOW = 5
 """Side of the windows that are compared, cells of two by two texels; a texel is about a pixel of the level."""
 COARSEST = 3
 """Times that the images are halved at most."""
 LARGEST_MAP = 1024
 SETTLED = 0.15
-"""Part of a sweep's step below which a level is at rest (root mean square over what is measured)."""
-MOST_SWEEPS, SWEEPS_OF_LIDS = 5, 2
+"""Part of a sweep's step below which the surface is at rest (root mean square over what is measured)."""
+SWEEPS, SWEEPS_OF_LIDS = 3, 2
 """Of a level, and of the two finest ones once more where lids have been closed."""
-ROBUST_STEPS = 0.7
-"""Distance from the surface, in steps of the sweep, where an offset counts as an outlier."""
 INDEPENDENT = 0.1
 """Part of the landmarks that count as measured on their own: neighbours are off alike."""
 OUTLIER_DEVIATIONS = 4.0
@@ -124,7 +124,7 @@ def find_surface(
         return _unchanged(geometry, "views from nearly one place: the surface stays in the model's span", began)
     level_step = STEP_PIXELS * resolution.pixel / resolution.parallax  # of level 0, world length
     coarsest = config.finest
-    while coarsest < COARSEST and FAR_LAYERS * level_step * 2**coarsest * capture.unit_mm < config.reach:
+    while coarsest < COARSEST and LAYERS[0] * level_step * 2**coarsest * capture.unit_mm < config.reach:
         coarsest += 1
 
     # The prior: modes and plate on the skin, which pieces that were added to the model, such as eyes, go along with.
@@ -146,10 +146,10 @@ def find_surface(
         geometry, model, pairs, skin, prior, motion, landmarks, sight, level_step, config.stiffness, progress
     )
 
-    # Sweep and solve in turn, each level until the surface rests.
+    # Sweep and solve in turn, coarse to fine.
     rest = Rest(State.of(model, geometry))
     for level in range(coarsest, config.finest - 1, -1):
-        rest = search.settle(rest, level, MOST_SWEEPS)
+        rest = search.settle(rest, level, SWEEPS)
     # Lids that have just closed lie where they fade into the skin around them: the finest levels measure them.
     lips, lids = LIPS * config.close_lips, LIDS * config.close_lids
     shut, closed = close_openings(capture, model, rest.state.estimate(geometry, model), cameras, lids)
@@ -272,7 +272,7 @@ class Landmarks:
         ones = np.ones(len(index), np.float32)
         points = sp.csr_matrix((ones, index, np.arange(len(index) + 1)), shape=(len(index), self.n_vertices))
         precision = INDEPENDENT * np.concatenate(precisions)
-        far = OUTLIER_DEVIATIONS / np.sqrt(precision)
+        far = OUTLIER_DEVIATIONS / np.sqrt(precision[:, None])
         return Measurements(points, np.concatenate(directions), np.concatenate(offsets), precision, far)
 
 
@@ -399,8 +399,7 @@ class Sight:
             factor = REACH * self.pixel / self.reach
         scene = self.scenes.last(timestep)
         found = find_borders(self.capture, scene, self.cameras, timestep, min(factor, 1.0))
-        moved = interpolate(vertices - scene.vertices, scene.faces, found.face, found.weights)
-        return replace(found, offset=found.offset - (moved * found.normal).sum(axis=1))
+        return found.moved(scene.faces, vertices - scene.vertices)
 
     def epipolar_residuals(
         self,
@@ -452,29 +451,30 @@ class Search:
     stiffness: float
     progress: Progress
 
-    def settle(self, rest: Rest, level: int, most: int) -> Rest:
-        """Sweep one level until the surface rests, ``most`` times at the most."""
+    def settle(self, rest: Rest, level: int, sweeps: int) -> Rest:
+        """Sweep one level."""
         model, sight, skin = self.model, self.sight, self.skin
         step = self.level_step * 2.0**level
         state, factor = rest.state, None
-        for number in range(most):
+        texels, cells = sight.texels(level)
+        swept = state.world(model)
+        for number in range(sweeps):
             world = state.world(model)
-            texels, cells = sight.texels(level)
-            posed = [sight.posed(t, at, texels, level) for t, at in zip(state.timesteps, world, strict=True)]
-            further: Sequence = ()
-            if len(posed) > 1:
-                aligned = align_timesteps(model, state.estimate(self.geometry, model), texels, posed)
-                state = state.posed_as(aligned)
-                posed = moved_with(model, texels, posed, state.world(model) - world)
-                world = state.world(model)
-                further = across_time(posed, state.rotation)
-            borders = joined(
-                [
-                    sight.borders(t, at, level).turned(rotation)
-                    for t, at, rotation in zip(state.timesteps, world, state.rotation, strict=True)
-                ]
-            )
-            half = LAYERS if number else FAR_LAYERS
+            if number < SWEEPS - 1:
+                posed = [sight.posed(t, at, texels, level) for t, at in zip(state.timesteps, world, strict=True)]
+                further: Sequence = ()
+                if len(posed) > 1:
+                    aligned = align_timesteps(model, state.estimate(self.geometry, model), texels, posed)
+                    state = state.posed_as(aligned)
+                    posed = moved_with(model, texels, posed, state.world(model) - world)
+                    world = state.world(model)
+                    further = across_time(posed, state.rotation)
+                borders = [sight.borders(t, at, level) for t, at in zip(state.timesteps, world, strict=True)]
+            else:  # the last sweep moves the surface by too little to change which parts of it are visible
+                posed = moved_with(model, texels, posed, world - swept)
+                borders = [b.moved(model.faces, way) for b, way in zip(borders, world - swept, strict=True)]
+            swept = world
+            half = LAYERS[number]
             joint = [((k, a), (k, b)) for k in range(len(posed)) for a, b in self.pairs]
             found = sweep(texels, cells, posed, step * np.arange(-half, half + 1), WINDOW, [*joint, *further])
             if not (found.precision > 0).any():
@@ -482,8 +482,9 @@ class Search:
 
             # Object space, all timesteps alike: the surface that explains offsets, outlines and landmarks.
             marks = self.landmarks.at(world, state.rotation)
-            robust = ROBUST_STEPS * step * max(4.0 * 0.5**number, 1.0)
-            rows = measurements(state, model, cells, world, found, borders, marks, robust)
+            outlines = joined([b.turned(r) for b, r in zip(borders, state.rotation, strict=True)])
+            robust = step * np.array(ROBUST_STEPS[number])
+            rows = measurements(state, model, cells, world, found, outlines, marks, robust)
             if skin.weights is not None:
                 rows = replace(rows, points=rows.points @ skin.weights)
             mean = state.expression.mean(axis=0)
@@ -501,9 +502,7 @@ class Search:
             moved = along_normals(state.world(model) - world, world, model.faces, measured)
             outcome = Outcome.CONVERGED if moved < SETTLED * step else Outcome.MAX_ITERATIONS
             rest = Rest(state, (*rest.levels, level), float((found.precision > 0).mean()), moved, outcome)
-            self.progress("find surface", len(rest.levels), len(rest.levels) + MOST_SWEEPS * level + most - number - 1)
-            if outcome is Outcome.CONVERGED and number >= 2:
-                break
+            self.progress("find surface", len(rest.levels), len(rest.levels) + SWEEPS * level + sweeps - number - 1)
         return rest
 
     def _bounds(self, state: State) -> NDArray[np.float64]:
@@ -524,7 +523,7 @@ def measurements(
     found: Found,
     borders: Borders,
     marks: Measurements,
-    robust: float,
+    robust: NDArray,
 ) -> Measurements:
     """Offsets that a sweep found, outlines and landmarks, all in object space."""
     scale = state.scale
@@ -538,7 +537,7 @@ def measurements(
         np.concatenate([normalize(normals), borders.normal, marks.normals]),
         np.concatenate([found.offset, borders.offset, marks.offsets]) / scale,
         np.concatenate([found.precision, borders.precision, marks.precision]) * scale**2,
-        np.concatenate([np.full(len(face), robust), marks.robust]) / scale,
+        np.concatenate([np.tile(robust, (len(face), 1)), np.repeat(marks.robust, len(robust), axis=1)]) / scale,
     )
 
 

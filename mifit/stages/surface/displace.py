@@ -55,8 +55,8 @@ class Measurements:
         The directions that are measured.
     offsets, precision : (N,)
         And their inverse variance; 0 where nothing is measured.
-    robust : (N,)
-        Residual where Geman and McClure's penalty turns.
+    robust : (N, R)
+        Residual where Geman and McClure's penalty turns, for each time that they are weighted.
     """
 
     points: sp.csr_matrix
@@ -222,27 +222,30 @@ def solve_surface(
         along_modes = stiffness * (bent.T @ x.ravel().astype(np.float32)).astype(np.float64)
         return np.asarray(bent @ la.cho_solve(inner, along_modes).astype(np.float32), np.float64)
 
-    # Geman and McClure's weights at the current surface; the sweeps that follow weight anew.
-    weight = precision / (1.0 + (measured.offsets / measured.robust) ** 2) ** 2
-    along = SLIDE * weight[:, None]
-    across = weight[:, None] - along
+    change = np.zeros_like(start)
+    for robust in measured.robust.T:
+        residual = measured.offsets - ((points @ change) * normals).sum(1)
+        weight = precision / (1.0 + (residual / robust) ** 2) ** 2
+        along = SLIDE * weight[:, None]
+        across = weight[:, None] - along
 
-    def apply(flat: NDArray) -> NDArray:
-        x = flat.reshape(-1, 3)
-        at = points @ x
-        normal = (at * normals).sum(1, keepdims=True) * normals
-        out = (stiffness * (prior.plate @ x) + transposed @ (across * normal + along * at)).ravel()
-        return np.asarray(out - stiffness * without_modes(x))
+        def apply(flat: NDArray, across: NDArray = across, along: NDArray = along) -> NDArray:
+            x = flat.reshape(-1, 3)
+            at = points @ x
+            normal = (at * normals).sum(1, keepdims=True) * normals
+            out = (stiffness * (prior.plate @ x) + transposed @ (across * normal + along * at)).ravel()
+            return np.asarray(out - stiffness * without_modes(x))
 
-    right = transposed @ ((weight * target)[:, None] * normals + along * held)
-    size = (start.size, start.size)
-    change, _ = spl.cg(
-        spl.LinearOperator(size, matvec=apply),
-        right.ravel() - apply(start),
-        rtol=RELATIVE,
-        maxiter=MOST_ITERATIONS,
-        M=spl.LinearOperator(size, matvec=precondition),
-    )
-    surface = start + change.reshape(-1, 3) + held_modes
+        right = transposed @ ((weight * target)[:, None] * normals + along * held)
+        size = (start.size, start.size)
+        step, _ = spl.cg(
+            spl.LinearOperator(size, matvec=apply),
+            right.ravel() - apply(start + change),
+            rtol=RELATIVE,
+            maxiter=MOST_ITERATIONS,
+            M=spl.LinearOperator(size, matvec=precondition),
+        )
+        change += step.reshape(-1, 3)
+    surface = start + change + held_modes
     coefficients, _ = prior.coefficients(surface, stiffness, bounds)
     return surface - prior.move(coefficients), coefficients

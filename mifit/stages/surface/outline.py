@@ -87,6 +87,11 @@ class Borders:
         """With normals in the object space that a rotation (3, 3) takes to world space."""
         return replace(self, normal=self.normal @ rotation)
 
+    def moved(self, faces: NDArray, way: NDArray) -> Borders:
+        """Of a surface whose vertices have moved by (V, 3) since, world length."""
+        along = (interpolate(way, faces, self.face, self.weights) * self.normal).sum(axis=1)
+        return replace(self, offset=self.offset - along)
+
 
 def find_borders(capture: Capture, scene: SurfaceScene, names: Sequence[str], timestep: int, factor: float) -> Borders:
     """Borders of the surface that ``scene`` holds in the images of one timestep.
