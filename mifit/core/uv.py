@@ -79,16 +79,21 @@ def _rasterize(uv: NDArray, faces_uv: NDArray, size: int, face_mask: NDArray | N
     k = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     x = low[tri, 0] + k % np.maximum(extent[tri, 0], 1)
     y = low[tri, 1] + k // np.maximum(extent[tri, 0], 1)
-    a, b, c = (corners[tri, i] for i in range(3))
-    px, py = x + 0.5, y + 0.5
-    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    a, b, c = (corners[:, i] for i in range(3))
+    ab, ac = b - a, c - a
+    area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        w1 = ((px - a[:, 0]) * (c[:, 1] - a[:, 1]) - (py - a[:, 1]) * (c[:, 0] - a[:, 0])) / area
-        w2 = ((b[:, 0] - a[:, 0]) * (py - a[:, 1]) - (b[:, 1] - a[:, 1]) * (px - a[:, 0])) / area
+        # The second and third corner's weights are products with these (F, 2), from the first corner on.
+        second, third = (np.stack(w, 1) / area[:, None] for w in ((ac[:, 1], -ac[:, 0]), (-ab[:, 1], ab[:, 0])))
+        px, py = x + 0.5 - a[tri, 0], y + 0.5 - a[tri, 1]
+        w1, w2 = (px * slope[tri, 0] + py * slope[tri, 1] for slope in (second, third))
         w = np.stack([1.0 - w1 - w2, w1, w2], axis=1)  # degenerate faces give NaN or infinity, refused below
-    inside = (w >= -1e-9).all(1) & np.isfinite(w).all(1)
-    flat, first = np.unique((y * size + x)[inside], return_index=True)
-    found = flat, selected[tri[inside][first]].astype(np.int32), w[inside][first].astype(np.float32)
+    inside = np.flatnonzero((np.minimum(np.minimum(w1, w2), w[:, 0]) >= -1e-9) & np.isfinite(w1) & np.isfinite(w2))
+    first = np.full(size * size, -1)
+    first[(y * size + x)[inside[::-1]]] = inside[::-1]  # of faces that share a texel the first one counts
+    flat = np.flatnonzero(first >= 0)
+    chosen = first[flat]
+    found = flat, selected[tri[chosen]].astype(np.int32), w[chosen].astype(np.float32)
     for array in found:
         array.flags.writeable = False
     return TexelMap(size, *found)
