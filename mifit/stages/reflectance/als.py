@@ -18,7 +18,7 @@ from mifit.core.uv import TexelMap
 from mifit.optim import Outcome
 from mifit.progress import Progress
 from mifit.sampling.observations import Surface
-from mifit.stages.reflectance.compact_lights import EXPONENT, OBSERVATIONS, best_exponent, find_lights
+from mifit.stages.reflectance.compact_lights import EXPONENT, ITERATIONS, OBSERVATIONS, best_exponent, find_lights
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution, active_weight, fit_lighting, noise_weight
 from mifit.stages.reflectance.lighting_equations import specular_pull
@@ -26,13 +26,10 @@ from mifit.stages.reflectance.maps import TexelSystems, solve_maps
 
 LIGHTING_TEXELS = 6000
 """Texels that determine the lighting; a few hundred unknowns against 24 values of eight images each."""
-MAP_PASSES = 3
-"""Passes over the maps: each takes new robust weights from the residuals of the last."""
-MAP_ITERATIONS = 40
-"""ADMM iterations of a pass. Every pass starts from its maps alone: going on from the multipliers of the pass before
-saves half of them, but carries over what the last weights took an outlier for."""
-FIRST_ITERATIONS = 12
-"""Gauss-Newton iterations of the lighting by which objects in front of the face are found."""
+MAP_ITERATIONS = (10, 10, 40)
+"""ADMM iterations of each pass over the maps, which takes new robust weights from the residuals of the last: what the
+first ones are for. Every pass starts from its maps alone: going on from the multipliers of the pass before carries over
+what the last weights took an outlier for."""
 SURROUNDINGS = 1 / 128
 """Half the side of the square of texels over which residuals are averaged, relative to the map."""
 
@@ -97,13 +94,15 @@ def find_forward(
     lobe = Lobe(given or EXPONENT, model.fresnel, model.normalized)
     forward = replace(Forward.of(model, model.bands or config.bands, lobe, surface.meshes), glossy=config.specular)
     some = surface.sample(max(1, OBSERVATIONS // surface.image_count), np.random.default_rng(seed))
-    seen, expected = surface.observe(some), albedo[some]
-    if config.robust and model.needs_shadows:
-        forward = forward.with_lights(find_lights(seen, forward, expected))
+    seen, expected, robust = surface.observe(some), albedo[some], config.robust
+    if robust and model.needs_shadows:
+        lights, found = find_lights(seen, forward, expected)
+        forward = forward.with_lights(lights)
+    else:
+        found = fit_lighting(seen, forward, expected, robust, ITERATIONS)
     if given is None and config.specular:
-        exponent = best_exponent(seen, forward, expected, config.robust)
-        forward = forward.with_lobe(replace(forward.lobe, exponent=exponent))
-    return forward, fit_lighting(seen, forward, expected, True, FIRST_ITERATIONS) if config.robust else None
+        forward, found = best_exponent(seen, forward, expected, robust, found)
+    return forward, found if robust else None
 
 
 def fit_als(
@@ -227,7 +226,8 @@ def solve_texels(
     """Maps for a lighting, expected to be ``prior`` (S, S, 4); without robust weights in one pass."""
     chunks, index = surface.chunks(), surface.texels.index
     smoothness = config.smoothness_weight, config.smoothness_weight * config.specular_smoothness
-    passes, expected = MAP_PASSES if config.robust else 1, float(prior[0, 0, 3])
+    iterations, expected = MAP_ITERATIONS[0 if config.robust else -1 :], float(prior[0, 0, 3])
+    passes = len(iterations)
     maps, energy, sigma, outcome = start, [], found.sigma, Outcome.MAX_ITERATIONS
     observability = np.ones(len(index), np.float32)
     kept: _Shaded | None = None
@@ -256,7 +256,7 @@ def solve_texels(
             usual, each = float(np.median([usual for usual, _ in sizes])), np.concatenate([each for _, each in sizes])
             observability = specular_observability(surface.texels, joined, each, usual, expected)
         pull = specular_pull(expected, sigma) if config.robust else 0.0
-        maps, outcome = solve_maps(joined, index, prior, smoothness, maps, pull, iterations=MAP_ITERATIONS)
+        maps, outcome = solve_maps(joined, index, prior, smoothness, maps, pull, iterations=iterations[number])
     progress("Reflectance maps", passes * len(chunks), passes * len(chunks))
     assert maps is not None
     return SolvedMaps(maps, energy, sigma, outcome, observability)

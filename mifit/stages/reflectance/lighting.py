@@ -129,9 +129,11 @@ class Residuals:
         weight = np.where(problem.clipped[:, None] & (self.residual <= 0), np.float32(0.0), weight)
         return float(np.sqrt((weight * self.residual**2).sum() / max(float(problem.weight.sum()), 1e-12)))
 
-    def equations(self, problem: LightingProblem, priors: LightingPriors = PRIORS) -> LightingEquations:
-        """Normal equations about this state, priors included."""
-        system = LightingEquations.accumulate(problem, self.maps, self.shading, self.residual, self.weight)
+    def equations(
+        self, problem: LightingProblem, priors: LightingPriors = PRIORS, rows: int | None = None
+    ) -> LightingEquations:
+        """Normal equations about this state, priors included; ``rows`` as in `LightingEquations.accumulate`."""
+        system = LightingEquations.accumulate(problem, self.maps, self.shading, self.residual, self.weight, rows)
         k, order = problem.specular.shape[1], problem.order
         expected = (
             problem.albedo,
@@ -173,14 +175,16 @@ def solve_lighting(
     if start is None:
         maps = problem.albedo.astype(np.float32), np.full(n, specular, np.float32)
         start = _initial(problem, *maps), *maps
-    state, energy, damping, outcome = start, [], 1e-3, Outcome.MAX_ITERATIONS  # type: ignore[var-annotated]
+    state, energy, outcome = start, [], Outcome.MAX_ITERATIONS  # type: ignore[var-annotated]
+    damping, least = 1e-3, 1e-5
     for _ in range(iterations):
         found = Residuals.of(problem, state[0], state[1:], robust)
         if not energy and not np.isfinite(found.energy):
             best, outcome = found, Outcome.DIVERGED
             break
         if energy and not found.energy < SLACK * energy[-1]:
-            damping *= 10.0  # the step made it worse: take a shorter one from where it started
+            # The step made it worse: take a shorter one from where it started, and none as long again.
+            least = damping = 10.0 * damping
             if damping > 1e3:
                 outcome = Outcome.STALLED
                 break
@@ -189,7 +193,7 @@ def solve_lighting(
             settled = len(energy) > 1 and abs(energy[-2] - energy[-1]) < tolerance * energy[-2]
             # The priors' energy goes on falling where the data's, which is kept here, no longer does.
             settled |= min(energy[-STILL:]) > (1.0 - tolerance) * min(energy[:-STILL], default=np.inf)
-            best, damping = found, max(0.1 * damping, 1e-5)
+            best, damping = found, max(0.1 * damping, least)
             if settled:
                 outcome = Outcome.CONVERGED
                 break
