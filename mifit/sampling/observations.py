@@ -230,6 +230,8 @@ class Surface:
 
     def without(self, masks: Sequence[NDArray[np.bool_]]) -> Surface:
         """The same surface with pixels (H, W) of every image left out."""
+        if not any(left_out.any() for left_out in masks):
+            return self
         less = copy.copy(self)
         less._kept = None
         less._images = [
@@ -245,8 +247,6 @@ class Surface:
     def without_hidden(self, reflectance: ReflectanceEstimate) -> Surface:
         """The same surface without what stage 2 found in front of the face; as it is where images have no labels."""
         found = [reflectance.label(image.camera.name, self.geometry.timesteps[image.step]) for image in self._images]
-        if all(labels is None for labels in found):
-            return self
         shapes = [image.unusable.shape for image in self._images]
         pairs = zip(found, shapes, strict=True)
         return self.without([np.zeros(shape, bool) if labels is None else hidden(labels) for labels, shape in pairs])

@@ -26,10 +26,11 @@ from mifit.stages.reflectance.maps import TexelSystems, solve_maps
 
 LIGHTING_TEXELS = 6000
 """Texels that determine the lighting; a few hundred unknowns against 24 values of eight images each."""
-MAP_ITERATIONS = (10, 10, 40)
-"""ADMM iterations of each pass over the maps, which takes new robust weights from the residuals of the last: what the
-first ones are for. Every pass starts from its maps alone: going on from the multipliers of the pass before carries over
-what the last weights took an outlier for."""
+MAP_PASSES = 3
+"""Passes over the maps: each takes new robust weights from the residuals of the last."""
+MAP_ITERATIONS = 40
+"""ADMM iterations of a pass. Every pass starts from its maps alone: going on from the multipliers of the pass before
+saves half of them, but carries over what the last weights took an outlier for."""
 SURROUNDINGS = 1 / 128
 """Half the side of the square of texels over which residuals are averaged, relative to the map."""
 
@@ -226,8 +227,7 @@ def solve_texels(
     """Maps for a lighting, expected to be ``prior`` (S, S, 4); without robust weights in one pass."""
     chunks, index = surface.chunks(), surface.texels.index
     smoothness = config.smoothness_weight, config.smoothness_weight * config.specular_smoothness
-    iterations, expected = MAP_ITERATIONS[0 if config.robust else -1 :], float(prior[0, 0, 3])
-    passes = len(iterations)
+    passes, expected = MAP_PASSES if config.robust else 1, float(prior[0, 0, 3])
     maps, energy, sigma, outcome = start, [], found.sigma, Outcome.MAX_ITERATIONS
     observability = np.ones(len(index), np.float32)
     kept: _Shaded | None = None
@@ -256,7 +256,7 @@ def solve_texels(
             usual, each = float(np.median([usual for usual, _ in sizes])), np.concatenate([each for _, each in sizes])
             observability = specular_observability(surface.texels, joined, each, usual, expected)
         pull = specular_pull(expected, sigma) if config.robust else 0.0
-        maps, outcome = solve_maps(joined, index, prior, smoothness, maps, pull, iterations=iterations[number])
+        maps, outcome = solve_maps(joined, index, prior, smoothness, maps, pull, iterations=MAP_ITERATIONS)
     progress("Reflectance maps", passes * len(chunks), passes * len(chunks))
     assert maps is not None
     return SolvedMaps(maps, energy, sigma, outcome, observability)

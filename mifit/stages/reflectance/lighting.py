@@ -176,15 +176,16 @@ def solve_lighting(
         maps = problem.albedo.astype(np.float32), np.full(n, specular, np.float32)
         start = _initial(problem, *maps), *maps
     state, energy, outcome = start, [], Outcome.MAX_ITERATIONS  # type: ignore[var-annotated]
-    damping, least = 1e-3, 1e-5
+    damping, failed, held = 1e-3, 0, 0
     for _ in range(iterations):
         found = Residuals.of(problem, state[0], state[1:], robust)
         if not energy and not np.isfinite(found.energy):
             best, outcome = found, Outcome.DIVERGED
             break
         if energy and not found.energy < SLACK * energy[-1]:
-            # The step made it worse: take a shorter one from where it started, and none as long again.
-            least = damping = 10.0 * damping
+            # The step made it worse: take a shorter one from where it started, and no longer ones for a while.
+            damping, failed = 10.0 * damping, failed + 1
+            held = failed
             if damping > 1e3:
                 outcome = Outcome.STALLED
                 break
@@ -193,7 +194,8 @@ def solve_lighting(
             settled = len(energy) > 1 and abs(energy[-2] - energy[-1]) < tolerance * energy[-2]
             # The priors' energy goes on falling where the data's, which is kept here, no longer does.
             settled |= min(energy[-STILL:]) > (1.0 - tolerance) * min(energy[:-STILL], default=np.inf)
-            best, damping = found, max(0.1 * damping, least)
+            best, held = found, max(held - 1, 0)
+            damping = damping if held else max(0.1 * damping, 1e-5)
             if settled:
                 outcome = Outcome.CONVERGED
                 break
