@@ -91,6 +91,12 @@ class Observations:
         """(N, J, 3) unit normal per image."""
         return self.normal[:, self.step]
 
+    def spread(self, values: NDArray) -> NDArray:
+        """(N, J, ...) values (M, ...) of the observations of some weight, among zeros."""
+        out = np.zeros((*self.weight.shape, *values.shape[1:]), values.dtype)
+        out[self.weight > 0] = values
+        return out
+
     @classmethod
     def join(cls, parts: Sequence[Observations]) -> Observations:
         """The observations of several sets of texels by the same images."""

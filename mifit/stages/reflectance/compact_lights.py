@@ -71,7 +71,7 @@ def find_lights(
         Diffuse albedo that the morphable model expects.
     """
     directions, lights = fibonacci_sphere(DIRECTIONS), tuple[DistantLight, ...]()
-    columns = [each[seen.weight > 0] for each in forward.columns(seen, directions)]
+    columns = forward.columns(seen, directions)
     problem, found = _solved(seen, forward, lights, albedo)
     while len(lights) < LIGHTS:
         best = int(np.argmax(_gains(problem, columns)))
@@ -136,7 +136,7 @@ def _settled(
         lights, problem, before = rounds[-1]
         ways = [_moved(light, sign * step) for light in lights for step in np.eye(3) for sign in (1.0, -1.0)]
         moved = forward.with_lights(tuple(ways))
-        both = (each[seen.weight > 0] for each in moved.transfers(seen, moved.dark))
+        both = moved.transfers(seen, moved.dark)
         slopes = [0.5 * (each[:, smooth::2] - each[:, smooth + 1 :: 2]) for each in both]
         steps = _place_steps(problem, before, slopes)
         lights = tuple(_moved(light, np.clip(step, -2.0, 2.0)) for light, step in zip(lights, steps, strict=True))

@@ -295,8 +295,8 @@ def lighting_problem(
         seen.colour[there],
         weight[there],
         seen.clipped[there],
-        diffuse[there],
-        specular[there],
+        diffuse,
+        specular,
         albedo,
         forward.order,
     )
