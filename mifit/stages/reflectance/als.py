@@ -29,8 +29,9 @@ LIGHTING_TEXELS = 6000
 MAP_PASSES = 3
 """Passes over the maps: each takes new robust weights from the residuals of the last."""
 MAP_ITERATIONS = 40
-"""ADMM iterations of a pass. Every pass starts from its maps alone: going on from the multipliers of the pass before
-saves half of them, but carries over what the last weights took an outlier for."""
+"""ADMM iterations of a pass; the first, there for the weights alone, takes half of them. Every pass starts from its maps
+alone: going on from the multipliers of the pass before saves half as well, but carries over what the last weights took
+an outlier for."""
 SURROUNDINGS = 1 / 128
 """Half the side of the square of texels over which residuals are averaged, relative to the map."""
 
@@ -256,7 +257,8 @@ def solve_texels(
             usual, each = float(np.median([usual for usual, _ in sizes])), np.concatenate([each for _, each in sizes])
             observability = specular_observability(surface.texels, joined, each, usual, expected)
         pull = specular_pull(expected, sigma) if config.robust else 0.0
-        maps, outcome = solve_maps(joined, index, prior, smoothness, maps, pull, iterations=MAP_ITERATIONS)
+        iterations = -(-MAP_ITERATIONS // 2) if number == 0 < passes - 1 else MAP_ITERATIONS
+        maps, outcome = solve_maps(joined, index, prior, smoothness, maps, pull, iterations=iterations)
     progress("Reflectance maps", passes * len(chunks), passes * len(chunks))
     assert maps is not None
     return SolvedMaps(maps, energy, sigma, outcome, observability)
