@@ -29,9 +29,9 @@ LIGHTING_TEXELS = 6000
 MAP_PASSES = 3
 """Passes over the maps: each takes new robust weights from the residuals of the last."""
 MAP_ITERATIONS = 40
-"""ADMM iterations of a pass; the first, there for the weights alone, takes half of them. Every pass starts from its maps
-alone: going on from the multipliers of the pass before saves half as well, but carries over what the last weights took
-an outlier for."""
+"""ADMM iterations of a pass; the first, there for the weights alone, takes half of them. Every pass starts from its
+maps: going on from the multipliers of the pass before saves half, but carries over what the last weights took an
+outlier for."""
 SURROUNDINGS = 1 / 128
 """Half the side of the square of texels over which residuals are averaged, relative to the map."""
 

@@ -94,12 +94,12 @@ def _gains(problem: LightingProblem, columns: Sequence[NDArray]) -> NDArray[np.f
     k, count = problem.diffuse.shape[1], columns[0].shape[1]
     wider, light = problem.with_columns(*columns), np.concatenate([found.light, np.zeros((count, 3))])
     left = Residuals.of(wider, light, (found.diffuse, found.specular))
-    remaining = left.equations(wider, rows=k).eliminate(1e-4)
+    remaining = left.equations(wider).eliminate(1e-4)
     old = np.arange(3 * (k + count)) % (k + count) < k
-    reduced, cross = remaining.reduced[:, old], remaining.reduced[:, ~old]
-    across = np.linalg.solve(reduced, cross)
+    cross = remaining.reduced[np.ix_(old, ~old)]
+    across = np.linalg.solve(remaining.reduced[np.ix_(old, old)], cross)
     force = remaining.right[~old] - across.T @ remaining.right[old]
-    stiffness = remaining.further - (across * cross).sum(0)
+    stiffness = np.diag(remaining.reduced)[~old] - (across * cross).sum(0)
     gain = np.maximum(force, 0.0) ** 2 / np.maximum(stiffness, 1e-9 * float(stiffness.max()))
     return np.asarray(gain.reshape(3, count).sum(0))
 

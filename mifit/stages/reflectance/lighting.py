@@ -129,11 +129,9 @@ class Residuals:
         weight = np.where(problem.clipped[:, None] & (self.residual <= 0), np.float32(0.0), weight)
         return float(np.sqrt((weight * self.residual**2).sum() / max(float(problem.weight.sum()), 1e-12)))
 
-    def equations(
-        self, problem: LightingProblem, priors: LightingPriors = PRIORS, rows: int | None = None
-    ) -> LightingEquations:
-        """Normal equations about this state, priors included; ``rows`` as in `LightingEquations.accumulate`."""
-        system = LightingEquations.accumulate(problem, self.maps, self.shading, self.residual, self.weight, rows)
+    def equations(self, problem: LightingProblem, priors: LightingPriors = PRIORS) -> LightingEquations:
+        """Normal equations about this state, priors included."""
+        system = LightingEquations.accumulate(problem, self.maps, self.shading, self.residual, self.weight)
         k, order = problem.specular.shape[1], problem.order
         expected = (
             problem.albedo,

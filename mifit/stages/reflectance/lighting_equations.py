@@ -149,8 +149,8 @@ class LightingEquations:
 
     Attributes
     ----------
-    system : (3, R, K), further : (3, K - R), right : (3, K)
-        Of the lighting, by channel: its first R rows, R = K where it is to be solved, and the diagonal of the others.
+    system : (3, K, K), right : (3, K)
+        Of the lighting, by channel.
     diffuse, both : (n, 3), specular : (n,)
         Blocks: curvature of the diffuse albedos, theirs with the specular one, and its own.
     own_right : (n, 4)
@@ -161,7 +161,6 @@ class LightingEquations:
     """
 
     system: NDArray[np.float64]
-    further: NDArray[np.float64]
     right: NDArray[np.float64]
     diffuse: NDArray[np.float64]
     both: NDArray[np.float64]
@@ -178,12 +177,8 @@ class LightingEquations:
         shading: tuple[NDArray, NDArray],
         residual: NDArray,
         weight: NDArray,
-        rows: int | None = None,
     ) -> LightingEquations:
-        """Sums over the observations, linearised about maps (n, 3), (n,) and diffuse and specular shading (M, 3).
-
-        ``rows`` is the number of rows of the light's system that are wanted; of the others it is the diagonal.
-        """
+        """Sums over the observations, linearised about maps (n, 3), (n,) and diffuse and specular shading (M, 3)."""
         (diffuse, specular_albedo), (diffuse_light, specular_light) = maps, shading
         n, k = len(diffuse), problem.specular.shape[1]
         by_diffuse, by_specular = weight * diffuse_light, weight * specular_light
@@ -191,36 +186,33 @@ class LightingEquations:
         forces = by_diffuse * residual, by_specular * residual
         own = problem.sums(np.concatenate([*products, *forces], axis=1)).astype(np.float64)
         dd, ds, ss, dr, sr = (own[:, 3 * i : 3 * i + 3] for i in range(5))
-        first = rows or k
-        system, further, right = np.zeros((3, first, k)), np.zeros((3, k - first)), np.zeros((3, k))
+        system, right = np.zeros((3, k, k)), np.zeros((3, k))
         diffuse_cross, specular_cross = np.empty((3, n, k), np.float32), np.empty((n, 3 * k), np.float32)
         root = np.sqrt(weight)
 
-        def add(each: Block) -> tuple[NDArray, NDArray, NDArray]:
-            """A block's part of the light's system, of the further diagonal and of its right-hand side."""
+        def add(each: Block) -> tuple[NDArray, NDArray]:
+            """A block's part of the light's system and of its right-hand side."""
             texels, part = each.texels, each.rows
             of = problem.texel[part]
             glossy = specular_albedo[of, None] * problem.specular[part]
             slope = np.empty_like(glossy)
-            square, rest, side = np.empty(system.shape, slope.dtype), np.empty(further.shape), np.empty((3, k))
+            square, side = np.empty((3, k, k), slope.dtype), np.empty((3, k))
             for c in range(3):
                 r = root[part, c]
                 np.multiply(diffuse[of, c, None], problem.diffuse[part], out=slope)
                 slope += glossy
                 slope *= r[:, None]
-                np.matmul(slope[:, :first].T, slope, out=square[c])
-                rest[c] = (slope[:, first:] ** 2).sum(0)
+                np.matmul(slope.T, slope, out=square[c])
                 side[c] = (r * residual[part, c]) @ slope
                 diffuse_cross[c, texels] = each.sums(r * diffuse_light[part, c], slope)
                 specular_cross[texels, c * k : (c + 1) * k] = each.sums(r * specular_light[part, c], slope)
-            return square, rest, side
+            return square, side
 
-        for square, rest, side in on_all_cores(add, problem.blocks):
+        for square, side in on_all_cores(add, problem.blocks):
             system += square
-            further += rest
             right += side
         own_right = np.concatenate([dr, sr.sum(1, keepdims=True)], axis=1)
-        return cls(system, further, right, dd, ds, ss.sum(1), own_right, diffuse_cross, specular_cross)
+        return cls(system, right, dd, ds, ss.sum(1), own_right, diffuse_cross, specular_cross)
 
     def add_priors(
         self,
@@ -236,8 +228,8 @@ class LightingEquations:
 
         ``maps`` (n, 3) and (n,) are pulled to the expected ones.
         """
-        first = self.system.shape[1]
-        scale = float(np.trace(self.system, axis1=1, axis2=2).mean()) / first
+        k = len(stiffness)
+        scale = float(np.trace(self.system, axis1=1, axis2=2).mean()) / k
         pull = priors.albedo * np.median(self.diffuse, axis=0)
         self.diffuse += pull
         self.own_right[:, :3] += pull * (expected[0] - maps[0])
@@ -248,14 +240,12 @@ class LightingEquations:
         smooth, force = priors.roughness * scale * stiffness, priors.negative * scale * 4.0 * np.pi / len(sphere_basis)
         for c in range(3):
             rows = sphere_basis[radiance[:, c] < 0]
-            self.system[c] += force * rows[:, :first].T @ rows + np.diag(smooth)[:first]
-            self.further[c] += (force * (rows**2).sum(0) + smooth)[first:]
+            self.system[c] += force * rows.T @ rows + np.diag(smooth)
             self.right[c] -= force * rows.T @ (rows @ light[:, c]) + smooth * light[:, c]
 
     def eliminate(self, damping: float) -> Eliminated:
         """What remains for the light once the texels follow it."""
-        (n, k), first = self.diffuse_cross.shape[1:], self.system.shape[1]
-        rows, others = (np.flatnonzero(each) for each in (np.arange(3 * k) % k < first, np.arange(3 * k) % k >= first))
+        n, k = self.diffuse_cross.shape[1:]
         floor = 1e-6 * float(np.median(np.concatenate([self.diffuse, self.specular[:, None]], axis=1))) + 1e-12
         pivot = (1.0 + damping) * self.diffuse + floor
         slope = self.both / pivot
@@ -263,34 +253,32 @@ class LightingEquations:
         own = self.own_right[:, :3] / pivot
         left = (self.own_right[:, 3] - (slope * self.own_right[:, :3]).sum(1)) / last
 
-        def take(texels: slice) -> tuple[NDArray, NDArray, NDArray]:
-            """What some of the texels take from the light's system, the further diagonal and the right-hand side."""
+        def take(texels: slice) -> tuple[NDArray, NDArray]:
+            """What some of the texels take from the light's system and from its right-hand side."""
             cross, steep = self.specular_cross[texels], slope[texels].astype(np.float32)
-            rest, squares, side = np.empty_like(cross), np.empty((3, first, k), cross.dtype), np.empty(3 * k)
-            taken = np.empty((3, k - first))
+            rest, squares, side = np.empty_like(cross), np.empty((3, k, k), cross.dtype), np.empty(3 * k)
             for c in range(3):
                 block, own_cross = slice(c * k, (c + 1) * k), self.diffuse_cross[c, texels]
                 np.multiply(own_cross, -steep[:, c, None], out=rest[:, block])
                 rest[:, block] += cross[:, block]
                 part = own_cross / np.sqrt(pivot[texels, c, None]).astype(np.float32)
-                np.matmul(part[:, :first].T, part, out=squares[c])
-                taken[c] = (part[:, first:] ** 2).sum(0)
+                np.matmul(part.T, part, out=squares[c])
                 side[block] = own[texels, c].astype(np.float32) @ own_cross
             side += left[texels].astype(np.float32) @ rest
             rest /= np.sqrt(last[texels]).astype(np.float32)[:, None]
-            square = (rest.T @ rest if first == k else rest[:, rows].T @ rest).astype(np.float64)
-            square += sl.block_diag(*squares)
-            return square, taken.ravel() + (rest[:, others] ** 2).sum(0), side
+            square = rest.T @ rest
+            for c in range(3):
+                block = slice(c * k, (c + 1) * k)
+                square[block, block] += squares[c]
+            return square, side
 
-        reduced, right, further = sl.block_diag(*self.system), self.right.ravel().copy(), self.further.ravel().copy()
-        diagonal = reduced[np.arange(len(rows)), rows]
-        further *= 1.0 + damping
-        for square, taken, side in on_all_cores(take, blocks(n, 8 * k)):
+        reduced, right = sl.block_diag(*self.system), self.right.ravel().copy()
+        diagonal = np.diag(reduced).copy()
+        for square, side in on_all_cores(take, blocks(n, 2 * k)):
             reduced -= square
-            further -= taken
             right -= side
-        reduced[np.arange(len(rows)), rows] += damping * diagonal + 1e-8 * diagonal.mean()
-        return Eliminated(pivot, slope, last, reduced, further, right)
+        reduced[np.diag_indices(3 * k)] += damping * diagonal + 1e-8 * diagonal.mean()
+        return Eliminated(pivot, slope, last, reduced, right)
 
     def solve(
         self, damping: float, lowest: NDArray | None = None
@@ -321,15 +309,14 @@ class Eliminated:
     pivot, slope : (n, 3), last : (n,)
         Of the texels' blocks: curvature of the diffuse albedos, how they follow the specular one, and its curvature
         once they do.
-    reduced : (3R, 3K), further : (3 (K - R),), right : (3K,)
-        What remains for the lighting, rows as in `LightingEquations`.
+    reduced : (3K, 3K), right : (3K,)
+        What remains for the lighting.
     """
 
     pivot: NDArray[np.float64]
     slope: NDArray[np.float64]
     last: NDArray[np.float64]
     reduced: NDArray[np.float64]
-    further: NDArray[np.float64]
     right: NDArray[np.float64]
 
 
