@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from mifit.core.arrays import Recent
 from mifit.core.mesh import face_cross
 from mifit.errors import InputError
 from mifit.morphable.model import MorphableModel
@@ -135,19 +135,12 @@ def with_eyes(model: MorphableModel) -> MorphableModel:
     return found
 
 
-_weights = Recent[sp.csr_matrix | None](4)  # stages ask for those of the same model
-
-
+@lru_cache(maxsize=2)  # stages ask for those of the same model
 def skin_weights(model: MorphableModel) -> sp.csr_matrix | None:
     """(V, V') weighted means of the first V' vertices that all vertices move with; None for a model that got no eyes.
 
     The first rows are the identity: pieces that were added go along with the skin and hold none of it back.
     """
-    return _weights.get(model.digest, lambda: _skin_weights(model))
-
-
-def _skin_weights(model: MorphableModel) -> sp.csr_matrix | None:
-    """`skin_weights`, where they aren't known yet."""
     balls = eyeballs(model)
     count = min((int(ball.min()) for ball in balls), default=0)
     own = leading_faces(model, count)

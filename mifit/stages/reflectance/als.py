@@ -96,13 +96,14 @@ def find_forward(
     lobe = Lobe(given or EXPONENT, model.fresnel, model.normalized)
     forward = replace(Forward.of(model, model.bands or config.bands, lobe, surface.meshes), glossy=config.specular)
     some = surface.sample(max(1, OBSERVATIONS // surface.image_count), np.random.default_rng(seed))
-    seen, expected, robust = surface.observe(some), albedo[some], config.robust
+    seen, expected, robust, found = surface.observe(some), albedo[some], config.robust, None
+    estimated = given is None and config.specular
     if robust and model.needs_shadows:
         lights, found = find_lights(seen, forward, expected)
         forward = forward.with_lights(lights)
-    else:
+    elif robust or estimated:
         found = fit_lighting(seen, forward, expected, robust, ITERATIONS)
-    if given is None and config.specular:
+    if found is not None and estimated:
         forward, found = best_exponent(seen, forward, expected, robust, found)
     return forward, found if robust else None
 
