@@ -316,7 +316,8 @@ def _read_transfer(transfer: VertexTransfer, count: int, order: int) -> list[Jit
     rows = [mi.UInt32(aligned(column, np.uint32)) for column in transfer.corners.T]
     weights = [mi.Float(aligned(column)) for column in transfer.weights.T]
     packets = -(-size // 4)
-    flat = mi.Float(aligned(np.pad(values, ((0, 0), (0, 4 * packets - size)))).ravel())
+    padded = np.pad(values, ((0, 0), (0, 4 * packets - size))) if 4 * packets > size else values
+    flat = mi.Float(aligned(padded).ravel())
     found: list[Jit] = []
     for packet in range(packets):
         read = [dr.gather(mi.Vector4f, flat, row * packets + packet) for row in rows]

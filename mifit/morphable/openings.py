@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import scipy.sparse as sp
@@ -134,6 +135,7 @@ def with_eyes(model: MorphableModel) -> MorphableModel:
     return found
 
 
+@lru_cache(maxsize=2)  # stages ask for those of the same model
 def skin_weights(model: MorphableModel) -> sp.csr_matrix | None:
     """(V, V') weighted means of the first V' vertices that all vertices move with; None for a model that got no eyes.
 

@@ -91,6 +91,12 @@ class Observations:
         """(N, J, 3) unit normal per image."""
         return self.normal[:, self.step]
 
+    def spread(self, values: NDArray) -> NDArray:
+        """(N, J, ...) values (M, ...) of the observations of some weight, among zeros."""
+        out = np.zeros((*self.weight.shape, *values.shape[1:]), values.dtype)
+        out[self.weight > 0] = values
+        return out
+
     @classmethod
     def join(cls, parts: Sequence[Observations]) -> Observations:
         """The observations of several sets of texels by the same images."""
@@ -230,6 +236,8 @@ class Surface:
 
     def without(self, masks: Sequence[NDArray[np.bool_]]) -> Surface:
         """The same surface with pixels (H, W) of every image left out."""
+        if not any(left_out.any() for left_out in masks):
+            return self
         less = copy.copy(self)
         less._kept = None
         less._images = [
@@ -245,8 +253,6 @@ class Surface:
     def without_hidden(self, reflectance: ReflectanceEstimate) -> Surface:
         """The same surface without what stage 2 found in front of the face; as it is where images have no labels."""
         found = [reflectance.label(image.camera.name, self.geometry.timesteps[image.step]) for image in self._images]
-        if all(labels is None for labels in found):
-            return self
         shapes = [image.unusable.shape for image in self._images]
         pairs = zip(found, shapes, strict=True)
         return self.without([np.zeros(shape, bool) if labels is None else hidden(labels) for labels, shape in pairs])
@@ -327,42 +333,44 @@ class Surface:
         face, weights = self.texels.face[texel], self.texels.weights[texel]
         n, j, t = len(texel), len(self._images), len(self.vertices)
         colour, view = (np.zeros((n, j, 3), dtype=np.float32) for _ in range(2))
-        weight, outlier = (np.zeros((n, j), dtype=np.float32) for _ in range(2))
+        weight, outlier, cosine = (np.zeros((n, j), dtype=np.float32) for _ in range(3))
         clipped = np.zeros((n, j), dtype=bool)
         point, normal = (np.zeros((n, t, 3), dtype=np.float32) for _ in range(2))
         for i in range(t):
             point[:, i] = interpolate(self.vertices[i], self.faces, face, weights)
             normal[:, i] = normalize(interpolate(self.normals[i], self.faces, face, weights))
 
-        def place(k: int) -> tuple[NDArray, NDArray]:
-            """Texels that face camera k before usable pixels, and where in the image."""
+        def place(k: int) -> tuple[NDArray, NDArray, NDArray]:
+            """Texels that face camera k before usable pixels, where in the image, and which part of it is unusable."""
             image, camera = self._images[k], self._images[k].camera
-            place = point[:, image.step].astype(np.float64)
-            view[:, k] = normalize(camera.position - place)
-            pixel = np.nan_to_num(camera.project(place), nan=-1e6) - 0.5
-            inside = (pixel >= 0).all(-1) & (pixel <= (camera.width - 1, camera.height - 1)).all(-1)
-            weight[:, k] = image.footprint[face] * facing(np.sum(normal[:, image.step] * view[:, k], axis=-1)) * inside
-            rows = np.flatnonzero(weight[:, k] > 0)
-            usable = bilinear(image.unusable, *pixel[rows].T) < 0.5
+            view[:, k] = normalize(camera.position.astype(np.float32) - point[:, image.step])
+            cosine[:, k] = np.einsum("nk,nk->n", normal[:, image.step], view[:, k])
+            weight[:, k] = image.footprint[face] * facing(cosine[:, k])
+            rows = np.flatnonzero(weight[:, k])
+            pixel = camera.project(point[rows, image.step]).T - 0.5
+            far = np.array([[camera.width - 1], [camera.height - 1]])
+            inside = np.logical_and(*((pixel >= 0) & (pixel <= far)))
+            weight[rows[~inside], k] = 0.0
+            rows, pixel = rows[inside], pixel[:, inside]
+            lost = bilinear(image.unusable, *pixel)
+            usable = lost < 0.5
             weight[rows[~usable], k] = 0.0
-            return rows[usable], pixel[rows[usable]]
+            return rows[usable], pixel[:, usable], lost[usable]
 
         def read(k: int) -> None:
-            image, camera, (rows, pixel) = self._images[k], self._images[k].camera, places[k]
-            usable = 1.0 - bilinear(image.unusable, *pixel.T)
-            colour[rows, k] = bilinear(image.colour, *pixel.T) / usable[:, None]  # of the usable pixels alone
-            clipped[rows, k] = bilinear(image.clipped, *pixel.T) > 0.0
+            image, camera, (rows, pixel, lost) = self._images[k], self._images[k].camera, places[k]
+            colour[rows, k] = bilinear(image.colour, *pixel) / (1.0 - lost)[:, None]  # of the usable pixels alone
+            clipped[rows, k] = bilinear(image.clipped, *pixel) > 0.0
             if self.robust:
-                depth = np.sum((point[rows, image.step] - camera.position) * camera.rotation[2], axis=1)
-                cosine = np.sum(normal[rows, image.step] * view[rows, k], axis=-1)
-                outlier[rows, k] = outlier_prior(cosine, bilinear(image.outline, *pixel.T) * depth / camera.fx)
+                depth = (point[rows, image.step] - camera.position) @ camera.rotation[2]
+                outlier[rows, k] = outlier_prior(cosine[rows, k], bilinear(image.outline, *pixel) * depth / camera.fx)
 
         places = on_all_cores(place, range(j))
-        for k, (image, (rows, pixel)) in enumerate(zip(self._images, places, strict=True)):
+        for k, (image, (rows, pixel, lost)) in enumerate(zip(self._images, places, strict=True)):
             # Rays take all cores by themselves.
             visible = self.meshes[image.step].scene.visible_from(point[rows, image.step], image.camera.position)
             weight[rows[~visible], k] = 0.0
-            places[k] = rows[visible], pixel[visible]
+            places[k] = rows[visible], pixel[:, visible], lost[visible]
         on_all_cores(read, range(j))
         step = np.array([image.step for image in self._images])
         inlier = np.float32(1.0) - outlier

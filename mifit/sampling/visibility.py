@@ -150,11 +150,14 @@ def background(image: NDArray, hit: NDArray[np.bool_], kept: NDArray[np.bool_]) 
         return np.zeros_like(hit)
     finite = np.nan_to_num(image, nan=0.0, posinf=1.0, neginf=0.0).astype(np.float32)
     smooth = cv2.GaussianBlur(finite, (0, 0), 1.5)
+    alike, asked = np.zeros_like(hit), ~off & ~kept
     row, column = distance_transform_edt(~off, return_distances=False, return_indices=True)
-    there = smooth[row, column]
-    alike = (np.abs(smooth - there) < ALIKE * there + 5.0 * DARKEST).all(axis=-1) & ~kept
-    _, piece = cv2.connectedComponents((alike | off).astype(np.uint8))
-    found = hit & alike & np.isin(piece, np.unique(piece[off]))
+    there = smooth[row[asked], column[asked]]
+    alike[asked] = (np.abs(smooth[asked] - there) < ALIKE * there + 5.0 * DARKEST).all(axis=-1)
+    count, piece = cv2.connectedComponents((alike | off).astype(np.uint8))
+    joined = np.zeros(count, bool)
+    joined[piece[off]] = True
+    found = hit & alike & joined[piece]
     # Pixels along its outline mix both: they alone would colour all that nothing else shows.
     return hit & ~kept & cv2.dilate(found.astype(np.uint8), around).astype(bool)
 

@@ -12,7 +12,7 @@ No network is involved. A capture's own masks (``mask_path``) replace this for t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -96,7 +96,8 @@ def common_albedos(surface: Surface, appearance: Forward, light: NDArray) -> Alb
         seen = surface.observe(rows)
         texels.append(rows)
         levels.append(opponent(seen.colour))
-        shadings.append(opponent(appearance.shade(seen, light)[0]))
+        every = replace(seen, weight=np.ones_like(seen.weight))  # images are compared beside what they measure, too
+        shadings.append(opponent(appearance.shade(every, light)[0]))
         weights.append(seen.measured)
     level, shading, weight = (np.concatenate(x) for x in (levels, shadings, weights))
     flat = level - shading

@@ -18,7 +18,7 @@ from mifit.core.uv import TexelMap
 from mifit.optim import Outcome
 from mifit.progress import Progress
 from mifit.sampling.observations import Surface
-from mifit.stages.reflectance.compact_lights import EXPONENT, OBSERVATIONS, best_exponent, find_lights
+from mifit.stages.reflectance.compact_lights import EXPONENT, ITERATIONS, OBSERVATIONS, best_exponent, find_lights
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution, active_weight, fit_lighting, noise_weight
 from mifit.stages.reflectance.lighting_equations import specular_pull
@@ -29,10 +29,9 @@ LIGHTING_TEXELS = 6000
 MAP_PASSES = 3
 """Passes over the maps: each takes new robust weights from the residuals of the last."""
 MAP_ITERATIONS = 40
-"""ADMM iterations of a pass. Every pass starts from its maps alone: going on from the multipliers of the pass before
-saves half of them, but carries over what the last weights took an outlier for."""
-FIRST_ITERATIONS = 12
-"""Gauss-Newton iterations of the lighting by which objects in front of the face are found."""
+"""ADMM iterations of a pass; the first, there for the weights alone, takes half of them. Every pass starts from its
+maps: going on from the multipliers of the pass before saves half, but carries over what the last weights took an
+outlier for."""
 SURROUNDINGS = 1 / 128
 """Half the side of the square of texels over which residuals are averaged, relative to the map."""
 
@@ -97,13 +96,16 @@ def find_forward(
     lobe = Lobe(given or EXPONENT, model.fresnel, model.normalized)
     forward = replace(Forward.of(model, model.bands or config.bands, lobe, surface.meshes), glossy=config.specular)
     some = surface.sample(max(1, OBSERVATIONS // surface.image_count), np.random.default_rng(seed))
-    seen, expected = surface.observe(some), albedo[some]
-    if config.robust and model.needs_shadows:
-        forward = forward.with_lights(find_lights(seen, forward, expected))
-    if given is None and config.specular:
-        exponent = best_exponent(seen, forward, expected, config.robust)
-        forward = forward.with_lobe(replace(forward.lobe, exponent=exponent))
-    return forward, fit_lighting(seen, forward, expected, True, FIRST_ITERATIONS) if config.robust else None
+    seen, expected, robust, found = surface.observe(some), albedo[some], config.robust, None
+    estimated = given is None and config.specular
+    if robust and model.needs_shadows:
+        lights, found = find_lights(seen, forward, expected)
+        forward = forward.with_lights(lights)
+    elif robust or estimated:
+        found = fit_lighting(seen, forward, expected, robust, ITERATIONS)
+    if found is not None and estimated:
+        forward, found = best_exponent(seen, forward, expected, robust, found)
+    return forward, found if robust else None
 
 
 def fit_als(
@@ -256,7 +258,8 @@ def solve_texels(
             usual, each = float(np.median([usual for usual, _ in sizes])), np.concatenate([each for _, each in sizes])
             observability = specular_observability(surface.texels, joined, each, usual, expected)
         pull = specular_pull(expected, sigma) if config.robust else 0.0
-        maps, outcome = solve_maps(joined, index, prior, smoothness, maps, pull, iterations=MAP_ITERATIONS)
+        iterations = -(-MAP_ITERATIONS // 2) if number == 0 < passes - 1 else MAP_ITERATIONS
+        maps, outcome = solve_maps(joined, index, prior, smoothness, maps, pull, iterations=iterations)
     progress("Reflectance maps", passes * len(chunks), passes * len(chunks))
     assert maps is not None
     return SolvedMaps(maps, energy, sigma, outcome, observability)

@@ -47,7 +47,7 @@ EXPONENTS = 10.0, 80.0
 ITERATIONS = 8
 """Gauss-Newton iterations of all light and albedos under lights in given places."""
 SETTLING = 4
-"""Moves of the lights' places."""
+"""Places of the lights that are tried at the most."""
 STEP = 1.0 / 255.0
 """Noise of an image beside all errors of the model: a step of 8 bits."""
 SLOPE = np.radians(1.0)
@@ -56,8 +56,10 @@ RADII = np.radians([0.25, 15.0])
 """Angular radii of a compact light; a larger one is smooth light."""
 
 
-def find_lights(seen: Observations, forward: Forward, albedo: NDArray) -> tuple[DistantLight, ...]:
-    """Compact lights beside smooth light, without colour; none where images show none.
+def find_lights(
+    seen: Observations, forward: Forward, albedo: NDArray
+) -> tuple[tuple[DistantLight, ...], LightingSolution]:
+    """Compact lights beside smooth light, without colour, and all light; none where images show none.
 
     Parameters
     ----------
@@ -69,19 +71,18 @@ def find_lights(seen: Observations, forward: Forward, albedo: NDArray) -> tuple[
         Diffuse albedo that the morphable model expects.
     """
     directions, lights = fibonacci_sphere(DIRECTIONS), tuple[DistantLight, ...]()
-    columns = [each[seen.weight > 0] for each in forward.columns(seen, directions)]
+    columns = forward.columns(seen, directions)
     problem, found = _solved(seen, forward, lights, albedo)
     while len(lights) < LIGHTS:
         best = int(np.argmax(_gains(problem, columns)))
         more = (*lights, DistantLight(directions[best], float(np.sqrt(RADII.prod())), np.zeros(3)))
-        more, problem, other = _settled(seen, forward, more, albedo)
-        # A light is six numbers: direction, radius, colour. So much of the energy six numbers of no meaning explain.
-        gain = np.log((found.unexplained**2 + STEP**2) / (other.unexplained**2 + STEP**2))
+        more, problem, other = _settled(seen, forward, more, albedo, found)
         reflected = float(other.light[-1] @ LUMINANCE * albedo.mean() / np.pi)
-        if gain < 6.0 / PATCHES or reflected < 2.0 * found.unexplained or more[-1].radius >= RADII[1]:
+        # A light is six numbers: direction, radius, colour.
+        if _explained(found, other) < 6.0 or reflected < 2.0 * found.unexplained or more[-1].radius >= RADII[1]:
             break
         lights, found = more, other
-    return lights
+    return lights, found
 
 
 def _gains(problem: LightingProblem, columns: Sequence[NDArray]) -> NDArray[np.float64]:
@@ -94,13 +95,18 @@ def _gains(problem: LightingProblem, columns: Sequence[NDArray]) -> NDArray[np.f
     wider, light = problem.with_columns(*columns), np.concatenate([found.light, np.zeros((count, 3))])
     left = Residuals.of(wider, light, (found.diffuse, found.specular))
     remaining = left.equations(wider).eliminate(1e-4)
-    number = np.arange(3 * (k + count)) % (k + count)
-    old, new = number < k, number >= k
-    across = np.linalg.solve(remaining.reduced[np.ix_(old, old)], remaining.reduced[np.ix_(old, new)])
-    force = remaining.right[new] - across.T @ remaining.right[old]
-    stiffness = np.diag(remaining.reduced)[new] - (across * remaining.reduced[np.ix_(old, new)]).sum(0)
+    old = np.arange(3 * (k + count)) % (k + count) < k
+    cross = remaining.reduced[np.ix_(old, ~old)]
+    across = np.linalg.solve(remaining.reduced[np.ix_(old, old)], cross)
+    force = remaining.right[~old] - across.T @ remaining.right[old]
+    stiffness = np.diag(remaining.reduced)[~old] - (across * cross).sum(0)
     gain = np.maximum(force, 0.0) ** 2 / np.maximum(stiffness, 1e-9 * float(stiffness.max()))
     return np.asarray(gain.reshape(3, count).sum(0))
+
+
+def _explained(before: LightingSolution, after: LightingSolution) -> float:
+    """Part of the energy that is explained since, relative to what one number of no meaning explains."""
+    return PATCHES * float(np.log((before.unexplained**2 + STEP**2) / (after.unexplained**2 + STEP**2)))
 
 
 def _solved(
@@ -113,23 +119,28 @@ def _solved(
 
 
 def _settled(
-    seen: Observations, forward: Forward, lights: tuple[DistantLight, ...], albedo: NDArray
+    seen: Observations,
+    forward: Forward,
+    lights: tuple[DistantLight, ...],
+    albedo: NDArray,
+    before: LightingSolution,
 ) -> tuple[tuple[DistantLight, ...], LightingProblem, LightingSolution]:
     """Lights whose directions and radii Gauss-Newton has moved together with all else, and all light and albedos then.
 
     A light of irradiance c adds ``c_k (t . slopes)`` to the image of channel k, where t are the three parameters of its
-    place, the same for all channels, and the slopes are differences of its columns. The best of all rounds is taken.
+    place, the same for all channels, and the slopes are differences of its columns. They move as long as that explains
+    more than ``before``; the best of all rounds is taken.
     """
-    smooth, rounds = forward.order**2, []
-    for _ in range(SETTLING):
-        problem, found = _solved(seen, forward, lights, albedo)
-        rounds.append((lights, problem, found))
+    smooth, rounds = forward.order**2, [(lights, *_solved(seen, forward, lights, albedo))]
+    while len(rounds) < SETTLING and _explained(before, rounds[-1][2]) > 1.0:
+        lights, problem, before = rounds[-1]
         ways = [_moved(light, sign * step) for light in lights for step in np.eye(3) for sign in (1.0, -1.0)]
         moved = forward.with_lights(tuple(ways))
-        both = (each[seen.weight > 0] for each in moved.transfers(seen, moved.dark))
+        both = moved.transfers(seen, moved.dark)
         slopes = [0.5 * (each[:, smooth::2] - each[:, smooth + 1 :: 2]) for each in both]
-        steps = _place_steps(problem, found, slopes)
+        steps = _place_steps(problem, before, slopes)
         lights = tuple(_moved(light, np.clip(step, -2.0, 2.0)) for light, step in zip(lights, steps, strict=True))
+        rounds.append((lights, *_solved(seen, forward, lights, albedo)))
     return min(rounds, key=lambda each: each[2].unexplained)
 
 
@@ -158,21 +169,27 @@ def _place_steps(problem: LightingProblem, found: LightingSolution, slopes: Sequ
     return np.asarray(steps, dtype=np.float64)
 
 
-def best_exponent(seen: Observations, forward: Forward, albedo: NDArray, robust: bool) -> float:
-    """Exponent of the lobe that leaves least unexplained, an octave at a time from the physical one.
+def best_exponent(
+    seen: Observations, forward: Forward, albedo: NDArray, robust: bool, found: LightingSolution
+) -> tuple[Forward, LightingSolution]:
+    """The exponent of the lobe that leaves least unexplained, an octave at a time from the physical one.
 
-    Parameters as in `find_lights`, with the lights in ``forward``.
+    Parameters as in `find_lights`, with the lights in ``forward``, and with all light ``found`` so far.
     """
 
-    def score(exponent: float) -> float:
-        found = fit_lighting(seen, forward.with_lobe(replace(forward.lobe, exponent=exponent)), albedo, robust, 8)
+    def score(forward: Forward, found: LightingSolution) -> float:
         # A prior of one octave beside so many independent measurements.
-        return float(np.log(max(found.unexplained, 1e-12)) + 0.5 / PATCHES * np.log2(exponent / EXPONENT) ** 2)
+        octaves = np.log2(forward.lobe.exponent / EXPONENT)
+        return float(np.log(max(found.unexplained, 1e-12)) + 0.5 / PATCHES * octaves**2)
 
-    best, least = EXPONENT, score(EXPONENT)
+    best = forward, found
     for factor in (2.0, 0.5):
-        while EXPONENTS[0] <= factor * best <= EXPONENTS[1] and (error := score(factor * best)) < least:
-            best, least = factor * best, error
-        if best != EXPONENT:
+        while EXPONENTS[0] <= (exponent := factor * best[0].lobe.exponent) <= EXPONENTS[1]:
+            other = forward.with_lobe(replace(forward.lobe, exponent=exponent))
+            trial = other, fit_lighting(seen, other, albedo, robust, ITERATIONS)
+            if score(*trial) >= score(*best):
+                break
+            best = trial
+        if best[0] is not forward:
             break
     return best

@@ -83,65 +83,62 @@ class Forward:
         return replace(self, appearance=replace(self.appearance, illumination=Illumination.dark(self.order, lights)))
 
     def transfers(self, seen: Observations, light: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Diffuse (N, J, K) and specular (N, J, K) transfer vectors of observations at unit albedo.
+        """Diffuse and specular transfer vectors (M, K), at unit albedo, of the observations that count.
 
         ``light`` (K, 3) matters to models that turn with the lighting alone.
         """
-        n, j = seen.weight.shape
-        found = self.under(light).transfers(*_flat(seen), self.occlusion(seen))
-        return found[0].reshape(n, j, -1), self._gloss(found[1].reshape(n, j, -1))
+        diffuse, specular = self.under(light).transfers(*_flat(seen), self.occlusion(seen))
+        return diffuse, self._gloss(specular)
 
     def shade(self, seen: Observations, light: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Diffuse and specular radiance (N, J, 3) at unit albedo, without ambient."""
-        n, j = seen.weight.shape
-        diffuse, specular = np.empty((n, j, 3), np.float32), np.empty((n, j, 3), np.float32)
+        """Diffuse and specular radiance (N, J, 3) at unit albedo, without ambient; 0 where observations don't count."""
+        diffuse, specular = (np.zeros((*seen.weight.shape, 3), np.float32) for _ in range(2))
         appearance = self.under(light)
-        for rows in blocks(n, 2 * j):
+        for rows in blocks(*seen.weight.shape):
             part = seen.take(rows)
             d, s = appearance.shade(*_flat(part), self.occlusion(part))
-            diffuse[rows], specular[rows] = d.reshape(-1, j, 3), s.reshape(-1, j, 3)
+            diffuse[rows], specular[rows] = part.spread(d), part.spread(s)
         return diffuse, self._gloss(specular)
 
     def _gloss(self, specular: NDArray[np.float32]) -> NDArray[np.float32]:
         return specular if self.glossy else np.zeros_like(specular)
 
     def occlusion(self, seen: Observations) -> Occlusion:
-        """Shadows at the N * J observations, image after image of each texel."""
+        """Shadows at the observations that count, image after image of each texel."""
         if not (self.model.needs_shadows or self.lights):
             return Occlusion()
         steps = [self.appearance.trace(mesh, _surface_points(seen, t)) for t, mesh in enumerate(self.meshes)]
-        transfer = None
+        transfer, there = None, seen.weight > 0
         if self.model.needs_shadows:
-            transfer = VertexTransfer.joined([s.transfer for s in steps if s.transfer is not None], seen.step)
+            every = VertexTransfer.joined([s.transfer for s in steps if s.transfer is not None], seen.step)
+            transfer = VertexTransfer(every.values, every.corners[there.ravel()], every.weights[there.ravel()])
         visible = tuple(
-            np.stack(bits, axis=1)[:, seen.step].ravel() for bits in zip(*(s.visible for s in steps), strict=True)
+            np.stack(bits, axis=1)[:, seen.step][there] for bits in zip(*(s.visible for s in steps), strict=True)
         )
         return Occlusion(transfer, visible)
 
     def columns(self, seen: Observations, directions: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Diffuse and specular radiance (N, J, M) at unit albedo per unit of irradiance from single directions.
+        """Diffuse and specular radiance (M, D) of the observations that count, at unit albedo per unit of irradiance
+        from single directions (D, 3).
 
         Shadows are traced, a ray each.
         """
-        n, j = seen.weight.shape
-        visible = np.empty((len(directions), n, len(self.meshes)), bool)
+        visible = np.empty((len(directions), len(seen.weight), len(self.meshes)), bool)
         for first in range(0, len(directions), 32):
             part = directions[first : first + 32]
             number = np.arange(len(part), dtype=np.uint32)[:, None]
             for t, mesh in enumerate(self.meshes):
                 bits = mesh.scene.open_towards(seen.point[:, t], seen.normal[:, t], part)
                 visible[first : first + 32, :, t] = (bits >> number) & 1
-        shown = visible[..., seen.step].reshape(len(directions), -1)
-        diffuse, specular = (
-            each.reshape(-1, n, j).transpose(1, 2, 0)
-            for each in self.appearance.light_transfer(*_flat(seen), directions, shown)
-        )
-        return diffuse, specular
+        shown = visible[..., seen.step][:, seen.weight > 0]
+        diffuse, specular = self.appearance.light_transfer(*_flat(seen), directions, shown)
+        return diffuse.T, specular.T
 
 
 def _flat(seen: Observations) -> tuple[NDArray, NDArray]:
-    """Normals and views (N * J, 3)."""
-    return seen.image_normal.reshape(-1, 3), seen.view.reshape(-1, 3)
+    """Normals and views (M, 3) of the observations that count."""
+    there = seen.weight > 0
+    return seen.image_normal[there], seen.view[there]
 
 
 def _surface_points(seen: Observations, step: int) -> MeshPoints:

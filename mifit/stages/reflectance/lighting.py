@@ -173,14 +173,17 @@ def solve_lighting(
     if start is None:
         maps = problem.albedo.astype(np.float32), np.full(n, specular, np.float32)
         start = _initial(problem, *maps), *maps
-    state, energy, damping, outcome = start, [], 1e-3, Outcome.MAX_ITERATIONS  # type: ignore[var-annotated]
+    state, energy, outcome = start, [], Outcome.MAX_ITERATIONS  # type: ignore[var-annotated]
+    damping, failed, held = 1e-3, 0, 0
     for _ in range(iterations):
         found = Residuals.of(problem, state[0], state[1:], robust)
         if not energy and not np.isfinite(found.energy):
             best, outcome = found, Outcome.DIVERGED
             break
         if energy and not found.energy < SLACK * energy[-1]:
-            damping *= 10.0  # the step made it worse: take a shorter one from where it started
+            # The step made it worse: take a shorter one from where it started, and no longer ones for a while.
+            damping, failed = 10.0 * damping, failed + 1
+            held = failed
             if damping > 1e3:
                 outcome = Outcome.STALLED
                 break
@@ -189,7 +192,8 @@ def solve_lighting(
             settled = len(energy) > 1 and abs(energy[-2] - energy[-1]) < tolerance * energy[-2]
             # The priors' energy goes on falling where the data's, which is kept here, no longer does.
             settled |= min(energy[-STILL:]) > (1.0 - tolerance) * min(energy[:-STILL], default=np.inf)
-            best, damping = found, max(0.1 * damping, 1e-5)
+            best, held = found, max(held - 1, 0)
+            damping = damping if held else max(0.1 * damping, 1e-5)
             if settled:
                 outcome = Outcome.CONVERGED
                 break
@@ -289,8 +293,8 @@ def lighting_problem(
         seen.colour[there],
         weight[there],
         seen.clipped[there],
-        diffuse[there],
-        specular[there],
+        diffuse,
+        specular,
         albedo,
         forward.order,
     )

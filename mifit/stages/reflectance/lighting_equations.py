@@ -266,7 +266,7 @@ class LightingEquations:
                 side[block] = own[texels, c].astype(np.float32) @ own_cross
             side += left[texels].astype(np.float32) @ rest
             rest /= np.sqrt(last[texels]).astype(np.float32)[:, None]
-            square = (rest.T @ rest).astype(np.float64)
+            square = rest.T @ rest
             for c in range(3):
                 block = slice(c * k, (c + 1) * k)
                 square[block, block] += squares[c]
@@ -274,10 +274,10 @@ class LightingEquations:
 
         reduced, right = sl.block_diag(*self.system), self.right.ravel().copy()
         diagonal = np.diag(reduced).copy()
-        for square, side in on_all_cores(take, blocks(n, 8 * k)):
+        for square, side in on_all_cores(take, blocks(n, 2 * k)):
             reduced -= square
             right -= side
-        reduced += np.diag(damping * diagonal + 1e-8 * diagonal.mean())
+        reduced[np.diag_indices(3 * k)] += damping * diagonal + 1e-8 * diagonal.mean()
         return Eliminated(pivot, slope, last, reduced, right)
 
     def solve(

@@ -132,7 +132,7 @@ def exact_lighting(
     values = maps.reshape(-1, 4)[surface.texels.index]
     for chunk in surface.chunks((32 if turns else 8) * k):
         seen, y = surface.observe(chunk), values[chunk, 3][:, None, None]
-        diffuse, specular = forward.transfers(seen, found.light)
+        diffuse, specular = map(seen.spread, forward.transfers(seen, found.light))
         slopes = [y * slope for slope in _turning(forward, seen, found.light)] if turns else []
         for c in range(3):
             own = np.arange(c * k, (c + 1) * k)
@@ -166,7 +166,7 @@ def _turning(forward: Forward, seen: Observations, light: NDArray) -> list[NDArr
         change = np.zeros_like(light)
         change[band + 1] = reach
         ahead, behind = (forward.transfers(seen, light + sign * change)[1] for sign in (1.0, -1.0))
-        found.append(((ahead - behind) @ light.astype(np.float32)) * np.float32(0.5 / reach))
+        found.append(seen.spread((ahead - behind) @ light.astype(np.float32)) * np.float32(0.5 / reach))
     return found
 
 
