@@ -30,7 +30,7 @@ from mifit.stages.geometry.parameters import exponential
 from mifit.stages.surface.band import FeatureImage
 from mifit.stages.surface.sweep import Posed
 
-POINTS = 8000
+POINTS = 3000
 """Texels that are compared at the most."""
 ITERATIONS = 10
 STILL_PIXELS = 0.02
