@@ -46,15 +46,10 @@ def digest(value: object) -> str:
 
 @dataclass(frozen=True)
 class Cache:
-    """A folder of estimates, or none.
+    """A folder of estimates; without one nothing is kept.
 
-    Attributes
-    ----------
-    folder : path, optional
-        Without one nothing is kept.
-    shared : bool
-        Whether processes with other settings use the folder too, at the same time perhaps: files are then named after
-        their keys, and who needs what another is busy with waits for it.
+    Where it is ``shared``, processes with other settings use it too, at the same time perhaps: files are then named
+    after their keys, and who needs what another is busy with waits for it.
     """
 
     folder: Path | None = None

@@ -36,12 +36,8 @@ def undistort_points(camera: Camera, pixels: NDArray) -> NDArray[np.float64]:
 class Undistortion:
     """Look-up of an undistorted image in the stored one.
 
-    Attributes
-    ----------
-    x, y : (H, W) float32
-        Integer-centred source column and row of every pixel.
-    valid : (H, W) bool
-        Pixels whose source lies inside the stored image and where the distortion model is one to one.
+    ``x`` and ``y`` (H, W) are the integer-centred source column and row of every pixel; ``valid`` (H, W) are pixels
+    whose source lies inside the stored image and where the distortion model is one to one.
     """
 
     x: NDArray[np.float32]

@@ -64,20 +64,9 @@ def calibrate_boards(
 ) -> BoardCalibration:
     """Calibrate cameras that watched one board at the same time.
 
-    Parameters
-    ----------
-    sources : sequence of Source
-        One video or folder of images per camera, in step; with a single camera only its intrinsics are found.
-    board : Board
-    units : str
-        Unit of length of the poses.
-    progress : Progress
-
-    Raises
-    ------
-    InputError
-        The board is seen sharply in too few frames (the message says why the others don't count), cameras don't see it
-        together, or the solution is too uncertain to be used.
+    ``sources`` are a video or folder of images per camera, in step; with a single camera only its intrinsics are found.
+    ``units`` is the unit of length of the poses. InputError where the board is seen sharply in too few frames (the
+    message says why the others don't count), cameras don't see it together, or the solution is too uncertain.
     """
     if len({file_name(source.name) for source in sources}) != len(sources):
         raise InputError("found cameras of one name, expected different names of videos or folders")
@@ -246,22 +235,11 @@ def adjust(
 ) -> tuple[list[Watched], list[NDArray[np.float64]]]:
     """Refine lenses, camera poses and board poses together (Triggs et al., "Bundle Adjustment", 2000).
 
+    ``poses`` (4, 4) are world to camera, OpenCV axes, millimetres; the first camera's frame is the world's. The cameras
+    returned have lenses, deviations of the focal lengths from the residuals, and errors of the frames.
+
     Lenses have a prior, whose weight is that of one coordinate with the points' noise: where the board was seen all
     over the image it says nothing, and where not it keeps distortion from bending what no point has shown.
-
-    Parameters
-    ----------
-    watched : sequence of Watched
-        A start, and the points that cameras see.
-    poses : sequence of (4, 4)
-        World to camera, OpenCV axes, millimetres; the first camera's frame is the world's.
-    board : Board
-
-    Returns
-    -------
-    watched : list of Watched
-        With lenses, deviations of the focal lengths from the residuals, and errors of the frames.
-    poses : list of (4, 4)
     """
     every = [error for one in watched for error in one.errors.values()]
     noise = max(float(np.median(every)) / np.sqrt(2.0), SETTINGS.least_noise)

@@ -22,14 +22,9 @@ PRINT_DPI = 300
 
 @dataclass(frozen=True)
 class BoardPoints:
-    """Points of a board in one image.
+    """Points of a board in one image: which ones, ``ids`` (N,), ascending, and where, ``pixels`` (N, 2).
 
-    Attributes
-    ----------
-    ids : (N,) int
-        Which points of the board, ascending.
-    pixels : (N, 2) float64
-        Where they are, the first pixel's centre at (0.5, 0.5).
+    The first pixel's centre is at (0.5, 0.5).
     """
 
     ids: NDArray[np.int64]
@@ -41,18 +36,10 @@ class BoardPoints:
 
 @dataclass(frozen=True)
 class Board:
-    """A flat board with points that can be told apart.
+    """A flat board of ``columns`` x ``rows`` squares with points that can be told apart.
 
-    Attributes
-    ----------
-    columns, rows : int
-        Squares.
-    size, marker : float
-        Millimetres: side of a square and of the marker in it.
-    dictionary : str
-        OpenCV's name of the set of markers.
-    named : bool
-        Whether the user named it: then no other is tried.
+    ``size`` and ``marker`` are the sides of a square and of the marker in it, millimetres; ``dictionary`` is OpenCV's
+    name of the set of markers. Where the user ``named`` it no other is tried.
     """
 
     columns: int
@@ -64,12 +51,8 @@ class Board:
 
     @classmethod
     def parse(cls, text: str) -> Board:
-        """Read ``charuco:9x6:30:22``, a dictionary's name behind it or not.
-
-        Raises
-        ------
-        InputError
-            Another form, or sizes that no board has.
+        """Read ``charuco:9x6:30:22``, a dictionary's name behind it or not; InputError for another form or sizes that
+        no board has.
         """
         form = f"--board: found {text[:80]!r}, expected charuco:COLUMNSxROWS:SQUARE:MARKER, lengths in millimetres"
         kind, *rest = text.split(":")

@@ -32,18 +32,11 @@ LARGEST_DEVIATION = 0.02
 
 @dataclass(frozen=True)
 class DenseCalibration:
-    """Cameras of a capture and how they were found.
+    """A capture with estimated cameras, those that the landmarks gave where matches don't decide.
 
-    Attributes
-    ----------
-    capture : Capture
-        With estimated cameras; those that the landmarks gave where matches don't decide.
-    note : str
-        What a person should know, in a line.
-    deviation : float or None
-        Standard deviation of the focal length relative to it, from the normal equations; None where landmarks decided.
-    residual : float or None
-        Median distance of matches from the adjusted points, pixels; None where landmarks decided.
+    ``note`` is what a person should know, in a line. Where matches decided, ``deviation`` is the standard deviation of
+    the focal length relative to it, from the normal equations, and ``residual`` the median distance of matches from the
+    adjusted points, pixels.
     """
 
     capture: Capture
@@ -76,23 +69,9 @@ def calibrate_densely(
 ) -> DenseCalibration:
     """Find unknown focal lengths, and the poses with them, by bundle adjustment of dense matches.
 
-    Parameters
-    ----------
-    start : HeadCalibration
-        What landmarks gave for the same cameras and timesteps.
-    model : MorphableModel
-    cameras : sequence of str
-        No other camera's images are read.
-    timesteps : sequence of int
-    progress : Progress
+    ``start`` is what landmarks gave for the same cameras and timesteps; no other camera's images are read. Lengths are
+    scaled so that the head is as large as the model's that landmarks gave.
 
-    Returns
-    -------
-    DenseCalibration
-        Lengths are scaled so that the head is as large as the model's that landmarks gave.
-
-    Notes
-    -----
     One focal length serves all cameras without one whose images have the same longer side; principal points of such
     cameras are in the middle and pixels are square. Two images don't determine a focal length: both look at the head,
     and then it is a family of solutions. Images of one camera leave expressions and perspective apart too badly.

@@ -65,25 +65,9 @@ def import_colmap(
 ) -> Path:
     """Make a capture folder from the cameras of a COLMAP model; else as `mifit.capture.import_capture`.
 
-    Parameters
-    ----------
-    model : path
-        Folder with ``cameras.txt`` and ``images.txt``.
-    out : path
-        Folder to make; it must be missing or empty.
-    videos, images : sequence of path
-        Pixels in place of the photographs, for cameras of these names.
-    photos : path, optional
-        Folder of the photographs; default: the model's, or one of the three above it.
-    units : str, optional
-        Default: cm.
-    **options
-        ``every``, ``start``, ``count``, ``starts``, ``trim`` and ``progress``.
-
-    Raises
-    ------
-    InputError
-        Input that is missing, damaged, not synchronous, or doesn't fit together.
+    ``model`` is the folder with ``cameras.txt`` and ``images.txt``; ``photos`` that of the photographs, by default the
+    model's, or one of the three above it. ``videos`` and ``images`` are pixels in their place, for cameras of these
+    names.
     """
     model = Path(model)
 
@@ -105,11 +89,7 @@ def read_colmap(folder: str | Path) -> tuple[Photo, ...]:
     """Read a text model.
 
     Each view is named after the image: its folder (``left/0000.png`` -> ``left``), or its stem when it has none.
-
-    Raises
-    ------
-    InputError
-        A missing or malformed file, an unknown camera model, or a pose that isn't one.
+    InputError for a missing or malformed file, an unknown camera model, or a pose that isn't one.
     """
     folder = Path(folder)
     cameras: dict[str, _Camera] = {}
@@ -177,10 +157,7 @@ def _lines(path: Path, every: int = 1) -> Iterator[tuple[str, list[str]]]:
 def find_photo(name: str, folders: Sequence[Path]) -> Path:
     """The file of a photograph, in one of the folders or its ``images``; its name may lack the suffix.
 
-    Raises
-    ------
-    InputError
-        There is none.
+    InputError where there is none.
     """
     relative = PurePosixPath(name.replace("\\", "/"))
     last = PurePosixPath(relative.name)
@@ -217,12 +194,8 @@ def group_photos(photos: Iterable[Photo]) -> dict[str, list[Photo]]:
     """Photographs by camera, each in the order of the names.
 
     Photographs of one folder with one pose are the timesteps of one camera, called after the folder. Where poses differ
-    a camera has moved about a still head: each photograph is a camera of its own, called after its file.
-
-    Raises
-    ------
-    InputError
-        Two photographs that would have one name.
+    a camera has moved about a still head: each photograph is a camera of its own, called after its file. InputError for
+    two photographs that would have one name.
     """
     folders: dict[str, list[Photo]] = {}
     for photo in photos:

@@ -43,21 +43,11 @@ def complete(  # noqa: PLR0913
     expression_bounds: NDArray | None = None,
     source: Path | None = None,
 ) -> MorphableModel:
-    """Build a model; what is None is made.
+    """Build a model of what ``MorphableModel`` holds; what is None is made.
 
-    Parameters
-    ----------
-    name, mean, faces, identity, expression, unit_mm
-        As in ``MorphableModel``.
-    albedo : ((V, 3), (V, 3, Ka)), optional
-        Mean and modes, linear.
-    uv : ((T, 2), (F, 3)), optional
-        Texture vertices and their indices.
-    landmarks, face_mask, expression_names, expression_bounds : optional
-        As in ``MorphableModel``.
-    source : Path, optional
-        The model's file: a file ``<name>.landmarks.json`` beside it (68 vertex indices) takes precedence over
-        landmarks found or given.
+    ``albedo`` ((V, 3), (V, 3, Ka)) are mean and modes, linear; ``uv`` ((T, 2), (F, 3)) texture vertices and their
+    indices. ``source`` is the model's file: ``<name>.landmarks.json`` beside it (68 vertex indices) takes precedence
+    over landmarks found or given.
     """
     computed = albedo is None or uv is None or landmarks is None
     given = [np.asarray(array) for pair in (albedo, uv) if pair is not None for array in pair]

@@ -39,33 +39,13 @@ _REGIONS = {
 
 
 def skin_model(
-    mean: NDArray,
-    faces_used: NDArray,
-    landmarks: NDArray,
-    unit_mm: float,
-    count: int,
+    mean: NDArray, faces_used: NDArray, landmarks: NDArray, unit_mm: float, count: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean albedo and albedo modes for a face surface.
+    """Mean albedo (V, 3), linear reflectance, and albedo modes (V, 3, count) for a face surface.
 
-    Parameters
-    ----------
-    mean : (V, 3) float
-        Vertices; y up, nose along +z.
-    faces_used : (F, 3) int
-        Faces of the photometric region, where the random fields live.
-    landmarks : (68,) int
-        iBUG vertices.
-    unit_mm : float
-        Millimetres per unit of ``mean``.
-    count : int
-        Albedo modes to make.
-
-    Returns
-    -------
-    mean_albedo : (V, 3) float32
-        Linear reflectance.
-    modes : (V, 3, count) float32
-        Orthogonal, premultiplied by their standard deviations.
+    ``mean`` (V, 3) has y up and the nose along +z, in units of ``unit_mm`` millimetres; ``faces_used`` (F, 3) are those
+    of the photometric region, where the random fields live; ``landmarks`` (68,) iBUG vertices. Modes are orthogonal,
+    premultiplied by their standard deviations.
     """
     points = np.asarray(mean, dtype=np.float64) * unit_mm
     masks = region_masks(points, landmarks)
@@ -99,9 +79,7 @@ def skin_model(
 def region_masks(points: NDArray, landmarks: NDArray) -> dict[str, NDArray[np.float64]]:
     """Soft masks (V,) in 0..1 of the regions of a face, from vertices in mm and the 68 landmarks."""
     p = points[landmarks]
-    eye = (
-        float(np.linalg.norm(p[36] - p[45])) / 90.0
-    )  # sizes below are for eyes 90 mm apart, outer corner to outer corner
+    eye = float(np.linalg.norm(p[36] - p[45])) / 90.0  # sizes below are for outer corners of eyes 90 mm apart
     lips = _inside(points[:, :2], p[48:60, :2], 1.2 * eye) * (1 - _inside(points[:, :2], p[60:68, :2], 0.3 * eye))
     depth = points[:, 2] - p[48:60, 2].min()
     masks = {"lips": lips * _step(depth, -12.0 * eye, 4.0 * eye)}

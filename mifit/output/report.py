@@ -55,16 +55,8 @@ def write_report(
 ) -> Path:
     """Write ``report.html`` into a folder, whole or not at all; returns the file.
 
-    Parameters
-    ----------
-    folder : path
-    result : Reconstruction
-    capture : Capture
-        Only the fitted cameras are read, and the evaluated one when an evaluation is given.
-    evaluation : dict, optional
-        What `evaluate` returned; adds the comparison of that view.
-    comparisons : sequence of Comparison
-        Those of the evaluation, where they are at hand; others are rendered.
+    ``evaluation``, what `evaluate` returned, adds the comparison of that view; ``comparisons`` are those of it that are
+    at hand, others are rendered. Only the fitted cameras are read, and the evaluated one.
     """
     capture = result.seen(capture)
     shown = result.timesteps[:SHOWN_TIMESTEPS]

@@ -69,24 +69,14 @@ def score(
     where the capture has a true mesh, what the fitted cameras see of it) and ``whole`` (all that the true mesh covers;
     without one, every valid pixel).
 
-    Parameters
-    ----------
-    fitted : sequence of str, optional
-        Cameras that the program was given; default: the first two. Views of others count as held out.
-    model : MorphableModel, optional
-        Gives the triangles of a truth that has vertices alone.
+    The cameras that the program was given, ``fitted``, are by default the first two; views of others count as held out.
+    ``model`` gives the triangles of a truth that has vertices alone.
 
-    Returns
-    -------
-    dict
-        ``views``: per camera, and for ``held_out`` together, by region what `output.compare.Errors.figures` gives;
-        ``relit``: PSNR per environment and their mean; ``passes``: per camera what `output.compare.separation` gives;
-        ``meshes``: distances (mm) from true points that all fitted cameras see; ``ignored``: files without a meaning.
+    Returns ``views``: per camera, and for ``held_out`` together, by region what `output.compare.Errors.figures` gives;
+    ``relit``: PSNR per environment and their mean; ``passes``: per camera what `output.compare.separation` gives;
+    ``meshes``: distances (mm) from true points that all fitted cameras see; ``ignored``: files without a meaning.
 
-    Raises
-    ------
-    InputError
-        No folder, nothing in it to score, an image of another size, or a truth that is missing.
+    InputError for no folder, nothing in it to score, an image of another size, or a truth that is missing.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -293,10 +293,7 @@ def _exposure(tracer: PathTracer, subject: _Subject, camera: Camera) -> float:
 def exposure_of(image: NDArray) -> float:
     """Factor that puts the brightest skin of an RGBA image, highlights aside, near the sensor's upper end.
 
-    Raises
-    ------
-    InputError
-        Nothing in it is lit.
+    InputError where nothing in it is lit.
     """
     seen = image[image[..., 3] > 0.9]
     level = float(np.percentile(seen[:, :3].max(axis=1), 97)) if len(seen) else 0.0

@@ -30,12 +30,9 @@ DENSITY = 0.66
 
 @cache
 def builtin_model(coarse: bool = False) -> MorphableModel:
-    """Return the built-in model, made now, read from the cache folder, or still in memory.
+    """The built-in model, made now, read from the cache folder, or still in memory.
 
-    Parameters
-    ----------
-    coarse : bool
-        About 9 000 instead of 15 000 vertices.
+    It has about 15 000 vertices, or 9 000 when ``coarse``.
     """
     path = cache_folder() / f"builtin-{'coarse' if coarse else 'full'}-{_DIGEST}.npz"
     if path.is_file():

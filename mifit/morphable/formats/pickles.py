@@ -201,11 +201,8 @@ def is_pickle(path: Path) -> bool:
 def read_pickle(path: Path) -> dict[str, object]:
     """Read a pickled dictionary of arrays; what isn't an array comes as `Instance`.
 
-    Raises
-    ------
-    InputError
-        The pickle names anything but array types (the name is in the message; nothing was run), is truncated, or
-        does not hold a dictionary.
+    InputError where the pickle names anything but array types (the name is in the message; nothing was run), is
+    truncated, or does not hold a dictionary.
     """
     data = read_bytes(path, MAX_MODEL_BYTES, "pickle")
     try:
