@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.capture.landmark_files import COUNT, Landmarks, read_landmarks
-from mifit.capture.lens import Undistortion, undistort_points
+from mifit.capture.lens import undistort_points, undistortion
 from mifit.capture.transforms import UNITS_MM, Shot, View, read_transforms
 from mifit.core.camera import Camera
 from mifit.core.files import file_digest, note_read
@@ -59,7 +59,6 @@ class _Cache:
     def __init__(self, limit: int):
         self.limit, self.used = limit, 0
         self._frames: OrderedDict[tuple[str, int], Frame] = OrderedDict()
-        self._lenses: dict[str, Undistortion] = {}
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -82,12 +81,6 @@ class _Cache:
             self.used += frame.nbytes
             while self.used > self.limit:
                 self.used -= self._frames.popitem(last=False)[1].nbytes
-
-    def lens(self, camera: Camera) -> Undistortion:
-        with self._lock:
-            if camera.name not in self._lenses:
-                self._lenses[camera.name] = Undistortion.of(camera)
-            return self._lenses[camera.name]
 
 
 @dataclass(frozen=True)
@@ -274,7 +267,7 @@ class Capture:
         if view.gain != (1.0, 1.0, 1.0):
             image = image * np.array(view.gain, dtype=np.float32)
         if view.intrinsics is not None and view.distortion:
-            lens = self._cache.lens(_lens_camera(view))
+            lens = undistortion(_lens_camera(view))
             image = lens.apply(image)
             valid = np.asarray(lens.valid & (lens.apply(valid.astype(np.float32)) > 0.999))
             clipped = np.asarray(lens.apply(clipped.astype(np.float32)) > 0.001)

@@ -20,7 +20,7 @@ from mifit.capture.sources import Source
 from mifit.capture.stereo import write_stereo
 from mifit.capture.transforms import UNITS_MM, Shot, View, write_transforms
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera, rigid
-from mifit.core.files import file_name, write_json
+from mifit.core.files import Document, file_name, write_json
 from mifit.errors import InputError
 from mifit.extras.board_camera import ALIKE, CONTRADICTS, SETTINGS, Watched, calibrate_one, look
 from mifit.extras.boards import Board, grey_image
@@ -260,9 +260,6 @@ def adjust(
         [np.tile([1e3] * 4 + [1, 1, 0.1, 0.1, 1], count), np.tile([1, 1, 1, 1e3, 1e3, 1e3], count - 1 + len(frames))]
     )
 
-    def residuals(x: NDArray) -> NDArray:
-        return system(x)[0]
-
     def system(x: NDArray) -> tuple[NDArray, NDArray]:
         """Residuals and their derivatives by the scaled unknowns."""
         x = x * scale
@@ -282,17 +279,14 @@ def adjust(
             if c:
                 slopes[row, at : at + POSE] = by[:, :6] @ by_camera
         for c, one in enumerate(watched):
-            row, columns = (
-                slice(ends[-1] + (LENS - 1) * c, ends[-1] + (LENS - 1) * (c + 1)),
-                slice(LENS * c, LENS * (c + 1)),
-            )
+            prior = ends[-1] + (LENS - 1) * c
+            row, columns = slice(prior, prior + LENS - 1), slice(LENS * c, LENS * (c + 1))
             value, slope = _unlikely(x[columns], one.size)
             out[row], slopes[row, columns] = noise * value, noise * slope
         return out, slopes * scale
 
-    solution = least_squares(
-        residuals, start / scale, jac=lambda x: system(x)[1], method="lm", xtol=1e-12, ftol=1e-12, max_nfev=60
-    )
+    value, slope = (lambda x: system(x)[0]), (lambda x: system(x)[1])
+    solution = least_squares(value, start / scale, jac=slope, method="lm", xtol=1e-12, ftol=1e-12, max_nfev=60)
     found_x = solution.x * scale
     free = max(len(solution.fun) - len(solution.x), 1)
     covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * (solution.fun @ solution.fun) / free
@@ -303,15 +297,10 @@ def adjust(
     adjusted = []
     for c, one in enumerate(watched):
         lens = found_x[LENS * c : LENS * (c + 1)]
-        adjusted.append(
-            dataclasses.replace(
-                one,
-                matrix=_intrinsics(lens),
-                distortion=tuple(lens[4:].tolist()),
-                focal_deviation=float(deviations[LENS * c : LENS * c + 2].max() / lens[0]),
-                errors=errors[c],
-            )
-        )
+        matrix, distortion = _intrinsics(lens), tuple(lens[4:].tolist())
+        deviation = float(deviations[LENS * c : LENS * c + 2].max() / lens[0])
+        new: Document = {"matrix": matrix, "distortion": distortion, "focal_deviation": deviation, "errors": errors[c]}
+        adjusted.append(dataclasses.replace(one, **new))
     moved = found_x[LENS * count : LENS * count + POSE * (count - 1)].reshape(-1, POSE)
     return adjusted, [np.eye(4), *(_matrix(v) for v in moved)]
 

@@ -37,8 +37,6 @@ _MODELS = {  # where fx, fy, cx, cy and OpenCV's distortion coefficients are amo
     "FULL_OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11)),
 }
 
-_Camera = tuple[int, int, tuple[float, float, float, float], tuple[float, ...]]
-
 
 @dataclass(frozen=True)
 class Photo:
@@ -92,11 +90,11 @@ def read_colmap(folder: str | Path) -> tuple[Photo, ...]:
     InputError for a missing or malformed file, an unknown camera model, or a pose that isn't one.
     """
     folder = Path(folder)
-    cameras: dict[str, _Camera] = {}
+    cameras: dict[str, View] = {}
     for where, words in _lines(folder / "cameras.txt"):
         if len(words) < 5:
             raise InputError(f"{where}: found {len(words)} fields, expected CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS")
-        cameras[words[0]] = _camera(where, words[1], words[2:])
+        cameras[words[0]] = _camera(where, words[0], words[1], words[2:])
     photos = []
     for where, words in _lines(folder / "images.txt", every=2):
         if len(words) < 10:
@@ -108,15 +106,14 @@ def read_colmap(folder: str | Path) -> tuple[Photo, ...]:
         if abs(length - 1.0) > 1e-3:
             raise InputError(f"{where}: found a quaternion of length {length:.4g}, expected 1")
         matrix = rigid(Rotation.from_quat([*pose[1:4], pose[0]]).as_matrix(), pose[4:])
-        columns, rows, intrinsics, distortion = cameras[key]
-        photos.append(Photo(name, View(view_name(name), columns, rows, intrinsics, distortion, matrix)))
+        photos.append(Photo(name, dataclasses.replace(cameras[key], name=view_name(name), world_to_camera=matrix)))
     if not photos:
         raise InputError(f"{folder / 'images.txt'}: found no image with a pose, expected at least one")
     return tuple(photos)
 
 
-def _camera(where: str, model: str, words: list[str]) -> _Camera:
-    """Width, height, intrinsics and OpenCV's distortion of one camera entry: width, height and its parameters."""
+def _camera(where: str, key: str, model: str, words: list[str]) -> View:
+    """The view of one camera entry, still without a pose: its width, height and parameters."""
     if model not in _MODELS:
         raise InputError(f"{where}: found camera model {model!r}, expected one of {', '.join(_MODELS)}")
     pinhole, lens = _MODELS[model]
@@ -135,7 +132,7 @@ def _camera(where: str, model: str, words: list[str]) -> _Camera:
     distortion = tuple(parameters[i] for i in lens)
     if len(distortion) in (1, 2):
         distortion = (*distortion, 0.0, 0.0, 0.0)[:4]
-    return int(width), int(height), (fx, fy, cx, cy), distortion if any(distortion) else ()
+    return View(key, int(width), int(height), (fx, fy, cx, cy), distortion if any(distortion) else ())
 
 
 def _lines(path: Path, every: int = 1) -> Iterator[tuple[str, list[str]]]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from mifit.core.image import srgb_to_linear
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
 from mifit.morphable.model import MorphableModel
@@ -145,9 +146,10 @@ def find_face_mask(mean: NDArray, faces: NDArray, landmarks: NDArray) -> NDArray
 def srgb_albedo(mean: NDArray, modes: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Linear mean and modes from sRGB-encoded ones in 0..1: modes by the derivative at the mean."""
     m = np.clip(np.asarray(mean, dtype=np.float64), 0.0, 1.0)
-    linear = np.where(m <= 0.04045, m / 12.92, ((m + 0.055) / 1.055) ** 2.4)
     slope = np.where(m <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((m + 0.055) / 1.055) ** 1.4)
-    return linear.astype(np.float32), (slope[..., None].astype(np.float32) * modes.astype(np.float32, copy=False))
+    return srgb_to_linear(m).astype(np.float32), (
+        slope[..., None].astype(np.float32) * modes.astype(np.float32, copy=False)
+    )
 
 
 def single(values: NDArray) -> NDArray[np.float32]:

@@ -61,14 +61,16 @@ def compress(columns: NDArray[np.float32], count: int) -> NDArray[np.float32]:
     return modes * np.where(modes[first, np.arange(modes.shape[1])] < 0, -1.0, 1.0).astype(np.float32)
 
 
-SYMMETRIC = ((75.0, 24, (3.2, 3.2, 3.8)), (34.0, 70, (2.4, 2.5, 2.8)), (15.0, 190, (1.3, 1.3, 1.5)))
-"""Correlation length in mm, inducing points, and deviation in mm along x, y, z of the deformations of either parity.
+DEFORMATIONS = {
+    1: ((75.0, 24, (3.2, 3.2, 3.8)), (34.0, 70, (2.4, 2.5, 2.8)), (15.0, 190, (1.3, 1.3, 1.5))),
+    -1: ((55.0, 24, (1.0, 0.9, 1.1)),),
+}
+"""Of the deformations of either parity: correlation length in mm, inducing points, and deviation in mm along x, y, z.
 
 With these, lengths of the face deviate as people's do: its breadth by 7 mm, nasion to chin 7, nasion to the nose's base
 4, the nose's protrusion 3, the mouth's width 4 (Zhuang and Bradtmiller, "Head-and-face anthropometric survey of U.S.
 respirator users", 2005).
 """
-ASYMMETRIC = ((55.0, 24, (1.0, 0.9, 1.1)),)
 STRETCH = 0.035
 """Deviation of the relative width, height and depth of the whole."""
 
@@ -79,7 +81,7 @@ def deformation_modes(points: NDArray, where: NDArray, count: int) -> NDArray[np
     ``where`` (V,) are vertices among which the process has its inducing points.
     """
     blocks: list[tuple[int, NDArray]] = []  # axis, modes (V, k); blocks are orthogonal to one another
-    for parity, kernels in ((1, SYMMETRIC), (-1, ASYMMETRIC)):
+    for parity, kernels in DEFORMATIONS.items():
         # a symmetric deformation has a mirror-odd x and mirror-even y and z
         fields_by_axis = {
             p: [field_modes(points, scale, inducing, p, where) for scale, inducing, _ in kernels] for p in (1, -1)

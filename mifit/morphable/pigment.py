@@ -22,12 +22,12 @@ MELANIN = np.array([1.0, 1.2, 1.4])
 HAEMOGLOBIN = np.array([0.12, 1.0, 0.72])
 """Absorption of the two pigments in the three channels, per unit of log reflectance."""
 
-_WHOLE_FACE = {"melanin": 0.27, "haemoglobin": 0.085}
 _FIELDS = ((35.0, 40, 0.07, 0.08), (14.0, 110, 0.045, 0.05))
 """Correlation length in mm, inducing points, deviation of melanin, deviation of haemoglobin."""
 
 _REGIONS = {
     # region: (mean melanin, mean haemoglobin, deviation of melanin, deviation of haemoglobin)
+    "whole": (0.0, 0.0, 0.27, 0.085),
     "lips": (0.12, 0.42, 0.10, 0.16),
     "brows": (0.75, 0.05, 0.22, 0.02),
     "cheeks": (0.0, 0.10, 0.03, 0.09),
@@ -56,11 +56,8 @@ def skin_model(
     n = len(points)
     used = np.zeros(n, dtype=bool)
     used[faces_used] = True
-    fields_m = [np.full((n, 1), _WHOLE_FACE["melanin"])]
-    fields_h = [np.full((n, 1), _WHOLE_FACE["haemoglobin"])]
-    for region, (_, _, sigma_m, sigma_h) in _REGIONS.items():
-        fields_m.append(masks[region][:, None] * sigma_m)
-        fields_h.append(masks[region][:, None] * sigma_h)
+    fields_m: list[NDArray] = [masks[region][:, None] * v[2] for region, v in _REGIONS.items()]
+    fields_h: list[NDArray] = [masks[region][:, None] * v[3] for region, v in _REGIONS.items()]
     for scale, inducing, sigma_m, sigma_h in _FIELDS:
         field = field_modes(points, scale, inducing, where=used)
         fields_m.append(field * sigma_m)
@@ -82,7 +79,7 @@ def region_masks(points: NDArray, landmarks: NDArray) -> dict[str, NDArray[np.fl
     eye = float(np.linalg.norm(p[36] - p[45])) / 90.0  # sizes below are for outer corners of eyes 90 mm apart
     lips = _inside(points[:, :2], p[48:60, :2], 1.2 * eye) * (1 - _inside(points[:, :2], p[60:68, :2], 0.3 * eye))
     depth = points[:, 2] - p[48:60, 2].min()
-    masks = {"lips": lips * _step(depth, -12.0 * eye, 4.0 * eye)}
+    masks = {"whole": np.ones(len(points)), "lips": lips * _step(depth, -12.0 * eye, 4.0 * eye)}
 
     brows = np.zeros(len(points))
     for first in (17, 22):

@@ -106,10 +106,8 @@ def _read_maps(files: Mapping[str, str | Path]) -> dict[str, NDArray[np.float32]
     for name, path in files.items():
         image = read_image(path)
         if name != "albedo":  # no colours: the codes themselves are the values
-            image = (
-                linear_to_srgb(np.clip(image, 0.0, 1.0)) if Path(path).suffix.lower() not in (".exr", ".hdr") else image
-            )
-            image = image.mean(axis=-1)
+            linear = Path(path).suffix.lower() in (".exr", ".hdr")
+            image = (image if linear else linear_to_srgb(np.clip(image, 0.0, 1.0))).mean(axis=-1)
         size = min(1024, min(image.shape[:2]))
         maps[name] = _resized(image, size)
     size = len(maps["albedo"])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
 from mifit.core.mesh import face_cross
+from mifit.core.mesh_solve import cotangent_laplacian
 from mifit.morphable.builtin import sculpt
 from mifit.morphable.builtin.action_units import (
     CENTRAL,
@@ -37,8 +38,8 @@ def expression_modes(template: Template) -> tuple[NDArray[np.float32], tuple[str
     """Modes (V, 3, 77) in mm, premultiplied by their deviations, with their names and bounds (77, 2)."""
     influence, names = _influences(template)
     index = {n: k for k, n in enumerate(names)}
-    anchors = _anchor_positions(template)
     v = template.vertices
+    anchors = v[list(_anchor_vertices(template).values())]
     left = sculpt.smooth_step(v[:, 0], -9.0, 9.0)[:, None]
     modes: dict[str, NDArray] = {}
     bounds: dict[str, tuple[float, float]] = {}
@@ -113,16 +114,12 @@ def _anchor_vertices(template: Template) -> dict[str, int]:
     return out
 
 
-def _anchor_positions(template: Template) -> NDArray[np.float64]:
-    return template.vertices[list(_anchor_vertices(template).values())]
-
-
 def _influences(template: Template) -> tuple[NDArray[np.float64], list[str]]:
     """(V, A) biharmonic influence of every named point, and the points' names."""
     anchors = _anchor_vertices(template)
     v = template.vertices
     faces = template.faces
-    weights = _cotangents(v, faces)
+    weights = cotangent_laplacian(v, faces, (-5.0, 50.0))
     area = np.zeros(len(v))
     np.add.at(area, faces.ravel(), np.repeat(np.linalg.norm(face_cross(v, faces), axis=1) / 6.0, 3))
     bilaplacian = (weights @ sp.diags(1.0 / np.maximum(area, 1e-6)) @ weights).tocsc()
@@ -141,22 +138,6 @@ def _influences(template: Template) -> tuple[NDArray[np.float64], list[str]]:
         columns = np.searchsorted(template.grid[template.mouth_row], template.upper_lip)
         out[margin] = out[template.grid[template.mouth_row + row, columns]]
     return out, list(anchors)
-
-
-def _cotangents(v: NDArray, faces: NDArray) -> sp.csr_matrix:
-    """Cotangent Laplacian (V, V), positive semi-definite."""
-    i, j, w = [], [], []
-    for k in range(3):
-        a, b, c = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
-        u, s = v[b] - v[a], v[c] - v[a]
-        cot = (u * s).sum(1) / np.maximum(np.linalg.norm(np.cross(u, s), axis=1), 1e-9)
-        i.append(b)
-        j.append(c)
-        w.append(0.5 * np.clip(cot, -5.0, 50.0))
-    i_, j_, w_ = map(np.concatenate, (i, j, w))
-    m = sp.coo_matrix((w_, (i_, j_)), shape=(len(v), len(v)))
-    m = (m + m.T).tocsr()
-    return (sp.diags(np.asarray(m.sum(1)).ravel()) - m).tocsr()
 
 
 def _rotate_x(p: NDArray, degrees: float) -> NDArray:
