@@ -14,17 +14,7 @@ from scipy.sparse.linalg import splu
 
 from mifit.core.mesh import face_cross
 from mifit.core.mesh_solve import cotangent_laplacian
-from mifit.morphable.builtin import sculpt
-from mifit.morphable.builtin.action_units import (
-    CENTRAL,
-    JAW_SHARE,
-    LOCAL,
-    LOCAL_LIPS,
-    LOCALISED,
-    PAIRED,
-    POINTS,
-    Motion,
-)
+from mifit.morphable.builtin import action_units, sculpt
 from mifit.morphable.builtin.landmarks import PointFinder
 from mifit.morphable.builtin.template import Template
 
@@ -44,7 +34,7 @@ def expression_modes(template: Template) -> tuple[NDArray[np.float32], tuple[str
     modes: dict[str, NDArray] = {}
     bounds: dict[str, tuple[float, float]] = {}
 
-    def displaced(motion: Motion) -> NDArray:
+    def displaced(motion: action_units.Motion) -> NDArray:
         d = np.zeros((len(names), 3))
         for point, vector in motion.items():
             for side in (1, -1):
@@ -55,15 +45,15 @@ def expression_modes(template: Template) -> tuple[NDArray[np.float32], tuple[str
                 d[index[point]] = vector
         return influence @ d
 
-    for name, motion in PAIRED.items():
+    for name, motion in action_units.PAIRED.items():
         field = displaced(motion)
         modes[f"{name}_L"], modes[f"{name}_R"] = field * left, field * (1 - left)
-    for name, motion in CENTRAL.items():
+    for name, motion in action_units.CENTRAL.items():
         modes[name] = displaced(motion)
     for name in modes:
         bounds[name] = (0.0, ACTION_BOUND)
 
-    share = np.array([JAW_SHARE.get(n.rstrip("+-"), 0.0) for n in names])
+    share = np.array([action_units.JAW_SHARE.get(n.rstrip("+-"), 0.0) for n in names])
     modes["jawOpen"] = influence @ (share[:, None] * (_rotate_x(anchors - _TMJ, 17.0) + _TMJ - anchors))
     bounds["jawOpen"] = (0.0, ACTION_BOUND)
     modes["jawForward"] = influence @ (share[:, None] * np.array([0.0, 0.0, 5.0]))
@@ -81,10 +71,10 @@ def expression_modes(template: Template) -> tuple[NDArray[np.float32], tuple[str
         bounds[f"{name}_L"] = bounds[f"{name}_R"] = (0.0, ACTION_BOUND)
 
     out = {n: m / ACTION_BOUND for n, m in modes.items()}
-    for point, axis, parity in LOCALISED:
+    for point, axis, parity in action_units.LOCALISED:
         name = f"local_{point}_{axis}{'' if parity == 1 else '_odd'}"
         lips = axis == "y" and point == "up_out"
-        vector = (LOCAL_LIPS if lips else LOCAL) * np.eye(3)["xyz".index(axis)]
+        vector = (action_units.LOCAL_LIPS if lips else action_units.LOCAL) * np.eye(3)["xyz".index(axis)]
         d = np.zeros((len(names), 3))
         if point in index:
             d[index[point]] = vector
@@ -102,7 +92,7 @@ def _anchor_vertices(template: Template) -> dict[str, int]:
     find = PointFinder(template)
     rows = {"eye": template.eye_row, "mouth": template.mouth_row}
     out: dict[str, int] = {}
-    for name, place in POINTS.items():
+    for name, place in action_units.POINTS.items():
         if isinstance(place[0], str):
             k = find.in_row(rows[place[0]] + place[1], place[2])
         else:
