@@ -39,13 +39,7 @@ from mifit.config import (
 )
 from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
-from mifit.core.estimate import (
-    GeometryEstimate,
-    MeshEstimate,
-    NormalsEstimate,
-    ReflectanceEstimate,
-    ResidualEstimate,
-)
+from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, ResidualEstimate
 from mifit.core.files import Document
 from mifit.core.process import one_blas_thread
 from mifit.errors import InputError

@@ -57,10 +57,7 @@ def open_detector(name: str | None = None) -> Detector:
 
 def available() -> dict[str, bool]:
     """Which detectors would start without installing anything."""
-    return {
-        "mediapipe": not missing(),
-        "face-alignment": importlib.util.find_spec("face_alignment") is not None,
-    }
+    return {"mediapipe": not missing(), "face-alignment": importlib.util.find_spec("face_alignment") is not None}
 
 
 class FaceAlignment:

@@ -113,12 +113,7 @@ def refine(
 
 
 def _followed(
-    result: Reconstruction,
-    capture: Capture,
-    further: Sequence[int],
-    config: FitConfig,
-    seed: int,
-    progress: Progress,
+    result: Reconstruction, capture: Capture, further: Sequence[int], config: FitConfig, seed: int, progress: Progress
 ) -> tuple[GeometryEstimate, dict[int, str]]:
     """Geometry of the fitted and of further timesteps, and why some of these are left out."""
     cameras, fitted = [camera.name for camera in result.cameras], result.fitted

@@ -28,11 +28,7 @@ class Registration:
 
 
 def register(
-    model: MorphableModel,
-    vertices: NDArray,
-    faces: NDArray,
-    landmarks: NDArray | None = None,
-    iterations: int = 20,
+    model: MorphableModel, vertices: NDArray, faces: NDArray, landmarks: NDArray | None = None, iterations: int = 20
 ) -> Registration:
     """Fit identity and pose to a surface.
 

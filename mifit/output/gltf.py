@@ -187,22 +187,14 @@ def write_glb(
 
 
 def _primitive(
-    out: _Buffer,
-    part: SplitMesh,
-    base: NDArray,
-    normals: NDArray,
-    codes: NDArray,
-    albedo: NDArray | None,
+    out: _Buffer, part: SplitMesh, base: NDArray, normals: NDArray, codes: NDArray, albedo: NDArray | None
 ) -> Document:
     """One primitive: with texture coordinates and tangents, or with vertex albedo (V, 3) where there are no maps.
 
     ``codes`` (V, 3, K) are the morph targets in steps.
     """
     n = normals[part.origin]
-    attributes = {
-        "POSITION": out.accessor(base[part.origin], "<f4", bounds=True),
-        "NORMAL": out.accessor(n, "<f4"),
-    }
+    attributes = {"POSITION": out.accessor(base[part.origin], "<f4", bounds=True), "NORMAL": out.accessor(n, "<f4")}
     if albedo is None:
         tangent, sign = tangents(base[part.origin], n, part.uv, part.faces)
         attributes["TANGENT"] = out.accessor(np.column_stack([tangent, sign]), "<f4")

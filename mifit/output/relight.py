@@ -35,10 +35,7 @@ Exposure = float | Literal["auto"]
 
 
 def relit(
-    result: Reconstruction,
-    lighting: Lighting,
-    rotations: Sequence[float | NDArray] = (0.0,),
-    exposure: Exposure = 1.0,
+    result: Reconstruction, lighting: Lighting, rotations: Sequence[float | NDArray] = (0.0,), exposure: Exposure = 1.0
 ) -> list[Reconstruction]:
     """The face under a lighting that is turned in several ways; see `Reconstruction.relight`."""
     reflectance = result.reflectance
