@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mifit.core.camera import Camera
 from mifit.core.files import Document
 from mifit.errors import InputError
-from mifit.render.description import Parameter, to_mitsuba
+from mifit.render.description import to_mitsuba
 from mifit.render.plugins import register_plugins
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def render_scene(
     return np.array(image, dtype=np.float32)
 
 
-def sensor_description(camera: Camera, spp: int | Parameter = 16) -> Document:
+def sensor_description(camera: Camera, spp: int = 16) -> Document:
     """The sensor of an undistorted camera, as a plain dictionary (`render.description`).
 
     Square pixels give Mitsuba's ``perspective``, others mifit's ``pinhole``. ``spp`` samples are drawn per pixel.
