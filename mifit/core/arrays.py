@@ -242,7 +242,7 @@ def content_key(*values: object) -> bytes:
     for value in values:
         if isinstance(value, np.ndarray):
             digest.update(f"{value.shape}{value.dtype}".encode())
-            digest.update(np.ascontiguousarray(value).tobytes())
+            digest.update(np.ascontiguousarray(value).data)
         else:
             digest.update(repr(value).encode())
     return digest.digest()

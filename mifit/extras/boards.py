@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mifit.core.files import replacing
 from mifit.core.image import decode_image, to_8_bit
@@ -155,9 +156,7 @@ def _spacing(pixels: NDArray) -> float:
     """Median distance of a point to its nearest neighbour."""
     if len(pixels) < 2:
         return 10.0
-    distance = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
-    np.fill_diagonal(distance, np.inf)
-    return float(np.median(distance.min(axis=1)))
+    return float(np.median(cKDTree(pixels).query(pixels, 2)[0][:, 1]))
 
 
 def edge_width(grey: NDArray[np.uint8], found: BoardPoints) -> float:

@@ -6,7 +6,6 @@ unwrapping of the face area, the albedo from the pigment model.
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from mifit.core.arrays import content_key
 from mifit.core.image import srgb_to_linear
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
@@ -86,17 +86,11 @@ def complete(  # noqa: PLR0913
         unit_mm=unit_mm,
         expression_names=expression_names,
         expression_bounds=expression_bounds,  # type: ignore[arg-type]
-        fingerprint=fingerprint(mean, faces, identity, expression, landmarks, *given) if computed else "",
+        # What was read, and the code that computes the rest from it.
+        fingerprint=content_key(_CODE, mean, faces, identity, expression, landmarks, *given).hex()[:32]
+        if computed
+        else "",
     )
-
-
-def fingerprint(*arrays: NDArray) -> str:
-    """Identify a model by the arrays that were read and the code that computes the others from them."""
-    h = hashlib.blake2b(_CODE, digest_size=16)
-    for array in arrays:
-        h.update(f"{array.shape}{array.dtype}".encode())
-        h.update(np.ascontiguousarray(array).data)
-    return h.hexdigest()
 
 
 def check_mesh(name: str, mean: NDArray, faces: NDArray, landmarks: NDArray | None) -> None:
