@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -11,7 +12,6 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from mifit.core.arrays import content_key
 from mifit.core.calls import finite, whole
 from mifit.core.limits import MAX_NUMBER
 from mifit.core.mesh import face_cross
@@ -300,8 +300,15 @@ class MorphableModel:
     @cached_property
     def _content(self) -> str:
         """Hexadecimal digest of all values but the name and the fingerprint."""
-        names = [f.name for f in fields(self) if f.name not in ("name", "fingerprint")]
-        return content_key(names, *(getattr(self, name) for name in names)).hex()[:32]
+        h = hashlib.blake2b(digest_size=16)
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, np.ndarray):
+                h.update(f"{f.name}{value.shape}{value.dtype}".encode())
+                h.update(value.data)
+            elif f.name != "name":
+                h.update(f"{f.name}={('' if f.name == 'fingerprint' else value)!r}".encode())
+        return h.hexdigest()
 
     @property
     def source(self) -> str:
