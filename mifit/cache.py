@@ -23,7 +23,7 @@ import numpy as np
 
 from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.lobe import Lobe
-from mifit.core.arrays import read_npz
+from mifit.core.arrays import content_key, read_npz
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import Report
 from mifit.core.files import replacing
@@ -46,15 +46,10 @@ def digest(value: object) -> str:
 
 @dataclass(frozen=True)
 class Cache:
-    """A folder of estimates, or none.
+    """A folder of estimates; without one nothing is kept.
 
-    Attributes
-    ----------
-    folder : path, optional
-        Without one nothing is kept.
-    shared : bool
-        Whether processes with other settings use the folder too, at the same time perhaps: files are then named after
-        their keys, and who needs what another is busy with waits for it.
+    Where it is ``shared``, processes with other settings use it too, at the same time perhaps: files are then named
+    after their keys, and who needs what another is busy with waits for it.
     """
 
     folder: Path | None = None
@@ -138,9 +133,5 @@ def _restored(value: object, arrays: Mapping[str, np.ndarray]) -> object:
 
 def _content(arrays: Mapping[str, np.ndarray], values: Mapping[str, object]) -> str:
     """Digest of what an estimate holds, so that a changed value or shape is noticed."""
-    state = hashlib.sha256(json.dumps(values, sort_keys=True).encode())
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        state.update(f"{name}{array.shape}{array.dtype}".encode())
-        state.update(array.tobytes())
-    return state.hexdigest()
+    names = sorted(arrays)
+    return content_key(json.dumps(values, sort_keys=True), names, *(arrays[name] for name in names)).hex()

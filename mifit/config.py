@@ -144,16 +144,9 @@ class GeometryConfig:
     """
 
     objective: Literal["landmarks", "paper"] = one_of("landmarks", "what is minimised")
-    eyes: bool = flag(
-        True,
-        "give a model whose eyes are holes simple eyes and the inside of a mouth",
-    )
+    eyes: bool = flag(True, "give a model whose eyes are holes simple eyes and the inside of a mouth")
     rounds: int = number(
-        2,
-        "objective paper: outer steps, in each of which visibility is found anew",
-        source="cost",
-        least=0,
-        most=100,
+        2, "objective paper: outer steps, in each of which visibility is found anew", source="cost", least=0, most=100
     )
     landmark_noise: float = number(
         1.0,
@@ -177,11 +170,7 @@ class GeometryConfig:
         5e-5, "objective paper: weight of the model's prior", source="paper", least=0, most=WEIGHT
     )
     pixels: int = number(
-        2000,
-        "facial pixels per image, chosen at random",
-        source="set by hand",
-        least=1,
-        most=1_000_000,
+        2000, "facial pixels per image, chosen at random", source="set by hand", least=1, most=1_000_000
     )
     robust_colour: float = number(
         30.0,
@@ -245,8 +234,7 @@ class PhotometryConfig:
     """Gains of cameras and exposures of images (``stages.photometry``)."""
 
     enabled: bool = flag(
-        True,
-        "divide images by gains of cameras and exposures of images where they surely differ; needs two timesteps",
+        True, "divide images by gains of cameras and exposures of images where they surely differ; needs two timesteps"
     )
 
 
@@ -256,8 +244,7 @@ class ReflectanceConfig:
 
     texture_size: int = number(512, "side of the maps", "texels", source="cost", least=16, most=4096)
     shading: Annotated[str, pydantic.AfterValidator(_known_shading)] = one_of(
-        "auto",
-        "paper, printed, prefiltered, shadowed, or another that is registered; auto is shadowed",
+        "auto", "paper, printed, prefiltered, shadowed, or another that is registered; auto is shadowed"
     )
     bands: int = number(
         10,
@@ -291,8 +278,7 @@ class ReflectanceConfig:
         True, "leave out what hides the face in an image: hair, cloth, glasses, a hand; with robust alone"
     )
     residual_shading: bool = flag(
-        True,
-        "both halves of the face share their skin; the rest belongs to the capture's light; with robust alone",
+        True, "both halves of the face share their skin; the rest belongs to the capture's light; with robust alone"
     )
     max_iterations: int = number(30, "Gauss-Newton iterations of the lighting", source="limit", least=1, most=10_000)
 
@@ -327,8 +313,7 @@ class ResidualConfig:
     """What the images of each timestep show beyond the model (``stages.find_residual``)."""
 
     enabled: bool = flag(
-        True,
-        "keep what images show beyond the model, for views of fitted timesteps in the capture's own light",
+        True, "keep what images show beyond the model, for views of fitted timesteps in the capture's own light"
     )
     prior: float = number(
         0.5,
@@ -372,17 +357,11 @@ class FitConfig:
         that with values of 0..1 it is 0.001 / 255.
         """
         return cls(
-            geometry=GeometryConfig(
-                objective="paper",
-                eyes=False,
-            ),
+            geometry=GeometryConfig(objective="paper", eyes=False),
             surface=SurfaceConfig(enabled=False),
             photometry=PhotometryConfig(enabled=False),
             reflectance=ReflectanceConfig(
-                shading="printed",
-                robust=False,
-                smoothness_weight=0.001 / 255.0,
-                specular_smoothness=1.0,
+                shading="printed", robust=False, smoothness_weight=0.001 / 255.0, specular_smoothness=1.0
             ),
             normals=NormalsConfig(magnitude_weight=0.3),
             residual=ResidualConfig(enabled=False),

@@ -39,13 +39,7 @@ from mifit.config import (
 )
 from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
-from mifit.core.estimate import (
-    GeometryEstimate,
-    MeshEstimate,
-    NormalsEstimate,
-    ReflectanceEstimate,
-    ResidualEstimate,
-)
+from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, ResidualEstimate
 from mifit.core.files import Document
 from mifit.core.process import one_blas_thread
 from mifit.errors import InputError
@@ -187,10 +181,6 @@ def fit(
     tell : callable, optional
         Called before the first step with what is wrong with the capture, where something is.
 
-    Returns
-    -------
-    Reconstruction
-
     Raises
     ------
     InputError
@@ -273,24 +263,12 @@ def fit_into(
 ) -> Reconstruction:
     """The result of a fit, written into its folder stage by stage, so that a killed run goes on.
 
-    Parameters
-    ----------
-    folder : path
-        New, empty, or a result folder.
-    resume : bool
-        Go on with what an earlier run left. A result that has all that is asked for, and perhaps more, stays as it is.
-    force : bool
-        Replace an existing result, or write beside files that aren't ours; those are never deleted.
-    capture, model, cameras, timesteps, config, until, seed
-        As in `mifit.fit`.
-    options
-        ``progress``, ``watch`` and ``tell`` of `mifit.fit`.
+    The folder is new, empty, or a result's; other parameters are those of `mifit.fit`. ``resume`` goes on with what an
+    earlier run left; a result that has all that is asked for, and perhaps more, stays as it is. ``force`` replaces an
+    existing result, or writes beside files that aren't ours; those are never deleted.
 
-    Raises
-    ------
-    InputError
-        Before any work: a folder with foreign files, or one that another process writes into; a result that is there
-        already, or of which ``resume`` would lose tracked timesteps or stages. Else as `mifit.fit`.
+    InputError, before any work, for a folder with foreign files, or one that another process writes into; a result that
+    is there already, or of which ``resume`` would lose tracked timesteps or stages. Else as `mifit.fit`.
     """
     folder, config = Path(folder), config or FitConfig()
     check_ours(folder, force)

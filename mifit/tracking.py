@@ -158,10 +158,7 @@ class Follower:
     def next(self, timestep: int) -> tuple[GeometryEstimate, bool, list[Diagnostic]]:
         """Geometry of a timestep, whether landmarks had to find the lost face again, and warnings.
 
-        Raises
-        ------
-        ConvergenceError
-            Neither the last pose nor the landmarks find the face.
+        ConvergenceError where neither the last pose nor the landmarks find the face.
         """
 
         def fit(start: GeometryEstimate) -> GeometryEstimate:

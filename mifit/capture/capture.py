@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.capture.landmark_files import COUNT, Landmarks, read_landmarks
-from mifit.capture.lens import Undistortion, undistort_points
+from mifit.capture.lens import undistort_points, undistortion
 from mifit.capture.transforms import UNITS_MM, Shot, View, read_transforms
 from mifit.core.camera import Camera
 from mifit.core.files import file_digest, note_read
@@ -31,23 +31,12 @@ CACHE_BYTES = 256 * 2**20
 class Frame:
     """One image, undistorted: what the stages see.
 
-    Attributes
-    ----------
-    image : (H, W, 3) float32
-        Linear Rec. 709, gain applied; 0 where not valid.
-    valid : (H, W) bool
-        Inside the stored image, the mask file and the alpha channel, and a number that is light.
-        Noise goes down to -0.1, skies reach 1e5 (white is 1); others are damage, as NaN is.
-    clipped : (H, W) bool
-        At the largest code value in some channel (touched by such a pixel after undistortion): no measurement.
-    landmarks : (68, 2) float64 or None
-        iBUG points in the undistorted image.
-    visible : (68,) bool
-        Landmarks to be trusted; all False without landmarks.
-    deviation : float
-        What the errors of the detector amount to, see `Landmarks`; 0 where it isn't known.
-    masked : bool
-        Whether a mask file says what is valid.
+    ``image`` (H, W, 3) is linear Rec. 709, gain applied, and 0 where not ``valid`` (H, W): inside the stored image, the
+    mask file, if it is ``masked``, and the alpha channel, and a number that is light. Noise goes down to -0.1, skies
+    reach 1e5 (white is 1); others are damage, as NaN is. ``clipped`` (H, W) pixels are at the largest code value in
+    some channel (touched by such a pixel after undistortion): no measurement. ``landmarks`` (68, 2) are iBUG points in
+    the undistorted image, ``visible`` (68,) those to be trusted, ``deviation`` what the errors of the detector amount
+    to, see `Landmarks`; 0 where it isn't known.
     """
 
     image: NDArray[np.float32]
@@ -70,7 +59,6 @@ class _Cache:
     def __init__(self, limit: int):
         self.limit, self.used = limit, 0
         self._frames: OrderedDict[tuple[str, int], Frame] = OrderedDict()
-        self._lenses: dict[str, Undistortion] = {}
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -93,12 +81,6 @@ class _Cache:
             self.used += frame.nbytes
             while self.used > self.limit:
                 self.used -= self._frames.popitem(last=False)[1].nbytes
-
-    def lens(self, camera: Camera) -> Undistortion:
-        with self._lock:
-            if camera.name not in self._lenses:
-                self._lenses[camera.name] = Undistortion.of(camera)
-            return self._lenses[camera.name]
 
 
 @dataclass(frozen=True)
@@ -134,18 +116,10 @@ class Capture:
 
     @classmethod
     def load(cls, path: str | Path, cache_bytes: int = CACHE_BYTES) -> Capture:
-        """Open a capture folder, or its ``transforms.json``.
+        """Open a capture folder, or its ``transforms.json``; at most ``cache_bytes`` of decoded images are kept in
+        memory.
 
-        Parameters
-        ----------
-        path : path
-        cache_bytes : int
-            Bound on decoded images kept in memory.
-
-        Raises
-        ------
-        InputError
-            A missing folder or file, or an entry that isn't what it must be.
+        InputError for a missing folder or file, or an entry that isn't what it must be.
         """
         path = Path(path)
         if not path.exists():
@@ -184,15 +158,10 @@ class Capture:
     def camera(self, name: str) -> Camera:
         """The pinhole camera of a view's undistorted images, calibrated or estimated.
 
-        Raises
-        ------
-        InputError
-            An unknown name, or a view that is neither calibrated nor estimated yet (`capture.calibrate`).
+        InputError for an unknown name, or a view that is neither calibrated nor estimated yet.
         """
-        view = self._view(name)
-        if name in self.estimated:
-            return dataclasses.replace(self.estimated[name], distortion=())
-        return dataclasses.replace(self.stored_camera(view.name), distortion=())
+        self._view(name)
+        return dataclasses.replace(self.estimated.get(name) or self.stored_camera(name), distortion=())
 
     def stored_camera(self, name: str) -> Camera:
         """The calibrated camera of a view's images as stored, with lens distortion; InputError where there is none."""
@@ -208,10 +177,8 @@ class Capture:
     def frame(self, name: str, timestep: int) -> Frame:
         """One image with its masks and landmarks, undistorted; arrays are read-only and may come from the cache.
 
-        Raises
-        ------
-        InputError
-            An unknown camera or timestep, a file that is missing, damaged, or of another size than ``w`` x ``h``.
+        InputError for an unknown camera or timestep, or a file that is missing, damaged, or of another size than ``w``
+        x ``h``.
         """
         shot = self._shot(name, timestep)
         frame = self._cache.get((name, timestep))
@@ -300,7 +267,7 @@ class Capture:
         if view.gain != (1.0, 1.0, 1.0):
             image = image * np.array(view.gain, dtype=np.float32)
         if view.intrinsics is not None and view.distortion:
-            lens = self._cache.lens(_lens_camera(view))
+            lens = undistortion(_lens_camera(view))
             image = lens.apply(image)
             valid = np.asarray(lens.valid & (lens.apply(valid.astype(np.float32)) > 0.999))
             clipped = np.asarray(lens.apply(clipped.astype(np.float32)) > 0.001)

@@ -25,17 +25,7 @@ EYES = ((37, 41, 38, 40, 36, 39), (43, 47, 44, 46, 42, 45))
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """Frames that were chosen.
-
-    Attributes
-    ----------
-    timesteps : tuple of int
-        Ascending.
-    why : dict of int to str
-        Of the chosen ones.
-    left_out : dict of int to str
-        Frames that could not be chosen, with the reason.
-    """
+    """Frames that were chosen, ascending, and ``why``, with those ``left_out`` that could not be, and the reason."""
 
     timesteps: tuple[int, ...]
     why: dict[int, str]

@@ -28,16 +28,10 @@ MOTION_RATE = 480
 
 @dataclass(frozen=True)
 class Start:
-    """When a clip began.
+    """By how many ``seconds`` a clip began later than the first one.
 
-    Attributes
-    ----------
-    seconds : float
-        By how much later than the first clip; negative: earlier.
-    by : str
-        ``sound``, ``motion``, or ``none``: nothing in common was found, and the clips are taken to begin together.
-    correlation : float
-        Of the two signals at that lag, -1..1.
+    It was found ``by`` ``sound``, ``motion``, or ``none``: nothing in common was found, and the clips are taken to
+    begin together. ``correlation`` is that of the two signals at that lag, -1..1.
     """
 
     seconds: float
@@ -147,15 +141,9 @@ def _small_frames(video: Video) -> Iterator[NDArray[np.float32]]:
 
 @dataclass(frozen=True)
 class Moments:
-    """Frames of a source in an order of their own: a source again.
+    """Some frames of a source, ``numbers``, ascending: a source again.
 
-    Attributes
-    ----------
-    source : Source
-    numbers : tuple of int
-        Its frames, ascending.
-    off : float
-        Mean distance in frames between the moments and the frames that stand for them.
+    ``off`` is the mean distance in frames between the moments and the frames that stand for them.
     """
 
     source: Source
@@ -187,19 +175,10 @@ def aligned(
 ) -> list[Moments]:
     """The moments that all sources show, one for each frame of the slowest clip.
 
-    Parameters
-    ----------
-    sources : sequence of Source
-        Clips may differ in length, rate and size. Lists of images are in step, one moment an image.
-    starts : sequence of float
-        Seconds by which each clip began later than the first one; default: all at once.
-    trim : (float, float), optional
-        Seconds of the first clip from which, and up to which, moments are taken.
-
-    Raises
-    ------
-    InputError
-        Unequal numbers of images, as many starts as there are no clips, or no moment that all clips show.
+    Clips may differ in length, rate and size. Lists of images are in step, one moment an image. ``starts`` are the
+    seconds by which each clip began later than the first one, by default all at once; ``trim`` those of the first clip
+    from which, and up to which, moments are taken. InputError for unequal numbers of images, starts that aren't as many
+    as the clips, or no moment that all clips show.
     """
     clips = [source for source in sources if isinstance(source, Video)]
     if starts and len(starts) != len(clips):

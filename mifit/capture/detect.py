@@ -42,20 +42,9 @@ class Detector(Protocol):
 
 
 def open_detector(name: str | None = None) -> Detector:
-    """Open a detector by name.
+    """Open a detector: ``mediapipe`` or ``face-alignment``, by default the paper's, the latter, where it is installed.
 
-    Parameters
-    ----------
-    name : str, optional
-        ``mediapipe`` or ``face-alignment``; by default the latter, the paper's detector, where it is installed, else
-        MediaPipe.
-
-    Raises
-    ------
-    InputError
-        An unknown name, or a package that is missing.
-    MifitError
-        The detector doesn't start.
+    InputError for an unknown name, or a package that is missing; MifitError where the detector doesn't start.
     """
     if name is None:
         name = "face-alignment" if importlib.util.find_spec("face_alignment") else "mediapipe"
@@ -68,10 +57,7 @@ def open_detector(name: str | None = None) -> Detector:
 
 def available() -> dict[str, bool]:
     """Which detectors would start without installing anything."""
-    return {
-        "mediapipe": not missing(),
-        "face-alignment": importlib.util.find_spec("face_alignment") is not None,
-    }
+    return {"mediapipe": not missing(), "face-alignment": importlib.util.find_spec("face_alignment") is not None}
 
 
 class FaceAlignment:
@@ -102,32 +88,18 @@ class FaceAlignment:
 
 
 def detect_landmarks(path: str | Path, detector: str | Detector | None = None, progress: Progress = silent) -> str:
-    """Find 68 landmarks in every image of a capture and write them into it.
+    """Find 68 landmarks in every image of a capture, write them into it, and say in a few lines what was found.
 
     Landmarks that jump in time or lie off their epipolar line are marked invisible. A camera is judged by those
     before it in the capture (the first by the second), so a held-out camera that comes last changes nothing for the
     others. An image without a face gets no landmarks and is named.
 
-    Parameters
-    ----------
-    path : path
-        Capture folder; ``landmarks/CAMERA/NNNN.json`` and the paths to them in ``transforms.json`` are written there,
-        each file whole or not at all. Landmarks that were there are kept in ``landmarks.before``.
-    detector : str or Detector, optional
-        See `open_detector`.
-    progress : Progress
+    ``landmarks/CAMERA/NNNN.json`` and the paths to them in ``transforms.json`` are written into the capture's folder,
+    each file whole or not at all. Landmarks that were there are kept in ``landmarks.before``. A ``detector`` may be a
+    name, see `open_detector`.
 
-    Returns
-    -------
-    str
-        What was found, in a few lines.
-
-    Raises
-    ------
-    InputError
-        The capture or an image can't be read, or no image has a face.
-    MifitError
-        The detector doesn't run.
+    InputError where the capture or an image can't be read, or no image has a face; MifitError where the detector
+    doesn't run.
     """
     capture = Capture.load(path)
     opened = open_detector(detector) if detector is None or isinstance(detector, str) else detector

@@ -69,11 +69,8 @@ def mirrored_points() -> NDArray[np.int64]:
 class Face:
     """One face as the networks see it.
 
-    Attributes
-    ----------
-    points : (478, 3) float64
-        Face Mesh points and two irises (centre, then four on its rim): x and y in pixels, the first pixel's centre at
-        (0.5, 0.5), and depth in pixels, growing away from the camera, its origin within the head.
+    ``points`` (478, 3) are Face Mesh points and two irises (centre, then four on its rim): x and y in pixels, the first
+    pixel's centre at (0.5, 0.5), and depth in pixels, growing away from the camera, its origin within the head.
     """
 
     points: NDArray[np.float64]
@@ -169,13 +166,7 @@ def _windows(image: NDArray) -> Iterator[list[_Square]]:
 
 
 class FaceMesh:
-    """The three networks behind the interface of a `Detector`.
-
-    Raises
-    ------
-    MifitError
-        The runtime or a network file is missing.
-    """
+    """The three networks behind the interface of a `Detector`; MifitError where the runtime or a file is missing."""
 
     name, scatter = "mediapipe", SCATTER
 

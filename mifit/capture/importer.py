@@ -63,31 +63,19 @@ def import_capture(
     Parameters
     ----------
     out : path
-        Folder to make; it must be missing or empty.
-    videos : sequence of path
-        One video per camera; lengths, rates and sizes may differ, and frames are paired by time. Cameras are called
-        after the files' stems.
-    calibration : path, optional
-        OpenCV stereo calibration, YAML.
-    images : sequence of path
-        One folder of images per camera, in the order of the numbers in the file names; or one photograph each.
-    transforms : path, optional
-        nerfstudio ``transforms.json``.
-    every, start, count : int
-        Keep every N-th frame from `start` on, at most `count`; frames are renumbered from 0.
+        Folder to make; it must be missing or empty. It is returned; nothing is left there when the import fails.
+    videos, images : sequence of path
+        One video per camera, whose lengths, rates and sizes may differ: frames are paired by time. Or one folder of
+        images, in the order of the numbers in the file names, or one photograph each. Cameras are called after them.
+    calibration, transforms : path, optional
+        OpenCV stereo calibration, YAML; nerfstudio ``transforms.json``.
     units : str, optional
         Unit of length of the calibration: ``mm``, ``cm`` (default), ``dm`` or ``m``. A ``transforms.json`` that says
         its own keeps it.
-    starts : sequence of float
-        Seconds by which each video began later than the first one (`capture.clips`); default: all at once.
-    trim : (float, float), optional
-        Seconds of the first video from which, and up to which, frames are taken.
-    progress : Progress
-
-    Returns
-    -------
-    Path
-        ``out``; nothing is left there when the import fails.
+    **options
+        Every N-th frame (``every``) from ``start`` on is kept, at most ``count``, renumbered from 0. ``starts`` are
+        seconds by which each video began later than the first one (`capture.clips`), by default all at once; ``trim``
+        (float, float) those of the first video from which, and up to which, frames are taken; and ``progress``.
 
     Raises
     ------

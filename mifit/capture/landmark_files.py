@@ -24,15 +24,9 @@ MIN_EXTENT = 4.0
 class Landmarks:
     """68 iBUG points in one image.
 
-    Attributes
-    ----------
-    points : (68, 2) float64
-        Pixel coordinates; finite, also where invisible.
-    visible : (68,) bool
-        Points to be trusted.
-    deviation : float
-        Standard deviation of a coordinate that the detector's errors amount to, in pixels, were they independent; 0
-        where it isn't known.
+    ``points`` (68, 2) are pixel coordinates, finite also where they aren't ``visible`` (68,), to be trusted.
+    ``deviation`` is the standard deviation of a coordinate that the detector's errors amount to, in pixels, were they
+    independent; 0 where it isn't known.
     """
 
     points: NDArray[np.float64]
@@ -43,12 +37,8 @@ class Landmarks:
 def read_landmarks(path: str | Path) -> Landmarks:
     """Read ``{"points": [[x, y], ...], "visible": [...], "deviation": 0}``, or a bare list of points.
 
-    A point without finite coordinates is invisible.
-
-    Raises
-    ------
-    InputError
-        A missing or malformed file, or another number of points than 68.
+    A point without finite coordinates is invisible. InputError for a missing or malformed file, or another number of
+    points than 68.
     """
     path = Path(path)
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -36,30 +37,27 @@ def undistort_points(camera: Camera, pixels: NDArray) -> NDArray[np.float64]:
 class Undistortion:
     """Look-up of an undistorted image in the stored one.
 
-    Attributes
-    ----------
-    x, y : (H, W) float32
-        Integer-centred source column and row of every pixel.
-    valid : (H, W) bool
-        Pixels whose source lies inside the stored image and where the distortion model is one to one.
+    ``x`` and ``y`` (H, W) are the integer-centred source column and row of every pixel; ``valid`` (H, W) are pixels
+    whose source lies inside the stored image and where the distortion model is one to one.
     """
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
     valid: NDArray[np.bool_]
 
-    @classmethod
-    def of(cls, camera: Camera) -> Undistortion:
-        """Compute the look-up for a camera; the undistorted image keeps size and intrinsics."""
-        matrix, size = opencv_matrix(camera), (camera.width, camera.height)
-        x, y = cv2.initUndistortRectifyMap(matrix, np.array(camera.distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
-        inside = (x >= 0) & (x <= camera.width - 1) & (y >= 0) & (y <= camera.height - 1)
-        return cls(np.asarray(x, np.float32), np.asarray(y, np.float32), inside & _one_to_one(camera, x, y))
-
     def apply(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Undistort an image (H, W) or (H, W, C), bilinear; 0 outside the stored image."""
         moved = cv2.remap(image, self.x, self.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         return np.asarray(moved, dtype=np.float32)
+
+
+@lru_cache(maxsize=4)
+def undistortion(camera: Camera) -> Undistortion:
+    """The look-up for a camera, kept for the last few; the undistorted image keeps size and intrinsics."""
+    matrix, size = opencv_matrix(camera), (camera.width, camera.height)
+    x, y = cv2.initUndistortRectifyMap(matrix, np.array(camera.distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
+    inside = (x >= 0) & (x <= camera.width - 1) & (y >= 0) & (y <= camera.height - 1)
+    return Undistortion(np.asarray(x, np.float32), np.asarray(y, np.float32), inside & _one_to_one(camera, x, y))
 
 
 def _one_to_one(camera: Camera, x: NDArray, y: NDArray) -> NDArray[np.bool_]:

@@ -13,17 +13,8 @@ def temporal_outliers(points: NDArray) -> NDArray[np.bool_]:
     """Landmarks that jump: far from where the frames before and after put them.
 
     The neighbours are moved onto each frame by the similarity that fits best, so head motion doesn't count. Expressions
-    and a detector's noise stay below the smallest jump that counts, 0.05 of the face's width.
-
-    Parameters
-    ----------
-    points : (T, 68, 2)
-        Landmarks over time; NaN where there are none.
-
-    Returns
-    -------
-    (T, 68) bool
-        All False for fewer than three frames.
+    and a detector's noise stay below the smallest jump that counts, 0.05 of the face's width. ``points`` (T, 68, 2) are
+    landmarks over time, NaN where there are none; (T, 68) outliers are returned, none of fewer than three frames.
     """
     count = len(points)
     residual = np.full(points.shape[:2], np.nan)

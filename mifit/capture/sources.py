@@ -142,10 +142,8 @@ def open_sources(
 ) -> list[Source]:
     """One camera for each video, or else for each folder of images or single photograph, named after it.
 
-    Raises
-    ------
-    InputError
-        Both or none of them, a file or folder that can't be read, or names that don't tell the cameras apart.
+    InputError for both or none of them, a file or folder that can't be read, or names that don't tell the cameras
+    apart.
     """
     if bool(videos) == bool(images):
         raise InputError(f"found {'videos and' if videos else 'no videos and no'} folders of images, expected one kind")

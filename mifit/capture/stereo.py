@@ -33,21 +33,10 @@ Nodes = dict[str, NDArray[np.float64] | float]
 
 
 def read_stereo(path: str | Path, names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> tuple[View, View]:
-    """Read the calibration of a pair of cameras.
+    """Read the calibration of a pair of cameras from YAML, with their names and (width, height) of their images.
 
-    Parameters
-    ----------
-    path : path
-        YAML file. Without ``R`` and ``T`` in it, ``extrinsics`` of the same suffix beside it is read too.
-    names : two str
-        Names of the first and the second camera.
-    sizes : two (width, height)
-        Sizes of their images.
-
-    Raises
-    ------
-    InputError
-        A missing key, a matrix of another shape, a rotation that isn't one, or another image size in the file.
+    Without ``R`` and ``T`` in the file, ``extrinsics`` of the same suffix beside it is read too. InputError for a
+    missing key, a matrix of another shape, a rotation that isn't one, or another image size in the file.
     """
     path = Path(path)
     found = read_nodes(path)
@@ -127,10 +116,8 @@ def _check_size(found: Nodes, sizes: Sequence[tuple[int, int]], path: Path) -> N
 def read_nodes(path: Path) -> Nodes:
     """Matrices and numbers at the top level of an OpenCV YAML file by name; strings, lists and maps are left out.
 
-    Raises
-    ------
-    InputError
-        The file is missing, no YAML of OpenCV's, or a matrix holds another number of values than it says.
+    InputError where the file is missing or no YAML of OpenCV's, or a matrix holds another number of values than it
+    says.
     """
     text = read_text(path, MAX_SETTINGS_BYTES, "calibration file").lstrip("\ufeff \r\n\t")
     if not text.startswith("%YAML"):

@@ -33,21 +33,11 @@ DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 @dataclass(frozen=True)
 class View:
-    """What a capture knows of one camera.
+    """What a capture knows of one camera and its images.
 
-    Attributes
-    ----------
-    name : str
-    width, height : int
-        Size of its images.
-    intrinsics : (fx, fy, cx, cy) or None
-        Pixels; None when not calibrated.
-    distortion : tuple of float
-        OpenCV coefficients; empty when none.
-    world_to_camera : (4, 4) float64 or None
-        OpenCV axes; None when not calibrated.
-    gain : (r, g, b)
-        Factors on the linear image that bring the cameras to one exposure and white balance.
+    ``intrinsics`` (fx, fy, cx, cy) are in pixels, ``world_to_camera`` (4, 4) has OpenCV axes; None when not calibrated.
+    ``distortion`` are OpenCV coefficients, empty when none; ``gain`` (r, g, b) factors on the linear image that bring
+    the cameras to one exposure and white balance.
     """
 
     name: str
@@ -100,16 +90,8 @@ class Transforms:
 def read_transforms(path: str | Path, units: str = "cm") -> Transforms:
     """Read and check a ``transforms.json``; file names in it are taken relative to its folder.
 
-    Parameters
-    ----------
-    path : path
-    units : str
-        Unit of length of a file that doesn't say its own.
-
-    Raises
-    ------
-    InputError
-        Names the entry and key, the value found and the one expected.
+    ``units`` is the unit of length of a file that doesn't say its own. InputError names the entry and key, the value
+    found and the one expected.
     """
     path = Path(path)
     document = _load(path)
@@ -168,17 +150,8 @@ def write_transforms(path: str | Path, views: Iterable[View], shots: Iterable[Sh
 def update_frames(path: str | Path, changes: Mapping[tuple[str, int], Mapping[str, object]]) -> None:
     """Set keys of some images' entries in a ``transforms.json``; all else in it stays, keys unknown to mifit too.
 
-    Parameters
-    ----------
-    path : path
-        The file; it is replaced whole or not at all.
-    changes : dict of (camera, timestep) to dict
-        New values by key; None takes a key away.
-
-    Raises
-    ------
-    InputError
-        The file can't be read.
+    ``changes`` are new values by key, None to take one away, by camera and timestep. The file is replaced whole or not
+    at all; InputError where it can't be read.
     """
     path = Path(path)
     document = _load(path)

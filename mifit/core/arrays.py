@@ -53,11 +53,8 @@ def npz_keys(path: Path) -> list[str] | None:
 def read_npz(path: str | Path, keys: Iterable[str] | None = None) -> dict[str, NDArray]:
     """Arrays of an ``.npz`` file, those of ``keys`` that are there, or all.
 
-    Raises
-    ------
-    InputError
-        Not an archive, truncated, an array's header disagrees with its size, an object array (which could run code), or
-        more data than a file of this size can honestly hold.
+    InputError for what is no archive, truncated, an array whose header disagrees with its size, an object array (which
+    could run code), or more data than a file of this size can honestly hold.
     """
     path = Path(path)
     wanted = None if keys is None else set(keys)
@@ -245,7 +242,7 @@ def content_key(*values: object) -> bytes:
     for value in values:
         if isinstance(value, np.ndarray):
             digest.update(f"{value.shape}{value.dtype}".encode())
-            digest.update(np.ascontiguousarray(value).tobytes())
+            digest.update(np.ascontiguousarray(value).data)
         else:
             digest.update(repr(value).encode())
     return digest.digest()

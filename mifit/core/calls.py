@@ -39,12 +39,8 @@ def whole(value: object, low: int, name: str, high: int = 2**31 - 1) -> int:
 def checked(function: Callable[P, R]) -> Callable[P, R]:
     """The function, which refuses objects of other classes than its annotations name, and a mesh of another model.
 
-    Raises
-    ------
-    TypeError
-        An object of another class. What has ``cameras`` or a ``frame`` counts as a capture.
-    InputError
-        A geometry, or a result's, that doesn't have the vertices of the model that it comes with.
+    TypeError for an object of another class; what has ``cameras`` or a ``frame`` counts as a capture. InputError for a
+    geometry that doesn't have the vertices of the model that it comes with.
     """
     signature = inspect.signature(function)
     kinds = {name: str(p.annotation).removesuffix(" | None") for name, p in signature.parameters.items()}

@@ -119,25 +119,12 @@ class Camera:
         distance: float | None = None,
         name: str | None = None,
     ) -> Camera:
-        """This camera moved about a point, which stays where it is in the image.
+        """This camera moved about the world point ``target`` (3,), which stays where it is in the image.
 
-        Parameters
-        ----------
-        yaw : float
-            Degrees about ``up``; positive ones move the camera to its right.
-        pitch : float
-            Degrees upwards, after the yaw.
-        target : (3,)
-            World point to move about.
-        distance : float, optional
-            From the target, the capture's units, above 0; default: as it is.
-        name : str, optional
-            Default: this camera's name with the angles.
-
-        Raises
-        ------
-        InputError
-            A distance that isn't positive, angles or vectors that aren't finite, or an ``up`` of no length.
+        ``yaw`` is in degrees about ``up``, positive ones move the camera to its right; ``pitch`` in degrees upwards,
+        after the yaw; ``distance`` from the target, the capture's units, by default as it is. The name is by default
+        this camera's with the angles. InputError for a distance that isn't positive, angles or vectors that aren't
+        finite, or an ``up`` of no length.
         """
         if distance is not None and not 0 < distance < math.inf:
             raise InputError(f"distance: found {distance}, expected a number above 0")

@@ -71,29 +71,15 @@ class Report:
 class GeometryEstimate:
     """Stage 1: morphable-model fit.
 
-    Attributes
-    ----------
-    timesteps : tuple of int
-    identity : (Ki,), albedo : (Ka,)
-        Shared coefficients in standard deviations.
-    expression : (T, Ke)
-    rotation : (T, 3, 3), translation : (T, 3), scale : float
-        Object to world.
-    vertices : (T, V, 3) float32
-        World space.
-    vertex_albedo : (V, 3) float32
-        Linear reflectance of the fitted model.
-    shading : (9, 3)
-        Paper's l_k in I_d = C_d * sum l_k phi_k(n): SH coefficients in world axes, basis of ``core.sh``.
-    ambient : float
-        The paper's I_a, in linear image units.
-    photometry : Photometry
-        Gains of cameras and exposures of images, which are divided out when a capture is read for this fit.
-    displacement : (V, 3) float32 or None
-        Neutral surface beyond the model's span, object space: ``model.mean`` plus this is what coefficients add to
-        (`displaced`). None where the surface is the model's.
-    landmark_noise : float
-        Standard deviation of a landmark coordinate, pixels: of the detector as set, or of residuals where that is more.
+    Coefficients ``identity`` (Ki,) and ``albedo`` (Ka,), which timesteps share, and ``expression`` (T, Ke) are in
+    standard deviations. ``rotation`` (T, 3, 3), ``translation`` (T, 3) and ``scale`` take object to world space, in
+    which the ``vertices`` (T, V, 3) are. ``vertex_albedo`` (V, 3) is the fitted model's linear reflectance; ``shading``
+    (9, 3) the paper's l_k in I_d = C_d * sum l_k phi_k(n): SH coefficients in world axes, basis of ``core.sh``;
+    ``ambient`` the paper's I_a, in linear image units. ``photometry`` are gains of cameras and exposures of images,
+    which are divided out when a capture is read for this fit. ``displacement`` (V, 3) is the neutral surface beyond the
+    model's span, object space: ``model.mean`` plus this is what coefficients add to; None where the surface is the
+    model's. ``landmark_noise`` is the standard deviation of a landmark coordinate, pixels: of the detector as set, or
+    of residuals where that is more.
     """
 
     timesteps: tuple[int, ...]
@@ -135,30 +121,14 @@ class GeometryEstimate:
 class ReflectanceEstimate:
     """Stage 2: maps shared by all timesteps, and lighting.
 
-    Attributes
-    ----------
-    diffuse : (S, S, 3) float32
-        Diffuse albedo C_d + delta C_d, 0..1.
-    specular : (S, S) float32
-        Specular albedo C_s, 0..1.
-    confidence : (S, S) float32
-        0 where never seen, 1 where seen often and well.
-    illumination : Illumination
-        What lights the face: smooth radiance, compact lights, ambient.
-    lobe : Lobe
-        Exponent, Fresnel factor and normalisation of the specular lobe.
-    shading_model : str
-        How maps and lighting make an image: a name of ``appearance.models``.
-    labels : tuple of (H, W) uint8
-        What each image of the fit shows (`core.estimate.Label`); empty where that wasn't looked for.
-    labelled : tuple of (camera, timestep)
-        Of which image each of ``labels`` is.
-    residual_shading : (S, S, 3) float32 or None
-        Factor of the diffuse light of the capture that mesh and lighting don't explain: relief finer than the mesh,
-        edges of shadows. None where nothing was parted from the albedo, and under any other light.
-    specular_confidence : (S, S) float32 or None
-        `confidence` of the specular map: 0 as well where a texel was seen but told nothing of its specular albedo. None
-        in results of older versions.
+    ``diffuse`` (S, S, 3) and ``specular`` (S, S) are albedo, the paper's C_d + delta C_d and C_s, 0..1; ``confidence``
+    (S, S) is 0 where never seen, 1 where seen often and well, and ``specular_confidence`` (S, S) 0 as well where a
+    texel was seen but told nothing of its specular albedo. ``shading_model``, a name of ``appearance.models``, says how
+    maps, ``lobe`` and ``illumination`` (smooth radiance, compact lights, ambient) make an image. ``labels`` (H, W) are
+    what images of the fit show (`core.estimate.Label`), each of the camera and timestep in ``labelled``; empty where
+    that wasn't looked for. ``residual_shading`` (S, S, 3) is the factor of the diffuse light of the capture that mesh
+    and lighting don't explain: relief finer than the mesh, edges of shadows. It is None where nothing was parted from
+    the albedo, and under any other light.
     """
 
     diffuse: NDArray

@@ -176,14 +176,8 @@ def at_place(folder: str | Path, name: str, make: bool = False) -> Iterator[tupl
     """Yield the last part of ``name`` and a descriptor of the folder that it is in, for functions with ``dir_fd``.
 
     ``name`` is a path below ``folder``, with ``/``; the folders between are no links, also if somebody changes them
-    meanwhile; ``make`` makes those that are missing.
-
-    Raises
-    ------
-    FileNotFoundError
-        A folder is missing.
-    InputError
-        A link or a file in place of a folder.
+    meanwhile; ``make`` makes those that are missing. FileNotFoundError for a missing folder, InputError for a link or a
+    file in its place.
     """
     *parents, last = PurePosixPath(name).parts
     if os.open not in os.supports_dir_fd:  # Windows, where links need an administrator

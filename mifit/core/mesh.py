@@ -23,14 +23,11 @@ def face_cross(vertices: NDArray, faces: NDArray) -> NDArray:
 
 def edges(faces: NDArray) -> tuple[NDArray, NDArray]:
     """Undirected edges (E, 2), each with its lower vertex first, and the number of faces at each (E,)."""
-    sides = _sides(faces).astype(np.int64)
+    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    sides = np.sort(sides, axis=1).astype(np.int64)
     base = int(sides.max(initial=0)) + 1
     unique, count = np.unique(sides[:, 0] * base + sides[:, 1], return_counts=True)
     return np.stack(np.divmod(unique, base), axis=1).astype(faces.dtype), count
-
-
-def _sides(faces: NDArray) -> NDArray:
-    return np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
 
 
 def vertex_normals(vertices: NDArray, faces: NDArray) -> NDArray:

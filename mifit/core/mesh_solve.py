@@ -104,10 +104,13 @@ class MeshUpdater:
         return trusted + shift
 
 
-def cotangent_laplacian(vertices: NDArray, faces: NDArray) -> sp.csr_matrix:
-    """(V, V) positive semidefinite cotangent Laplacian, constants in its null space; small cotangents are raised."""
+def cotangent_laplacian(vertices: NDArray, faces: NDArray, bounds: tuple[float, float] = (0.05, 20.0)) -> sp.csr_matrix:
+    """(V, V) cotangent Laplacian, constants in its null space; cotangents are held within ``bounds``.
+
+    It is positive semidefinite where small ones are raised.
+    """
     faces = np.asarray(faces, dtype=np.int64)
-    return _stiffness(faces, _cotangents(np.asarray(vertices, dtype=np.float64), faces), len(vertices))
+    return _stiffness(faces, _cotangents(np.asarray(vertices, dtype=np.float64), faces, bounds), len(vertices))
 
 
 def _stiffness(faces: NDArray, corner_weight: NDArray, count: int) -> sp.csr_matrix:
@@ -119,7 +122,7 @@ def _stiffness(faces: NDArray, corner_weight: NDArray, count: int) -> sp.csr_mat
     return (sp.diags(np.asarray(off.sum(1)).ravel()) - off).tocsr()
 
 
-def _cotangents(vertices: NDArray, faces: NDArray) -> NDArray:
+def _cotangents(vertices: NDArray, faces: NDArray, bounds: tuple[float, float] = (0.05, 20.0)) -> NDArray:
     """(F, 3) half cotangents of each corner, the weight of the opposite edge."""
     out = np.empty((len(faces), 3))
     for k in range(3):
@@ -128,7 +131,7 @@ def _cotangents(vertices: NDArray, faces: NDArray) -> NDArray:
         area = np.linalg.norm(np.cross(u, v), axis=1)
         out[:, k] = np.sum(u * v, axis=1) / np.maximum(area, 1e-12)
     # Raised where small: obtuse and degenerate triangles would make the system indefinite.
-    return 0.5 * np.clip(out, 0.05, 20.0)
+    return 0.5 * np.clip(out, *bounds)
 
 
 def face_average(texels: TexelMap, values: NDArray, n_faces: int) -> NDArray[np.float64]:

@@ -42,12 +42,8 @@ class Photometry:
 
     @classmethod
     def from_document(cls, document: Document) -> Photometry:
-        """What `document` wrote.
-
-        Raises
-        ------
-        ValueError, TypeError, KeyError, AttributeError
-            Values of another kind, or factors that aren't positive and finite.
+        """What `document` wrote; ValueError, TypeError, KeyError or AttributeError for values of another kind, or
+        factors that aren't positive and finite.
         """
         gain = {name: tuple(map(float, rgb)) for name, rgb in document.get("gain", {}).items()}
         exposure = {

@@ -323,10 +323,7 @@ def _inputs(e: Experiment) -> dict[str, tuple]:
 
 
 def _digest(
-    kind: str,
-    name: str,
-    cameras: tuple[str, ...] | None = None,
-    timesteps: tuple[int, ...] | None = None,
+    kind: str, name: str, cameras: tuple[str, ...] | None = None, timesteps: tuple[int, ...] | None = None
 ) -> str:
     """Digest of the content of an input; InputError where it can't be used."""
     if kind == "file":

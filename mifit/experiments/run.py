@@ -51,23 +51,12 @@ def run_experiment(
 ) -> str:
     """The table of all runs of an experiment file in Markdown, once those that are left of it have run.
 
-    Parameters
-    ----------
-    overrides : sequence of str
-        ``KEY=VALUE`` settings that replace the file's.
-    out : path, optional
-        Folder for the runs, ``summary.md`` and ``summary.json``; default ``out/NAME``.
-    dask : str, optional
-        Address of a Dask scheduler whose workers see the same files; default: processes of this machine.
-    seed : int
-        Seed where the file gives none.
+    ``overrides`` are ``KEY=VALUE`` settings that replace the file's; ``out`` is the folder for the runs, ``summary.md``
+    and ``summary.json``, by default ``out/NAME``; ``dask`` the address of a scheduler whose workers see the same files,
+    by default processes of this machine; ``seed`` that of runs where the file gives none.
 
-    Raises
-    ------
-    InputError
-        Bad file or input, before anything runs.
-    MifitError
-        Runs that failed, after all others have finished; InputError where inputs or a full disk were the reason of all.
+    InputError for a bad file or input, before anything runs. MifitError for runs that failed, after all others have
+    finished; InputError where inputs or a full disk were the reason of all.
     """
     plan = load_plan(path, overrides, seed)
     folder = Path(out) if out is not None else Path("out") / file_name(plan.name)

@@ -20,7 +20,7 @@ from mifit.capture.sources import Source
 from mifit.capture.stereo import write_stereo
 from mifit.capture.transforms import UNITS_MM, Shot, View, write_transforms
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera, rigid
-from mifit.core.files import file_name, write_json
+from mifit.core.files import Document, file_name, write_json
 from mifit.errors import InputError
 from mifit.extras.board_camera import ALIKE, CONTRADICTS, SETTINGS, Watched, calibrate_one, look
 from mifit.extras.boards import Board, grey_image
@@ -64,20 +64,9 @@ def calibrate_boards(
 ) -> BoardCalibration:
     """Calibrate cameras that watched one board at the same time.
 
-    Parameters
-    ----------
-    sources : sequence of Source
-        One video or folder of images per camera, in step; with a single camera only its intrinsics are found.
-    board : Board
-    units : str
-        Unit of length of the poses.
-    progress : Progress
-
-    Raises
-    ------
-    InputError
-        The board is seen sharply in too few frames (the message says why the others don't count), cameras don't see it
-        together, or the solution is too uncertain to be used.
+    ``sources`` are a video or folder of images per camera, in step; with a single camera only its intrinsics are found.
+    ``units`` is the unit of length of the poses. InputError where the board is seen sharply in too few frames (the
+    message says why the others don't count), cameras don't see it together, or the solution is too uncertain.
     """
     if len({file_name(source.name) for source in sources}) != len(sources):
         raise InputError("found cameras of one name, expected different names of videos or folders")
@@ -246,22 +235,11 @@ def adjust(
 ) -> tuple[list[Watched], list[NDArray[np.float64]]]:
     """Refine lenses, camera poses and board poses together (Triggs et al., "Bundle Adjustment", 2000).
 
+    ``poses`` (4, 4) are world to camera, OpenCV axes, millimetres; the first camera's frame is the world's. The cameras
+    returned have lenses, deviations of the focal lengths from the residuals, and errors of the frames.
+
     Lenses have a prior, whose weight is that of one coordinate with the points' noise: where the board was seen all
     over the image it says nothing, and where not it keeps distortion from bending what no point has shown.
-
-    Parameters
-    ----------
-    watched : sequence of Watched
-        A start, and the points that cameras see.
-    poses : sequence of (4, 4)
-        World to camera, OpenCV axes, millimetres; the first camera's frame is the world's.
-    board : Board
-
-    Returns
-    -------
-    watched : list of Watched
-        With lenses, deviations of the focal lengths from the residuals, and errors of the frames.
-    poses : list of (4, 4)
     """
     every = [error for one in watched for error in one.errors.values()]
     noise = max(float(np.median(every)) / np.sqrt(2.0), SETTINGS.least_noise)
@@ -282,9 +260,6 @@ def adjust(
         [np.tile([1e3] * 4 + [1, 1, 0.1, 0.1, 1], count), np.tile([1, 1, 1, 1e3, 1e3, 1e3], count - 1 + len(frames))]
     )
 
-    def residuals(x: NDArray) -> NDArray:
-        return system(x)[0]
-
     def system(x: NDArray) -> tuple[NDArray, NDArray]:
         """Residuals and their derivatives by the scaled unknowns."""
         x = x * scale
@@ -304,17 +279,14 @@ def adjust(
             if c:
                 slopes[row, at : at + POSE] = by[:, :6] @ by_camera
         for c, one in enumerate(watched):
-            row, columns = (
-                slice(ends[-1] + (LENS - 1) * c, ends[-1] + (LENS - 1) * (c + 1)),
-                slice(LENS * c, LENS * (c + 1)),
-            )
+            prior = ends[-1] + (LENS - 1) * c
+            row, columns = slice(prior, prior + LENS - 1), slice(LENS * c, LENS * (c + 1))
             value, slope = _unlikely(x[columns], one.size)
             out[row], slopes[row, columns] = noise * value, noise * slope
         return out, slopes * scale
 
-    solution = least_squares(
-        residuals, start / scale, jac=lambda x: system(x)[1], method="lm", xtol=1e-12, ftol=1e-12, max_nfev=60
-    )
+    value, slope = (lambda x: system(x)[0]), (lambda x: system(x)[1])
+    solution = least_squares(value, start / scale, jac=slope, method="lm", xtol=1e-12, ftol=1e-12, max_nfev=60)
     found_x = solution.x * scale
     free = max(len(solution.fun) - len(solution.x), 1)
     covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * (solution.fun @ solution.fun) / free
@@ -325,15 +297,10 @@ def adjust(
     adjusted = []
     for c, one in enumerate(watched):
         lens = found_x[LENS * c : LENS * (c + 1)]
-        adjusted.append(
-            dataclasses.replace(
-                one,
-                matrix=_intrinsics(lens),
-                distortion=tuple(lens[4:].tolist()),
-                focal_deviation=float(deviations[LENS * c : LENS * c + 2].max() / lens[0]),
-                errors=errors[c],
-            )
-        )
+        matrix, distortion = _intrinsics(lens), tuple(lens[4:].tolist())
+        deviation = float(deviations[LENS * c : LENS * c + 2].max() / lens[0])
+        new: Document = {"matrix": matrix, "distortion": distortion, "focal_deviation": deviation, "errors": errors[c]}
+        adjusted.append(dataclasses.replace(one, **new))
     moved = found_x[LENS * count : LENS * count + POSE * (count - 1)].reshape(-1, POSE)
     return adjusted, [np.eye(4), *(_matrix(v) for v in moved)]
 

@@ -24,54 +24,32 @@ CONTRADICTS = "contradicts the others: error {:.2f} pixels, {:.2f} is the limit"
 
 @dataclass(frozen=True)
 class BoardSettings:
-    """Numbers of a calibration from a board.
+    """Numbers of a calibration from a board."""
 
-    Attributes
-    ----------
-    most_searched, most_used : int
-        Frames of a video in which the board is looked for, spread evenly; frames that a camera is calibrated from.
-    least_frames, least_shared : int
-        Frames that a camera, and a pair of cameras, needs.
-    least_part : float
-        Part of the board's points below which it is only partly seen.
-    most_blur, blur_factor : float
-        Edges wider than this, pixels, or than this many times those of a camera's sharper frames, are blurred.
-    outlier, least_outlier, out_of_step : float
-        Frames whose error is this many times the median are left out: from so many pixels on for a camera alone, and
-        for what other cameras show (a tilted board that is found a little off still helps more than it harms).
-    cells : int
-        Cells across and down in which coverage is counted.
-    most_focal_deviation, most_error : float
-        Refused beyond: relative deviation of the focal length, error in pixels.
-    weak_coverage, weak_focal : float
-        Warned of: part of covered cells below this, relative deviation of the focal length above this.
-    centre, aspect, radial, tangential : float
-        Deviations beforehand of a lens: principal point from the image's middle, in longer sides; fy / fx from 1; k1,
-        k2, k3 and p1, p2 from 0.
-    least_noise : float
-        Deviation of a board's points from where they are found, pixels, at the least.
-    """
-
-    most_searched: int = 300
-    most_used: int = 40
-    least_frames: int = 6
-    least_shared: int = 3
-    least_part: float = 0.4
-    most_blur: float = 4.0
-    blur_factor: float = 1.6
+    most_searched: int = 300  # frames of a video in which the board is looked for, spread evenly
+    most_used: int = 40  # frames that a camera is calibrated from
+    least_frames: int = 6  # that a camera needs
+    least_shared: int = 3  # that a pair of cameras needs
+    least_part: float = 0.4  # of the board's points, below which it is only partly seen
+    most_blur: float = 4.0  # pixels: wider edges are blurred,
+    blur_factor: float = 1.6  # as are those this many times as wide as in a camera's sharper frames
+    # Frames whose error is this many times the median are left out: from so many pixels on for a camera alone, and for
+    # what other cameras show (a tilted board that is found a little off still helps more than it harms).
     outlier: float = 3.0
     least_outlier: float = 0.3
     out_of_step: float = 0.5
-    cells: int = 6
-    most_focal_deviation: float = 0.03
-    most_error: float = 2.0
-    weak_coverage: float = 0.4
-    weak_focal: float = 0.005
+    cells: int = 6  # across and down, in which coverage is counted
+    most_focal_deviation: float = 0.03  # relative; refused beyond
+    most_error: float = 2.0  # pixels; refused beyond
+    weak_coverage: float = 0.4  # part of covered cells; warned of below
+    weak_focal: float = 0.005  # relative deviation of the focal length; warned of above
+    # Deviations beforehand of a lens: principal point from the image's middle, in longer sides; fy / fx from 1; k1, k2,
+    # k3 and p1, p2 from 0.
     centre: float = 0.03
     aspect: float = 0.01
     radial: float = 0.5
     tangential: float = 0.003
-    least_noise: float = 0.05
+    least_noise: float = 0.05  # pixels: deviation of a board's points from where they are found, at the least
 
 
 SETTINGS = BoardSettings()
@@ -79,16 +57,8 @@ SETTINGS = BoardSettings()
 
 @dataclass(frozen=True)
 class Watched:
-    """One camera's look at the board.
-
-    Attributes
-    ----------
-    used : dict of int to BoardPoints
-        Frames that the calibration uses.
-    errors : dict of int to float
-        Root-mean-square reprojection error of each, pixels.
-    left_out : dict of int to str
-        Frames that it doesn't, and why.
+    """One camera's look at the board: ``used`` frames, ``errors``, the root-mean-square reprojection error of each in
+    pixels, and frames ``left_out``, with the reason.
     """
 
     name: str

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mifit.core.files import replacing
 from mifit.core.image import decode_image, to_8_bit
@@ -22,14 +23,9 @@ PRINT_DPI = 300
 
 @dataclass(frozen=True)
 class BoardPoints:
-    """Points of a board in one image.
+    """Points of a board in one image: which ones, ``ids`` (N,), ascending, and where, ``pixels`` (N, 2).
 
-    Attributes
-    ----------
-    ids : (N,) int
-        Which points of the board, ascending.
-    pixels : (N, 2) float64
-        Where they are, the first pixel's centre at (0.5, 0.5).
+    The first pixel's centre is at (0.5, 0.5).
     """
 
     ids: NDArray[np.int64]
@@ -41,18 +37,10 @@ class BoardPoints:
 
 @dataclass(frozen=True)
 class Board:
-    """A flat board with points that can be told apart.
+    """A flat board of ``columns`` x ``rows`` squares with points that can be told apart.
 
-    Attributes
-    ----------
-    columns, rows : int
-        Squares.
-    size, marker : float
-        Millimetres: side of a square and of the marker in it.
-    dictionary : str
-        OpenCV's name of the set of markers.
-    named : bool
-        Whether the user named it: then no other is tried.
+    ``size`` and ``marker`` are the sides of a square and of the marker in it, millimetres; ``dictionary`` is OpenCV's
+    name of the set of markers. Where the user ``named`` it no other is tried.
     """
 
     columns: int
@@ -64,12 +52,8 @@ class Board:
 
     @classmethod
     def parse(cls, text: str) -> Board:
-        """Read ``charuco:9x6:30:22``, a dictionary's name behind it or not.
-
-        Raises
-        ------
-        InputError
-            Another form, or sizes that no board has.
+        """Read ``charuco:9x6:30:22``, a dictionary's name behind it or not; InputError for another form or sizes that
+        no board has.
         """
         form = f"--board: found {text[:80]!r}, expected charuco:COLUMNSxROWS:SQUARE:MARKER, lengths in millimetres"
         kind, *rest = text.split(":")
@@ -172,9 +156,7 @@ def _spacing(pixels: NDArray) -> float:
     """Median distance of a point to its nearest neighbour."""
     if len(pixels) < 2:
         return 10.0
-    distance = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
-    np.fill_diagonal(distance, np.inf)
-    return float(np.median(distance.min(axis=1)))
+    return float(np.median(cKDTree(pixels).query(pixels, 2)[0][:, 1]))
 
 
 def edge_width(grey: NDArray[np.uint8], found: BoardPoints) -> float:

@@ -37,14 +37,10 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Freedom:
-    """How C cameras may move: by ``design @ z``, with a Gaussian prior on z (R,).
+    """How C cameras may move: by ``design`` (7 C, R) times z, with a Gaussian prior on z.
 
-    Attributes
-    ----------
-    design : (7 C, R)
-        To the C logarithms of focal lengths, then turn and shift of each camera, camera axes.
-    mean : (R,), precision : (R, R)
-        Of the prior; precision 0 where nothing is known.
+    It gives the C logarithms of focal lengths, then turn and shift of each camera, camera axes. ``mean`` (R,) and
+    ``precision`` (R, R) are the prior's; a precision of 0: nothing is known.
     """
 
     design: NDArray[np.float64]
@@ -71,18 +67,9 @@ class Freedom:
 class Bundle:
     """Cameras and a moving head; OpenCV axes. The pose at timestep 0 stays as it is: it fixes the gauge.
 
-    Attributes
-    ----------
-    focal : (C,)
-        Pixels.
-    cameras : (C, 4, 4)
-        From a common frame, such as the first camera's, to each camera's.
-    heads : (T, 4, 4)
-        From the head's frame to the common one.
-    points : (N, 3)
-        Head's frame, at timestep 0.
-    expression : (T, K)
-        Coefficients relative to timestep 0.
+    ``focal`` (C,) is in pixels; ``cameras`` (C, 4, 4) go from a common frame, such as the first camera's, to each
+    camera's, ``heads`` (T, 4, 4) from the head's frame to the common one. ``points`` (N, 3) are in the head's frame at
+    timestep 0, and coefficients ``expression`` (T, K) relative to it.
     """
 
     focal: NDArray[np.float64]
@@ -94,21 +81,12 @@ class Bundle:
 
 @dataclass(frozen=True)
 class AdjustedBundle:
-    """A bundle at the optimum, or where the iterations ended.
+    """A bundle at the optimum, or where the iterations ended, which ``settled`` says.
 
-    Attributes
-    ----------
-    bundle : Bundle
-    movement : (R,)
-        What cameras were moved by, in the order of the freedom's design.
-    deviations : (R,)
-        Their standard deviations, from the normal equations with all else eliminated, scaled by the residuals. Errors
-        that matches share aren't in them.
-    energy : float
-        Of matches and priors.
-    residual : float
-        Median distance of a point from its match, pixels.
-    settled : bool
+    ``movement`` (R,) is what cameras were moved by, in the order of the freedom's design, and ``deviations`` (R,) its
+    standard deviations from the normal equations with all else eliminated, scaled by the residuals. Errors that matches
+    share aren't in them. ``energy`` is that of matches and priors, ``residual`` the median distance of a point from its
+    match, pixels.
     """
 
     bundle: Bundle
@@ -120,16 +98,7 @@ class AdjustedBundle:
 
 
 def adjust_bundle(start: Bundle, seen: Sightings, freedom: Freedom, modes: NDArray | None = None) -> AdjustedBundle:
-    """Bring projections onto matches.
-
-    Parameters
-    ----------
-    start : Bundle
-    seen : Sightings
-    freedom : Freedom
-    modes : (N, 3, K), optional
-        How expressions move the points; none by default.
-    """
+    """Bring projections onto matches; ``modes`` (N, 3, K) are how expressions move the points, none by default."""
     modes = np.zeros((len(start.points), 3, 0)) if modes is None else modes
     problem = _Problem(start, seen, freedom, modes)
     solution = minimize(problem, problem.start(), energy_tolerance=1e-5)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mifit.capture import Capture
 from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
+from mifit.core.files import Document
 from mifit.core.process import one_blas_thread
 from mifit.extras.bundle import AdjustedBundle, Bundle, Freedom, Sightings, adjust_bundle
 from mifit.extras.calibrate_heads import FOCAL_PRIOR, HeadCalibration, calibrate_heads
@@ -32,18 +33,11 @@ LARGEST_DEVIATION = 0.02
 
 @dataclass(frozen=True)
 class DenseCalibration:
-    """Cameras of a capture and how they were found.
+    """A capture with estimated cameras, those that the landmarks gave where matches don't decide.
 
-    Attributes
-    ----------
-    capture : Capture
-        With estimated cameras; those that the landmarks gave where matches don't decide.
-    note : str
-        What a person should know, in a line.
-    deviation : float or None
-        Standard deviation of the focal length relative to it, from the normal equations; None where landmarks decided.
-    residual : float or None
-        Median distance of matches from the adjusted points, pixels; None where landmarks decided.
+    ``note`` is what a person should know, in a line. Where matches decided, ``deviation`` is the standard deviation of
+    the focal length relative to it, from the normal equations, and ``residual`` the median distance of matches from the
+    adjusted points, pixels.
     """
 
     capture: Capture
@@ -52,6 +46,7 @@ class DenseCalibration:
     residual: float | None = None
 
 
+@one_blas_thread()
 def calibrate_capture(
     capture: Capture,
     model: MorphableModel,
@@ -59,44 +54,18 @@ def calibrate_capture(
     timesteps: Sequence[int],
     progress: Progress = silent,
 ) -> DenseCalibration:
-    """An uncalibrated capture with cameras estimated from landmarks and the model's, then from dense matches."""
-    scale = model.unit_mm / capture.unit_mm
-    mean, modes = model.mean[model.landmarks], model.identity[model.landmarks][..., :30]
-    start = calibrate_heads(capture, scale * mean, scale * modes, cameras, timesteps)
-    return calibrate_densely(start, model, cameras, timesteps, progress)
+    """An uncalibrated capture with cameras from landmarks and the model's, then from dense matches.
 
+    Unknown focal lengths, and the poses with them, are found by bundle adjustment of the matches. No other camera's
+    images are read. Lengths are scaled so that the head is as large as the model's that landmarks gave.
 
-@one_blas_thread()
-def calibrate_densely(
-    start: HeadCalibration,
-    model: MorphableModel,
-    cameras: Sequence[str],
-    timesteps: Sequence[int],
-    progress: Progress = silent,
-) -> DenseCalibration:
-    """Find unknown focal lengths, and the poses with them, by bundle adjustment of dense matches.
-
-    Parameters
-    ----------
-    start : HeadCalibration
-        What landmarks gave for the same cameras and timesteps.
-    model : MorphableModel
-    cameras : sequence of str
-        No other camera's images are read.
-    timesteps : sequence of int
-    progress : Progress
-
-    Returns
-    -------
-    DenseCalibration
-        Lengths are scaled so that the head is as large as the model's that landmarks gave.
-
-    Notes
-    -----
     One focal length serves all cameras without one whose images have the same longer side; principal points of such
     cameras are in the middle and pixels are square. Two images don't determine a focal length: both look at the head,
     and then it is a family of solutions. Images of one camera leave expressions and perspective apart too badly.
     """
+    unit = model.unit_mm / capture.unit_mm
+    mean, identity = model.mean[model.landmarks], model.identity[model.landmarks][..., :30]
+    start = calibrate_heads(capture, unit * mean, unit * identity, cameras, timesteps)
     capture = start.capture
     unknown = np.array([capture.views[name].intrinsics is None for name in cameras])
     if not unknown.any():
@@ -108,7 +77,6 @@ def calibrate_densely(
         return _left(start, cameras, "one camera can't tell expressions from perspective, expected two")
     if images < FEWEST_IMAGES:
         return _left(start, cameras, f"{images} images can't tell more, expected {FEWEST_IMAGES}")
-    unit = model.unit_mm / capture.unit_mm
     neutral = model.mean + model.identity[..., : len(start.shape)].astype(np.float64) @ start.shape
     vertices = unit * neutral  # of the head that landmarks gave, head's frame
     world = [vertices @ pose[:3, :3].T + pose[:3, 3] for pose in OPENGL_FROM_OPENCV @ start.heads]
@@ -180,9 +148,8 @@ def _calibration(
     for view, focal, pose in zip(views, bundle.focal, bundle.cameras, strict=True):
         scaled = pose.copy()
         scaled[:3, 3] *= sizes[0] / sizes[1]
-        known = start.capture.views[view.name].intrinsics is not None
-        fx, fy = (view.fx, view.fy) if known else (float(focal), float(focal))
-        found.append(replace(view, fx=fx, fy=fy, world_to_camera=scaled @ OPENGL_FROM_OPENCV))
+        lens: Document = {} if start.capture.views[view.name].intrinsics else {"fx": float(focal), "fy": float(focal)}
+        found.append(replace(view, **lens, world_to_camera=scaled @ OPENGL_FROM_OPENCV))
     free = [k for k, view in enumerate(views) if start.capture.views[view.name].intrinsics is None]
     lengths = ", ".join(dict.fromkeys(f"{bundle.focal[k]:.0f}" for k in free))
     before = ", ".join(dict.fromkeys(f"{views[k].fx:.0f}" for k in free))

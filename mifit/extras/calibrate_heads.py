@@ -34,16 +34,10 @@ WEIGHTS = np.repeat([0.3, 1.0, 0.4], [17, 31, 20])
 
 @dataclass(frozen=True)
 class HeadCalibration:
-    """Cameras of a capture with the head that they were estimated by.
+    """A capture with estimated cameras, whose world is the first one's frame with OpenGL axes, and the head.
 
-    Attributes
-    ----------
-    capture : Capture
-        With the estimated cameras; the world is the first one's frame with OpenGL axes.
-    heads : (T, 4, 4)
-        Pose of the head at each timestep: from the model's frame to the first camera's, OpenCV axes.
-    shape : (K,)
-        Identity coefficients.
+    ``heads`` (T, 4, 4) are its poses: from the model's frame to the first camera's, OpenCV axes; ``shape`` (K,) are
+    identity coefficients.
     """
 
     capture: Capture
@@ -75,28 +69,12 @@ def calibrate_heads(
 ) -> HeadCalibration:
     """Estimate the cameras of a capture that came without calibration, and the head's poses and shape.
 
-    Parameters
-    ----------
-    capture : Capture
-        With landmarks. Intrinsics that are known stay as they are.
-    landmarks3d : (68, 3)
-        The model's mean landmarks in the capture's unit of length.
-    modes : (68, 3, K), optional
-        Identity modes at the landmarks in the same unit, premultiplied by their standard deviations.
-    cameras, timesteps : sequence, optional
-        What to use; all by default. Only landmarks of these cameras are read.
-    noise : float
-        Standard deviation of a landmark as a part of the image's longer side.
+    Intrinsics that are known stay as they are. ``landmarks3d`` (68, 3) are the model's mean landmarks in the capture's
+    unit of length, ``modes`` (68, 3, K) identity modes there, premultiplied by their standard deviations. Only
+    landmarks of ``cameras`` are read, all by default; ``noise`` is a landmark's standard deviation as a part of the
+    image's longer side. The capture returned has the named cameras, and stays one that isn't `calibrated`.
 
-    Returns
-    -------
-    HeadCalibration
-        Its capture's `camera` answers for the named cameras; `calibrated` stays False.
-
-    Raises
-    ------
-    InputError
-        No landmarks, or fewer than 6 visible ones in some image.
+    InputError for no landmarks, or fewer than 6 visible ones in some image.
     """
     names = tuple(cameras) if cameras is not None else capture.cameras
     steps = tuple(timesteps) if timesteps is not None else capture.timesteps
@@ -220,12 +198,8 @@ def calibrate_others(
     """All cameras of a capture whose ``decided`` ones are estimated, each with its error in pixels.
 
     The decided ones give every landmark a place in space; another camera is the one that sees them where its own
-    landmarks are. So a held-out camera moves none of the others.
-
-    Raises
-    ------
-    InputError
-        A single camera has decided, which gives nothing a place; or a camera can't be placed.
+    landmarks are. So a held-out camera moves none of the others. InputError where a single camera has decided, which
+    gives nothing a place, or a camera can't be placed.
     """
     places = _places(capture, decided, timesteps)
     if len(decided) < len(capture.cameras) and not places:
@@ -262,21 +236,10 @@ def resect_camera(
 ) -> tuple[Camera, float]:
     """The camera that sees points where they are, and its root-mean-square error in pixels at weight 1.
 
-    Parameters
-    ----------
-    view : View
-        Its intrinsics are kept where it has any; else the principal point is the image's middle and pixels are square.
-    points : (N, 3), pixels : (N, 2), weights : (N,)
-        World space; undistorted pixels; weights of their distances.
-    focal : float
-        Expected focal length in pixels, where the view has none: to 2 % if ``same``, else to half of it.
-    same : bool
-        Whether its images have the size of those that ``focal`` is from.
-
-    Raises
-    ------
-    InputError
-        No pose explains the points.
+    ``points`` (N, 3) are world space, ``pixels`` (N, 2) undistorted, ``weights`` (N,) those of their distances. A view
+    keeps its intrinsics. One without has square pixels, the principal point in the middle, and a focal length near
+    ``focal``, pixels: to 2 % if its images have the ``same`` size as those that it is from, else to half of it.
+    InputError where no pose explains the points.
     """
     fx, fy, cx, cy = view.intrinsics or (focal, focal, view.width / 2, view.height / 2)
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])

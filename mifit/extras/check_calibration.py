@@ -38,20 +38,11 @@ PRIOR = 0.3, np.radians(5.0)
 
 @dataclass(frozen=True)
 class CameraError:
-    """An error of the calibration that matches were adjusted with.
+    """An error of the calibration that matches were adjusted with: of one camera, or of all where it is None.
 
-    Attributes
-    ----------
-    camera : str or None
-        None: all of them.
-    value : tuple of float
-        Correction: of the focal length relative to it, or of a turn, degrees about the camera's own x, y and z.
-    deviation : float
-        Of the value, as the matches give it.
-    explained : float
-        Part of the energy that this correction takes away.
-    text : str
-        The correction in words.
+    ``value`` is the correction, of the focal length relative to it, or of a turn, degrees about the camera's own x, y
+    and z, and ``deviation`` its standard deviation, as the matches give it. ``explained`` is the part of the energy
+    that it takes away, ``text`` says it in words.
     """
 
     camera: str | None
@@ -69,16 +60,10 @@ class CameraError:
 
 @dataclass(frozen=True)
 class CalibrationCheck:
-    """The test of a calibration by matches.
+    """The test of a calibration by matches of ``points`` tracked in `FEWEST_IMAGES` or more images.
 
-    Attributes
-    ----------
-    points : int
-        Tracked in `FEWEST_IMAGES` or more images; too few test nothing, and the rest is empty.
-    residual : float or None
-        Median distance of a match from its point under the calibration as it is, pixels.
-    errors : tuple of CameraError
-        Each as if it were the only one, the likeliest first.
+    Too few test nothing, and the rest is empty: ``residual``, the median distance of a match from its point under the
+    calibration as it is, pixels; ``errors``, each as if it were the only one, the likeliest first.
     """
 
     points: int

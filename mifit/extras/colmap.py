@@ -37,8 +37,6 @@ _MODELS = {  # where fx, fy, cx, cy and OpenCV's distortion coefficients are amo
     "FULL_OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11)),
 }
 
-_Camera = tuple[int, int, tuple[float, float, float, float], tuple[float, ...]]
-
 
 @dataclass(frozen=True)
 class Photo:
@@ -65,25 +63,9 @@ def import_colmap(
 ) -> Path:
     """Make a capture folder from the cameras of a COLMAP model; else as `mifit.capture.import_capture`.
 
-    Parameters
-    ----------
-    model : path
-        Folder with ``cameras.txt`` and ``images.txt``.
-    out : path
-        Folder to make; it must be missing or empty.
-    videos, images : sequence of path
-        Pixels in place of the photographs, for cameras of these names.
-    photos : path, optional
-        Folder of the photographs; default: the model's, or one of the three above it.
-    units : str, optional
-        Default: cm.
-    **options
-        ``every``, ``start``, ``count``, ``starts``, ``trim`` and ``progress``.
-
-    Raises
-    ------
-    InputError
-        Input that is missing, damaged, not synchronous, or doesn't fit together.
+    ``model`` is the folder with ``cameras.txt`` and ``images.txt``; ``photos`` that of the photographs, by default the
+    model's, or one of the three above it. ``videos`` and ``images`` are pixels in their place, for cameras of these
+    names.
     """
     model = Path(model)
 
@@ -105,18 +87,14 @@ def read_colmap(folder: str | Path) -> tuple[Photo, ...]:
     """Read a text model.
 
     Each view is named after the image: its folder (``left/0000.png`` -> ``left``), or its stem when it has none.
-
-    Raises
-    ------
-    InputError
-        A missing or malformed file, an unknown camera model, or a pose that isn't one.
+    InputError for a missing or malformed file, an unknown camera model, or a pose that isn't one.
     """
     folder = Path(folder)
-    cameras: dict[str, _Camera] = {}
+    cameras: dict[str, View] = {}
     for where, words in _lines(folder / "cameras.txt"):
         if len(words) < 5:
             raise InputError(f"{where}: found {len(words)} fields, expected CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS")
-        cameras[words[0]] = _camera(where, words[1], words[2:])
+        cameras[words[0]] = _camera(where, words[0], words[1], words[2:])
     photos = []
     for where, words in _lines(folder / "images.txt", every=2):
         if len(words) < 10:
@@ -128,15 +106,14 @@ def read_colmap(folder: str | Path) -> tuple[Photo, ...]:
         if abs(length - 1.0) > 1e-3:
             raise InputError(f"{where}: found a quaternion of length {length:.4g}, expected 1")
         matrix = rigid(Rotation.from_quat([*pose[1:4], pose[0]]).as_matrix(), pose[4:])
-        columns, rows, intrinsics, distortion = cameras[key]
-        photos.append(Photo(name, View(view_name(name), columns, rows, intrinsics, distortion, matrix)))
+        photos.append(Photo(name, dataclasses.replace(cameras[key], name=view_name(name), world_to_camera=matrix)))
     if not photos:
         raise InputError(f"{folder / 'images.txt'}: found no image with a pose, expected at least one")
     return tuple(photos)
 
 
-def _camera(where: str, model: str, words: list[str]) -> _Camera:
-    """Width, height, intrinsics and OpenCV's distortion of one camera entry: width, height and its parameters."""
+def _camera(where: str, key: str, model: str, words: list[str]) -> View:
+    """The view of one camera entry, still without a pose: its width, height and parameters."""
     if model not in _MODELS:
         raise InputError(f"{where}: found camera model {model!r}, expected one of {', '.join(_MODELS)}")
     pinhole, lens = _MODELS[model]
@@ -155,7 +132,7 @@ def _camera(where: str, model: str, words: list[str]) -> _Camera:
     distortion = tuple(parameters[i] for i in lens)
     if len(distortion) in (1, 2):
         distortion = (*distortion, 0.0, 0.0, 0.0)[:4]
-    return int(width), int(height), (fx, fy, cx, cy), distortion if any(distortion) else ()
+    return View(key, int(width), int(height), (fx, fy, cx, cy), distortion if any(distortion) else ())
 
 
 def _lines(path: Path, every: int = 1) -> Iterator[tuple[str, list[str]]]:
@@ -177,10 +154,7 @@ def _lines(path: Path, every: int = 1) -> Iterator[tuple[str, list[str]]]:
 def find_photo(name: str, folders: Sequence[Path]) -> Path:
     """The file of a photograph, in one of the folders or its ``images``; its name may lack the suffix.
 
-    Raises
-    ------
-    InputError
-        There is none.
+    InputError where there is none.
     """
     relative = PurePosixPath(name.replace("\\", "/"))
     last = PurePosixPath(relative.name)
@@ -217,12 +191,8 @@ def group_photos(photos: Iterable[Photo]) -> dict[str, list[Photo]]:
     """Photographs by camera, each in the order of the names.
 
     Photographs of one folder with one pose are the timesteps of one camera, called after the folder. Where poses differ
-    a camera has moved about a still head: each photograph is a camera of its own, called after its file.
-
-    Raises
-    ------
-    InputError
-        Two photographs that would have one name.
+    a camera has moved about a still head: each photograph is a camera of its own, called after its file. InputError for
+    two photographs that would have one name.
     """
     folders: dict[str, list[Photo]] = {}
     for photo in photos:

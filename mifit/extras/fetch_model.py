@@ -39,25 +39,10 @@ def fetch_ict(address: str = ADDRESS, progress: Progress = silent) -> Path:
     """Fetch ICT-FaceKit Light, check it, and write it as ``auto`` finds it.
 
     Files that lie in the folder ``FaceXModel`` beside that place already, copied by hand or from a run that was
-    stopped, are not fetched. They are removed once the model is written.
+    stopped, are not fetched. They are removed once the model is written. ``address`` is the folder of the files.
 
-    Parameters
-    ----------
-    address : str
-        Folder of the files: an ``https`` address, or ``http`` of this machine.
-    progress : Progress
-
-    Returns
-    -------
-    Path
-        The model's file.
-
-    Raises
-    ------
-    InputError
-        Another kind of address.
-    MifitError
-        A file can't be fetched, or the files are not the expected ones.
+    InputError for an address that is neither ``https`` nor ``http`` of this machine; MifitError where a file can't be
+    fetched, or the files are not the expected ones.
     """
     place = urlsplit(address)
     if place.scheme != "https" and not (place.scheme == "http" and place.hostname in ("127.0.0.1", "localhost", "::1")):

@@ -53,16 +53,8 @@ LABELS = {"pca": "morphable model", "diffuse": "without specular", "full": "ever
 
 @dataclass(frozen=True)
 class Shown:
-    """What the controls ask for.
-
-    Attributes
-    ----------
-    method : {"full", "diffuse", "pca"}
-    timestep : int
-    turn : float
-        Of the light about the vertical, degrees.
-    environment : path or None
-        Lat-long environment in place of the recovered light.
+    """What the controls ask for: ``turn`` is that of the light about the vertical, degrees; ``environment`` a lat-long
+    one in place of the recovered light.
     """
 
     method: Method
@@ -72,12 +64,7 @@ class Shown:
 
 
 class Picture:
-    """Renders what is shown from any camera and keeps the last relit result.
-
-    Parameters
-    ----------
-    result : Reconstruction
-    """
+    """Renders what is shown from any camera and keeps the last relit result."""
 
     def __init__(self, result: Reconstruction) -> None:
         self.result = result
@@ -103,18 +90,10 @@ def under(result: Reconstruction, turn: float, environment: Path | None) -> Reco
 
 
 def browser_camera(wxyz: NDArray, position: NDArray, fov: float, aspect: float, rows: int) -> Camera:
-    """The camera of a browser window.
+    """The camera of a browser window, for a picture of so many ``rows``.
 
-    Parameters
-    ----------
-    wxyz : (4,), position : (3,)
-        Rotation, camera to world in OpenCV's axes, as a quaternion; centre in world space.
-    fov : float
-        Vertical field of view in radians.
-    aspect : float
-        Width over height.
-    rows : int
-        Height of the picture in pixels.
+    ``wxyz`` (4,) is the rotation, camera to world in OpenCV's axes, as a quaternion; ``position`` (3,) the centre in
+    world space; ``fov`` the vertical field of view in radians; ``aspect`` width over height.
     """
     numbers = np.array([*wxyz, *position, fov, aspect], dtype=np.float64)
     within = np.abs(numbers) < 1e9  # False for NaN
@@ -142,15 +121,8 @@ def is_of_our_page(host: str, origin: str | None, given: str) -> bool:
     """Whether a request comes from a page of this server, by its headers ``Host`` and ``Origin``.
 
     A page of elsewhere that a browser here shows has another origin; one whose name was made to lead here (DNS
-    rebinding) has that name for a host. Names of this machine and addresses are ours.
-
-    Parameters
-    ----------
-    host : str
-    origin : str or None
-        None where there is none: no browser leaves it out of what opens a socket.
-    given : str
-        The host that the server listens at.
+    rebinding) has that name for a host. Names of this machine and addresses are ours, as is the host ``given`` to
+    listen at. No browser leaves the origin out of what opens a socket.
     """
     name = (urlsplit(f"//{host}").hostname or "").rstrip(".")
     own = {"localhost", given.lower(), socket.gethostname().lower()}
@@ -198,17 +170,8 @@ def _guarded(host: str) -> Iterator[None]:
 class LiveView:
     """A server that shows a result; `run` answers requests until it is stopped, `poll` those that are waiting.
 
-    Parameters
-    ----------
-    result : Reconstruction
-        Fitted, tracked or relit.
-    host, port : str, int
-        Where the server listens; port 0 takes a free one.
-
-    Raises
-    ------
-    InputError
-        The result has no cameras, viser isn't installed, or nothing can listen at the address.
+    Port 0 takes a free one. InputError where the result has no cameras, viser isn't installed, or nothing can listen at
+    the address.
     """
 
     def __init__(self, result: Reconstruction, host: str = "127.0.0.1", port: int = 8080) -> None:

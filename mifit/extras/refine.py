@@ -17,6 +17,7 @@ from mifit.config import FitConfig, from_mapping
 from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
+from mifit.core.files import Document
 from mifit.core.process import one_blas_thread
 from mifit.errors import ConvergenceError, InputError
 from mifit.progress import Progress, silent
@@ -112,15 +113,10 @@ def refine(
 
 
 def _followed(
-    result: Reconstruction,
-    capture: Capture,
-    further: Sequence[int],
-    config: FitConfig,
-    seed: int,
-    progress: Progress,
+    result: Reconstruction, capture: Capture, further: Sequence[int], config: FitConfig, seed: int, progress: Progress
 ) -> tuple[GeometryEstimate, dict[int, str]]:
     """Geometry of the fitted and of further timesteps, and why some of these are left out."""
-    names, fitted = [camera.name for camera in result.cameras], result.fitted
+    cameras, fitted = [camera.name for camera in result.cameras], result.fitted
     home = result.geometry.at(fitted)
     usual = float(np.median([_difference(result, capture, home.at((t,))) for t in fitted]))
     follower: Follower | None = None
@@ -131,7 +127,7 @@ def _followed(
             if timestep in result.timesteps:
                 one = result.geometry.at((timestep,))
             else:
-                follower = follower or Follower(capture, result.model, home, names, config.geometry)
+                follower = follower or Follower(capture, result.model, home, cameras, config.geometry)
                 one = follower.next(timestep)[0]
         except ConvergenceError:
             failed[timestep] = "the face isn't found in it"
@@ -143,15 +139,9 @@ def _followed(
             found.append(one)
     progress("follow frames", len(further), len(further))
     timesteps = tuple(t for one in found for t in one.timesteps)
-    together = replace(
-        home,
-        timesteps=timesteps,
-        expression=np.concatenate([one.expression for one in found]),
-        rotation=np.concatenate([one.rotation for one in found]),
-        translation=np.concatenate([one.translation for one in found]),
-        vertices=np.concatenate([one.vertices for one in found]),
-    )
-    return together.at(sorted(timesteps)), failed
+    names = ("expression", "rotation", "translation", "vertices")
+    arrays: Document = {name: np.concatenate([getattr(one, name) for one in found]) for name in names}
+    return replace(home, timesteps=timesteps, **arrays).at(sorted(timesteps)), failed
 
 
 def _difference(result: Reconstruction, capture: Capture, geometry: GeometryEstimate) -> float:

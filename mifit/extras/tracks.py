@@ -36,14 +36,8 @@ MATCH_SIDE = 680.0
 class Unwrapped:
     """One image in UV space.
 
-    Attributes
-    ----------
-    detail : (S, S) uint8
-        Local contrast, 128 where nothing is seen.
-    seen : (S, S) bool
-        Texels that the image shows, away from outlines.
-    pixels : (S, S, 2) float32
-        Where in the image each texel lies.
+    ``detail`` (S, S) is local contrast, 128 where nothing is seen; ``seen`` (S, S) are texels that the image shows,
+    away from outlines, and ``pixels`` (S, S, 2) where in the image each texel lies.
     """
 
     detail: NDArray[np.uint8]
@@ -53,17 +47,10 @@ class Unwrapped:
 
 @dataclass(frozen=True)
 class Tracks:
-    """N surface points and where images show them.
+    """N surface points and M sightings of them in images.
 
-    Attributes
-    ----------
-    texel : (N,) int64
-        Flat index of the texel that each started from.
-    point : (M,) int64
-        Point of each sighting, ascending.
-    image : (M,) int64
-        Position among the unwrapped images.
-    pixels : (M, 2) float64
+    ``texel`` (N,) is the flat index of the texel that each started from. Of each sighting, ``point`` (M,) is the point,
+    ascending, ``image`` (M,) the position among the unwrapped images, and ``pixels`` (M, 2) the place in it.
     """
 
     texel: NDArray[np.int64]

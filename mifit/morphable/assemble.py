@@ -6,7 +6,6 @@ unwrapping of the face area, the albedo from the pigment model.
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from mifit.core.arrays import content_key
+from mifit.core.image import srgb_to_linear
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
 from mifit.morphable.model import MorphableModel
@@ -43,21 +44,11 @@ def complete(  # noqa: PLR0913
     expression_bounds: NDArray | None = None,
     source: Path | None = None,
 ) -> MorphableModel:
-    """Build a model; what is None is made.
+    """Build a model of what ``MorphableModel`` holds; what is None is made.
 
-    Parameters
-    ----------
-    name, mean, faces, identity, expression, unit_mm
-        As in ``MorphableModel``.
-    albedo : ((V, 3), (V, 3, Ka)), optional
-        Mean and modes, linear.
-    uv : ((T, 2), (F, 3)), optional
-        Texture vertices and their indices.
-    landmarks, face_mask, expression_names, expression_bounds : optional
-        As in ``MorphableModel``.
-    source : Path, optional
-        The model's file: a file ``<name>.landmarks.json`` beside it (68 vertex indices) takes precedence over
-        landmarks found or given.
+    ``albedo`` ((V, 3), (V, 3, Ka)) are mean and modes, linear; ``uv`` ((T, 2), (F, 3)) texture vertices and their
+    indices. ``source`` is the model's file: ``<name>.landmarks.json`` beside it (68 vertex indices) takes precedence
+    over landmarks found or given.
     """
     computed = albedo is None or uv is None or landmarks is None
     given = [np.asarray(array) for pair in (albedo, uv) if pair is not None for array in pair]
@@ -95,17 +86,11 @@ def complete(  # noqa: PLR0913
         unit_mm=unit_mm,
         expression_names=expression_names,
         expression_bounds=expression_bounds,  # type: ignore[arg-type]
-        fingerprint=fingerprint(mean, faces, identity, expression, landmarks, *given) if computed else "",
+        # What was read, and the code that computes the rest from it.
+        fingerprint=content_key(_CODE, mean, faces, identity, expression, landmarks, *given).hex()[:32]
+        if computed
+        else "",
     )
-
-
-def fingerprint(*arrays: NDArray) -> str:
-    """Identify a model by the arrays that were read and the code that computes the others from them."""
-    h = hashlib.blake2b(_CODE, digest_size=16)
-    for array in arrays:
-        h.update(f"{array.shape}{array.dtype}".encode())
-        h.update(np.ascontiguousarray(array).data)
-    return h.hexdigest()
 
 
 def check_mesh(name: str, mean: NDArray, faces: NDArray, landmarks: NDArray | None) -> None:
@@ -155,9 +140,10 @@ def find_face_mask(mean: NDArray, faces: NDArray, landmarks: NDArray) -> NDArray
 def srgb_albedo(mean: NDArray, modes: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Linear mean and modes from sRGB-encoded ones in 0..1: modes by the derivative at the mean."""
     m = np.clip(np.asarray(mean, dtype=np.float64), 0.0, 1.0)
-    linear = np.where(m <= 0.04045, m / 12.92, ((m + 0.055) / 1.055) ** 2.4)
     slope = np.where(m <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((m + 0.055) / 1.055) ** 1.4)
-    return linear.astype(np.float32), (slope[..., None].astype(np.float32) * modes.astype(np.float32, copy=False))
+    return srgb_to_linear(m).astype(np.float32), (
+        slope[..., None].astype(np.float32) * modes.astype(np.float32, copy=False)
+    )
 
 
 def single(values: NDArray) -> NDArray[np.float32]:

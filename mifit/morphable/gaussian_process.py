@@ -23,25 +23,12 @@ def kernel(x: NDArray, y: NDArray, scale: float) -> NDArray:
 def field_modes(
     points: NDArray, scale: float, count: int, parity: int = 0, where: NDArray | None = None
 ) -> NDArray[np.float32]:
-    """Modes of a scalar field of unit standard deviation with a squared-exponential kernel.
+    """Modes (V, <= count) of a scalar field of unit standard deviation with a squared-exponential kernel.
 
-    Parameters
-    ----------
-    points : (V, 3) float
-        Vertices.
-    scale : float
-        Correlation length, in units of the points.
-    count : int
-        Inducing points.
-    parity : {0, 1, -1}
-        1: fields that equal their mirror image in x -> -x; -1: fields that change their sign; 0: neither.
-        With 1 or -1 the pointwise deviation is 1 or 0 on the mirror plane, 1/sqrt(2) far from it.
-    where : (V,) bool, optional
-        Vertices among which inducing points are spread; all by default.
-
-    Returns
-    -------
-    (V, <= count) float32
+    ``scale`` is the correlation length, in units of the points (V, 3), ``count`` the number of inducing points, which
+    are spread among the vertices ``where`` (V,), by default all. With a ``parity`` of 1 fields equal their mirror image
+    in x -> -x, with -1 they change their sign; the pointwise deviation then is 1 or 0 on the mirror plane, 1/sqrt(2)
+    far from it.
     """
     pool = points if where is None else points[where]
     if parity:
@@ -58,20 +45,10 @@ def field_modes(
 
 
 def compress(columns: NDArray[np.float32], count: int) -> NDArray[np.float32]:
-    """Leading principal modes of the process with the given columns.
+    """Leading principal modes (N, min(count, M)) of the process with the given columns (N, M).
 
-    Parameters
-    ----------
-    columns : (N, M) float32
-        Modes with independent unit-variance coefficients; they need not be orthogonal.
-    count : int
-        Modes to keep, at most M.
-
-    Returns
-    -------
-    (N, min(count, M)) float32
-        Orthogonal modes, each as long as its standard deviation, longest first; the first large entry
-        of each is positive.
+    Columns have independent unit-variance coefficients and need not be orthogonal. The modes are, each as long as its
+    standard deviation, longest first; the first large entry of each is positive.
     """
     modes = columns
     for sample in (columns[:: max(1, len(columns) // 30_000)], None):  # find the subspace fast, then its exact axes
@@ -84,31 +61,27 @@ def compress(columns: NDArray[np.float32], count: int) -> NDArray[np.float32]:
     return modes * np.where(modes[first, np.arange(modes.shape[1])] < 0, -1.0, 1.0).astype(np.float32)
 
 
-SYMMETRIC = ((75.0, 24, (3.2, 3.2, 3.8)), (34.0, 70, (2.4, 2.5, 2.8)), (15.0, 190, (1.3, 1.3, 1.5)))
-"""Correlation length in mm, inducing points, and deviation in mm along x, y, z of the deformations of either parity.
+DEFORMATIONS = {
+    1: ((75.0, 24, (3.2, 3.2, 3.8)), (34.0, 70, (2.4, 2.5, 2.8)), (15.0, 190, (1.3, 1.3, 1.5))),
+    -1: ((55.0, 24, (1.0, 0.9, 1.1)),),
+}
+"""Of the deformations of either parity: correlation length in mm, inducing points, and deviation in mm along x, y, z.
 
 With these, lengths of the face deviate as people's do: its breadth by 7 mm, nasion to chin 7, nasion to the nose's base
 4, the nose's protrusion 3, the mouth's width 4 (Zhuang and Bradtmiller, "Head-and-face anthropometric survey of U.S.
 respirator users", 2005).
 """
-ASYMMETRIC = ((55.0, 24, (1.0, 0.9, 1.1)),)
 STRETCH = 0.035
 """Deviation of the relative width, height and depth of the whole."""
 
 
 def deformation_modes(points: NDArray, where: NDArray, count: int) -> NDArray[np.float32]:
-    """Modes (V, 3, count) in mm of smooth random deformations of points (V, 3) in mm.
+    """Modes (V, 3, count) in mm of smooth random deformations of points (V, 3) in mm, left and right as x -> -x.
 
-    Parameters
-    ----------
-    points : (V, 3) float
-        Vertices, left and right as x -> -x.
-    where : (V,) bool
-        Vertices among which the process has its inducing points.
-    count : int
+    ``where`` (V,) are vertices among which the process has its inducing points.
     """
     blocks: list[tuple[int, NDArray]] = []  # axis, modes (V, k); blocks are orthogonal to one another
-    for parity, kernels in ((1, SYMMETRIC), (-1, ASYMMETRIC)):
+    for parity, kernels in DEFORMATIONS.items():
         # a symmetric deformation has a mirror-odd x and mirror-even y and z
         fields_by_axis = {
             p: [field_modes(points, scale, inducing, p, where) for scale, inducing, _ in kernels] for p in (1, -1)

@@ -201,19 +201,9 @@ class MorphableModel:
     # -- evaluation ---------------------------------------------------------------------------------------
 
     def shape(self, identity: ArrayLike | None = None, expression: ArrayLike | None = None) -> NDArray[np.float32]:
-        """Vertices for given coefficients.
+        """Vertices (V, 3) for coefficients in standard deviations, object space, in units of ``unit_mm`` millimetres.
 
-        Parameters
-        ----------
-        identity : (<= Ki,) float, optional
-            Identity coefficients in standard deviations; missing ones are zero.
-        expression : (<= Ke,) float, optional
-            Expression coefficients, likewise.
-
-        Returns
-        -------
-        (V, 3) float32
-            Object space, in units of ``unit_mm`` millimetres.
+        ``identity`` (<= Ki,) and ``expression`` (<= Ke,) may be shorter than the model's: missing ones are zero.
         """
         out = self.mean.ravel()
         if identity is not None:
@@ -232,19 +222,10 @@ class MorphableModel:
     def sample(
         self, seed: int = 0, scale: float = 1.0
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Draw random coefficients from the model's prior.
+        """Random coefficients, identity (Ki,), expression (Ke,) and albedo (Ka,), from the model's prior.
 
-        Parameters
-        ----------
-        seed : int
-            The same seed gives the same subject.
-        scale : float
-            Factor on the standard deviations.
-
-        Returns
-        -------
-        identity (Ki,), expression (Ke,), albedo (Ka,) : float32
-            Normal draws; expressions are clipped to their bounds.
+        The same seed gives the same subject; ``scale`` is a factor on the standard deviations. Expressions are clipped
+        to their bounds.
         """
         rng, scale = np.random.default_rng(seed), float(finite(scale, (), "scale"))
         identity, expression, albedo = (
@@ -264,17 +245,8 @@ class MorphableModel:
     ) -> MorphableModel:
         """The model with fewer modes or a smaller photometric region.
 
-        Parameters
-        ----------
-        identity, expression, albedo : int or slice, optional
-            Modes to keep: a number of leading modes, or a slice; all by default.
-        region : (F,) bool, optional
-            Faces that may stay in ``face_mask``.
-
-        Raises
-        ------
-        InputError
-            A number below 0, or a region of another shape.
+        Modes to keep are a number of leading ones, or a slice; all by default. ``region`` (F,) are faces that may stay
+        in ``face_mask``. InputError for a number below 0, or a region of another shape.
         """
 
         def modes(kept: int | slice | None, name: str) -> slice:
@@ -349,19 +321,12 @@ class MorphableModel:
     def load(cls, path: str | Path, kind: str | None = None) -> MorphableModel:
         """Load a model, whatever its kind.
 
-        Parameters
-        ----------
-        path : str or Path
-            ``"builtin"`` (about 15 000 vertices), ``"builtin:coarse"`` (about 9 000), ``"auto"`` (the model that
-            ``mifit model fetch ict`` has fetched, else ``"builtin"``), or a file or folder of a known format,
-            recognised by content; with ``+eyes`` behind it eyes are added.
-        kind : str, optional
-            The format, where it is to be set rather than recognised: a key of ``recognise.KINDS``.
+        ``path`` is ``"builtin"`` (about 15 000 vertices), ``"builtin:coarse"`` (about 9 000), ``"auto"`` (the model
+        that ``mifit model fetch ict`` has fetched, else ``"builtin"``), or a file or folder of a known format,
+        recognised by content; with ``+eyes`` behind it eyes are added. ``kind``, a key of ``recognise.KINDS``, sets the
+        format.
 
-        Raises
-        ------
-        InputError
-            The file is missing, damaged or of no known kind; the message says what was found.
+        InputError where the file is missing, damaged or of no known kind; the message says what was found.
         """
         if isinstance(path, str) and path.partition("+")[0] == "auto":
             path = path.replace("auto", str(_PROVIDED["automatic"]()), 1)

@@ -60,13 +60,7 @@ class _Piece:
 
 
 def eyeballs(model: MorphableModel) -> list[NDArray[np.int64]]:
-    """Vertices of each eyeball: pieces of the mesh that are joined to nothing else and lie at an eye.
-
-    Returns
-    -------
-    list of (n,) int64
-        Empty for a model without eyes.
-    """
+    """Vertices (n,) of each eyeball: pieces of the mesh that are joined to nothing else and lie at an eye."""
     piece = sp.csgraph.connected_components(adjacency(model.faces, model.n_vertices), directed=False)[1]
     sizes = np.bincount(piece)
     low, high = (np.full((len(sizes), 3), sign * np.inf) for sign in (1.0, -1.0))
@@ -94,12 +88,8 @@ def with_eyes(model: MorphableModel) -> MorphableModel:
     """The model with eyeballs in the holes of its eyes and a sheet in that of its mouth.
 
     New vertices come after the old ones, whose order, shape and modes stay; texture coordinates move up by a strip.
-    `MorphableModel.load` makes the same of ``"FILE+eyes"``, which is the ``source`` of the model returned.
-
-    Raises
-    ------
-    InputError
-        The model has no hole at an eye.
+    `MorphableModel.load` makes the same of ``"FILE+eyes"``, which is the ``source`` of the model returned. InputError
+    where the model has no hole at an eye.
     """
     eyes, mouth = openings(model) if not eyeballs(model) else ([], None)
     if len(eyes) < 2:

@@ -22,12 +22,12 @@ MELANIN = np.array([1.0, 1.2, 1.4])
 HAEMOGLOBIN = np.array([0.12, 1.0, 0.72])
 """Absorption of the two pigments in the three channels, per unit of log reflectance."""
 
-_WHOLE_FACE = {"melanin": 0.27, "haemoglobin": 0.085}
 _FIELDS = ((35.0, 40, 0.07, 0.08), (14.0, 110, 0.045, 0.05))
 """Correlation length in mm, inducing points, deviation of melanin, deviation of haemoglobin."""
 
 _REGIONS = {
     # region: (mean melanin, mean haemoglobin, deviation of melanin, deviation of haemoglobin)
+    "whole": (0.0, 0.0, 0.27, 0.085),
     "lips": (0.12, 0.42, 0.10, 0.16),
     "brows": (0.75, 0.05, 0.22, 0.02),
     "cheeks": (0.0, 0.10, 0.03, 0.09),
@@ -39,33 +39,13 @@ _REGIONS = {
 
 
 def skin_model(
-    mean: NDArray,
-    faces_used: NDArray,
-    landmarks: NDArray,
-    unit_mm: float,
-    count: int,
+    mean: NDArray, faces_used: NDArray, landmarks: NDArray, unit_mm: float, count: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean albedo and albedo modes for a face surface.
+    """Mean albedo (V, 3), linear reflectance, and albedo modes (V, 3, count) for a face surface.
 
-    Parameters
-    ----------
-    mean : (V, 3) float
-        Vertices; y up, nose along +z.
-    faces_used : (F, 3) int
-        Faces of the photometric region, where the random fields live.
-    landmarks : (68,) int
-        iBUG vertices.
-    unit_mm : float
-        Millimetres per unit of ``mean``.
-    count : int
-        Albedo modes to make.
-
-    Returns
-    -------
-    mean_albedo : (V, 3) float32
-        Linear reflectance.
-    modes : (V, 3, count) float32
-        Orthogonal, premultiplied by their standard deviations.
+    ``mean`` (V, 3) has y up and the nose along +z, in units of ``unit_mm`` millimetres; ``faces_used`` (F, 3) are those
+    of the photometric region, where the random fields live; ``landmarks`` (68,) iBUG vertices. Modes are orthogonal,
+    premultiplied by their standard deviations.
     """
     points = np.asarray(mean, dtype=np.float64) * unit_mm
     masks = region_masks(points, landmarks)
@@ -76,11 +56,8 @@ def skin_model(
     n = len(points)
     used = np.zeros(n, dtype=bool)
     used[faces_used] = True
-    fields_m = [np.full((n, 1), _WHOLE_FACE["melanin"])]
-    fields_h = [np.full((n, 1), _WHOLE_FACE["haemoglobin"])]
-    for region, (_, _, sigma_m, sigma_h) in _REGIONS.items():
-        fields_m.append(masks[region][:, None] * sigma_m)
-        fields_h.append(masks[region][:, None] * sigma_h)
+    fields_m: list[NDArray] = [masks[region][:, None] * v[2] for region, v in _REGIONS.items()]
+    fields_h: list[NDArray] = [masks[region][:, None] * v[3] for region, v in _REGIONS.items()]
     for scale, inducing, sigma_m, sigma_h in _FIELDS:
         field = field_modes(points, scale, inducing, where=used)
         fields_m.append(field * sigma_m)
@@ -99,12 +76,10 @@ def skin_model(
 def region_masks(points: NDArray, landmarks: NDArray) -> dict[str, NDArray[np.float64]]:
     """Soft masks (V,) in 0..1 of the regions of a face, from vertices in mm and the 68 landmarks."""
     p = points[landmarks]
-    eye = (
-        float(np.linalg.norm(p[36] - p[45])) / 90.0
-    )  # sizes below are for eyes 90 mm apart, outer corner to outer corner
+    eye = float(np.linalg.norm(p[36] - p[45])) / 90.0  # sizes below are for outer corners of eyes 90 mm apart
     lips = _inside(points[:, :2], p[48:60, :2], 1.2 * eye) * (1 - _inside(points[:, :2], p[60:68, :2], 0.3 * eye))
     depth = points[:, 2] - p[48:60, 2].min()
-    masks = {"lips": lips * _step(depth, -12.0 * eye, 4.0 * eye)}
+    masks = {"whole": np.ones(len(points)), "lips": lips * _step(depth, -12.0 * eye, 4.0 * eye)}
 
     brows = np.zeros(len(points))
     for first in (17, 22):

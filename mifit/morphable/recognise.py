@@ -57,19 +57,7 @@ def automatic_model() -> str:
 
 
 def load_model(path: str | Path, kind: str | None = None) -> MorphableModel:
-    """Load ``"builtin"``, ``"builtin:coarse"``, or a file or folder of a known kind; see `MorphableModel.load`.
-
-    Parameters
-    ----------
-    path : str or Path
-    kind : str, optional
-        A key of ``KINDS``; recognised by content when it is not given.
-
-    Raises
-    ------
-    InputError
-        The file is missing, damaged or of no known kind.
-    """
+    """Load ``"builtin"``, ``"builtin:coarse"``, or a file or folder of a known kind; see `MorphableModel.load`."""
     if str(path) in BUILTIN:
         return builtin_model(coarse=str(path) == "builtin:coarse")
     base = str(path).removesuffix(SUFFIX)

@@ -15,16 +15,10 @@ from mifit.morphable.model import MorphableModel
 
 @dataclass(frozen=True)
 class Registration:
-    """A model fitted to a surface.
+    """A model fitted to a surface, with ``target = rotation @ model + translation`` in mm.
 
-    Attributes
-    ----------
-    identity : (Ki,) float64
-        Coefficients in standard deviations.
-    rotation : (3, 3), translation : (3,)
-        ``target = rotation @ model + translation`` in mm.
-    vertices : (V, 3) float64
-        The fitted model in the target's space, in mm.
+    ``identity`` (Ki,) are coefficients in standard deviations, ``vertices`` (V, 3) the fitted model in the target's
+    space, in mm.
     """
 
     identity: NDArray[np.float64]
@@ -34,27 +28,15 @@ class Registration:
 
 
 def register(
-    model: MorphableModel,
-    vertices: NDArray,
-    faces: NDArray,
-    landmarks: NDArray | None = None,
-    iterations: int = 20,
+    model: MorphableModel, vertices: NDArray, faces: NDArray, landmarks: NDArray | None = None, iterations: int = 20
 ) -> Registration:
     """Fit identity and pose to a surface.
 
     Each iteration finds, for vertices of the face area, the closest target vertices with a similar normal, and
     takes a Gauss-Newton step on point-to-plane distances, landmarks and the prior of the coefficients.
 
-    Parameters
-    ----------
-    model : MorphableModel
-    vertices : (N, 3) float
-        Target surface in mm, roughly upright (y up) and facing +z.
-    faces : (M, 3) int
-        Its triangles, counter-clockwise outwards.
-    landmarks : (68,) int, optional
-        Target vertices of the iBUG points. Without them the pose starts from the tips of the noses.
-    iterations : int
+    The target, ``vertices`` (N, 3) in mm and ``faces`` (M, 3), counter-clockwise outwards, is roughly upright (y up)
+    and faces +z; ``landmarks`` (68,) are its iBUG points. Without them the pose starts from the tips of the noses.
     """
     unit = model.unit_mm
     mean, basis = unit * model.mean.astype(np.float64), model.identity

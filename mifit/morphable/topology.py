@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
-from mifit.core.files import read_text
+from mifit.core.files import read_json
 from mifit.core.limits import MAX_SETTINGS_BYTES
 from mifit.core.mesh import edges
 from mifit.errors import InputError
@@ -39,12 +38,7 @@ IBUG_MIRROR = np.array(
 
 def read_landmark_file(path: Path) -> NDArray[np.int64]:
     """Read a JSON list of 68 vertex indices, 0-based, in iBUG order."""
-    try:
-        values = json.loads(read_text(path, MAX_SETTINGS_BYTES, "landmark file"))
-    except InputError:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON: {error}") from None
+    values = read_json(path, MAX_SETTINGS_BYTES, "landmark file")
     if not isinstance(values, list) or len(values) != 68 or not all(type(v) is int for v in values):
         raise InputError(f"{path}: expected a list of 68 vertex indices in iBUG order")
     return np.array(values)
@@ -103,11 +97,7 @@ def opening_faces(mean: NDArray, faces: NDArray, landmarks: NDArray) -> NDArray[
 def mirror_map(mean: NDArray, tolerance: float) -> NDArray[np.int32] | None:
     """(V,) index of each vertex's mirror image in x -> -x, or None where the mesh has no such symmetry.
 
-    Parameters
-    ----------
-    mean : (V, 3) float
-    tolerance : float
-        How far a mirrored vertex may lie from its partner.
+    ``tolerance`` is how far a mirrored vertex may lie from its partner.
     """
     distance, partner = cKDTree(mean).query(mean * (-1.0, 1.0, 1.0))
     if distance.max() > tolerance or (partner[partner] != np.arange(len(mean))).any():

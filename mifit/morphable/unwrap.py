@@ -60,12 +60,7 @@ def _disc(mean: NDArray, faces: NDArray, loops: list[NDArray]) -> tuple[NDArray,
 
 def _square(t: NDArray) -> NDArray:
     """Points of the unit square's border at fractions of its length, counter-clockwise from the lower left."""
-    s = 4.0 * t
-    k = np.minimum(s.astype(int), 3)
-    f = s - k
-    x = np.choose(k, [f, np.ones_like(f), 1 - f, np.zeros_like(f)])
-    y = np.choose(k, [np.zeros_like(f), f, np.ones_like(f), 1 - f])
-    return np.stack([x, y], axis=1)
+    return np.stack([np.interp(4.0 * t, range(5), corners) for corners in ([0, 1, 1, 0, 0], [0, 0, 1, 1, 0])], axis=1)
 
 
 def _xatlas(mean: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:

@@ -68,11 +68,7 @@ def tint(
 
 
 def draw_landmarks(
-    photograph: NDArray[np.uint8],
-    camera: Camera,
-    detected: NDArray | None,
-    visible: NDArray,
-    fitted: NDArray,
+    photograph: NDArray[np.uint8], camera: Camera, detected: NDArray | None, visible: NDArray, fitted: NDArray
 ) -> NDArray[np.uint8]:
     """Mark detected landmarks (rings) and the fitted model's (dots), joined by a line where both are visible.
 

@@ -136,18 +136,19 @@ def write_glb(
     images, textures, skin = _skin(out, result, timestep, shape)
     subject = Path(path).stem
     head: Document = {"name": subject, "mesh": 0}
+    place = geometry.translation[i] * metre
     animations = []
-    if animate:
-        # A node that is animated may have no matrix.
-        head |= {
-            "rotation": _quaternions(rotation[None])[0].tolist(),
-            "translation": (geometry.translation[i] * metre).tolist(),
-        }
+    if animate:  # a node that is animated may have no matrix
+        head |= {"rotation": _quaternions(rotation[None])[0].tolist(), "translation": place.tolist()}
         rows = [result.index(t) for t in animate]
         animations.append(_animation(out, geometry, rows, np.subtract(animate, animate[0]) / fps, metre, full))
     else:
-        head["matrix"] = rigid(rotation, geometry.translation[i] * metre).T.ravel().tolist()
-    nodes = [head, *(_camera_node(camera, k, metre) for k, camera in enumerate(result.cameras))]
+        head["matrix"] = rigid(rotation, place).T.ravel().tolist()
+    nodes = [head]
+    for k, camera in enumerate(result.cameras):
+        pose = camera.camera_to_world_opengl.copy()
+        pose[:3, 3] *= metre
+        nodes.append({"name": camera.name, "camera": k, "matrix": pose.T.ravel().tolist()})
     document: Document = {
         "asset": {"version": "2.0", "generator": f"mifit {mifit.__version__}"},
         "extensionsUsed": list(skin["extensions"]),
@@ -186,22 +187,14 @@ def write_glb(
 
 
 def _primitive(
-    out: _Buffer,
-    part: SplitMesh,
-    base: NDArray,
-    normals: NDArray,
-    codes: NDArray,
-    albedo: NDArray | None,
+    out: _Buffer, part: SplitMesh, base: NDArray, normals: NDArray, codes: NDArray, albedo: NDArray | None
 ) -> Document:
     """One primitive: with texture coordinates and tangents, or with vertex albedo (V, 3) where there are no maps.
 
     ``codes`` (V, 3, K) are the morph targets in steps.
     """
     n = normals[part.origin]
-    attributes = {
-        "POSITION": out.accessor(base[part.origin], "<f4", bounds=True),
-        "NORMAL": out.accessor(n, "<f4"),
-    }
+    attributes = {"POSITION": out.accessor(base[part.origin], "<f4", bounds=True), "NORMAL": out.accessor(n, "<f4")}
     if albedo is None:
         tangent, sign = tangents(base[part.origin], n, part.uv, part.faces)
         attributes["TANGENT"] = out.accessor(np.column_stack([tangent, sign]), "<f4")
@@ -228,26 +221,23 @@ def _skin(
     lobe = result.lobe
     # Plain Blinn-Phong reflects alike at all angles; a fitted Fresnel factor has Schlick's form, as glTF's has.
     grazing = lobe.grazing
+    strength = np.dstack([np.full((*maps.specular.shape, 3), 255), 255 * maps.specular / peak])
     planes = {
         "baseColor": to_8_bit(maps.diffuse),
         "normal": np.round(127.5 * (bent + 1)).astype(np.uint8),
-        # KHR_materials_specular reads the alpha channel.
-        "specular": np.dstack([np.full((*maps.specular.shape, 3), 255), 255 * maps.specular / peak])
-        .round()
-        .astype(np.uint8),
+        "specular": strength.round().astype(np.uint8),  # KHR_materials_specular reads the alpha channel
     }
     images = [
         {"name": name, "mimeType": "image/png", "bufferView": out.view(encode_png(codes))}
         for name, codes in planes.items()
     ]
     textures = [{"sampler": 0, "source": k} for k in range(3)]
-    alpha = lobe.roughness
     skin = {
         "name": "skin",
         "pbrMetallicRoughness": {
             "baseColorTexture": {"index": 0},
             "metallicFactor": 0.0,
-            "roughnessFactor": math.sqrt(alpha),
+            "roughnessFactor": math.sqrt(lobe.roughness),
         },
         "normalTexture": {"index": 1},
         "extensions": {
@@ -267,10 +257,7 @@ def _animation(
 ) -> Document:
     """Pose and expression of node 0 over time, linear between timesteps."""
     times = out.accessor(seconds, "<f4", target=None, bounds=True)
-    values = {
-        "translation": geometry.translation[rows] * metre,
-        "rotation": _quaternions(geometry.rotation[rows]),
-    }
+    values = {"translation": geometry.translation[rows] * metre, "rotation": _quaternions(geometry.rotation[rows])}
     if geometry.expression.shape[1]:
         values["weights"] = (geometry.expression[rows] / full).ravel()
     return {
@@ -300,12 +287,6 @@ def _camera(camera: Camera) -> Document:
             "znear": 0.01,
         },
     }
-
-
-def _camera_node(camera: Camera, index: int, metre: float) -> Document:
-    pose = camera.camera_to_world_opengl.copy()
-    pose[:3, 3] *= metre
-    return {"name": camera.name, "camera": index, "matrix": pose.T.ravel().tolist()}
 
 
 def _write(path: Path, document: Document, binary: bytes) -> None:

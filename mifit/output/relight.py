@@ -35,10 +35,7 @@ Exposure = float | Literal["auto"]
 
 
 def relit(
-    result: Reconstruction,
-    lighting: Lighting,
-    rotations: Sequence[float | NDArray] = (0.0,),
-    exposure: Exposure = 1.0,
+    result: Reconstruction, lighting: Lighting, rotations: Sequence[float | NDArray] = (0.0,), exposure: Exposure = 1.0
 ) -> list[Reconstruction]:
     """The face under a lighting that is turned in several ways; see `Reconstruction.relight`."""
     reflectance = result.reflectance
@@ -122,27 +119,15 @@ def write_relit(
     ``NAME.png`` (RGBA) is a camera's view, or ``NAME_NNN.png`` where the light is turned several times; ``relight.png``
     shows several cameras side by side; ``relight.json`` holds what is returned.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        Default: the fitted ones.
-    rotations : sequence of float
-        Degrees by which the environment is turned about the vertical. What no light changes is computed once.
-    exposure : float or "auto"
-        As in `Reconstruction.relight`.
-    video : path, optional
-        ``.mp4`` or ``.webp`` to write the turning light to, ``fps`` rotations per second, in place of images.
-    integrator, seed
-        ``local`` traces no paths; ``path`` traces 144 per pixel. See `Reconstruction.render`.
-    check : bool
-        Compare both integrators in one small view: the first camera's at a quarter of the size.
+    The cameras are by default the fitted ones. ``rotations`` are degrees by which the environment is turned about the
+    vertical; what no light changes is computed once. ``exposure`` is as in `Reconstruction.relight`. The turning light
+    goes into a ``video``, ``.mp4`` or ``.webp``, with ``fps`` rotations per second, in place of images. ``local``
+    traces no paths, ``path`` 144 per pixel, see `Reconstruction.render`; ``check`` compares both in one small view: the
+    first camera's at a quarter of the size.
 
-    Returns
-    -------
-    dict
-        ``exposure``; ``capture_exposure``, the one that gives the capture's mean luminance; ``mean_radiance``,
-        ``rotations``, ``integrator``, ``files``; with ``check`` PSNR (dB) and RMSE (0..255) of the fast view against
-        the path-traced one in 8-bit sRGB, over the pixels that the head covers.
+    Returns ``exposure``; ``capture_exposure``, the one that gives the capture's mean luminance; ``mean_radiance``,
+    ``rotations``, ``integrator``, ``files``; with ``check`` PSNR (dB) and RMSE (0..255) of the fast view against the
+    path-traced one in 8-bit sRGB, over the pixels that the head covers.
     """
     folder = Path(folder)
     if video is not None:

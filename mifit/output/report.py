@@ -15,21 +15,8 @@ import mifit
 from mifit.capture import Capture
 from mifit.core.files import Document, write_text
 from mifit.core.image import to_8_bit
+from mifit.output import figures as draw
 from mifit.output.evaluate import Comparison, compare, face_area, rgba_8_bit
-from mifit.output.figures import (
-    HEAT_LIMIT,
-    TINTS,
-    bounding_box,
-    draw_landmarks,
-    energy_plot,
-    heat_map,
-    heat_scale,
-    jpeg_uri,
-    lighting_balls,
-    overlay,
-    png_uri,
-    tint,
-)
 from mifit.output.scene import render_view
 from mifit.output.viewer import viewer_data
 from mifit.result import Reconstruction
@@ -55,16 +42,8 @@ def write_report(
 ) -> Path:
     """Write ``report.html`` into a folder, whole or not at all; returns the file.
 
-    Parameters
-    ----------
-    folder : path
-    result : Reconstruction
-    capture : Capture
-        Only the fitted cameras are read, and the evaluated one when an evaluation is given.
-    evaluation : dict, optional
-        What `evaluate` returned; adds the comparison of that view.
-    comparisons : sequence of Comparison
-        Those of the evaluation, where they are at hand; others are rendered.
+    ``evaluation``, what `evaluate` returned, adds the comparison of that view; ``comparisons`` are those of it that are
+    at hand, others are rendered. Only the fitted cameras are read, and the evaluated one.
     """
     capture = result.seen(capture)
     shown = result.timesteps[:SHOWN_TIMESTEPS]
@@ -84,7 +63,8 @@ def write_report(
     links = "".join(f'<a href="#s{i}">{title}</a>' for i, (title, _) in enumerate(sections))
     body = "".join(f'<section><h2 id="s{i}">{title}</h2>{text}</section>' for i, (title, text) in enumerate(sections))
     cameras = " and ".join(c.name for c in result.cameras)
-    subtitle = f"Model {result.model.name}; fitted to cameras {cameras} at timesteps {_some(result.timesteps)}."
+    steps = ", ".join(map(str, result.timesteps[:12])) + ", ..." * (len(result.timesteps) > 12)
+    subtitle = f"Model {result.model.name}; fitted to cameras {cameras} at timesteps {steps}."
     page = f"""<!doctype html>
 <html lang="en">
 <head>
@@ -113,10 +93,6 @@ def _asset(name: str) -> str:
     return resources.files("mifit.output").joinpath("assets", name).read_text(encoding="utf-8")
 
 
-def _some(timesteps: Sequence[int]) -> str:
-    return ", ".join(map(str, timesteps[:12])) + (", ..." if len(timesteps) > 12 else "")
-
-
 def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     head = "".join(f"<th>{text}</th>" for text in heads)
     body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
@@ -125,7 +101,7 @@ def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 def _figure(picture: NDArray | str, caption: str, alt: str) -> str:
     """A picture, as an array or a data URI, with its caption."""
-    uri = picture if isinstance(picture, str) else jpeg_uri(picture)
+    uri = picture if isinstance(picture, str) else draw.jpeg_uri(picture)
     return f'<figure><img src="{uri}" alt="{html.escape(alt)}"><figcaption>{html.escape(caption)}</figcaption></figure>'
 
 
@@ -158,14 +134,9 @@ def _summary(result: Reconstruction, evaluation: Document | None) -> str:
 
 def _measures(methods: Mapping[str, Mapping[str, float]]) -> str:
     """Table of errors."""
+    measures = {"psnr": ".2f", "rmse": ".2f", "ssim": ".4f", "flip": ".4f"}
     rows = (
-        (
-            NAMES.get(m, m.replace("_", " ")),
-            f"{f['psnr']:.2f}",
-            f"{f['rmse']:.2f}",
-            f"{f['ssim']:.4f}",
-            f"{f['flip']:.4f}",
-        )
+        (NAMES.get(m, m.replace("_", " ")), *(format(f[key], digits) for key, digits in measures.items()))
         for m, f in methods.items()
     )
     return _table(("Method", "PSNR, dB", "RMSE of 255", "SSIM", "FLIP"), rows)
@@ -193,16 +164,16 @@ def _comparison(
 ) -> str:
     known = {found.timestep: found for found in comparisons}
     parts = [
-        f'<p class="scale">Error maps: 0 <img src="{jpeg_uri(heat_scale())}" alt="black to yellow"> '
-        f"{HEAT_LIMIT:.0f} of 255 or more</p>"
+        f'<p class="scale">Error maps: 0 <img src="{draw.jpeg_uri(draw.heat_scale())}" alt="black to yellow"> '
+        f"{draw.HEAT_LIMIT:.0f} of 255 or more</p>"
     ]
     for entry in evaluation["per_timestep"][:SHOWN_TIMESTEPS]:
         timestep, figures = entry["timestep"], entry["methods"]
         found = known.get(timestep) or compare(result, capture, evaluation["camera"], timestep, evaluation["region"])
-        box = bounding_box(found.region)
+        box = draw.bounding_box(found.region)
         maps = _grid(
             _figure(
-                heat_map(found.photograph, render, found.region)[box],
+                draw.heat_map(found.photograph, render, found.region)[box],
                 f"{NAMES[m]}: {figures[m]['psnr']:.2f} dB",
                 f"error map of {NAMES[m]}",
             )
@@ -214,17 +185,17 @@ def _comparison(
 
 def _slider(found: Comparison) -> str:
     """Photograph and render under one draggable divider, with a choice of methods."""
-    box = bounding_box(found.region)
+    box = draw.bounding_box(found.region)
     methods = list(found.renders)[::-1]
     name = f"slider{found.timestep}"
     tops, buttons = "", ""
     for m in methods:
-        uri = jpeg_uri(overlay(found.photograph, found.renders[m])[box], 90)
+        uri = draw.jpeg_uri(draw.overlay(found.photograph, found.renders[m])[box], 90)
         hidden, pressed = ("", "true") if m == methods[0] else (" hidden", "false")
         tops += f'<img class="top" data-for="{m}" alt="render by {NAMES[m]}" src="{uri}"{hidden}>'
         buttons += f'<button type="button" value="{m}" aria-pressed="{pressed}">{NAMES[m]}</button>'
     return f"""<div><div class="slider" id="{name}">
-<img alt="photograph" src="{jpeg_uri(found.photograph[box], 90)}">{tops}<span class="bar"></span>
+<img alt="photograph" src="{draw.jpeg_uri(found.photograph[box], 90)}">{tops}<span class="bar"></span>
 <span class="tag" style="left:6px">Photograph</span>
 <span class="tag" data-name style="right:6px">{NAMES[methods[0]]}</span>
 <input type="range" min="0" max="100" value="50" aria-label="divider between photograph and render"></div>
@@ -234,7 +205,7 @@ def _slider(found: Comparison) -> str:
 def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]) -> str:
     """Photographs with landmarks, under the fit, and with what was not used of them."""
     swatches = "".join(
-        f'<span><i style="background:rgb{colour};height:12px"></i>{name}</span>' for _, colour, name in TINTS
+        f'<span><i style="background:rgb{colour};height:12px"></i>{name}</span>' for _, colour, name in draw.TINTS
     )
     parts = [
         '<p class="soft">Cyan rings: detected landmarks. Orange dots: the fitted model\'s.</p>'
@@ -247,17 +218,19 @@ def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]
             view, frame, label = capture.camera(camera), capture.frame(camera, timestep), html.escape(camera)
             photograph = to_8_bit(frame.image)
             render = rgba_8_bit(render_view(result, view, timestep, result.methods[-1], samples=1))
-            box = bounding_box(render[..., 3] > 0)
-            marked = draw_landmarks(photograph, view, frame.landmarks, frame.visible, vertices[model.landmarks])
+            box = draw.bounding_box(render[..., 3] > 0)
+            marked = draw.draw_landmarks(photograph, view, frame.landmarks, frame.visible, vertices[model.landmarks])
             area = face_area(vertices, model.faces, model.face_mask, view) & frame.valid
             clipped = frame.clipped & area
             labels = None if result.reflectance is None else result.reflectance.label(camera, timestep)
-            kinds = [] if labels is None else [(np.asarray(labels == kind), colour) for kind, colour, _ in TINTS[1:]]
-            tinted = tint(photograph, (clipped, TINTS[0][1]), *kinds)
+            areas = [(clipped, draw.TINTS[0][1])]
+            if labels is not None:
+                areas += [(np.asarray(labels == kind), colour) for kind, colour, _ in draw.TINTS[1:]]
+            tinted = draw.tint(photograph, *areas)
             share = clipped.sum() / max(int(area.sum()), 1)
             figures += [
                 _figure(marked[box], f"{label}: input with landmarks", f"input from {label}"),
-                _figure(overlay(photograph, render)[box], f"{label}: fit laid over", f"fit over {label}"),
+                _figure(draw.overlay(photograph, render)[box], f"{label}: fit laid over", f"fit over {label}"),
                 _figure(tinted[box], f"{label}: {share:.1%} clipped", f"face mask of {label}"),
             ]
         parts.append(f"<h3>Timestep {timestep}</h3>{_grid(figures)}")
@@ -314,13 +287,13 @@ def _largest(values: NDArray) -> float:
 
 def _lighting(result: Reconstruction) -> str:
     lighting = result.lighting
-    ball, mirror = lighting_balls(lighting)
+    ball, mirror = draw.lighting_balls(lighting)
     panorama = np.maximum(lighting.to_latlong(), 0)
     codes = to_8_bit(panorama / max(float(panorama.max()), 1e-12))
     lights = [light.describe() for light in result.illumination.lights]
     compact = "".join(f"; the sharp light {light}, was found apart from them" for light in lights)
-    return f"""<div class="balls">{_figure(png_uri(ball), "White matt ball", "lighting on a matt ball")}
-{_figure(png_uri(mirror), "Mirror ball", "lighting in a mirror ball")}
+    return f"""<div class="balls">{_figure(draw.png_uri(ball), "White matt ball", "lighting on a matt ball")}
+{_figure(draw.png_uri(mirror), "Mirror ball", "lighting in a mirror ball")}
 {_figure(codes, "All directions, latitude by longitude", "lighting panorama")}</div>
 <p class="soft">Recovered as spherical harmonics of {lighting.order} bands, so only broad light shows{compact}.
 Ambient term {result.illumination.ambient:.4f}.</p>"""
@@ -337,7 +310,7 @@ def _convergence(result: Reconstruction) -> str:
         for name, report in result.reports.items()
     )
     memory = f", peak memory {result.peak_memory / 2**20:.0f} MB" if result.peak_memory else ""
-    plots = [(STAGES[name], energy_plot(report.energies)) for name, report in result.reports.items()]
+    plots = [(STAGES[name], draw.energy_plot(report.energies)) for name, report in result.reports.items()]
     return (
         f"{_table(('Stage', 'Ended', 'Iterations', 'Seconds'), rows)}<p>Whole fit {result.seconds:.1f} s{memory}.</p>"
         + "".join(f"<h3>{name}: energy by iteration</h3>{plot}" for name, plot in plots if plot)

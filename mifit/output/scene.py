@@ -26,8 +26,7 @@ from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
 from mifit.output.deferred import render_local, visible_surface
 from mifit.output.surface import Shape, mapped_faces, shape_of, surface_maps, vertex_materials
-from mifit.render.description import Parameter, to_mitsuba, to_xml
-from mifit.render.scene import load_scene, render_scene, sensor_description
+from mifit.render.scene import load_scene, render_scene, sensor_description, to_mitsuba, to_xml
 from mifit.render.variant import check_active_variant
 from mifit.result import METHODS, Method, Reconstruction
 
@@ -198,19 +197,19 @@ def scene_description(
     method: Method,
     files: str,
     integrator: Mapping[str, object] | None = None,
-    samples: int | None = None,
+    samples: int = 64,
 ) -> Document:
-    """The scene of `write_scene` as a plain dictionary (`render.description`), its files in the folder ``files``.
+    """The scene of `write_scene` as a description (`render.scene`), its files in the folder ``files``.
 
     Ids are ours, not the user's: ``skin`` and ``light`` (maps and lighting), ``light_1`` ... (compact lights),
     ``face`` and ``rest`` (shapes), and ``camera_NAME`` (see `sensor_ids`).
     """
     if method == "pca":
         result = replace(result, reflectance=None, normals=None)
-    path = {"type": "path", "max_depth": Parameter("max_depth", 5), "hide_emitters": True}
+    path = {"type": "path", "max_depth": 5, "hide_emitters": True}
     scene: Document = {"type": "scene", "integrator": path if integrator is None else dict(integrator)}
     for name, camera in zip(sensor_ids(cameras), cameras, strict=True):
-        scene[name] = sensor_description(camera, Parameter("spp", 64) if samples is None else samples)
+        scene[name] = sensor_description(camera, samples)
     scene["skin"] = {
         "type": "blinnphong",
         "diffuse_reflectance": _texture(f"{files}/diffuse.exr", False),

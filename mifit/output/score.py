@@ -30,26 +30,7 @@ from mifit.core.files import Document
 from mifit.core.image import SUFFIXES, read_image, to_8_bit
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
-from mifit.output.compare import (
-    Errors,
-    face_region,
-    pass_region,
-    relit_region,
-    scaled_psnr,
-    separation,
-    skin_region,
-)
-from mifit.output.truth import (
-    TrueMesh,
-    distance_figures,
-    landmarks_of,
-    nearest_points,
-    points_seen,
-    read_mesh,
-    relit_truths,
-    true_mesh,
-    true_passes,
-)
+from mifit.output import compare, truth
 from mifit.progress import Progress, silent
 from mifit.render.image_based import image_based
 
@@ -69,24 +50,14 @@ def score(
     where the capture has a true mesh, what the fitted cameras see of it) and ``whole`` (all that the true mesh covers;
     without one, every valid pixel).
 
-    Parameters
-    ----------
-    fitted : sequence of str, optional
-        Cameras that the program was given; default: the first two. Views of others count as held out.
-    model : MorphableModel, optional
-        Gives the triangles of a truth that has vertices alone.
+    The cameras that the program was given, ``fitted``, are by default the first two; views of others count as held out.
+    ``model`` gives the triangles of a truth that has vertices alone.
 
-    Returns
-    -------
-    dict
-        ``views``: per camera, and for ``held_out`` together, by region what `output.compare.Errors.figures` gives;
-        ``relit``: PSNR per environment and their mean; ``passes``: per camera what `output.compare.separation` gives;
-        ``meshes``: distances (mm) from true points that all fitted cameras see; ``ignored``: files without a meaning.
+    Returns ``views``: per camera, and for ``held_out`` together, by region what `output.compare.Errors.figures` gives;
+    ``relit``: PSNR per environment and their mean; ``passes``: per camera what `output.compare.separation` gives;
+    ``meshes``: distances (mm) from true points that all fitted cameras see; ``ignored``: files without a meaning.
 
-    Raises
-    ------
-    InputError
-        No folder, nothing in it to score, an image of another size, or a truth that is missing.
+    InputError for no folder, nothing in it to score, an image of another size, or a truth that is missing.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -104,16 +75,16 @@ def score(
             f"diffuse_{example}.exr, specular_{example}.exr or 0000.ply"
         )
     progress("Scoring", 0, jobs)
-    truth = _Truths(capture, cameras, model)
+    known = _Truths(capture, cameras, model)
     if found["views"]:
-        out["views"] = _views(found["views"], truth)
+        out["views"] = _views(found["views"], known)
     if found["relit"]:
         out["relit"] = _relit(found["relit"], capture)
     if found["passes"]:
         of = dict.fromkeys(camera for camera, _ in found["passes"])
         out["passes"] = {camera: _passes(found["passes"], camera, capture) for camera in of}
     if found["meshes"]:
-        out["meshes"] = _meshes(found["meshes"], truth)
+        out["meshes"] = _meshes(found["meshes"], known)
     out["ignored"] = list(found["ignored"])
     progress("Scoring", jobs, jobs)
     return out
@@ -152,13 +123,13 @@ class _Truths:
 
     def __init__(self, capture: Capture, fitted: Sequence[str], model: MorphableModel | None) -> None:
         self.capture, self.fitted, self._model = capture, tuple(fitted), model
-        self._meshes: dict[int, TrueMesh | None] = {}
+        self._meshes: dict[int, truth.TrueMesh | None] = {}
 
-    def at(self, timestep: int) -> TrueMesh | None:
+    def at(self, timestep: int) -> truth.TrueMesh | None:
         """The mesh of a timestep; None where there is none, or no triangles are known."""
         if timestep not in self._meshes:
             try:
-                mesh = true_mesh(self.capture, timestep, self._model)
+                mesh = truth.true_mesh(self.capture, timestep, self._model)
             except InputError:
                 if self._model is not None:
                     raise
@@ -169,13 +140,13 @@ class _Truths:
     def regions(self, camera: str, timestep: int) -> dict[str, NDArray[np.bool_]]:
         """Pixels of one photograph that count, by region."""
         view, frame = self.capture.camera(camera), self.capture.frame(camera, timestep)
-        marks = landmarks_of(self.capture, camera, timestep)
-        skin, whole, mesh = skin_region(marks, view), frame.valid, self.at(timestep)
+        marks = truth.landmarks_of(self.capture, camera, timestep)
+        skin, whole, mesh = compare.skin_region(marks, view), frame.valid, self.at(timestep)
         if mesh is not None:
             cameras = [self.capture.camera(name) for name in self.fitted]
             shown = image_based(self.capture, cameras, view, timestep, mesh.vertices, mesh.faces)
             skin, whole = skin & shown.seen, whole & shown.hit
-        regions = {"skin": skin & frame.valid, "face": face_region(marks, view) & frame.valid, "whole": whole}
+        regions = {"skin": skin & frame.valid, "face": compare.face_region(marks, view) & frame.valid, "whole": whole}
         for name, region in regions.items():
             if not region.any():
                 raise InputError(
@@ -185,29 +156,29 @@ class _Truths:
         return regions
 
 
-def _views(files: dict[tuple[str, int], Path], truth: _Truths) -> Document:
-    tallies: dict[str, dict[str, Errors]] = {}
+def _views(files: dict[tuple[str, int], Path], known: _Truths) -> Document:
+    tallies: dict[str, dict[str, compare.Errors]] = {}
     for (camera, timestep), path in files.items():
-        frame = truth.capture.frame(camera, timestep)
+        frame = known.capture.frame(camera, timestep)
         image = to_8_bit(_read(path, frame.image.shape[:2]))
-        groups = [camera] if camera in truth.fitted else [camera, "held_out"]
-        for region, pixels in truth.regions(camera, timestep).items():
+        groups = [camera] if camera in known.fitted else [camera, "held_out"]
+        for region, pixels in known.regions(camera, timestep).items():
             for group in groups:
-                tally = tallies.setdefault(group, {}).setdefault(region, Errors())
+                tally = tallies.setdefault(group, {}).setdefault(region, compare.Errors())
                 tally.add(image, to_8_bit(frame.image), pixels)
     return {group: {region: e.figures() for region, e in found.items()} for group, found in tallies.items()}
 
 
 def _relit(files: dict[str, Path], capture: Capture) -> dict[str, float]:
-    truths = relit_truths(capture)
+    truths = truth.relit_truths(capture)
     camera, timestep = capture.cameras[-1], capture.timesteps[0]
-    region = relit_region(landmarks_of(capture, camera, timestep), capture.camera(camera))
+    region = compare.relit_region(truth.landmarks_of(capture, camera, timestep), capture.camera(camera))
     out = {}
     for name, path in files.items():
         if name not in truths:
             known = ", ".join(truths) or "none"
             raise InputError(f"{path}: the capture's truth has no view relit by {name!r}; it has {known}")
-        out[name] = scaled_psnr(_read(path, region.shape), truths[name].image, region)
+        out[name] = compare.scaled_psnr(_read(path, region.shape), truths[name].image, region)
     return {**out, "mean": float(np.mean(list(out.values())))}
 
 
@@ -217,28 +188,28 @@ def _passes(files: dict[tuple[str, str], Path], camera: str, capture: Capture) -
     if missing is not None:
         there = next(iter(paths.values()))
         raise InputError(f"{there}: found without {missing}_{camera}{there.suffix}, expected both passes")
-    truth = true_passes(capture, camera)
-    if truth is None:
+    expected = truth.true_passes(capture, camera)
+    if expected is None:
         raise InputError(f"{paths['diffuse']}: the capture's truth has no passes of camera {camera!r}")
-    view, marks = capture.camera(camera), landmarks_of(capture, camera, capture.timesteps[0])
-    region = pass_region(marks, view)
+    view, marks = capture.camera(camera), truth.landmarks_of(capture, camera, capture.timesteps[0])
+    region = compare.pass_region(marks, view)
     diffuse, specular = (_read(paths[kind], region.shape) for kind in ("diffuse", "specular"))
-    return separation(diffuse, specular, truth.diffuse, truth.specular, region)
+    return compare.separation(diffuse, specular, expected.diffuse, expected.specular, region)
 
 
-def _meshes(files: dict[int, Path], truth: _Truths) -> dict[str, float]:
+def _meshes(files: dict[int, Path], known: _Truths) -> dict[str, float]:
     distances = []
     for timestep, path in files.items():
-        found = truth.at(timestep)
+        found = known.at(timestep)
         if found is None:
             raise InputError(
                 f"{path}: the capture's truth has no mesh of timestep {timestep}, or vertices without triangles; name "
                 "the model that it was made with"
             )
-        points = points_seen(found, truth.capture, truth.fitted, timestep)
-        mesh = read_mesh(path)
-        distances.append(nearest_points(points.position, mesh.vertices, mesh.faces)[0])
-    return distance_figures(np.concatenate(distances) * truth.capture.unit_mm)
+        points = truth.points_seen(found, known.capture, known.fitted, timestep)
+        mesh = truth.read_mesh(path)
+        distances.append(truth.nearest_points(points.position, mesh.vertices, mesh.faces)[0])
+    return truth.distance_figures(np.concatenate(distances) * known.capture.unit_mm)
 
 
 def _read(path: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:

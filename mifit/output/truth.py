@@ -65,12 +65,7 @@ def true_mesh(capture: Capture, timestep: int, model: MorphableModel | None = No
     """The true mesh of a timestep; None where the capture has none.
 
     ``model`` gives the faces of a truth that has vertices alone. Of a model that got eyes the truth may have the
-    first vertices, those of the model's file.
-
-    Raises
-    ------
-    InputError
-        A damaged file, or vertices of unknown faces.
+    first vertices, those of the model's file. InputError for a damaged file, or vertices of unknown faces.
     """
     folder = Path(capture.path) / "truth"
     for path in (folder / f"{timestep:04d}.ply", folder / "head.ply"):

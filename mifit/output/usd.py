@@ -28,12 +28,8 @@ def write_usdz(result: Reconstruction, path: str | Path, timestep: int) -> None:
 
     The head is in metres, in world space with y up. The skin is a ``UsdPreviewSurface`` in its specular workflow:
     albedo in sRGB, reflectance along the normal and tangent-space normals as they are, GGX roughness as in
-    `gltf.write_glb`. Faces without maps have vertex colours. The fitted cameras stand beside it.
-
-    Raises
-    ------
-    InputError
-        Without usd-core.
+    `gltf.write_glb`. Faces without maps have vertex colours. The fitted cameras stand beside it. InputError without
+    usd-core.
     """
     try:
         from pxr import Usd, UsdGeom, UsdUtils

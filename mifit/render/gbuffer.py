@@ -121,14 +121,7 @@ class SurfaceScene:
         self._kept.clear()
 
     def gbuffer(self, camera: Camera) -> GBuffer:
-        """Intersect the rays through all pixel centres of an undistorted camera.
-
-        Raises
-        ------
-        InputError
-            The camera has lens distortion; undistort the images first.
-        """
-
+        """Intersect the rays through all pixel centres of an undistorted camera; InputError for lens distortion."""
         if any(camera.distortion):
             raise InputError(f"camera {camera.name}: found lens distortion, expected an undistorted camera")
         box, face, u, v, depth = self._hits(camera)

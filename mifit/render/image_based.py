@@ -63,22 +63,11 @@ def image_based(
     blends: Sequence[Blend] = ("cosine",),
     oversampling: int = 1,
 ) -> ImageBased:
-    """One view of one timestep from the photographs of other views.
+    """One view of one timestep from the photographs of the ``fitted`` cameras; no other images are read.
 
-    Parameters
-    ----------
-    capture : Capture
-        Only images of the fitted cameras are read.
-    fitted : sequence of Camera
-        Undistorted cameras whose photographs give the colours.
-    camera : Camera
-        Undistorted camera of the wanted view.
-    vertices : (V, 3), faces : (F, 3)
-        Mesh in the capture's world space.
-    blends : sequence of {"cosine", "nearest", "angle"}
-    oversampling : int
-        Samples per pixel along each side; a pixel is the mean of its samples that hit, and has a face (that of one of
-        them) or is seen where all of its samples do.
+    All cameras are undistorted; ``vertices`` (V, 3) and ``faces`` (F, 3) are a mesh in the capture's world space. There
+    are ``oversampling`` samples along each side of a pixel, which is the mean of those that hit, and has a face (that
+    of one of them) or is seen where all of its samples do.
     """
     surface = trace_mesh(vertices, faces, camera, oversampling)
     face, wanted, count = surface.face, surface.view, len(surface.face)

@@ -47,20 +47,11 @@ class Surface:
 class PathTracer:
     """Materials and environment, loaded once; surfaces are given per image.
 
-    Parameters
-    ----------
-    environment : (H, W, 3)
-        Lat-long radiance in Mitsuba's ``envmap`` layout: row 0 up, u = 0 along -z, u = 1/4 along +x.
-    specular : bool
-        Whether the lobes reflect; without them the diffuse base alone is left.
+    ``environment`` (H, W, 3) is lat-long radiance in Mitsuba's ``envmap`` layout: row 0 up, u = 0 along -z, u = 1/4
+    along +x. Without ``specular`` the lobes don't reflect: the diffuse base alone is left.
     """
 
-    def __init__(
-        self,
-        materials: dict[str, Material],
-        environment: NDArray,
-        specular: bool = True,
-    ) -> None:
+    def __init__(self, materials: dict[str, Material], environment: NDArray, specular: bool = True) -> None:
         import mitsuba as mi
 
         self._bsdfs = {name: mi.load_dict(_bsdf(material, float(specular))) for name, material in materials.items()}

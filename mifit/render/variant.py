@@ -66,12 +66,8 @@ def check_llvm() -> Llvm:
     """Decide which libLLVM Dr.Jit shall load and tell it through ``DRJIT_LIBLLVM_PATH``.
 
     A path that is already in the variable is honoured, whatever else is installed; otherwise the newest library
-    that loads and works is taken. Nothing is compiled in this process.
-
-    Returns
-    -------
-    Llvm
-        The library; its ``error`` says what is wrong and what mends it when none can be used.
+    that loads and works is taken. Nothing is compiled in this process. The ``error`` of what is returned says what is
+    wrong and what mends it when none can be used.
     """
     named = os.environ.get(_ENVIRONMENT)
     if named:

@@ -41,11 +41,7 @@ class VisibleSurface:
 
 
 def trace_mesh(
-    vertices: NDArray,
-    faces: NDArray,
-    camera: Camera,
-    oversampling: int,
-    joined: NDArray[np.bool_] | None = None,
+    vertices: NDArray, faces: NDArray, camera: Camera, oversampling: int, joined: NDArray[np.bool_] | None = None
 ) -> VisibleSurface:
     """The front-facing surface of a mesh under a camera's samples.
 

@@ -244,11 +244,10 @@ def _read_mesh(path: Path, mesh: SplitMesh) -> dict[str, NDArray]:
 def _read_map(path: Path, channels: int, size: int | None = None) -> NDArray[np.float32]:
     """Read one map and check its shape and that it is finite."""
     image = read_image(path)
-    if channels == 1 and image.ndim == 3:
-        image = image[..., 0]
+    image = image[..., 0] if channels == 1 else image
     shape = image.shape[:2]
     expected = (size, size) if size else (shape[0], shape[0])
-    if shape != expected or (channels == 3 and image.shape[2:] != (3,)) or not np.isfinite(image).all():
+    if shape != expected or not np.isfinite(image).all():
         raise InputError(
             f"{path}: found an image of shape {image.shape}, expected {expected[0]} x {expected[1]} texels "
             f"of {channels} finite channels; fit again"
@@ -311,10 +310,8 @@ def _labels(folder: Path, document: Document) -> dict[tuple[str, int], NDArray[n
             path = folder / label_file(camera.name, timestep)
             if path.is_file():
                 image = to_8_bit(read_image(path)[..., 0])
-                if image.shape != (camera.height, camera.width):
-                    raise InputError(
-                        f"{path}: found {image.shape}, expected {(camera.height, camera.width)}; fit again"
-                    )
+                if image.shape != (size := (camera.height, camera.width)):
+                    raise InputError(f"{path}: found {image.shape}, expected {size}; fit again")
                 found[camera.name, timestep] = image
     return found
 
@@ -324,9 +321,8 @@ def _normals(folder: Path, document: Document) -> NormalsEstimate | None:
         return None
     timesteps = [int(s["timestep"]) for s in document["timesteps"] if s["refined_normals"]]
     tracked = {int(s["timestep"]): str(s["tracked"]) for s in document["timesteps"] if s["tracked"]}
-    return NormalsEstimate(
-        tuple(timesteps), _read_maps(folder, "normal_object", timesteps, 3), _report(document, "normals"), tracked
-    )
+    maps = _read_maps(folder, "normal_object", timesteps, 3)
+    return NormalsEstimate(tuple(timesteps), maps, _report(document, "normals"), tracked)
 
 
 def _residual(folder: Path, document: Document, size: int) -> ResidualEstimate | None:

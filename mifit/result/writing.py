@@ -92,11 +92,7 @@ def _write_timestep(result: Reconstruction, folder: Path, timestep: int) -> None
 def _document(result: Reconstruction) -> Document:
     """``result.json`` as a dictionary."""
     geometry, reflectance = result.geometry, result.reflectance
-    lighting: Document = {
-        "order": 3,
-        "shading": geometry.shading.tolist(),
-        "shading_ambient": float(geometry.ambient),
-    }
+    lighting: Document = {"order": 3, "shading": geometry.shading.tolist(), "shading_ambient": float(geometry.ambient)}
     if reflectance is not None:
         lighting |= {
             "order": reflectance.illumination.order,

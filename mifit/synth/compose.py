@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -118,7 +117,6 @@ def synthesize(  # noqa: PLR0913
     shape = MorphableModel.load(model)
     radiance = None if env is None else read_environment(env)
     out.mkdir(parents=True, exist_ok=True)  # a place that can't be written is refused now, not after the first render
-    total = subjects * (timesteps + 1)
     cameras = place_cameras(width, height)
     map_size = 1024 if min(width / 680, height / 480) > 0.6 else 512
     for i in range(subjects):
@@ -127,13 +125,12 @@ def synthesize(  # noqa: PLR0913
         style = style.portrait() if portrait else style
         subject = _draw_subject(shape, style, timesteps, map_size, outside, landmark_bias)
         light = studio_environment(seed + i) if radiance is None else radiance
-        advance = partial(_advance, progress, i * (timesteps + 1), total)
+
+        def advance(done: int, before: int = i * (timesteps + 1)) -> None:
+            progress("Rendering", before + done, subjects * (timesteps + 1))
+
         _write_capture(folder, subject, cameras, light, spp, advance)
     return out
-
-
-def _advance(progress: Progress, start: int, total: int, done: int) -> None:
-    progress("Rendering", start + done, total)
 
 
 def place_cameras(width: int, height: int, distance: float = 72.0) -> list[Camera]:
@@ -207,7 +204,8 @@ def _write_capture(
     """Render and write one capture; ``transforms.json`` comes last, so a broken-off folder isn't taken for whole."""
     advance(0)
     tracer = PathTracer(_materials(subject), environment)
-    exposure = _exposure(tracer, subject, cameras[0])
+    first = _surfaces(subject, subject.poses[0], _world_vertices(subject, subject.poses[0]))
+    exposure = exposure_of(tracer.render(first, [cameras[0].resized(0.25)], 16, seed=subject.seed)[0])  # a quick one
     maps = subject.skin["face"]
     halves = {name: getattr(maps, name).astype(np.float16) for name in ("albedo", "specular", "roughness", "bump")}
     with replacing(folder / "truth" / "maps.npz") as temporary:
@@ -220,22 +218,16 @@ def _write_capture(
     advance(1)
     for t, pose in enumerate(subject.poses):
         world = _world_vertices(subject, pose)
-        images = tracer.render(
-            _surfaces(subject, pose, world), cameras, spp, seed=(subject.seed * 100_003 + t) % (MAX_SEED + 1)
-        )
+        seed = (subject.seed * 100_003 + t) % (MAX_SEED + 1)
+        images = tracer.render(_surfaces(subject, pose, world), cameras, spp, seed=seed)
         visibility.update(world)
         for c, (camera, image) in enumerate(zip(cameras, images, strict=True)):
             rng = np.random.default_rng([subject.seed, t, c, 21])
-            shot = Shot(
-                camera.name,
-                t,
-                folder / "images" / camera.name / f"{t:04d}.png",
-                landmarks=folder / "landmarks" / camera.name / f"{t:04d}.json",
-            )
-            assert shot.landmarks is not None
+            at, beside = (folder / kind / camera.name / f"{t:04d}" for kind in ("images", "landmarks"))
+            shot = Shot(camera.name, t, at.with_suffix(".png"), landmarks=beside.with_suffix(".json"))
             write_image(shot.image, expose(image[..., :3] * exposure, rng))
             marks = head.mark(subject.model, world, camera, visibility, rng, bias @ pose.rotation.T)
-            write_landmarks(shot.landmarks, marks)
+            write_landmarks(beside.with_suffix(".json"), marks)
             shots.append(shot)
         with replacing(folder / "truth" / f"{t:04d}.npz") as temporary:
             np.savez_compressed(
@@ -283,20 +275,10 @@ def _surfaces(subject: _Subject, pose: head.HeadPose, world: NDArray) -> list[Su
     return surfaces
 
 
-def _exposure(tracer: PathTracer, subject: _Subject, camera: Camera) -> float:
-    """`exposure_of` a quick render of the first timestep."""
-    pose = subject.poses[0]
-    surfaces = _surfaces(subject, pose, _world_vertices(subject, pose))
-    return exposure_of(tracer.render(surfaces, [camera.resized(0.25)], 16, seed=subject.seed)[0])
-
-
 def exposure_of(image: NDArray) -> float:
     """Factor that puts the brightest skin of an RGBA image, highlights aside, near the sensor's upper end.
 
-    Raises
-    ------
-    InputError
-        Nothing in it is lit.
+    InputError where nothing in it is lit.
     """
     seen = image[image[..., 3] > 0.9]
     level = float(np.percentile(seen[:, :3].max(axis=1), 97)) if len(seen) else 0.0

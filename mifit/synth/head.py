@@ -49,15 +49,8 @@ def neutral_shape(model: MorphableModel, seed: int, outside: float = OUTSIDE) ->
 def draw_motion(model: MorphableModel, timesteps: int, seed: int, scale: float, centre: NDArray) -> list[HeadPose]:
     """A pose and an expression per timestep, which differ as widely as in photographs; the first one is neutral.
 
-    Parameters
-    ----------
-    model : MorphableModel
-    timesteps : int
-    seed : int
-    scale : float
-        World units per model unit.
-    centre : (3,)
-        Object-space point that the head turns about and that stays near the world's origin.
+    ``scale`` is in world units per model unit; ``centre`` (3,) the object-space point that the head turns about and
+    that stays near the world's origin.
     """
     rng = np.random.default_rng([seed, 12])
     phase, speed = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.5, 1.1, 6)
@@ -139,13 +132,8 @@ def draw_bias(seed: int, deviation: float) -> NDArray[np.float64]:
     """(68, 3) displacement of each landmark in object space, the same in all images of a head.
 
     Detectors put a landmark where annotators would, not where a model's vertex is: MediaPipe's points on renders of
-    scanned heads lie about 5 pixels, at a width of 680, from the points that fit all views.
-
-    Parameters
-    ----------
-    seed : int
-    deviation : float
-        Standard deviation of each coordinate; a frontal view shows 1.25 times it on average.
+    scanned heads lie about 5 pixels, at a width of 680, from the points that fit all views. ``deviation`` is the
+    standard deviation of each coordinate; a frontal view shows 1.25 times it on average.
     """
     return deviation * np.random.default_rng([seed, 15]).standard_normal((COUNT, 3))
 
@@ -160,18 +148,8 @@ def mark(
 ) -> Landmarks:
     """Landmarks of one image as a detector would find them, knowing which are hidden.
 
-    Parameters
-    ----------
-    model : MorphableModel
-    world : (V, 3)
-        Vertices in world space.
-    camera : Camera
-    scene : SurfaceScene
-        The head at these vertices.
-    rng : numpy Generator
-        Of the noise.
-    bias : (68, 3), optional
-        Displacement in world space.
+    ``world`` (V, 3) are vertices in world space and ``scene`` the head there; ``rng`` draws the noise, and ``bias``
+    (68, 3) is a displacement in world space.
     """
     points = world[model.landmarks]
     normals = vertex_normals(world, model.faces)[model.landmarks]

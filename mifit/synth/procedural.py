@@ -49,13 +49,8 @@ def _softbox(
 def smooth_noise(points: NDArray, wavelength: float, rng: np.random.Generator, octaves: int = 1) -> NDArray[np.float32]:
     """Noise with mean 0 and standard deviation about 1 at points (N, 3).
 
-    Parameters
-    ----------
-    points : (N, 3)
-    wavelength : float
-        Feature size of the first octave, in the points' unit; every further octave halves size and amplitude.
-    rng : numpy Generator
-    octaves : int
+    ``wavelength`` is the feature size of the first octave, in the points' unit; every further octave halves size and
+    amplitude.
     """
     total = np.zeros(len(points), dtype=np.float32)
     for octave in range(octaves):

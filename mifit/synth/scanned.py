@@ -34,12 +34,8 @@ MAPS = ("albedo", "specular", "roughness", "displacement")
 class ScannedHead:
     """A head in centimetres, y up, nose along +z, turned about the origin.
 
-    Attributes
-    ----------
-    vertices : (V, 3), faces : (F, 3), uv : (V, 2)
-        One texture coordinate per vertex; row 0 of a map is at v = 1.
-    maps : dict of (S, S, ...) float32
-        ``albedo`` (linear, 0..1), ``specular`` and ``roughness`` (0..1), ``displacement`` (centimetres).
+    It has one texture coordinate per vertex, ``uv`` (V, 2); row 0 of a map is at v = 1. ``maps`` (S, S, ...) are
+    ``albedo`` (linear, 0..1), ``specular`` and ``roughness`` (0..1), ``displacement`` (centimetres).
     """
 
     vertices: NDArray[np.float64]
@@ -51,23 +47,12 @@ class ScannedHead:
     def load(
         cls, path: str | Path, maps: Mapping[str, str | Path], unit_mm: float = 10.0, flip_v: bool = False
     ) -> ScannedHead:
-        """Read a mesh with texture coordinates (glTF, OBJ, PLY) and its maps.
+        """Read a mesh with texture coordinates (glTF, OBJ, PLY), of ``unit_mm`` millimetres per unit, and its maps.
 
-        Parameters
-        ----------
-        path : path
-        maps : dict of name to path
-            ``albedo`` must be there; see `MAPS`. Images with an 8-bit transfer curve are decoded for the albedo only.
-        unit_mm : float
-            Millimetres per unit of the mesh.
-        flip_v : bool
-            Turn the maps upside down: glTF counts v from the top, most other formats from the bottom, and some files
-            keep the other one's habit.
-
-        Raises
-        ------
-        InputError
-            No mesh, no texture coordinates, an unknown or unreadable map.
+        Among the maps must be ``albedo``; see `MAPS`. Images with an 8-bit transfer curve are decoded for the albedo
+        only. ``flip_v`` turns them upside down: glTF counts v from the top, most other formats from the bottom, and
+        some files keep the other one's habit. InputError for no mesh, no texture coordinates, or an unknown or
+        unreadable map.
         """
         try:
             mesh = trimesh.load_mesh(path, process=False)
@@ -121,10 +106,8 @@ def _read_maps(files: Mapping[str, str | Path]) -> dict[str, NDArray[np.float32]
     for name, path in files.items():
         image = read_image(path)
         if name != "albedo":  # no colours: the codes themselves are the values
-            image = (
-                linear_to_srgb(np.clip(image, 0.0, 1.0)) if Path(path).suffix.lower() not in (".exr", ".hdr") else image
-            )
-            image = image.mean(axis=-1)
+            linear = Path(path).suffix.lower() in (".exr", ".hdr")
+            image = (image if linear else linear_to_srgb(np.clip(image, 0.0, 1.0))).mean(axis=-1)
         size = min(1024, min(image.shape[:2]))
         maps[name] = _resized(image, size)
     size = len(maps["albedo"])
@@ -175,26 +158,10 @@ def synthesize_scan(
     ``truth/full_CAMERA.exr`` and ``truth/diffuse_CAMERA.exr`` the last camera's view of the first timestep with and
     without specular reflection, ``truth/relit_NAME.exr`` the same view under another environment, and
     ``truth/environment_NAME.exr`` that environment; all linear. ``truth/meta.json`` has the factor of each to the
-    sensor's range. There are no landmarks: `mifit landmarks` finds them.
+    sensor's range. There are no landmarks: `mifit landmarks` finds them. ``transforms.json`` is written last.
 
-    Parameters
-    ----------
-    out : path
-        Capture folder.
-    head : ScannedHead
-    cameras : sequence of Camera
-        The last one is the held-out view by custom.
-    environment : (H, W, 3)
-        Lat-long radiance.
-    relit : dict of name to (H, W, 3), optional
-        Environments of the relit truths.
-    timesteps, seed, spp : int
-    progress : Progress
-
-    Returns
-    -------
-    Path
-        ``out``; ``transforms.json`` is written last.
+    The last camera is the held-out view by custom; ``environment`` (H, W, 3) is lat-long radiance, and ``relit`` are
+    those of the relit truths by name.
     """
     out, relit = Path(out), dict(relit or {})
     total = timesteps + len(relit)

@@ -28,18 +28,9 @@ DEEP = np.array([0.16, 0.088, 0.058])
 class SkinMaps:
     """Maps of one piece of surface, row 0 at v = 1.
 
-    Attributes
-    ----------
-    albedo : (S, S, 3) float32
-        Linear reflectance.
-    specular : (S, S) float32
-        Weight of the oily lobe against the dry one, 0..1.
-    roughness : (S, S) float32
-        Roughness of the dry lobe (square root of the microfacet width).
-    bump : (S, S) float32
-        Relief along the normal in millimetres.
-    cover : (S, S) bool
-        Texels of the surface; the others repeat their nearest neighbour.
+    ``albedo`` (S, S, 3) is linear reflectance, ``specular`` (S, S) the weight of the oily lobe against the dry one,
+    0..1, ``roughness`` (S, S) that of the dry lobe (square root of the microfacet width), ``bump`` (S, S) relief along
+    the normal in millimetres. Texels outside ``cover`` (S, S) repeat their nearest neighbour.
     """
 
     albedo: NDArray[np.float32]
@@ -123,20 +114,9 @@ class Anatomy:
 def paint(
     texels: TexelMap, mean_mm: NDArray, normals: NDArray, faces: NDArray, landmarks: NDArray, style: SkinStyle
 ) -> SkinMaps:
-    """Paint the maps of a piece of surface.
+    """Paint the maps of a piece of surface with ``faces`` (F, 3), which ``texels`` are of.
 
-    Parameters
-    ----------
-    texels : TexelMap
-        Surface points of the maps, by index into `faces`.
-    mean_mm : (V, 3), normals : (V, 3)
-        The whole mean face in millimetres and its normals.
-    faces : (F, 3)
-        Faces of the piece.
-    landmarks : (68,)
-        Vertices of the iBUG points.
-    style : SkinStyle
-        The subject.
+    ``mean_mm`` and ``normals`` (V, 3) are the whole mean face in millimetres; ``landmarks`` (68,) its iBUG points.
     """
     p = interpolate(mean_mm, faces, texels.face, texels.weights).astype(np.float32)
     n = normalize(interpolate(normals, faces, texels.face, texels.weights))

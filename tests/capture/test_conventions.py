@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mifit.capture.lens import Undistortion, opencv_matrix, undistort_points
+from mifit.capture.lens import opencv_matrix, undistort_points, undistortion
 from mifit.capture.stereo import read_stereo, write_stereo
 from mifit.capture.transforms import Shot, View, read_transforms, write_transforms
 from mifit.core.camera import Camera
@@ -192,7 +192,7 @@ def test_undistorted_images_show_points_where_the_pinhole_puts_them() -> None:
     points = POINTS[:12]
     for x, y in project_distorted(camera, points):
         image += np.exp(-0.5 * ((centre[..., 0] - x) ** 2 + (centre[..., 1] - y) ** 2) / 1.5**2).astype(np.float32)
-    lens = Undistortion.of(camera)
+    lens = undistortion(camera)
     straight = lens.apply(image)
     assert lens.valid.mean() > 0.9
     for x, y in camera.project(points):
@@ -206,7 +206,7 @@ def test_undistorted_images_show_points_where_the_pinhole_puts_them() -> None:
 
 def test_a_lens_polynomial_that_folds_over_is_invalid_there() -> None:
     camera = Camera("a", 200, 200, 100.0, 100.0, 100.0, 100.0, np.eye(4), (-0.6, 0.0, 0.0, 0.0))
-    valid = Undistortion.of(camera).valid
+    valid = undistortion(camera).valid
     assert valid[100, 100]
     assert valid[100, 150]
     assert not valid[2, 2]  # radius 1.4: the derivative 1 - 1.8 r^2 is negative from r = 0.75 on

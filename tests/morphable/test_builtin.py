@@ -167,7 +167,7 @@ def test_blink_closes_the_eye(coarse, template):
     for side, lids in zip((-1, 1), template.upper_lids, strict=True):
         ball = np.array([0, 34, 10]) + sculpt.EYE * (side, 1, 1)
         middle = lids[8:-8] if len(lids) > 20 else lids[4:-4]
-        assert (np.linalg.norm(v[middle] - ball, axis=1) > sculpt.EYE_RADIUS - 2.5).all()
+        assert (np.linalg.norm(v[middle] - ball, axis=1) > sculpt.LID_RADIUS - 4.4).all()
 
 
 RISKY = [

@@ -13,17 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
 from mifit.core.mesh import face_cross
-from mifit.morphable.builtin import sculpt
-from mifit.morphable.builtin.action_units import (
-    CENTRAL,
-    JAW_SHARE,
-    LOCAL,
-    LOCAL_LIPS,
-    LOCALISED,
-    PAIRED,
-    POINTS,
-    Motion,
-)
+from mifit.core.mesh_solve import cotangent_laplacian
+from mifit.morphable.builtin import action_units, sculpt
 from mifit.morphable.builtin.landmarks import PointFinder
 from mifit.morphable.builtin.template import Template
 
@@ -37,13 +28,13 @@ def expression_modes(template: Template) -> tuple[NDArray[np.float32], tuple[str
     """Modes (V, 3, 77) in mm, premultiplied by their deviations, with their names and bounds (77, 2)."""
     influence, names = _influences(template)
     index = {n: k for k, n in enumerate(names)}
-    anchors = _anchor_positions(template)
     v = template.vertices
+    anchors = v[list(_anchor_vertices(template).values())]
     left = sculpt.smooth_step(v[:, 0], -9.0, 9.0)[:, None]
     modes: dict[str, NDArray] = {}
     bounds: dict[str, tuple[float, float]] = {}
 
-    def displaced(motion: Motion) -> NDArray:
+    def displaced(motion: action_units.Motion) -> NDArray:
         d = np.zeros((len(names), 3))
         for point, vector in motion.items():
             for side in (1, -1):
@@ -54,15 +45,15 @@ def expression_modes(template: Template) -> tuple[NDArray[np.float32], tuple[str
                 d[index[point]] = vector
         return influence @ d
 
-    for name, motion in PAIRED.items():
+    for name, motion in action_units.PAIRED.items():
         field = displaced(motion)
         modes[f"{name}_L"], modes[f"{name}_R"] = field * left, field * (1 - left)
-    for name, motion in CENTRAL.items():
+    for name, motion in action_units.CENTRAL.items():
         modes[name] = displaced(motion)
     for name in modes:
         bounds[name] = (0.0, ACTION_BOUND)
 
-    share = np.array([JAW_SHARE.get(n.rstrip("+-"), 0.0) for n in names])
+    share = np.array([action_units.JAW_SHARE.get(n.rstrip("+-"), 0.0) for n in names])
     modes["jawOpen"] = influence @ (share[:, None] * (_rotate_x(anchors - _TMJ, 17.0) + _TMJ - anchors))
     bounds["jawOpen"] = (0.0, ACTION_BOUND)
     modes["jawForward"] = influence @ (share[:, None] * np.array([0.0, 0.0, 5.0]))
@@ -80,10 +71,10 @@ def expression_modes(template: Template) -> tuple[NDArray[np.float32], tuple[str
         bounds[f"{name}_L"] = bounds[f"{name}_R"] = (0.0, ACTION_BOUND)
 
     out = {n: m / ACTION_BOUND for n, m in modes.items()}
-    for point, axis, parity in LOCALISED:
+    for point, axis, parity in action_units.LOCALISED:
         name = f"local_{point}_{axis}{'' if parity == 1 else '_odd'}"
         lips = axis == "y" and point == "up_out"
-        vector = (LOCAL_LIPS if lips else LOCAL) * np.eye(3)["xyz".index(axis)]
+        vector = (action_units.LOCAL_LIPS if lips else action_units.LOCAL) * np.eye(3)["xyz".index(axis)]
         d = np.zeros((len(names), 3))
         if point in index:
             d[index[point]] = vector
@@ -101,7 +92,7 @@ def _anchor_vertices(template: Template) -> dict[str, int]:
     find = PointFinder(template)
     rows = {"eye": template.eye_row, "mouth": template.mouth_row}
     out: dict[str, int] = {}
-    for name, place in POINTS.items():
+    for name, place in action_units.POINTS.items():
         if isinstance(place[0], str):
             k = find.in_row(rows[place[0]] + place[1], place[2])
         else:
@@ -113,16 +104,12 @@ def _anchor_vertices(template: Template) -> dict[str, int]:
     return out
 
 
-def _anchor_positions(template: Template) -> NDArray[np.float64]:
-    return template.vertices[list(_anchor_vertices(template).values())]
-
-
 def _influences(template: Template) -> tuple[NDArray[np.float64], list[str]]:
     """(V, A) biharmonic influence of every named point, and the points' names."""
     anchors = _anchor_vertices(template)
     v = template.vertices
     faces = template.faces
-    weights = _cotangents(v, faces)
+    weights = cotangent_laplacian(v, faces, (-5.0, 50.0))
     area = np.zeros(len(v))
     np.add.at(area, faces.ravel(), np.repeat(np.linalg.norm(face_cross(v, faces), axis=1) / 6.0, 3))
     bilaplacian = (weights @ sp.diags(1.0 / np.maximum(area, 1e-6)) @ weights).tocsc()
@@ -141,22 +128,6 @@ def _influences(template: Template) -> tuple[NDArray[np.float64], list[str]]:
         columns = np.searchsorted(template.grid[template.mouth_row], template.upper_lip)
         out[margin] = out[template.grid[template.mouth_row + row, columns]]
     return out, list(anchors)
-
-
-def _cotangents(v: NDArray, faces: NDArray) -> sp.csr_matrix:
-    """Cotangent Laplacian (V, V), positive semi-definite."""
-    i, j, w = [], [], []
-    for k in range(3):
-        a, b, c = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
-        u, s = v[b] - v[a], v[c] - v[a]
-        cot = (u * s).sum(1) / np.maximum(np.linalg.norm(np.cross(u, s), axis=1), 1e-9)
-        i.append(b)
-        j.append(c)
-        w.append(0.5 * np.clip(cot, -5.0, 50.0))
-    i_, j_, w_ = map(np.concatenate, (i, j, w))
-    m = sp.coo_matrix((w_, (i_, j_)), shape=(len(v), len(v)))
-    m = (m + m.T).tocsr()
-    return (sp.diags(np.asarray(m.sum(1)).ravel()) - m).tocsr()
 
 
 def _rotate_x(p: NDArray, degrees: float) -> NDArray:

@@ -30,12 +30,9 @@ DENSITY = 0.66
 
 @cache
 def builtin_model(coarse: bool = False) -> MorphableModel:
-    """Return the built-in model, made now, read from the cache folder, or still in memory.
+    """The built-in model, made now, read from the cache folder, or still in memory.
 
-    Parameters
-    ----------
-    coarse : bool
-        About 9 000 instead of 15 000 vertices.
+    It has about 15 000 vertices, or 9 000 when ``coarse``.
     """
     path = cache_folder() / f"builtin-{'coarse' if coarse else 'full'}-{_DIGEST}.npz"
     if path.is_file():
@@ -101,15 +98,10 @@ def template_face_mask(t: Template) -> NDArray[np.bool_]:
 def _source_digest() -> str:
     """Digest of the code that makes the model: a cached file is valid for this code only."""
     here = Path(__file__).parent
-    files = sorted(
-        [
-            *here.glob("*.py"),
-            *(here.parent / f for f in ("gaussian_process.py", "openings.py", "pigment.py", "topology.py")),
-            here.parents[1] / "core" / "mesh.py",
-        ]
-    )
+    files = [here.parent / f for f in ("gaussian_process.py", "openings.py", "pigment.py", "topology.py")]
+    files += [here.parents[1] / "core" / f for f in ("mesh.py", "mesh_solve.py")]
     h = hashlib.blake2b(digest_size=8)
-    for file in files:
+    for file in sorted([*here.glob("*.py"), *files]):
         h.update(file.read_bytes())
     return h.hexdigest()
 

@@ -10,14 +10,16 @@ from mifit.morphable.builtin import sculpt
 from mifit.morphable.builtin.template import Template
 from mifit.morphable.topology import IBUG_MIRROR
 
-# targets on the side x > 0 in mm; mirrored for x < 0
-_JAW = [
-    (70, 0, 15), (69.5, -17, 18), (67, -34, 22), (62, -52, 27), (55, -67, 33),
-    (45, -82, 45), (31, -95, 62), (16, -104, 80), (0, -108.5, 86),
-]  # fmt: skip
-_BROW = [(54, 14), (46, 20.5), (36, 23.5), (24, 22.5), (13, 18.5)]
-_NOSE = [(0, 1), (0, -12), (0, -24), (0, -38)]
-_NOSTRILS = [(13, -46), (7, -48.5), (0, -50)]
+_PLACES: dict[int, list[tuple[float, ...]]] = {
+    0: [
+        (70, 0, 15), (69.5, -17, 18), (67, -34, 22), (62, -52, 27), (55, -67, 33),
+        (45, -82, 45), (31, -95, 62), (16, -104, 80), (0, -108.5, 86),
+    ],
+    17: [(54, 14), (46, 20.5), (36, 23.5), (24, 22.5), (13, 18.5)],
+    27: [(0, 1), (0, -12), (0, -24), (0, -38)],
+    31: [(13, -46), (7, -48.5), (0, -50)],
+}  # fmt: skip
+"""Jaw, brow, nose and nostrils on the side x > 0 in mm, by their first landmarks; mirrored for x < 0."""
 
 
 class PointFinder:
@@ -27,17 +29,13 @@ class PointFinder:
         self._t = template
         v = template.vertices
         self._half = template.grid.shape[1] // 2
-        self._candidates = np.flatnonzero(v[:, 0] <= 1e-9)
-        self._candidates = np.setdiff1d(self._candidates, self._rolled())
+        lids, lips = (template.upper_lids, template.lower_lids), (template.upper_lip, template.lower_lip)
+        slits = np.concatenate([margin.ravel() for margin in (*lids, *lips)])  # which lie inside
+        self._candidates = np.setdiff1d(np.flatnonzero(v[:, 0] <= 1e-9), slits)
         front = self._candidates[v[self._candidates, 2] > 20.0]
         self._front, self._tree_front = front, cKDTree(v[front, :2])
         self._tree = cKDTree(v[self._candidates])
         self._midline = template.grid[:, self._half]
-
-    def _rolled(self) -> NDArray:
-        """Vertices on the slits themselves, which lie inside."""
-        t = self._t
-        return np.concatenate([t.upper_lids.ravel(), t.lower_lids.ravel(), t.upper_lip, t.lower_lip])
 
     def at(self, *position: float) -> int:
         """Vertex nearest to (x, y) on the visible front, or to (x, y, z); x >= 0 means distance from the midline."""
@@ -62,10 +60,7 @@ def landmark_vertices(template: Template) -> NDArray[np.int32]:
     find = PointFinder(template)
     er, mr = template.eye_row, template.mouth_row
     canthi = sculpt.CANTHI
-    right: dict[int, int] = {k: find.at(*p) for k, p in enumerate(_JAW)}
-    right |= {17 + k: find.at(*p) for k, p in enumerate(_BROW)}
-    right |= {27 + k: find.at(*p) for k, p in enumerate(_NOSE)}
-    right |= {31 + k: find.at(*p) for k, p in enumerate(_NOSTRILS)}
+    right = {first + k: find.at(*p) for first, places in _PLACES.items() for k, p in enumerate(places)}
     right |= {36: find.in_row(er, canthi[1]), 39: find.in_row(er, canthi[0])}
     right |= {37: find.in_row(er - 1, 36.0), 38: find.in_row(er - 1, 27.0)}
     right |= {40: find.in_row(er + 1, 27.0), 41: find.in_row(er + 1, 36.0)}
@@ -77,7 +72,5 @@ def landmark_vertices(template: Template) -> NDArray[np.int32]:
     right[60] = find.in_row(mr - 1, sculpt.MOUTH_HALF - 3.0)
     right |= {61: find.in_row(mr - 1, 9.0), 62: find.in_row(mr - 1, 0.0)}
     right |= {66: find.in_row(mr + 1, 0.0), 67: find.in_row(mr + 1, 9.0)}
-    out = np.empty(68, dtype=np.int32)
-    for k in range(68):
-        out[k] = right[k] if k in right else template.symmetry[right[int(IBUG_MIRROR[k])]]
-    return out
+    found = [right[k] if k in right else template.symmetry[right[int(IBUG_MIRROR[k])]] for k in range(68)]
+    return np.array(found, dtype=np.int32)

@@ -43,21 +43,20 @@ _SLICES = np.array(
 _COLUMNS = np.array([[0, 15], [13, 11], [22, 20], [42, 9], [60, 8], [82, 19], [112, 6], [180, 0]])
 
 EYE = np.array([31.5, 0.0, 71.8])
-EYE_RADIUS = 12.2
-_LID = 1.9  # thickness
+LID_RADIUS = 12.2 + 1.9  # of the eyeball, and the thickness of a lid
 CANTHI = (15.6, 46.4)
 MOUTH_HALF = 25.5
 
 
-def _knots() -> tuple[NDArray, CubicSpline]:
-    """Positions of the slices along the loft, and the spline through them."""
+def _knots() -> NDArray:
+    """Positions of the slices along the loft."""
     step = np.linalg.norm(np.diff(_SLICES[:, :2], axis=0), axis=1)
     step = 0.6 * step + 0.4 * np.linalg.norm(np.diff(_SLICES[:, 2:5], axis=0), axis=1)
-    knots = np.concatenate([[0.0], np.cumsum(step)])
-    return knots, CubicSpline(knots, _SLICES[:, :8])
+    return np.concatenate([[0.0], np.cumsum(step)])
 
 
-_KNOTS, _SPLINE = _knots()
+_KNOTS = _knots()
+_SPLINE = CubicSpline(_KNOTS, _SLICES[:, :8])
 
 
 def _spread(positions: NDArray, lines: NDArray) -> NDArray:
@@ -158,10 +157,15 @@ def _along(x: NDArray, y: NDArray, line: list[tuple[float, float]], width: float
     return np.exp(-0.5 * best / width**2)
 
 
-_NOSE_Y = np.array([14, 6, 0, -8, -16, -24, -31, -36, -39.5, -42.5, -45, -47.5, -50])
-_NOSE_Z = np.array([0, 0.5, 2.0, 5.6, 9.6, 13.6, 16.8, 18.2, 18.0, 15.6, 10.4, 4.2, 0])
-_NOSE_W = np.array([9, 10, 11, 12.5, 14, 16, 17, 17, 16.5, 15, 13, 11, 9])
-_nose_z, _nose_w = PchipInterpolator(_NOSE_Y[::-1], _NOSE_Z[::-1]), PchipInterpolator(_NOSE_Y[::-1], _NOSE_W[::-1])
+# The nose from the chin upwards: y, how far it stands out, and half its width.
+_NOSE = np.array(
+    [
+        [-50, -47.5, -45, -42.5, -39.5, -36, -31, -24, -16, -8, 0, 6, 14],
+        [0, 4.2, 10.4, 15.6, 18.0, 18.2, 16.8, 13.6, 9.6, 5.6, 2.0, 0.5, 0],
+        [9, 11, 13, 15, 16.5, 17, 17, 16, 14, 12.5, 11, 10, 9],
+    ]
+)
+_nose_z, _nose_w = (PchipInterpolator(_NOSE[0], row) for row in _NOSE[1:])
 
 
 def features(p: NDArray) -> NDArray:
@@ -183,7 +187,7 @@ def features(p: NDArray) -> NDArray:
     dx += 0.7 * cheek
     dz -= 2.6 * _g(x, y, 46, -56, 12, 13)
     # nose: bridge, wings with their crease, septum, nostrils
-    bounded = np.clip(y, _NOSE_Y[-1], _NOSE_Y[0])
+    bounded = np.clip(y, _NOSE[0, 0], _NOSE[0, -1])
     height, width = _nose_z(bounded), _nose_w(bounded)
     q = x / width
     bell = np.where(q < 1, (1 - np.minimum(q, 1) ** 2.2) ** 2.0, 0.0)
@@ -209,9 +213,9 @@ def lids(p: NDArray, upper: NDArray) -> NDArray:
     """Drape points near the eyes over the eyeballs, with a crease above the upper lid."""
     x, y, z = np.abs(p[..., 0]), p[..., 1], p[..., 2]
     r2 = (x - EYE[0]) ** 2 + (y - EYE[1]) ** 2
-    ball = EYE[2] + np.sqrt(np.maximum((EYE_RADIUS + _LID) ** 2 - r2, 1e-3))
+    ball = EYE[2] + np.sqrt(np.maximum(LID_RADIUS**2 - r2, 1e-3))
     near = 1.0 - smooth_step(np.sqrt(r2), 11.5, 15.5)
-    draped = _smooth_max(z, np.where(r2 < (EYE_RADIUS + _LID) ** 2, ball, -1e3), 1.5)
+    draped = _smooth_max(z, np.where(r2 < LID_RADIUS**2, ball, -1e3), 1.5)
     z = np.where(z > 20, z + near * (draped - z), z)
     top = lid_curves(x)[0]
     q = np.clip((x - CANTHI[0]) / (CANTHI[1] - CANTHI[0]), 0, 1)

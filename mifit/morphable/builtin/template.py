@@ -16,24 +16,12 @@ from mifit.morphable.builtin import sculpt
 
 @dataclass(frozen=True)
 class Template:
-    """Vertices in mm with their place on the grid.
+    """Vertices (V, 3) in mm with their place on the grid; faces and the rest as a `MorphableModel` has them.
 
-    Attributes
-    ----------
-    vertices : (V, 3) float64
-    faces : (F, 3) int32
-    uv : (T, 2) float32
-    faces_uv : (F, 3) int32
-    symmetry : (V,) int32
-    grid : (R, N) int32
-        Vertex of each row and column; columns run from the back's midline through x < 0 to the front and on.
-        Along slits it holds the upper vertices.
-    upper_lids, lower_lids : (2, K) int32
-        Vertices on either side of the slits of the eyes at x < 0 and x > 0, corners left out.
-    upper_lip, lower_lip : (L,) int32
-        The same for the mouth.
-    eye_row, mouth_row : int
-        Rows of the slits.
+    ``grid`` (R, N) has the vertex of each row and column; columns run from the back's midline through x < 0 to the
+    front and on, and along slits it holds the upper vertices. ``upper_lids`` and ``lower_lids`` (2, K) are vertices on
+    either side of the slits of the eyes at x < 0 and x > 0, corners left out, ``upper_lip`` and ``lower_lip`` (L,)
+    those of the mouth, ``eye_row`` and ``mouth_row`` the rows of the slits.
     """
 
     vertices: NDArray[np.float64]

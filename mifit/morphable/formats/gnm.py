@@ -49,7 +49,10 @@ def load_gnm(path: Path) -> MorphableModel:
     corners = data["triangle_uvs"]
     if corners.shape != (*triangles.shape, 2) or not (np.abs(corners) <= 1.0).all():
         raise InputError(f"{path}: triangle_uvs has shape {corners.shape}, expected {(*triangles.shape, 2)} in 0..1")
-    groups = _groups(path, data["vertex_group_names"], data["vertex_groups"], len(mean))
+    names, weights = data["vertex_group_names"], data["vertex_groups"]
+    if names.ndim != 1 or weights.shape != (len(names), len(mean)):
+        raise InputError(f"{path}: vertex_groups has shape {weights.shape}, expected {(names.size, len(mean))}")
+    groups = {str(name): np.asarray(row > 0.5) for name, row in zip(names, weights, strict=True)}
     clear = np.any([groups[name] for name in CLEAR if name in groups] or [np.zeros(len(mean), bool)], axis=0)
     shown = ~clear[triangles].all(axis=1)
     used, faces = np.unique(triangles[shown], return_inverse=True)
@@ -82,13 +85,6 @@ def load_gnm(path: Path) -> MorphableModel:
         face_mask=face_mask,
         source=path,
     )
-
-
-def _groups(path: Path, names: NDArray, weights: NDArray, count: int) -> dict[str, NDArray[np.bool_]]:
-    """(V,) vertices of each group."""
-    if names.ndim != 1 or weights.shape != (len(names), count):
-        raise InputError(f"{path}: vertex_groups has shape {weights.shape}, expected {(names.size, count)}")
-    return {str(name): np.asarray(row > 0.5) for name, row in zip(names, weights, strict=True)}
 
 
 def _modes(path: Path, basis: NDArray, key: str, used: NDArray, skin: NDArray, most: int) -> NDArray[np.float32]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.arrays import read_npz
-from mifit.core.files import read_bytes, read_text
+from mifit.core.files import read_bytes, read_json
 from mifit.core.limits import MAX_FILE_BYTES, MAX_SETTINGS_BYTES
 from mifit.errors import InputError
 from mifit.morphable.assemble import check_mesh, complete
@@ -63,10 +62,12 @@ def load_ict_folder(path: Path) -> MorphableModel:
     Only the skin of face, head and neck is kept; quads are split along their first diagonal.
     """
     try:
-        index = json.loads(read_text(path / "vertex_indices.json", MAX_SETTINGS_BYTES))
+        index = read_json(path / "vertex_indices.json", MAX_SETTINGS_BYTES)
         landmarks = np.array(index["idx_to_landmark_verts"])
         known = [str(name) for name in index["expressions"]]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except InputError:
+        raise
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{path / 'vertex_indices.json'}: {type(error).__name__}: {error}; "
             "expected idx_to_landmark_verts and expressions"

@@ -41,21 +41,14 @@ def mat_names(path: Path) -> list[str]:
 def read_mat(path: Path, keys: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, NDArray]:
     """Read the named numeric arrays.
 
-    Raises
-    ------
-    InputError
-        A key is missing, an array is not a real numeric one, sizes disagree, or the file is truncated or packed
-        beyond any honest ratio.
+    InputError where a key is missing, an array is not a real numeric one, sizes disagree, or the file is truncated or
+    packed beyond any honest ratio.
     """
-    out = {}
-    present = []
-    for name, array in _matrices(path, wanted=(*keys, *optional)):
-        present.append(name)
-        if array is not None:
-            out[name] = array
+    present = dict(_matrices(path, wanted=(*keys, *optional)))
+    out = {name: array for name, array in present.items() if array is not None}
     missing = [k for k in keys if k not in out]
     if missing:
-        raise InputError(f"{path}: lacks {', '.join(missing)}; found {', '.join(present[:12]) or 'no arrays'}")
+        raise InputError(f"{path}: lacks {', '.join(missing)}; found {', '.join([*present][:12]) or 'no arrays'}")
     return out
 
 

@@ -94,25 +94,20 @@ def _encode(text: object, encoding: object = "latin1") -> bytes:
 
 
 class _Recipe:
-    """What a name stands for: it may be called, and nothing else can be done to it."""
+    """What a name stands for: it may be called, if it makes something, and nothing else can be done to it."""
 
-    __slots__ = ("make",)
+    __slots__ = ("make", "name")
 
-    def __init__(self, make: Callable[..., object]) -> None:
-        self.make = make
+    def __init__(self, make: Callable[..., object] | None, name: str = "") -> None:
+        self.make, self.name = make, name
 
     def __call__(self, *arguments: object) -> object:
+        if self.make is None:
+            raise InputError(f"wants to run {self.name}, which is refused; expected arrays only")
         return self.make(*arguments)
 
     def __setstate__(self, state: object) -> None:
         raise InputError("sets the state of a function, which is refused; expected arrays only")
-
-
-def _refused(name: str) -> _Recipe:
-    def refuse(*_: object) -> object:
-        raise InputError(f"wants to run {name}, which is refused; expected arrays only")
-
-    return _Recipe(refuse)
 
 
 def _object(kind: object, *_: object) -> Instance:
@@ -123,14 +118,14 @@ def _object(kind: object, *_: object) -> Instance:
 
 _RECIPES: dict[str, object] = {
     "numpy.dtype": _Recipe(_Dtype),
-    "numpy.ndarray": _refused("numpy.ndarray"),
+    "numpy.ndarray": _Recipe(None, "numpy.ndarray"),
     "numpy.core.multiarray._reconstruct": _Recipe(_Array),
     "numpy.core.multiarray.scalar": _Recipe(lambda dtype, data: _frombuffer(data, dtype, (), "C")),
     "numpy.core.numeric._frombuffer": _Recipe(_frombuffer),
     "copyreg._reconstructor": _Recipe(_object),
     "_codecs.encode": _Recipe(_encode),
     "builtins.bytes": _Recipe(lambda: b""),
-    "builtins.object": _refused("builtins.object"),
+    "builtins.object": _Recipe(None, "builtins.object"),
     "scipy.sparse._csc.csc_matrix": Instance,
     "chumpy.ch.Ch": Instance,
 }
@@ -201,11 +196,8 @@ def is_pickle(path: Path) -> bool:
 def read_pickle(path: Path) -> dict[str, object]:
     """Read a pickled dictionary of arrays; what isn't an array comes as `Instance`.
 
-    Raises
-    ------
-    InputError
-        The pickle names anything but array types (the name is in the message; nothing was run), is truncated, or
-        does not hold a dictionary.
+    InputError where the pickle names anything but array types (the name is in the message; nothing was run), is
+    truncated, or does not hold a dictionary.
     """
     data = read_bytes(path, MAX_MODEL_BYTES, "pickle")
     try:

@@ -68,10 +68,7 @@ def make() -> type:
             textures = [self.diffuse, self.specular, self.exponent, self.fresnel]
             varying = self.correction is not None or any(t.is_spatially_varying() for t in textures if t is not None)
             common = mi.BSDFFlags.FrontSide | (mi.BSDFFlags.SpatiallyVarying if varying else mi.BSDFFlags.Empty)
-            self.m_components = [
-                mi.BSDFFlags.GlossyReflection | common,
-                mi.BSDFFlags.DiffuseReflection | common,
-            ]
+            self.m_components = [mi.BSDFFlags.GlossyReflection | common, mi.BSDFFlags.DiffuseReflection | common]
             self.m_flags = self.m_components[0] | self.m_components[1]
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -221,9 +218,7 @@ def make() -> type:
             bs.eta = 1.0
             bs.sampled_component = dr.select(take_lobe, mi.UInt32(0), mi.UInt32(1))
             bs.sampled_type = dr.select(
-                take_lobe,
-                mi.UInt32(+mi.BSDFFlags.GlossyReflection),
-                mi.UInt32(+mi.BSDFFlags.DiffuseReflection),
+                take_lobe, mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
             )
             value, density = self._both(ctx, si, bs.wo, parameters, active)
             bs.pdf = dr.detach(density)
