@@ -60,7 +60,8 @@ WINDOW = 5
 """Side of the windows that are compared, cells of two by two texels; a texel is about a pixel of the level."""
 COARSEST = 3
 """Times that the images are halved at most."""
-LARGEST_MAP = 1024
+LARGEST_MAP = 720
+"""Texels along a side at most; a level with more than twice as many pixels is left out. Chosen on Emily c3,c4."""
 SETTLED = 0.15
 """Part of a sweep's step below which the surface is at rest (root mean square over what is measured)."""
 SWEEPS, SWEEPS_OF_LIDS = 3, 2
@@ -123,7 +124,10 @@ def find_surface(
     if resolution.parallax < NARROWEST:
         return _unchanged(geometry, "views from nearly one place: the surface stays in the model's span", began)
     level_step = STEP_PIXELS * resolution.pixel / resolution.parallax  # of level 0, world length
-    coarsest = config.finest
+    finest = config.finest
+    while texture_size(model, world[0], resolution.pixel * 2.0**finest, 4 * LARGEST_MAP) > 2 * LARGEST_MAP:
+        finest += 1
+    coarsest = finest
     while coarsest < COARSEST and LAYERS[0] * level_step * 2**coarsest * capture.unit_mm < config.reach:
         coarsest += 1
 
@@ -140,7 +144,7 @@ def find_surface(
     )
     scenes = Scenes(skin.faces, np.unique(model.faces[model.face_mask]), SLACK * resolution.pixel)
     reach = config.reach / capture.unit_mm
-    sight = Sight(capture, model, tuple(cameras), scenes, world[0], resolution.pixel, reach, config.finest)
+    sight = Sight(capture, model, tuple(cameras), scenes, world[0], resolution.pixel, reach, finest)
     landmarks = Landmarks.of(capture, model, cameras, geometry)
     search = Search(
         geometry, model, pairs, skin, prior, motion, landmarks, sight, level_step, config.stiffness, progress
@@ -148,14 +152,14 @@ def find_surface(
 
     # Sweep and solve in turn, coarse to fine.
     rest = Rest(State.of(model, geometry))
-    for level in range(coarsest, config.finest - 1, -1):
+    for level in range(coarsest, finest - 1, -1):
         rest = search.settle(rest, level, SWEEPS)
     # Lids that have just closed lie where they fade into the skin around them: the finest levels measure them.
     lips, lids = LIPS * config.close_lips, LIDS * config.close_lids
     shut, closed = close_openings(capture, model, rest.state.estimate(geometry, model), cameras, lids)
     if any(opening["closed"] for opening in closed.values()):
         rest = replace(rest, state=State.of(model, shut))
-        for level in range(min(coarsest, config.finest + 1), config.finest - 1, -1):
+        for level in range(min(coarsest, finest + 1), finest - 1, -1):
             rest = search.settle(rest, level, SWEEPS_OF_LIDS)
     progress("find surface", len(rest.levels), len(rest.levels))
 
@@ -163,8 +167,8 @@ def find_surface(
     result = close_again(model, rest.state.estimate(geometry, model), closed, lids)
     result, closed_lips = close_openings(capture, model, result, cameras, lips)
     world = result.vertices.astype(np.float64)
-    residuals = sight.epipolar_residuals(views, pairs, result.timesteps, world, max(config.finest, 1))
-    likenesses = sight.likenesses(pairs, result.timesteps[0], world[0], max(config.finest, 1))
+    residuals = sight.epipolar_residuals(views, pairs, result.timesteps, world, max(finest, 1))
+    likenesses = sight.likenesses(pairs, result.timesteps[0], world[0], max(finest, 1))
     seconds = time.perf_counter() - began
     moved = np.linalg.norm(rest.state.displacement, axis=1)[np.unique(model.faces[model.face_mask])] * model.unit_mm
     phase = {
