@@ -3,8 +3,8 @@
 The surface is the model's modes, the head's pose and a smooth displacement under one Gaussian prior
 (`surface.displace`). It is measured by sweeps along its normals, which find where the views agree best
 (`surface.sweep`), and by the outlines of the head (`surface.outline`). Sweeps and solutions take turns, coarse to
-fine, at each level until the surface rests: coarse levels reach far in few samples, and the prior holds what they
-don't measure. Stage 1 is only a start.
+fine: coarse levels reach far in few samples, and the prior holds what they don't measure. A solution weights the
+offsets of its sweep anew as outliers come apart from them. Stage 1 is only a start.
 """
 
 from __future__ import annotations

@@ -222,7 +222,8 @@ def solve_surface(
         along_modes = stiffness * (bent.T @ x.ravel().astype(np.float32)).astype(np.float64)
         return np.asarray(bent @ la.cho_solve(inner, along_modes).astype(np.float32), np.float64)
 
-    change = np.zeros_like(start)
+    change, size = np.zeros_like(start), (start.size, start.size)
+    goal = None
     for robust in measured.robust.T:
         residual = measured.offsets - ((points @ change) * normals).sum(1)
         weight = precision / (1.0 + (residual / robust) ** 2) ** 2
@@ -237,11 +238,13 @@ def solve_surface(
             return np.asarray(out - stiffness * without_modes(x))
 
         right = transposed @ ((weight * target)[:, None] * normals + along * held)
-        size = (start.size, start.size)
+        left = right.ravel() - apply(start + change)
+        goal = RELATIVE * float(np.linalg.norm(left)) if goal is None else goal
         step, _ = spl.cg(
             spl.LinearOperator(size, matvec=apply),
-            right.ravel() - apply(start + change),
-            rtol=RELATIVE,
+            left,
+            rtol=0.0,
+            atol=goal,
             maxiter=MOST_ITERATIONS,
             M=spl.LinearOperator(size, matvec=precondition),
         )
