@@ -22,9 +22,9 @@ from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
 from mifit.progress import Progress
 from mifit.render.gbuffer import SurfaceScene
+from mifit.sampling.visibility import DARKEST
 from mifit.stages.geometry.landmarks import LandmarkFit, LandmarkView, State, coordinate_deviation, world_vertices
 from mifit.stages.geometry.parameters import Frames
-from mifit.stages.surface.band import DARKEST
 from mifit.stages.surface.epipolar import likeness
 from mifit.stages.surface.views import LARGEST_TEXTURE, Resolution, pose_views, texture_size
 

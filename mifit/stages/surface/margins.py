@@ -22,17 +22,16 @@ if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
 
 NEAR_MM = 4.0
-"""Distance of a landmark from the margins at the most."""
+"""Distance of a landmark from the margins at the most, and of what lies behind these and moves with them."""
 COLUMNS = np.linspace(0.03, 0.97, 61)
 """Places along an opening, from corner to corner, at which images are read."""
-REACH_MM, INSIDE_MM = 14.0, 4.0
-"""Distance from the margins along the surface up to which it moves with them, on the skin and behind it."""
-TOUCHING_MM = 0.1
-"""Distance of other pieces' vertices from the margins, or from what lies behind, within which they move with them."""
+REACH_MM = 14.0
+"""Distance from the margins along the surface up to which it moves with them."""
 HELD_MM, STEPS = 8.0, 2
 """Wavelength above which the movement stays on the found surface, and steps in which it follows that one's normals."""
 CLEAR_MM = 0.3
-"""Height that the rims behind closed margins keep from these, each on its side."""
+"""Height that the rims behind closed margins keep from these, each on its side; other pieces' vertices nearer than this
+move with what they touch."""
 ELSEWHERE = 0.1
 """Weight of a vertex away from the margins against one on them where expressions are found."""
 UP = np.array([0.0, 1.0, 0.0])
@@ -150,13 +149,13 @@ class Region:
         in_face = np.zeros(len(vertices), bool)
         in_face[shown] = True
         skin = np.flatnonzero(in_face & (distance < REACH_MM))
-        behind = np.flatnonzero(~in_face & (distance < INSIDE_MM))
+        behind = np.flatnonzero(~in_face & (distance < NEAR_MM))
         inside = np.setdiff1d(behind, links[count == 1])
         ends = np.setdiff1d(behind, inside)
         ends = np.stack([ends, margin[cKDTree(model.mean[margin]).query(model.mean[ends])[1]]], axis=1)
         near = np.union1d(margin, behind)
         away, nearest = cKDTree(model.mean[near]).query(model.mean)
-        touching = np.flatnonzero((away < TOUCHING_MM / model.unit_mm) & np.isinf(distance))
+        touching = np.flatnonzero((away < CLEAR_MM / model.unit_mm) & np.isinf(distance))
         touching = np.stack([touching, near[nearest[touching]]], axis=1)
         held, clear = HELD_MM / model.unit_mm, CLEAR_MM / model.unit_mm
         return cls(vertices, model.faces.astype(np.int64), shown, margins, skin, inside, ends, touching, held, clear)
