@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from mifit.core.estimate import Label
 from mifit.core.image import box, to_8_bit
 from mifit.core.mesh import interpolate
-from mifit.core.metrics import NORMAL
+from mifit.core.metrics import NORMAL, SURE
 from mifit.core.process import on_all_cores
 from mifit.morphable.topology import BROWS, EYES_AND_MOUTH
 from mifit.sampling.visibility import DARKEST
@@ -39,20 +39,17 @@ FLOOR = np.array([0.12, 0.03, 0.03])
 """Least standard deviations of the three: texture that a fitted mesh shifts, and shading that no light explains."""
 COVERED = (0.9, 0.45)
 """Difference in brightness and in chroma (logarithms) from the face's skin that no plain skin has."""
-SURE, LIKELY, CLEAN = 4.0, 3.0, 1.0
-"""Departures in standard deviations: of what starts an object, may belong to one, and is skin."""
+CLEAN = 1.0
+"""Departure in standard deviations up to which a pixel is skin; `SURE` starts an object."""
 BLUR = 0.003
 """Standard deviation of the blur against noise and shifted texture, as a part of the face's size in pixels."""
-RIM = 0.012
-"""Distance from the rim of the face, as a part of its size, within which nothing starts: the mesh is off by as much."""
-REACH = 0.02
-"""Distance around what was found in which its outline lies."""
+REACH = 0.015
+"""Distance, as a part of the face's size, by which the mesh may be off: within it from the rim of the face nothing
+starts, and in it about what was found lies its outline."""
 WIDE = 4
 """The same of what covers the face in every image, in multiples: it is looked for beside the brows only."""
 SMALLEST = 0.004
 """Part of the face that an object covers at the least."""
-HIGHLIGHT = 0.5
-"""Red over blue of what a highlight adds at the least: a window's is bluish."""
 LARGE = 0.02
 """The same of one that covers it in every image: birthmarks are smaller."""
 LEAST_SIZE = 16
@@ -229,13 +226,13 @@ def _objects(
     smooth = cv2.GaussianBlur(image, (0, 0), 0.5 * blur)
     level = opponent(smooth)
     # The mesh is a little off, so the edge of a shadow may lie anywhere about there.
-    about = np.ones((2 * max(1, round(RIM * size)) + 1,) * 2, np.uint8)
+    about = np.ones((2 * max(1, round(REACH * size)) + 1,) * 2, np.uint8)
     lit = np.clip(level - colour, cv2.erode(shaded, about), cv2.dilate(shaded, about))
     departure = np.sqrt((((level - colour - lit) / albedos.deviation) ** 2).mean(axis=-1))
     departure[~usable | _highlight(smooth, np.exp(predicted @ np.linalg.inv(OPPONENT).T))] = 0.0
     weight = cv2.GaussianBlur(usable.astype(np.float32), (0, 0), blur)
     departure = cv2.GaussianBlur(departure.astype(np.float32), (0, 0), blur) / np.maximum(weight, 1e-3)
-    inner = cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 3) > RIM * size
+    inner = cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 3) > REACH * size
     # What covers a point in most images needn't in this one, nor end in all of them at the same point.
     strange = no_skin(level - shaded, albedos.skin) & usable
     covered = no_skin(colour, albedos.skin) & strange
@@ -243,7 +240,7 @@ def _objects(
     found = _outlines(
         picture,
         (departure > SURE) & inner,
-        departure > LIKELY,
+        departure > CLEAN,
         (departure < CLEAN) & usable,
         facial,
         SMALLEST,
@@ -294,11 +291,9 @@ def _outlines(
 
 
 def _highlight(linear: NDArray, predicted: NDArray) -> NDArray[np.bool_]:
-    """Pixels that show the predicted colour and light added to it, no bluer than a lamp's."""
+    """Pixels that show the predicted colour and light added to it."""
     added = linear - predicted
-    return (added > 0).all(axis=-1) & (added[..., 0] > HIGHLIGHT * added[..., 2]) | (np.abs(added) < DARKEST).all(
-        axis=-1
-    )
+    return (added > 0).all(axis=-1) | (np.abs(added) < DARKEST).all(axis=-1)
 
 
 def _plain(shape: tuple[int, ...], marks: NDArray) -> NDArray[np.bool_]:
