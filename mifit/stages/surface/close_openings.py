@@ -176,8 +176,7 @@ def _closed(
     shared = region.fade(mean)
     expression = geometry.expression.copy()
     for k in range(len(shapes)):
-        # What a timestep has beyond the others is small, or expressions follow it roughly anyway: one step does.
-        rest = region.fade(wanted[k] - mean, steps=1) if k in wanted else -shared
+        rest = region.fade(wanted[k] - mean) if k in wanted else -shared
         expression[k] = region.adjusted(model, expression[k], rest)
     return moved_by(model, replace(geometry, expression=expression), shared)
 

@@ -27,11 +27,13 @@ LINE_MM = 1.0
 CONTRAST = 0.15
 """Difference of logarithms of colour that shows something: the line below both sides, red over green of the white of an
 eye below that of skin."""
-LESS_RED, TEETH = 0.3, 0.25
-"""Teeth: near the line red over green falls by this (log) below the lips', in this part of the columns at least."""
-DARK, EYE = 1.2, 0.45
-"""An eye is open where it is pale or colours fall by ``DARK``, as those of iris and pupil, in this part of it at least.
-Closed eyes of a scan have 0.3 at the most, Digital Emily's open ones 0.75 at least, painted ones 0.6."""
+LESS_RED = 0.3
+"""Teeth: near the line red over green falls by this (log) below the lips'."""
+DARK = 1.2
+"""An eye is open where it is pale, or colours fall by this (log) as those of iris and pupil."""
+OPEN = 0.45
+"""Part of columns or pixels from which teeth show that a mouth, and white or iris that an eye is open. Closed eyes of a
+scan have 0.3 at the most, Digital Emily's open ones 0.75 at least, painted ones 0.6."""
 MARGINAL = 0.2
 """Part of an eye along either lid and at either corner that doesn't tell: lashes and the corner's tissue show there."""
 BEND = 0.01
@@ -98,7 +100,7 @@ def shows_teeth(strip: Strip) -> bool:
     red, seen = strip.red, strip.seen
     window = np.abs(np.arange(red.shape[1])[None] - strip.row[:, None]) <= round(LINE_MM / STEP_MM)
     least = np.where(window, red, np.inf).min(axis=1)
-    return float((least[seen] < np.median(red[seen]) - LESS_RED).mean()) >= TEETH
+    return float((least[seen] < np.median(red[seen]) - LESS_RED).mean()) >= OPEN
 
 
 def shows_an_eye(strip: Strip) -> bool:
@@ -114,7 +116,7 @@ def shows_an_eye(strip: Strip) -> bool:
     dark, red = strip.dark[columns], strip.red[columns]
     pale = red < np.nanmedian(beside * red) - CONTRAST
     black = dark < np.nanmedian(beside * dark, axis=1, keepdims=True) - DARK  # shading changes along the eye
-    return bool((pale | black)[within].mean() > EYE) if within.any() else True
+    return bool((pale | black)[within].mean() > OPEN) if within.any() else True
 
 
 def read_strip(

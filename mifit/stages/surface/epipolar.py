@@ -19,7 +19,7 @@ from mifit.stages.surface.sweep import Posed, sweep
 FARTHEST = 4
 """Pixels that are searched to either side."""
 FEWEST = 200
-"""Cells that must match for a residual to be told."""
+"""Cells or points that must match for their residuals to say something."""
 
 
 def epipolar_residual(

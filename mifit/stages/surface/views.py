@@ -15,7 +15,6 @@ from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.process import on_all_cores
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.render.gbuffer import SurfaceScene
-from mifit.sampling.visibility import GRAZING
 from mifit.stages.surface.band import feature_image
 from mifit.stages.surface.sweep import Posed
 
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from mifit.capture import Capture, Frame
     from mifit.morphable import MorphableModel
 
+GRAZING_COSINE = 0.2  # beyond about 78 degrees a pixel covers too much surface to compare it
 OUTLINE_SCALE = 0.25  # outlines are found in images of this scale
 LONGEST_SIDE = 1000.0  # pixels of images whose texture is compared over time: larger ones are reduced
 LARGEST_TEXTURE = 512  # texels along a side, of that
@@ -62,7 +62,7 @@ def pose_views(
     for row, (camera, frame) in enumerate(views):  # rays take all cores by themselves
         shown.append((camera, frame.image, frame.valid & ~frame.clipped & shows_surface(scene, camera)))
         cosine = (normalize(camera.position - position) * normal).sum(1)
-        towards = np.flatnonzero(cosine > GRAZING)
+        towards = np.flatnonzero(cosine > GRAZING_COSINE)
         towards = towards[scene.visible_from(position[towards], camera.position)]
         seen[row, towards] = cosine[towards]
     images = on_all_cores(lambda view: feature_image(*view, factor), shown)
