@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.capture.transforms import MIN_SIDE
 from mifit.core.estimate import Label
 from mifit.core.image import box, to_8_bit
 from mifit.core.mesh import interpolate
@@ -52,8 +53,6 @@ SMALLEST = 0.004
 """Part of the face that an object covers at the least."""
 LARGE = 0.02
 """The same of one that covers it in every image: birthmarks are smaller."""
-LEAST_SIZE = 16
-"""Pixels: smaller faces and objects are left alone."""
 MARGIN = 0.08
 """Distance around eyes and brows, as a part of the distance between the eyes' outer corners, that is theirs."""
 LONGEST = 640
@@ -210,7 +209,7 @@ def _objects(
     face, weights, usable = np.maximum(view.face[grid], 0), view.weights[grid], usable[grid]
     facial, plain = facial[grid], plain[grid]
     size = float(np.sqrt(usable.sum()))
-    if size < LEAST_SIZE:
+    if size < MIN_SIDE:
         return np.zeros_like(usable)
     image = cv2.resize(image, usable.shape[::-1], interpolation=cv2.INTER_AREA)
     blur = max(BLUR * size, 0.7)
@@ -279,7 +278,7 @@ def _outlines(
         state[~facial] = cv2.GC_BGD
         about = box(cv2.dilate(near.astype(np.uint8), around).astype(bool))
         part = np.ascontiguousarray(state[about])
-        if min((part == cv2.GC_FGD).sum(), (part == cv2.GC_BGD).sum()) < LEAST_SIZE:
+        if min((part == cv2.GC_FGD).sum(), (part == cv2.GC_BGD).sum()) < MIN_SIDE:
             out |= core.astype(bool)
             continue
         cv2.setRNGSeed(0)
