@@ -15,6 +15,8 @@ Image = NDArray
 Mask = NDArray[np.bool_] | None
 NORMAL = 1.4826
 """Standard deviation of a normal distribution over the median of its absolute value."""
+SURE = 4.0
+"""Standard deviations beyond which a difference is surely no noise: 6 in 100,000 of a normal distribution."""
 
 
 def median_deviation(residuals: NDArray) -> float:

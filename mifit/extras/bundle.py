@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mifit.optim import Outcome, minimize
+from mifit.stages.checks.landmark_model import EXPRESSION_DEVIATION
 from mifit.stages.geometry.parameters import cross_matrix, left_jacobian
 
 CAUCHY = 1.5
 """Deviations of a match where the robust loss turns."""
-EXPRESSION_DEVIATION = 0.3
-"""Prior deviation of expression coefficients' changes between timesteps."""
 
 
 @dataclass(frozen=True)

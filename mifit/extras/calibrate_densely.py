@@ -23,8 +23,8 @@ from mifit.extras.calibrate_heads import FOCAL_PRIOR, HeadCalibration, calibrate
 from mifit.extras.tracks import FEWEST_IMAGES, focal_of, follow_head, points_of, sightings_of
 from mifit.morphable import MorphableModel
 from mifit.progress import Progress, silent
+from mifit.stages.surface.epipolar import FEWEST
 
-FEWEST_TRACKS = 200
 MOST_TIMESTEPS = 6
 """Timesteps that are matched, spread evenly over more: cameras keep still, and each has its expression to find."""
 LARGEST_DEVIATION = 0.02
@@ -82,9 +82,9 @@ def calibrate_capture(
     world = [vertices @ pose[:3, :3].T + pose[:3, 3] for pose in OPENGL_FROM_OPENCV @ start.heads]
     views = [capture.camera(name) for name in cameras]
     tracks, texels = follow_head(capture, model, views, timesteps, world, progress)
-    if len(tracks.texel) < FEWEST_TRACKS:
+    if len(tracks.texel) < FEWEST:
         count = f"{len(tracks.texel)} points are found in {FEWEST_IMAGES} or more images"
-        return _left(start, cameras, f"{count}, expected {FEWEST_TRACKS}; add timesteps where the head turns")
+        return _left(start, cameras, f"{count}, expected {FEWEST}; add timesteps where the head turns")
     seen = sightings_of(tracks, views)
     points, modes = points_of(tracks, texels, model, vertices)
     adjusted, focals = _adjust(start, views, unknown, seen, points, modes * unit)

@@ -20,10 +20,10 @@ from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.files import Document
 from mifit.extras.bundle import Bundle, Freedom, Sightings, adjust_bundle
-from mifit.extras.calibrate_densely import FEWEST_TRACKS
 from mifit.extras.tracks import FEWEST_IMAGES, focal_of, follow_head, points_of, sightings_of
 from mifit.morphable import MorphableModel
 from mifit.progress import Progress, silent
+from mifit.stages.surface.epipolar import FEWEST
 
 FOCALS, FOCAL, TURN = 0.08, 0.005, 0.3
 """Errors below which nothing is named: of all focal lengths, of one of them relative to the others, and degrees.
@@ -89,7 +89,7 @@ class CalibrationCheck:
         if self.residual is None:
             return [
                 f"calibration: not tested, {self.points} points are found in {FEWEST_IMAGES} or more images, "
-                f"expected {FEWEST_TRACKS}; add timesteps where the head turns"
+                f"expected {FEWEST}; add timesteps where the head turns"
             ]
         head = f"calibration: matches of {self.points} points are {self.residual:.2f} pixels off"
         return [head, *(f"  {one.text} explains {one.explained:.1%} of that" for one in self.errors)]
@@ -115,7 +115,7 @@ def check_calibration(
     if len(views) < 2 or len(views) * len(geometry.timesteps) < FEWEST_IMAGES:
         return CalibrationCheck(0)
     tracks, texels = follow_head(capture, model, views, geometry.timesteps, list(geometry.vertices), progress)
-    if len(tracks.texel) < FEWEST_TRACKS:
+    if len(tracks.texel) < FEWEST:
         return CalibrationCheck(len(tracks.texel))
     head = (geometry.vertices[0] - geometry.translation[0]) @ geometry.rotation[0]
     points, modes = points_of(tracks, texels, model, head)

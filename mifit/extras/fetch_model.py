@@ -11,6 +11,7 @@ from urllib.error import HTTPError
 from urllib.parse import urlsplit
 
 from mifit.core.files import write_bytes
+from mifit.core.limits import MAX_DOCUMENT_BYTES
 from mifit.errors import InputError, MifitError
 from mifit.morphable.formats.ict import load_ict_folder
 from mifit.morphable.recognise import fetched_model
@@ -22,8 +23,6 @@ INDEX, NEUTRAL = "vertex_indices.json", "generic_neutral_mesh.obj"
 IDENTITIES = 100
 DIGEST = "8fc28905c645862e4162769898a01620bf2589538795190ccd530f86da1b115e"
 """SHA-256 over a line ``NAME SHA-256`` of each file, in the order of `wanted`."""
-MAX_BYTES = 2**23
-"""Of one file; the largest has 2.6 MB."""
 
 
 def wanted(index: bytes) -> list[str]:
@@ -73,7 +72,7 @@ def _content(address: str, folder: Path, name: str) -> bytes:
         return path.read_bytes()
     try:
         with urllib.request.urlopen(f"{address}/{name}", timeout=30) as answer:
-            content = answer.read(MAX_BYTES + 1)
+            content = answer.read(MAX_DOCUMENT_BYTES + 1)
     except (OSError, ValueError) as error:
         reason = getattr(error, "reason", error)
         if isinstance(error, HTTPError):
@@ -82,7 +81,7 @@ def _content(address: str, folder: Path, name: str) -> bytes:
             f"{address}/{name}: can't be fetched ({reason}); offline, copy the folder FaceXModel of the repository "
             f"ICT-VGL/ICT-FaceKit, commit {COMMIT[:7]}, to {folder}, and run this again"
         ) from None
-    if len(content) > MAX_BYTES:
-        raise MifitError(f"{address}/{name}: found more than {MAX_BYTES} bytes, expected a file of the model")
+    if len(content) > MAX_DOCUMENT_BYTES:
+        raise MifitError(f"{address}/{name}: found more than {MAX_DOCUMENT_BYTES} bytes, expected a file of the model")
     write_bytes(path, content)
     return content

@@ -17,6 +17,10 @@ from mifit.morphable.topology import EYES_AND_MOUTH
 
 SKIN = np.array([0.47, 0.285, 0.205])
 """Linear Rec. 709 reflectance of skin of medium pigmentation."""
+SPREAD = 0.28
+"""Standard deviation of the log luminance of skin over a face, brows and lips included."""
+SPECULAR = 0.03
+"""Specular reflectance of skin at normal incidence (index of refraction 1.4)."""
 
 MELANIN = np.array([1.0, 1.2, 1.4])
 HAEMOGLOBIN = np.array([0.12, 1.0, 0.72])

@@ -15,12 +15,8 @@ from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import vertex_normals
 from mifit.core.process import blocks, on_all_cores
 from mifit.morphable import MorphableModel
-from mifit.morphable.openings import eyeballs, leading_faces
+from mifit.morphable.openings import GAP_MM, RADIUS_MM, eyeballs, leading_faces
 
-SEARCH_MM = 12.0
-"""Depth of an eyeball outside the skin up to which it is found."""
-GAP_MM = 0.5
-"""Distance that is left between lid and eyeball."""
 PASSES = 2
 """Vertices that have moved have other normals, along which a few more stand out."""
 
@@ -49,7 +45,7 @@ def behind_lids(model: MorphableModel, geometry: GeometryEstimate) -> GeometryEs
                 near = np.linalg.norm(world - points.mean(axis=0), axis=1) < np.ptp(points, axis=0).max()
                 covering = ~own & near[model.faces].any(axis=1)
                 skin = model.faces[covering if lids is None else covering & lids]
-                depth = _depth_outside(points, normals[eye], world.astype(np.float64), skin, SEARCH_MM * unit)
+                depth = _depth_outside(points, normals[eye], world.astype(np.float64), skin, RADIUS_MM * unit)
                 # Its neighbours go with a vertex: an edge from one behind the skin to one at it may cut the skin.
                 inner = np.searchsorted(eye, model.faces[own])
                 deepest = depth.copy()

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.capture import Capture
+from mifit.capture.landmark_files import MIN_VISIBLE
 from mifit.config import GeometryConfig
 from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
@@ -21,7 +22,6 @@ from mifit.progress import Progress, silent
 from mifit.stages.geometry.appearance import fit_appearance, gather
 from mifit.stages.geometry.images import blind_warnings, facial_pixels
 from mifit.stages.geometry.landmarks import (
-    FEWEST_LANDMARKS,
     LandmarkFit,
     LandmarkView,
     State,
@@ -161,7 +161,7 @@ def fit_pose_expression(
     state = _state_of(geometry, geometry.timesteps[-1])
     noise = _landmark_noise(capture, cameras, (timestep,), config)
     views = landmark_views(capture, baked, cameras, (timestep,), noise, fewest=0)
-    if sum(len(view.index) for view in views) >= FEWEST_LANDMARKS:
+    if sum(len(view.index) for view in views) >= MIN_VISIBLE:
         state = initial_state(baked, views, 1, state.layout, geometry.scale, state)
         start = fit_landmarks(baked, views, state, noise, priors_of(config))
         journal.phase("landmarks", _usable(start.solution, "landmarks"))

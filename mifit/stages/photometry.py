@@ -25,13 +25,14 @@ from numpy.typing import NDArray
 from mifit.config import PhotometryConfig
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate
-from mifit.core.metrics import median_deviation
+from mifit.core.metrics import SURE, median_deviation
 from mifit.core.photometry import Photometry
 from mifit.core.sh import bands, basis, cosine_coefficients
+from mifit.morphable.pigment import SPECULAR, SPREAD
 from mifit.optim import geman_mcclure
 from mifit.progress import Progress, silent
 from mifit.sampling.observations import Observations, Surface
-from mifit.sampling.visibility import GRAZING
+from mifit.sampling.visibility import DARKEST, GRAZING
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
@@ -39,20 +40,16 @@ if TYPE_CHECKING:
 
 MAP_SIZE, VALUES, FEWEST_POINTS = 256, 16_000, 50
 """Texels along the side of the map; observations (points times images) that are compared; fewest points that serve."""
-DARKEST, FRONTAL = 0.02, 3.0
-"""Linear colour, and multiple of the grazing cosine, below which a colour says nothing of the factor."""
-BANDS, SPECULAR = 4, 0.03
-"""Bands of the lighting; specular level of skin at normal incidence (refractive index 1.4)."""
-SPREAD, SPECULAR_SPREAD = 0.3, 0.5
-"""Prior standard deviations of logarithms: factors of images and albedo about the model's; specular level."""
+FRONTAL = 3.0
+"""Multiple of the grazing cosine below which a colour says nothing of the factor."""
+BANDS = 4
+"""Bands of the lighting."""
 NEIGHBOURS = 0.03
 """Independent measurements per observation: neighbours share errors of the mesh."""
-SURE = 4.0
-"""Posterior deviations by which a factor differs from 1 where it is taken."""
 LEAST = {"gain": 0.1, "exposure": 0.05, "own": 0.05}
 """Least logarithm of a factor worth taking. Below, cameras of one kind differ by what specular reflection leaves."""
-ITERATIONS, SETTLED = 20, 1e-3
-"""Gauss-Newton steps at most, and the change of log factors that ends them."""
+ITERATIONS = 12
+"""Gauss-Newton steps."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +204,7 @@ def solve_factors(seen: Observations, albedo: NDArray, factors: Factors) -> Solu
     k, u = BANDS**2, len(factors.group)
     light_at = [slice(u + c * k, u + (c + 1) * k) for c in range(3)]
     # Unknowns: factors, light per channel, log of the specular level over skin's. The albedo starts at the model's.
-    prior = np.concatenate([np.full(u, SPREAD**-2.0), np.zeros(3 * k), [SPECULAR_SPREAD**-2.0]])
+    prior = np.concatenate([np.full(u, SPREAD**-2.0), np.zeros(3 * k), [SPREAD**-2.0]])
     rough = np.tile((bands(BANDS) * (bands(BANDS) + 1.0)) ** 2, 3)
     expected = np.log(albedo)
     log_albedo, x, sigma = expected.copy(), np.zeros(u + 3 * k + 1), SPREAD / 2.0
@@ -245,8 +242,6 @@ def solve_factors(seen: Observations, albedo: NDArray, factors: Factors) -> Solu
         damped = min(1.0, 0.5 / max(float(np.abs(albedo_step).max()), 1e-12)) if number < 3 else 1.0
         x, log_albedo = x + damped * step, log_albedo + damped * albedo_step
         sigma = max(median_deviation(residual[measured]), 1e-3)
-        if number > 5 and np.abs(step[:u]).max() < SETTLED:
-            break
     return Solution(factors, x[:u], np.sqrt(np.diag(np.linalg.inv(system + floor)))[:u])
 
 

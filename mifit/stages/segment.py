@@ -19,10 +19,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.capture.transforms import MIN_SIDE
 from mifit.core.estimate import Label
 from mifit.core.image import box, to_8_bit
 from mifit.core.mesh import interpolate
-from mifit.core.metrics import NORMAL
+from mifit.core.metrics import NORMAL, SURE
 from mifit.core.process import on_all_cores
 from mifit.morphable.topology import BROWS, EYES_AND_MOUTH
 from mifit.sampling.visibility import DARKEST
@@ -39,24 +40,19 @@ FLOOR = np.array([0.12, 0.03, 0.03])
 """Least standard deviations of the three: texture that a fitted mesh shifts, and shading that no light explains."""
 COVERED = (0.9, 0.45)
 """Difference in brightness and in chroma (logarithms) from the face's skin that no plain skin has."""
-SURE, LIKELY, CLEAN = 4.0, 3.0, 1.0
-"""Departures in standard deviations: of what starts an object, may belong to one, and is skin."""
+CLEAN = 1.0
+"""Departure in standard deviations up to which a pixel is skin; `SURE` starts an object."""
 BLUR = 0.003
 """Standard deviation of the blur against noise and shifted texture, as a part of the face's size in pixels."""
-RIM = 0.012
-"""Distance from the rim of the face, as a part of its size, within which nothing starts: the mesh is off by as much."""
-REACH = 0.02
-"""Distance around what was found in which its outline lies."""
+REACH = 0.015
+"""Distance, as a part of the face's size, by which the mesh may be off: within it from the rim of the face nothing
+starts, and in it about what was found lies its outline."""
 WIDE = 4
 """The same of what covers the face in every image, in multiples: it is looked for beside the brows only."""
 SMALLEST = 0.004
 """Part of the face that an object covers at the least."""
-HIGHLIGHT = 0.5
-"""Red over blue of what a highlight adds at the least: a window's is bluish."""
 LARGE = 0.02
 """The same of one that covers it in every image: birthmarks are smaller."""
-LEAST_SIZE = 16
-"""Pixels: smaller faces and objects are left alone."""
 MARGIN = 0.08
 """Distance around eyes and brows, as a part of the distance between the eyes' outer corners, that is theirs."""
 LONGEST = 640
@@ -213,7 +209,7 @@ def _objects(
     face, weights, usable = np.maximum(view.face[grid], 0), view.weights[grid], usable[grid]
     facial, plain = facial[grid], plain[grid]
     size = float(np.sqrt(usable.sum()))
-    if size < LEAST_SIZE:
+    if size < MIN_SIDE:
         return np.zeros_like(usable)
     image = cv2.resize(image, usable.shape[::-1], interpolation=cv2.INTER_AREA)
     blur = max(BLUR * size, 0.7)
@@ -229,13 +225,13 @@ def _objects(
     smooth = cv2.GaussianBlur(image, (0, 0), 0.5 * blur)
     level = opponent(smooth)
     # The mesh is a little off, so the edge of a shadow may lie anywhere about there.
-    about = np.ones((2 * max(1, round(RIM * size)) + 1,) * 2, np.uint8)
+    about = np.ones((2 * max(1, round(REACH * size)) + 1,) * 2, np.uint8)
     lit = np.clip(level - colour, cv2.erode(shaded, about), cv2.dilate(shaded, about))
     departure = np.sqrt((((level - colour - lit) / albedos.deviation) ** 2).mean(axis=-1))
     departure[~usable | _highlight(smooth, np.exp(predicted @ np.linalg.inv(OPPONENT).T))] = 0.0
     weight = cv2.GaussianBlur(usable.astype(np.float32), (0, 0), blur)
     departure = cv2.GaussianBlur(departure.astype(np.float32), (0, 0), blur) / np.maximum(weight, 1e-3)
-    inner = cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 3) > RIM * size
+    inner = cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 3) > REACH * size
     # What covers a point in most images needn't in this one, nor end in all of them at the same point.
     strange = no_skin(level - shaded, albedos.skin) & usable
     covered = no_skin(colour, albedos.skin) & strange
@@ -243,7 +239,7 @@ def _objects(
     found = _outlines(
         picture,
         (departure > SURE) & inner,
-        departure > LIKELY,
+        departure > CLEAN,
         (departure < CLEAN) & usable,
         facial,
         SMALLEST,
@@ -282,7 +278,7 @@ def _outlines(
         state[~facial] = cv2.GC_BGD
         about = box(cv2.dilate(near.astype(np.uint8), around).astype(bool))
         part = np.ascontiguousarray(state[about])
-        if min((part == cv2.GC_FGD).sum(), (part == cv2.GC_BGD).sum()) < LEAST_SIZE:
+        if min((part == cv2.GC_FGD).sum(), (part == cv2.GC_BGD).sum()) < MIN_SIDE:
             out |= core.astype(bool)
             continue
         cv2.setRNGSeed(0)
@@ -294,11 +290,9 @@ def _outlines(
 
 
 def _highlight(linear: NDArray, predicted: NDArray) -> NDArray[np.bool_]:
-    """Pixels that show the predicted colour and light added to it, no bluer than a lamp's."""
+    """Pixels that show the predicted colour and light added to it."""
     added = linear - predicted
-    return (added > 0).all(axis=-1) & (added[..., 0] > HIGHLIGHT * added[..., 2]) | (np.abs(added) < DARKEST).all(
-        axis=-1
-    )
+    return (added > 0).all(axis=-1) | (np.abs(added) < DARKEST).all(axis=-1)
 
 
 def _plain(shape: tuple[int, ...], marks: NDArray) -> NDArray[np.bool_]:

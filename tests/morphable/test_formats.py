@@ -10,8 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.formats.bfm_mat import load_bfm2009
-from mifit.morphable.formats.gnm import STRIP
-from mifit.morphable.openings import SCLERA_ALBEDO, eyeballs, lacks_eyes
+from mifit.morphable.openings import SCLERA_ALBEDO, STRIP, eyeballs, lacks_eyes
 from mifit.morphable.recognise import recognise
 from mifit.morphable.topology import adjacency
 

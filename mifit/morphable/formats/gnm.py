@@ -18,7 +18,7 @@ from mifit.core.arrays import read_npz
 from mifit.errors import InputError
 from mifit.morphable.assemble import N_ALBEDO, check_mesh, complete, find_face_mask, single, transfer_landmarks
 from mifit.morphable.model import MorphableModel
-from mifit.morphable.openings import IRIS_ALBEDO, MARGIN, MOUTH_ALBEDO, PUPIL_ALBEDO, SCLERA_ALBEDO
+from mifit.morphable.openings import IRIS_ALBEDO, MARGIN, MOUTH_ALBEDO, PUPIL_ALBEDO, SCLERA_ALBEDO, STRIP
 from mifit.morphable.pigment import skin_model
 from mifit.morphable.topology import adjacency
 
@@ -34,8 +34,6 @@ ALBEDO = {
     "gums": (0.4, 0.14, 0.12), "teeth": (0.6, 0.56, 0.48),
 }  # fmt: skip
 """Linear albedo of groups that aren't skin, by the names of both versions; later ones count."""
-STRIP = 0.12
-"""Height of the strip at the bottom of the maps that holds all pieces but the skin."""
 
 
 def load_gnm(path: Path) -> MorphableModel:

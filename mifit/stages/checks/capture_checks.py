@@ -34,16 +34,12 @@ views are then less likely as they are by a factor of e^20 or more; errors are c
 ALIKE = 1.15
 """Costs, over the least, of mistakes that landmarks leave open: all are named."""
 SHIFTED = 1.5
-"""Shift of an image's landmarks from a detector's, in deviations of one landmark, beyond which no two detectors differ,
-and how far single ones may then lie off at the median; on development heads 0.7 and 1.2 at most."""
-SMALLEST = 2.0
-"""Deviation of a landmark, pixels, from which a face is large enough for a detector to judge: some 100 pixels wide."""
+"""Shift of landmarks from a detector's or from the fitted face, in deviations of one landmark, beyond which no two
+detectors differ, and how far single ones may then lie off at the median; on development heads 0.7 and 1.2 at most."""
 LARGEST_FACE = 1.6
 """Size of a face over the model's, and its inverse, beyond which nobody's is: outer corners of adults' eyes lie
 91 +- 5 mm apart, an infant's 60 mm (Farkas 1994)."""
-UNIT_SPREAD = 1.35
-"""Size of a face over the model's up to which a unit of length is named."""
-OFF_CENTRE, OFF_SQUARE = 0.05, 0.03
+OFF_CENTRE = 0.05
 """Distance of the principal point from the middle as part of the image's width, and of the pixels' sides: lenses are
 centred to 2 %, pixels of cameras square to 1 %; images that were cropped or stretched are not."""
 SAME_CODES = 0.5
@@ -167,8 +163,6 @@ def shift_diagnostics(capture: Capture, cameras: Sequence[str], timestep: int) -
     detector, said = open_detector("mediapipe"), []
     for shot in landmark_shots(capture, cameras, [timestep]):
         noise = noise_of([shot])
-        if noise < SMALLEST:
-            continue
         seen = detector.detect(to_8_bit(capture.frame(shot.camera.name, timestep).image))
         if seen is None:
             continue
@@ -207,7 +201,7 @@ def _size_diagnostics(right: Explanation, unit_mm: float) -> list[Diagnostic]:
         return []
     unit = min(UNITS_MM, key=lambda name: abs(np.log(size * UNITS_MM[name] / unit_mm)))
     factor = UNITS_MM[unit] / unit_mm
-    if abs(np.log(size * factor)) <= np.log(UNIT_SPREAD):
+    if abs(np.log(size * factor)) <= np.log(LARGEST_FACE):
         named = UNITS_MM[unit] in FILE_UNITS_MM.values()
         text = (
             f"the face is {size:.3g} times a human one: lengths of the cameras are in {unit}, the capture says one is "
@@ -239,7 +233,7 @@ def intrinsics_diagnostics(capture: Capture, cameras: Sequence[str]) -> list[Dia
                 f"expected within {OFF_CENTRE * camera.width:.0f} unless images are cropped; check cx, cy"
             )
             found.append(Diagnostic("principal-point", text, camera=name))
-        if abs(np.log(camera.fy / camera.fx)) > OFF_SQUARE:
+        if abs(np.log(camera.fy / camera.fx)) > OFF_CENTRE:
             text = (
                 f"camera {name}: pixels are {camera.fx / camera.fy:.3f} times as high as wide, expected 1 unless "
                 "images are stretched; check fl_x, fl_y"

@@ -13,12 +13,9 @@ from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
 from mifit.morphable import MorphableModel
 from mifit.morphable.topology import INNER
-from mifit.stages.checks.capture_checks import landmark_shots
+from mifit.stages.checks.capture_checks import SHIFTED, landmark_shots
 from mifit.stages.checks.landmark_model import noise_of
 
-SHIFT = 1.5
-"""Shift that the landmarks of all cameras share from the face that the images show, in deviations of one landmark,
-beyond which it is no detector's: a detector's is up to 0.9 on development heads."""
 CONTRADICTIONS = ("views-disagree", "skin-differs", "landmarks-shifted", "landmarks-unexplained", "landmarks-scatter")
 """Codes of what a fit that explains its images doesn't have."""
 INCONSISTENT = "inconsistent"
@@ -49,7 +46,7 @@ def check_fit(
         if mine:
             off.append(np.nanmedian(np.concatenate(mine), axis=0))
     x, y = np.mean(off, axis=0)
-    allowed = SHIFT * noise_of(shots)
+    allowed = SHIFTED * noise_of(shots)
     if np.hypot(x, y) <= allowed:
         return []
     text = (

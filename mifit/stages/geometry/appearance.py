@@ -19,13 +19,9 @@ from mifit.stages.geometry.rendering import WHITE
 
 AMBIENT_PRIOR = 1e-2  # of the squared ambient term in 0..1: fixes the gauge against the constant harmonic
 SHADING_PRIOR = 1e-4  # of the squared coefficients, 0..255: decides only what the visible normals leave open
-LEVEL_PRIOR = 1.0
-"""Of the squared relative change of the face's mean albedo, per channel, 0..255: fixes the gauge against the lighting.
-
-Images show the product of albedo and light alone, so nothing tells the level; but beside a prior of the modes darker
-skin in brighter light makes all contrasts cheap: without this it falls to half, in light far from white to nothing.
-As a prior alone, 0.28 of the logarithm as skin's luminance spreads is a hundred times too weak to hold it.
-"""
+# The squared relative change of the face's mean albedo, per channel, counts like a residual, 0..255: images show the
+# product of albedo and light alone, but beside a prior of the modes darker skin in brighter light makes all contrasts
+# cheap, and in light far from white they fall to nothing. As a prior alone, skin's spread of luminance is too weak.
 
 
 @dataclass(frozen=True)
@@ -101,7 +97,7 @@ class AppearanceProblem:
         squared = (self._residual(x)[0].astype(np.float64) ** 2).sum(1)
         data = float((self.weight * geman_mcclure(squared, self.robust)[0]).sum())
         change = self.level @ x[: self.albedo_size]
-        level = LEVEL_PRIOR * WHITE**2 * float(change @ change)
+        level = WHITE**2 * float(change @ change)
         return {"photo": data, "prior": float(self._priors() @ (x * x)) + level}
 
     def linearize(self, x: NDArray) -> DenseSystem:
@@ -120,7 +116,7 @@ class AppearanceProblem:
         flat = rows.reshape(3 * n, a + 29)
         normal = (flat.T @ flat).astype(np.float64)
         prior = np.diag(self._priors())
-        prior[:a, :a] += LEVEL_PRIOR * WHITE**2 * self.level.T @ self.level
+        prior[:a, :a] += WHITE**2 * self.level.T @ self.level
         return DenseSystem(normal[:-1, :-1] + prior, normal[:-1, -1] + prior @ x)
 
 

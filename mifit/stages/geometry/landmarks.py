@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.capture import Capture
+from mifit.capture.landmark_files import MIN_VISIBLE
 from mifit.config import GeometryConfig
 from mifit.core.camera import Camera
 from mifit.core.mesh import face_cross
-from mifit.core.metrics import median_deviation
+from mifit.core.metrics import SURE, median_deviation
 from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.topology import INNER
@@ -21,9 +22,10 @@ from mifit.stages.geometry.initial import pose_candidates, reprojection
 from mifit.stages.geometry.parameters import Frames, Layout, NormalEquations, prior_energy
 from mifit.stages.geometry.points import PointBasis, geometry_columns, project
 
-FEWEST_LANDMARKS = 6
 FARTHEST_PIXEL = 10.0  # in image sizes
-OUTLIER_PIXELS = 4.0  # in units of the landmark noise: where Geman and McClure's penalty turns
+CONTRADICTS = 0.025
+"""Deviation of landmarks from a fit, as part of their extent, that errors of detector and model don't reach: 0.002 to
+0.017 on the shared captures."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,7 @@ def landmark_views(
     cameras: Sequence[str],
     timesteps: Sequence[int],
     noise: float,
-    fewest: int = FEWEST_LANDMARKS,
+    fewest: int = MIN_VISIBLE,
 ) -> tuple[LandmarkView, ...]:
     """Visible landmarks of all images; raises InputError for a timestep with fewer than ``fewest`` in total."""
     views = []
@@ -320,7 +322,7 @@ def fit_landmarks(
         if number == 3:
             noise = max(noise, coordinate_deviation(state, views))
             views = tuple(replace(view, weight=noise**-2) for view in views)
-        term = LandmarkTerm(views, OUTLIER_PIXELS * noise * widening)
+        term = LandmarkTerm(views, SURE * noise * widening)
         problem = LandmarkProblem(layout, state.frames, term, priors)
         solution = minimize(
             problem,
@@ -339,6 +341,12 @@ def coordinate_deviation(state: State, views: tuple[LandmarkView, ...]) -> float
     term = LandmarkTerm(views, np.inf)
     residual = [term.distances(view, state.layout, state.frames, state.x).ravel() for view in views]
     return median_deviation(np.concatenate(residual))
+
+
+def contradicts(state: State, views: tuple[LandmarkView, ...]) -> bool:
+    """Whether landmarks lie farther from a fit than any detector's or model's errors."""
+    extent = [np.ptp(view.pixels, axis=0).max() for view in views]
+    return bool(extent) and coordinate_deviation(state, views) > CONTRADICTS * float(np.median(extent))
 
 
 def world_vertices(model: MorphableModel, state: State) -> NDArray[np.float64]:

@@ -17,33 +17,20 @@ from numpy.typing import NDArray
 
 from mifit.capture import Capture
 from mifit.core.camera import Camera, rigid
-from mifit.core.metrics import median_deviation
+from mifit.core.metrics import SURE, median_deviation
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
 from mifit.progress import Progress
 from mifit.render.gbuffer import SurfaceScene
-from mifit.stages.geometry.landmarks import LandmarkFit, LandmarkView, State, coordinate_deviation, world_vertices
+from mifit.sampling.visibility import DARKEST, EDGE_PIXELS, OUTLINE_MM
+from mifit.stages.geometry.landmarks import LandmarkFit, LandmarkView, State, contradicts, world_vertices
 from mifit.stages.geometry.parameters import Frames
-from mifit.stages.surface.band import DARKEST
 from mifit.stages.surface.epipolar import likeness
 from mifit.stages.surface.views import LARGEST_TEXTURE, Resolution, pose_views, texture_size
 
-STEP = 0.01
-"""Between the logarithms of sizes that are tried: what views show agrees within a hundredth of the right one."""
-SIZES = np.exp(STEP * np.arange(-40, 41))
-"""Sizes of a head, by the model's: what scans and files call a unit differs by more than people do."""
-MOST_VIEWS = 3
-"""Views that are compared with the one that has landmarks."""
-STANDS_OUT = 4.0
-"""Standard deviations by which the evidence for a size stands out; below it the head stays where the model's size has
-it. For scan_city's head from the front and both sides it is 6 to 7, and below 3 for the best wrong size."""
-CONTRADICTS = 0.025
-"""Deviation of landmarks from a fit, as part of their extent, that errors of detector and model don't reach: 0.002 to
-0.017 on the shared captures."""
-PIXEL_MM = 3.3
-"""Length of a pixel at the face in images that are compared: a surface that isn't fitted yet is off by as much."""
-BLUR = 2.0
-"""Pixels around the outline over which either side's colours are averaged."""
+SIZES = np.exp(0.01 * np.arange(-40, 41))
+"""Sizes of a head, by the model's: what scans and files call a unit differs by more than people do. Views
+agree within a hundredth of the right one."""
 
 
 def place_head(
@@ -73,24 +60,19 @@ def place_head(
     """
     views = {name: tuple(view for view in start.views if view.camera.name == name) for name in cameras}
     marked = [name for name, own in views.items() if own]
-    if len(cameras) == 1 or len(marked) > 2 or (len(marked) == 2 and not _contradicts(start.state, start.views)):
+    if len(cameras) == 1 or len(marked) > 2 or (len(marked) == 2 and not contradicts(start.state, start.views)):
         return start, ()
-    best, most, left_out = start, STANDS_OUT, tuple[str, ...]()
+    # Evidence below stays where the model's size has the head: of scan_city's right size 6 to 7, below 3 of wrong ones.
+    best, most, left_out = start, SURE, tuple[str, ...]()
     steps = {view.step for view in start.views}
     for name in (name for name in marked if {view.step for view in views[name]} == steps):
         alone = fit(views[name]) if len(marked) == 2 else start
-        others = [other for other in cameras if other != name][:MOST_VIEWS]
+        others = [other for other in cameras if other != name]
         state, evidence = _placed(capture, model, (name, *others), timestep, alone.state, progress)
         if evidence > most:
             best, most = replace(alone, state=state), evidence
             left_out = tuple(other for other in marked if other != name)
     return best, left_out
-
-
-def _contradicts(state: State, views: tuple[LandmarkView, ...]) -> bool:
-    """Whether landmarks lie farther from a fit than any detector's or model's errors."""
-    extent = np.median([np.ptp(view.pixels, axis=0).max() for view in views])
-    return coordinate_deviation(state, views) > CONTRADICTS * extent
 
 
 def _placed(
@@ -99,7 +81,7 @@ def _placed(
     """A state scaled about the first camera so that the other views agree best, and by how much that stands out."""
     centre, world = capture.camera(names[0]).position, world_vertices(model, state)[0]
     pixel = Resolution.of([capture.camera(name) for name in names], world.mean(axis=0), [(0, 1)]).pixel
-    factor = min(1.0, pixel * capture.unit_mm / PIXEL_MM)
+    factor = min(1.0, pixel * capture.unit_mm / OUTLINE_MM)
     side = texture_size(model, world, 0.5 * pixel / factor, LARGEST_TEXTURE)
     texels = rasterize_uv(model.uv, model.faces_uv, side, model.face_mask)
     scene = SurfaceScene(world, model.faces)
@@ -134,7 +116,7 @@ def _placed(
     total = np.nansum((found - np.nanmedian(found, axis=0)) / spread, axis=1) / np.sqrt(found.shape[1])
     best = int(np.argmax(total))
     low, peak, high = total[np.clip([best - 1, best, best + 1], 0, len(SIZES) - 1)]
-    size = SIZES[best] * np.exp(STEP * 0.5 * (high - low) / max(2.0 * peak - low - high, 1e-6))
+    size = SIZES[best] * (SIZES[1] / SIZES[0]) ** (0.5 * (high - low) / max(2.0 * peak - low - high, 1e-6))
     return _scaled(state, float(size), centre), float(peak)
 
 
@@ -154,11 +136,11 @@ def outline_contrast(mask: NDArray[np.bool_], log: NDArray) -> float | None:
 
     Where the image ends there is none.
     """
-    shown, wide = mask.astype(np.uint8), np.ones((5, 5), np.uint8)
+    shown, wide = mask.astype(np.uint8), np.ones((2 * round(EDGE_PIXELS) + 1,) * 2, np.uint8)
     rings = [ring.astype(np.float32) for ring in (shown - cv2.erode(shown, wide), cv2.dilate(shown, wide) - shown)]
-    weights = [cv2.GaussianBlur(ring, (0, 0), BLUR) for ring in rings]
+    weights = [cv2.GaussianBlur(ring, (0, 0), EDGE_PIXELS) for ring in rings]
     inside, outside = (
-        cv2.GaussianBlur(log * ring[..., None], (0, 0), BLUR) / np.maximum(weight, 1e-6)[..., None]
+        cv2.GaussianBlur(log * ring[..., None], (0, 0), EDGE_PIXELS) / np.maximum(weight, 1e-6)[..., None]
         for ring, weight in zip(rings, weights, strict=True)
     )
     edge = (rings[0] + rings[1] > 0) & (np.minimum(*weights) > 0.05)

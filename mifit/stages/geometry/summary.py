@@ -12,10 +12,9 @@ from mifit.core.estimate import GeometryEstimate, Report
 from mifit.morphable import MorphableModel
 from mifit.optim import Outcome, Solution
 from mifit.progress import Progress
-from mifit.stages.geometry.landmarks import LandmarkView, State, coordinate_deviation, world_vertices
+from mifit.stages.geometry.landmarks import LandmarkView, State, contradicts, coordinate_deviation, world_vertices
 
 FARTHEST_IDENTITY = 8.0  # standard deviations; heads beyond a model's span reach six, wrong cameras ten
-SCATTER_OF_WIDTH = 0.015  # deviation of landmarks from the fit, as part of the image's width, that deserves a warning
 
 
 class Journal:
@@ -86,9 +85,8 @@ def pack(
     poses = [state.frames.pose(layout, x, k) for k in range(len(timesteps))]
     albedo, shading, ambient = np.split(appearance, [model.n_albedo, model.n_albedo + 27])
     expression = np.stack([x[layout.at("expression", k)] for k in range(len(timesteps))])
-    width = min((view.camera.width for view in views), default=np.inf)
-    scatter = coordinate_deviation(state, views) if views else 0.0
-    if scatter > SCATTER_OF_WIDTH * width:
+    if contradicts(state, views):
+        scatter = coordinate_deviation(state, views)
         text = f"landmarks scatter by {scatter:.1f} pixels about the fitted face: check detector and calibration"
         journal.warn(Diagnostic("landmarks-scatter", text))
     identity = x[layout.at("identity")].copy()

@@ -19,6 +19,7 @@ from mifit.optim import Outcome
 from mifit.progress import Progress
 from mifit.sampling.observations import Surface
 from mifit.stages.reflectance.compact_lights import EXPONENT, ITERATIONS, OBSERVATIONS, best_exponent, find_lights
+from mifit.stages.reflectance.fill import ALIKE
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution, active_weight, fit_lighting, noise_weight
 from mifit.stages.reflectance.lighting_equations import specular_pull
@@ -32,8 +33,6 @@ MAP_ITERATIONS = 40
 """ADMM iterations of a pass; the first, there for the weights alone, takes half of them. Every pass starts from its
 maps: going on from the multipliers of the pass before saves half, but carries over what the last weights took an
 outlier for."""
-SURROUNDINGS = 1 / 128
-"""Half the side of the square of texels over which residuals are averaged, relative to the map."""
 
 
 @dataclass(frozen=True)
@@ -301,7 +300,7 @@ def specular_observability(
     expected : float
         Specular albedo expected beforehand.
     """
-    side = 2 * max(1, round(SURROUNDINGS * texels.size)) + 1
+    side = 2 * max(1, round(ALIKE * texels.size)) + 1
     around = cv2.boxFilter(
         texels.to_map(sizes), cv2.CV_32F, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT
     )

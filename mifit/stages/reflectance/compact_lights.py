@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.illumination import DistantLight
-from mifit.appearance.reception import fibonacci_sphere
+from mifit.appearance.reception import DIRECTIONS, fibonacci_sphere
 from mifit.core.mesh import normalize
 from mifit.core.sh import LUMINANCE
 from mifit.sampling.observations import Observations
+from mifit.sampling.visibility import DARKEST
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import (
     LightingSolution,
@@ -34,8 +35,6 @@ from mifit.stages.reflectance.lighting import (
 )
 from mifit.stages.reflectance.lighting_equations import PATCHES, LightingProblem
 
-DIRECTIONS = 512
-"""Directions from which light may come at first, 7 degrees apart."""
 OBSERVATIONS = 8000
 """Texels times images that the estimate is made from."""
 LIGHTS = 3
@@ -45,11 +44,7 @@ EXPONENT = 40.0
 EXPONENTS = 10.0, 80.0
 """Exponents between which the lobe is looked for: Beckmann roughness 0.4 to 0.15."""
 ITERATIONS = 8
-"""Gauss-Newton iterations of all light and albedos under lights in given places."""
-SETTLING = 4
-"""Places of the lights that are tried at the most."""
-STEP = 1.0 / 255.0
-"""Noise of an image beside all errors of the model: a step of 8 bits."""
+"""Gauss-Newton iterations of all light and albedos under lights in given places, and places that are tried."""
 SLOPE = np.radians(1.0)
 """Angle over which the columns of a light are differentiated: shadows have edges."""
 RADII = np.radians([0.25, 15.0])
@@ -106,7 +101,7 @@ def _gains(problem: LightingProblem, columns: Sequence[NDArray]) -> NDArray[np.f
 
 def _explained(before: LightingSolution, after: LightingSolution) -> float:
     """Part of the energy that is explained since, relative to what one number of no meaning explains."""
-    return PATCHES * float(np.log((before.unexplained**2 + STEP**2) / (after.unexplained**2 + STEP**2)))
+    return PATCHES * float(np.log((before.unexplained**2 + DARKEST**2) / (after.unexplained**2 + DARKEST**2)))
 
 
 def _solved(
@@ -132,7 +127,7 @@ def _settled(
     more than ``before``; the best of all rounds is taken.
     """
     smooth, rounds = forward.order**2, [(lights, *_solved(seen, forward, lights, albedo))]
-    while len(rounds) < SETTLING and _explained(before, rounds[-1][2]) > 1.0:
+    while len(rounds) < ITERATIONS and _explained(before, rounds[-1][2]) > 1.0:
         lights, problem, before = rounds[-1]
         ways = [_moved(light, sign * step) for light in lights for step in np.eye(3) for sign in (1.0, -1.0)]
         moved = forward.with_lights(tuple(ways))

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from mifit.core.mesh import interpolate
 from mifit.core.uv import TexelMap
 from mifit.morphable import MorphableModel
+from mifit.morphable.pigment import SPREAD
 from mifit.sampling.visibility import DARKEST
 from mifit.stages.reflectance.fill import BLEND
 
-SPREAD = 0.28
-"""Standard deviation of the log luminance of skin over a face, brows and lips included."""
 FEATURE = 0.06
 """Extent of the widest dark feature of a face, relative to the map: brows."""
 BORDER = 0.03

@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.appearance.formation import form_image
-from mifit.appearance.reception import fibonacci_sphere
+from mifit.appearance.reception import DIRECTIONS, fibonacci_sphere
 from mifit.core.metrics import median_deviation
 from mifit.core.process import blocks, on_all_cores
 from mifit.core.sh import bands, basis
+from mifit.morphable.pigment import SPECULAR
 from mifit.optim import Outcome
 from mifit.sampling.observations import Observations
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting_equations import (
     PRIORS,
-    SPECULAR_LIMIT,
     LightingEquations,
     LightingPriors,
     LightingProblem,
@@ -32,10 +32,6 @@ from mifit.stages.reflectance.lighting_equations import (
     expected_specular,
 )
 
-NEGATIVE_DIRECTIONS = 400
-"""Directions at which negative radiance is penalised."""
-STILL = 3
-"""Steps without a lower energy that end the iterations."""
 SLACK = 1.02
 """A step may raise the energy by this factor: robust weights and the gauge move between steps."""
 GROSS = 0.1
@@ -145,7 +141,7 @@ class Residuals:
 def solve_lighting(
     problem: LightingProblem,
     start: tuple[NDArray, NDArray, NDArray] | None = None,
-    specular: float = SPECULAR_LIMIT,
+    specular: float = SPECULAR,
     priors: LightingPriors = PRIORS,
     robust: bool = True,
     iterations: int = 12,
@@ -166,7 +162,7 @@ def solve_lighting(
         Give outliers less weight (Cauchy).
     iterations : int
     tolerance : float
-        Stop when the energy changes by less than this part, or has not fallen by it in the last `STILL` steps.
+        Stop when the energy changes by less than this part.
     """
     n = len(problem.albedo)
     seen = problem.sums(problem.weight)
@@ -190,8 +186,6 @@ def solve_lighting(
         else:
             energy.append(found.energy)
             settled = len(energy) > 1 and abs(energy[-2] - energy[-1]) < tolerance * energy[-2]
-            # The priors' energy goes on falling where the data's, which is kept here, no longer does.
-            settled |= min(energy[-STILL:]) > (1.0 - tolerance) * min(energy[:-STILL], default=np.inf)
             best, held = found, max(held - 1, 0)
             damping = damping if held else max(0.1 * damping, 1e-5)
             if settled:
@@ -219,7 +213,7 @@ def solve_lighting(
 @cache
 def _sphere(order: int) -> NDArray[np.float64]:
     """Basis functions at the directions in which radiance is kept from being negative."""
-    return basis(fibonacci_sphere(NEGATIVE_DIRECTIONS), order)
+    return basis(fibonacci_sphere(DIRECTIONS), order)
 
 
 def _stiffness(order: int, count: int) -> NDArray[np.float64]:
@@ -306,7 +300,7 @@ def fit_lighting(
     albedo: NDArray,
     robust: bool,
     iterations: int,
-    specular: float = SPECULAR_LIMIT,
+    specular: float = SPECULAR,
     priors: LightingPriors = PRIORS,
 ) -> LightingSolution:
     """Lighting and the subset's albedos; a model that turns with the lighting is linearised anew."""

@@ -12,12 +12,10 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mifit.core.process import BLOCK, blocks, on_all_cores
+from mifit.morphable.pigment import SPECULAR
 
 SPECULAR_SPREAD = 0.15
 """Standard deviation of the specular albedo over a face, relative to its median."""
-SPECULAR_LIMIT = 0.03
-"""Specular albedo expected of skin where the images don't tell: at the most what it reflects at normal incidence (index
-of refraction 1.4)."""
 FEW_IMAGES = 4
 """Images of a texel from which its four albedos are told by the images."""
 PATCHES = 100
@@ -112,7 +110,7 @@ def expected_specular(specular: NDArray, images: NDArray) -> float:
     Two or three images of a still head leave it open how much of the broad reflection is specular.
     """
     found = float(np.median(specular))
-    return found if float(np.median(images)) >= FEW_IMAGES else min(found, SPECULAR_LIMIT)
+    return found if float(np.median(images)) >= FEW_IMAGES else min(found, SPECULAR)
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,6 @@ from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution
 from mifit.stages.reflectance.maps import laplacian
 
-ROUNDS = 20
-"""Rounds at the most."""
 LENGTHS = (3.0, 1.0, 0.3, 0.1)
 """Step lengths of the lighting that are tried: alternation creeps, so the longer step is right more often than not."""
 SETTLED = 1e-3
@@ -45,7 +43,7 @@ def fit_paper(
     terms = energies(surface, forward, found.light, found.ambient, solved.maps, albedo, config)
     history = {name: [value] for name, value in terms.items()}
     outcome = Outcome.MAX_ITERATIONS
-    for _ in range(ROUNDS):
+    for _ in range(config.max_iterations):
         light, ambient = exact_lighting(surface, forward, found, solved.maps, config)
         before = sum(terms.values())
         for length in LENGTHS:

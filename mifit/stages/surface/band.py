@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
 from mifit.core.image import box
+from mifit.core.process import blocks
+from mifit.sampling.visibility import DARKEST
 
-DARKEST = 4e-3
-"""Added before the logarithm, in linear image units: below it the noise of 8-bit images outweighs the signal."""
 WINDOW = 3.0
 """Wide blur of the band, pixels of the level."""
-SAMPLED = 4096
-"""Points that are looked up at a time: what they need stays in a core's cache."""
 LARGEST = 0.3
 """Contrast in the logarithm above which a feature stops growing: highlights, hair, the edges of cast shadows."""
 
@@ -52,8 +50,7 @@ class FeatureImage:
         middle = np.float32(camera.cx * factor - 0.5), np.float32(camera.cy * factor - 0.5)
         steps = np.asarray(offsets, np.float32)[:, None]
         out = np.empty((len(steps), len(start), self.values.shape[-1]), np.float32)
-        for first in range(0, len(start), SAMPLED):
-            part = slice(first, first + SAMPLED)
+        for part in blocks(len(start), 256):
             depth = z[part] + steps * dz[part]
             behind = depth <= 1e-12
             if behind.any():

@@ -20,7 +20,16 @@ from numpy.typing import NDArray
 from mifit.core.estimate import GeometryEstimate
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.geometry.surfaces import moved_by, object_shapes
-from mifit.stages.surface.closed_line import Strip, heights, read_strip, sample, shows_an_eye, shows_teeth
+from mifit.stages.surface.closed_line import (
+    BEYOND_MM,
+    STEP_MM,
+    Strip,
+    heights,
+    read_strip,
+    sample,
+    shows_an_eye,
+    shows_teeth,
+)
 from mifit.stages.surface.margins import UP, Gap, Margins, Region
 
 if TYPE_CHECKING:
@@ -29,10 +38,8 @@ if TYPE_CHECKING:
 
 SMALLEST_PIXELS = 4.5
 """Opening up to which margins stay: the line and margins that are a little apart look alike in so few pixels."""
-DEPTH_MM, HEIGHT_MM = 0.5, 0.15
-"""Standard deviations of the line's depth about the middle between the margins, and of its height in an image."""
-FORWARD_MM = 3.0
-"""A column is seen where the point so far in front of it is."""
+DEPTH_MM = 0.5
+"""Standard deviation of the line's depth about the middle between the margins."""
 FORWARD = np.array([0.0, 0.0, 1.0])
 
 
@@ -169,8 +176,7 @@ def _closed(
     shared = region.fade(mean)
     expression = geometry.expression.copy()
     for k in range(len(shapes)):
-        # What a timestep has beyond the others is small, or expressions follow it roughly anyway: one step does.
-        rest = region.fade(wanted[k] - mean, steps=1) if k in wanted else -shared
+        rest = region.fade(wanted[k] - mean) if k in wanted else -shared
         expression[k] = region.adjusted(model, expression[k], rest)
     return moved_by(model, replace(geometry, expression=expression), shared)
 
@@ -200,7 +206,7 @@ def _closed_line(
 
     column_mm = float(np.linalg.norm(np.diff(middle, axis=0), axis=1).mean()) * unit_mm
     points = world(middle[:, None] + height[None, :, None] * UP)
-    front = world(middle + FORWARD_MM / unit_mm * FORWARD)
+    front = world(middle + BEYOND_MM / unit_mm * FORWARD)  # seen where lips and lids don't hide it
     opening_mm = (gap.upper - gap.lower) @ UP * unit_mm
     votes, rows, pixel = [], [], np.inf
     for name in cameras:
@@ -225,7 +231,7 @@ def _closed_line(
     if 2 * sum(votes) <= len(votes):
         return (False if votes else None), None, pixel
     h, weight, slope = (np.stack(part) for part in zip(*rows, strict=True))
-    precision = weight / weight.max() / HEIGHT_MM**2
+    precision = weight / weight.max() / STEP_MM**2
     a, b, c = (precision.sum(0) + 1e-6, (precision * slope).sum(0), (precision * slope**2).sum(0) + DEPTH_MM**-2.0)
     p, q = (precision * h).sum(0), (precision * slope * h).sum(0)
     determinant = a * c - b**2

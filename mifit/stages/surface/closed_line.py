@@ -16,33 +16,28 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from mifit.core.uv import bilinear
+from mifit.sampling.visibility import DARKEST
 
 STEP_MM = 0.1
 """Distance of samples across the lips."""
 BEYOND_MM = 4.0
 """How far past the modelled opening the line is looked for."""
-NARROWEST_MM, WIDEST_MM, PART = 0.6, 1.2, 0.4
-"""Distance from the line at which both sides are brighter, least, largest, and in parts of the modelled opening."""
-BLUR_MM = 0.2
-DARKER = 0.15
-"""Least median depth of the line below both sides, log of linear green and blue."""
-TEETH_MM, LESS_RED, TEETH = 1.0, 0.3, 0.25
-"""Teeth: so near the line red over green falls by this (log) below the lips', in this part of the columns at least."""
-WITHIN, BESIDE_MM = 0.35, (1.0, 4.0)
-"""An eye is looked at so far from the middle, in parts of the opening, and compared with the skin so far beyond."""
-PALE, DARK, EYE = 0.15, 1.2, 0.45
-"""An eye is open where red over green falls by ``PALE`` (log) below the skin's, as the white's does, or colours by
-``DARK``, as those of iris and pupil, in this part of it at least. Closed eyes of a scan have 0.3 at the most, Digital
-Emily's open ones 0.75 at least, painted ones 0.6."""
+LINE_MM = 1.0
+"""Distance from the line at which lips and lids are bright on both sides, and teeth pale between lips."""
+CONTRAST = 0.15
+"""Difference of logarithms of colour that shows something: the line below both sides, red over green of the white of an
+eye below that of skin."""
+LESS_RED = 0.3
+"""Teeth: near the line red over green falls by this (log) below the lips'."""
+DARK = 1.2
+"""An eye is open where it is pale, or colours fall by this (log) as those of iris and pupil."""
+OPEN = 0.45
+"""Part of columns or pixels from which teeth show that a mouth, and white or iris that an eye is open. Closed eyes of a
+scan have 0.3 at the most, Digital Emily's open ones 0.75 at least, painted ones 0.6."""
 MARGINAL = 0.2
-"""Part of the columns at either corner of an eye that doesn't tell: the corner's tissue shows there."""
-FEWEST = 0.5
-"""Part of the columns that an image must show to have a vote."""
+"""Part of an eye along either lid and at either corner that doesn't tell: lashes and the corner's tissue show there."""
 BEND = 0.01
 """Price of a line's step of one sample from one column to the next, squared, in units of its depth."""
-FAINT = 0.05
-"""Depth below which a column says nothing of where the line is."""
-DARKEST = 1e-3
 
 
 @dataclass(frozen=True)
@@ -66,7 +61,7 @@ class ClosedLine:
 
 def heights(opening_mm: float) -> NDArray[np.float64]:
     """(R,) heights at which images are sampled, mm, for a modelled opening."""
-    reach = 0.5 * max(opening_mm, 0.0) + BEYOND_MM + WIDEST_MM
+    reach = 0.5 * max(opening_mm, 0.0) + BEYOND_MM + LINE_MM
     return np.arange(-reach, reach + 0.5 * STEP_MM, STEP_MM)
 
 
@@ -79,7 +74,7 @@ def sample(image: NDArray, pixels: NDArray) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Strip:
-    """An image that was straightened along the opening, blurred by `BLUR_MM`.
+    """An image that was straightened along the opening and blurred.
 
     Attributes
     ----------
@@ -103,9 +98,9 @@ class Strip:
 def shows_teeth(strip: Strip) -> bool:
     """Whether the line runs along teeth rather than between lips."""
     red, seen = strip.red, strip.seen
-    window = np.abs(np.arange(red.shape[1])[None] - strip.row[:, None]) <= round(TEETH_MM / STEP_MM)
+    window = np.abs(np.arange(red.shape[1])[None] - strip.row[:, None]) <= round(LINE_MM / STEP_MM)
     least = np.where(window, red, np.inf).min(axis=1)
-    return float((least[seen] < np.median(red[seen]) - LESS_RED).mean()) >= TEETH
+    return float((least[seen] < np.median(red[seen]) - LESS_RED).mean()) >= OPEN
 
 
 def shows_an_eye(strip: Strip) -> bool:
@@ -116,12 +111,12 @@ def shows_an_eye(strip: Strip) -> bool:
     if not len(columns):
         columns = np.flatnonzero(strip.seen)
     off = np.abs(heights(float(np.median(strip.opening_mm))))[None] - 0.5 * strip.opening_mm[columns, None]
-    within = off < (WITHIN - 0.5) * strip.opening_mm[columns, None]
-    beside = np.where((off > BESIDE_MM[0]) & (off < BESIDE_MM[1]), 1.0, np.nan)
+    within = off < -MARGINAL * strip.opening_mm[columns, None]
+    beside = np.where((off > LINE_MM) & (off < BEYOND_MM), 1.0, np.nan)
     dark, red = strip.dark[columns], strip.red[columns]
-    pale = red < np.nanmedian(beside * red) - PALE
+    pale = red < np.nanmedian(beside * red) - CONTRAST
     black = dark < np.nanmedian(beside * dark, axis=1, keepdims=True) - DARK  # shading changes along the eye
-    return bool((pale | black)[within].mean() > EYE) if within.any() else True
+    return bool((pale | black)[within].mean() > OPEN) if within.any() else True
 
 
 def read_strip(
@@ -149,15 +144,15 @@ def read_strip(
     opening = float(np.median(opening_mm))
     height = heights(opening)
     nothing = ClosedLine(None, np.zeros(len(strip)), np.zeros(len(strip)))
-    if seen.mean() < FEWEST:
+    if seen.mean() < 0.5:
         return nothing
     colour = gaussian_filter(
         np.log(np.maximum(np.asarray(strip, dtype=np.float64), DARKEST)),
-        (BLUR_MM / column_mm, BLUR_MM / STEP_MM, 0.0),
+        (STEP_MM / column_mm, 1.0, 0.0),
         mode="nearest",
     )
     dark, red = 0.5 * (colour[..., 1] + colour[..., 2]), colour[..., 0] - colour[..., 1]
-    apart = round(float(np.clip(PART * opening, NARROWEST_MM, WIDEST_MM)) / STEP_MM)
+    apart = round(LINE_MM / STEP_MM)
     depth = np.full(dark.shape, -np.inf)
     inner = slice(apart, dark.shape[1] - apart)
     sides = np.minimum(dark[:, 2 * apart :], dark[:, : dark.shape[1] - 2 * apart])
@@ -166,10 +161,10 @@ def read_strip(
     row = _seam(np.maximum(depth, -1.0))
     columns = np.arange(len(row))
     found = np.where(seen, depth[columns, row], 0.0)
-    if np.median(found[seen]) < DARKER:
+    if np.median(found[seen]) < CONTRAST:
         return nothing
     closed = not shows_inside(Strip(dark, red, seen, row, np.minimum(opening_mm, opening + BEYOND_MM)))
-    weight = np.where(found > FAINT, found, 0.0)
+    weight = np.maximum(found, 0.0)
     clear = np.flatnonzero(weight)
     smooth = gaussian_filter1d(np.interp(columns, clear, height[row[clear]]), 1.5, mode="nearest")
     return ClosedLine(closed, smooth, weight)

@@ -19,9 +19,7 @@ from mifit.stages.surface.sweep import Posed, sweep
 FARTHEST = 4
 """Pixels that are searched to either side."""
 FEWEST = 200
-"""Cells that must match for a residual to be told."""
-FACING = 0.4
-"""Cosine of the angle of view above which views are compared as they are."""
+"""Cells or points that must match for their residuals to say something."""
 
 
 def epipolar_residual(
@@ -73,7 +71,7 @@ def epipolar_residual(
 def likeness(step: Posed, pair: tuple[int, int]) -> float | None:
     """Correlation of the features that a pair of views shows on a surface; None where few texels face both."""
     first, second = (step.images[view].sample(step.position, step.normal, np.zeros(1))[0] for view in pair)
-    used = (first[:, 1] > 0.99) & (second[:, 1] > 0.99) & (step.seen[list(pair)].min(axis=0) > FACING)
+    used = (first[:, 1] > 0.99) & (second[:, 1] > 0.99) & (step.seen[list(pair)].min(axis=0) > 0)
     both = np.stack([first[used, 0], second[used, 0]])
     if used.sum() < FEWEST or not both.std(axis=1).all():
         return None

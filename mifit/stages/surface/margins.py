@@ -22,17 +22,16 @@ if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
 
 NEAR_MM = 4.0
-"""Distance of a landmark from the margins at the most."""
+"""Distance of a landmark from the margins at the most, and of what lies behind these and moves with them."""
 COLUMNS = np.linspace(0.03, 0.97, 61)
 """Places along an opening, from corner to corner, at which images are read."""
-REACH_MM, INSIDE_MM = 14.0, 4.0
-"""Distance from the margins along the surface up to which it moves with them, on the skin and behind it."""
-TOUCHING_MM = 0.1
-"""Distance of other pieces' vertices from the margins, or from what lies behind, within which they move with them."""
-HELD_MM, STEPS = 8.0, 2
-"""Wavelength above which the movement stays on the found surface, and steps in which it follows that one's normals."""
+REACH_MM = 14.0
+"""Distance from the margins along the surface up to which it moves with them."""
+HELD_MM = 8.0
+"""Wavelength above which the movement stays on the found surface."""
 CLEAR_MM = 0.3
-"""Height that the rims behind closed margins keep from these, each on its side."""
+"""Height that the rims behind closed margins keep from these, each on its side; other pieces' vertices nearer than this
+move with what they touch."""
 ELSEWHERE = 0.1
 """Weight of a vertex away from the margins against one on them where expressions are found."""
 UP = np.array([0.0, 1.0, 0.0])
@@ -150,13 +149,13 @@ class Region:
         in_face = np.zeros(len(vertices), bool)
         in_face[shown] = True
         skin = np.flatnonzero(in_face & (distance < REACH_MM))
-        behind = np.flatnonzero(~in_face & (distance < INSIDE_MM))
+        behind = np.flatnonzero(~in_face & (distance < NEAR_MM))
         inside = np.setdiff1d(behind, links[count == 1])
         ends = np.setdiff1d(behind, inside)
         ends = np.stack([ends, margin[cKDTree(model.mean[margin]).query(model.mean[ends])[1]]], axis=1)
         near = np.union1d(margin, behind)
         away, nearest = cKDTree(model.mean[near]).query(model.mean)
-        touching = np.flatnonzero((away < TOUCHING_MM / model.unit_mm) & np.isinf(distance))
+        touching = np.flatnonzero((away < CLEAR_MM / model.unit_mm) & np.isinf(distance))
         touching = np.stack([touching, near[nearest[touching]]], axis=1)
         held, clear = HELD_MM / model.unit_mm, CLEAR_MM / model.unit_mm
         return cls(vertices, model.faces.astype(np.int64), shown, margins, skin, inside, ends, touching, held, clear)
@@ -175,19 +174,15 @@ class Region:
             movement[[first, second]] = movement[[first, second]].mean(axis=0)
         return movement
 
-    def fade(self, moved: NDArray, steps: int = STEPS) -> NDArray[np.float64]:
+    def fade(self, moved: NDArray) -> NDArray[np.float64]:
         """(V, 3) movement of the margins (m, 3) that fades into the skin with least bending, along the surface found.
 
         Behind the margins the surface is spanned anew as a net of springs is. A net lies between what holds it, so
         that the sheets behind lips, whose way from one to the other may narrow before it widens, don't cross.
         """
         out = np.zeros_like(self.vertices)
-        for k in range(steps):
-            step = np.zeros_like(out)
-            step[self.margin] = moved / steps
-            solve = self._first if k == 0 else self._bend(out)
-            step[self._free] = solve(-(self._bending[0] @ step).ravel()).reshape(-1, 3)
-            out += step
+        out[self.margin] = moved
+        out[self._free] = self._bend(-(self._bending[0] @ out).ravel()).reshape(-1, 3)
         place = self.vertices + out
         place[self.ends[:, 0]] += out[self.ends[:, 1]] + self._out_of_the_way(out)
         net, springs, spanned = self._net
@@ -229,20 +224,17 @@ class Region:
         held: NDArray[np.float64] = area[self._free].astype(np.float64)
         return (laplacian.T @ sp.diags(1.0 / area) @ laplacian).tocsr()[self._free], held
 
-    def _bend(self, moved: NDArray) -> Callable[[NDArray], NDArray]:
-        """Solver of the bending of the surface where it was moved to, held along its normals there."""
+    @cached_property
+    def _bend(self) -> Callable[[NDArray], NDArray]:
+        """Solver of the bending of the surface, held along its normals."""
         free, (bending, area) = self._free, self._bending
-        normal = vertex_normals(self.vertices + moved, self.shown)[free]
+        normal = vertex_normals(self.vertices, self.shown)[free]
         rows = sp.csr_matrix(
             (normal.ravel(), np.arange(3 * len(free)), np.arange(0, 3 * len(free) + 1, 3)),
             shape=(len(free), 3 * len(free)),
         )
         held = rows.T @ sp.diags((2.0 * np.pi / self.held) ** 4 * area) @ rows
         return spl.factorized((sp.kron(bending[:, free], sp.identity(3)) + held).tocsc())
-
-    @cached_property
-    def _first(self) -> Callable[[NDArray], NDArray]:
-        return self._bend(np.zeros_like(self.vertices))
 
     @cached_property
     def _net(self) -> tuple[NDArray[np.int64], sp.csr_matrix, Callable[[NDArray], NDArray]]:

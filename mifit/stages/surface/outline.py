@@ -22,39 +22,28 @@ from mifit.core.camera import Camera
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.process import on_all_cores
 from mifit.render.gbuffer import GBuffer, SurfaceScene
+from mifit.sampling.visibility import DARKEST
 from mifit.stages.surface.band import look_up
 
 if TYPE_CHECKING:
     from mifit.capture import Capture, Frame
 
 REACH = 8
-"""Farthest that the border is looked for to either side of the fitted silhouette, pixels of the level."""
-STRIP = 6
-"""Width of the strips that tell the colours of either side, pixels."""
+"""Farthest that the border is looked for to either side of the fitted silhouette, pixels of the level; strips as wide
+beyond it tell the colours of either side."""
 ALONG = 25
 """Pixels along the silhouette that share their colours."""
-DARKEST = 4e-3
-"""Added to linear colours before the logarithm."""
 SPREAD = 0.06
 """Least deviation of the logarithm of a colour within a strip."""
-STRAY = 0.05
-"""Part of the pixels of either side that neither colour explains."""
-RANGE = 6.0
-"""Of the logarithm of a colour, over which stray ones are even."""
+STRAY = 2e-4
+"""Density of colours that neither side explains, per cube of logarithms: 5 % over a range of 6 in each channel."""
 EVIDENCE = 0.3
 """Weight of a pixel's evidence: neighbours err alike."""
-BEND = 0.5
-"""Deviation of the border's change from one pixel of the silhouette to the next, pixels."""
-BLUR = 0.7
-"""Least deviation of a border, pixels: borders are soft, and a silhouette of the mesh is known to half a pixel."""
-DOUBT = 0.5
-"""Deviation of a border, in terms of the reach, above which it isn't known."""
-SHORTEST = 12
-"""Pixels of a piece of the silhouette below which it is left out."""
+BLUR = 0.5
+"""Least deviation of a border, and of its change from one pixel of the silhouette to the next, pixels: borders are
+soft, and a silhouette of the mesh is known to half a pixel."""
 EDGE_ON = 0.5
 """Cosine between normal and line of sight above which the mesh ends there, as at the neck, rather than turns away."""
-EVERY = 2
-"""Pixels of the silhouette per border that counts, whose precision is theirs together."""
 INDEPENDENT = 0.1
 """Part of the borders that count as measured on their own."""
 
@@ -136,9 +125,9 @@ def _borders(camera: Camera, frame: Frame, buffer: GBuffer, scene: SurfaceScene,
         way = across[:, :2] / np.maximum(length, 1e-9)[:, None]
         shift, deviation = _border(log, valid, buffer.mask, pixels, way)
         pixel = buffer.depth[at].astype(np.float64) / (np.sqrt(camera.fx * camera.fy) * np.maximum(length, 0.5))
-        known = np.flatnonzero(turned & (deviation < DOUBT * REACH) & (length > 0.5))
-        known = known[known % EVERY == 0]
-        precision = INDEPENDENT * EVERY / ((deviation**2 + BLUR**2) * pixel**2)
+        # A border that may be anywhere within the reach has a deviation of 0.58 of it.
+        known = turned & (2.0 * deviation < REACH) & (length > 0.5)
+        precision = INDEPENDENT / ((deviation**2 + BLUR**2) * pixel**2)
         found.append(
             Borders(
                 face[known], weights[known], position[known], normal[known], (shift * pixel)[known], precision[known]
@@ -167,7 +156,7 @@ def _pieces(mask: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
             start = int(np.flatnonzero(~good)[0])
             line, good = np.roll(line, -start, axis=0), np.roll(good, -start)
         edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
-        pieces += [line[a:b].astype(np.intp) for a, b in edges.reshape(-1, 2) if b - a >= SHORTEST]
+        pieces += [line[a:b].astype(np.intp) for a, b in edges.reshape(-1, 2)]
     return pieces
 
 
@@ -179,7 +168,7 @@ def _border(
     From logarithms of colours (H, W, 3), the part of each pixel that is valid, the pixels that show the surface and
     the ways (N, 2) out of it in the image.
     """
-    steps = np.arange(-REACH - STRIP, REACH + STRIP, dtype=np.float64) + 0.5  # centres of pixels across
+    steps = np.arange(-2 * REACH, 2 * REACH, dtype=np.float64) + 0.5  # centres of pixels across
     # The silhouette passes half a pixel outside the last pixel that shows the surface.
     at = (pixels[:, None] + (0.5 + steps)[:, None] * way[:, None]).reshape(-1, 2)
     sides = np.stack([valid, mask], axis=-1).astype(np.float32)
@@ -190,13 +179,13 @@ def _border(
     outside = usable & ~covered & (steps > REACH)
     evidence = np.where(usable, _likelihood(colour, inside) - _likelihood(colour, outside), 0.0)
     # Border at position j: pixels before it are skin, those from it on are not.
-    some = evidence[:, STRIP:-STRIP]
+    some = evidence[:, REACH:-REACH]
     score = EVIDENCE * np.concatenate([np.zeros((len(some), 1)), np.cumsum(some, axis=1)], axis=1)
     position = np.arange(-REACH, REACH + 1, dtype=np.float64)
     belief = _chain(score, position)
     mean = belief @ position
     deviation = np.sqrt(np.maximum(belief @ position**2 - mean**2, 0.0))
-    told = (inside.sum(1) > STRIP / 2) & (outside.sum(1) > STRIP / 2)
+    told = (inside.sum(1) > REACH / 2) & (outside.sum(1) > REACH / 2)
     return mean, np.where(told, deviation, np.inf)
 
 
@@ -215,12 +204,12 @@ def _likelihood(colour: NDArray, strip: NDArray[np.bool_]) -> NDArray:
     difference = colour - mean[:, None]
     distance = np.einsum("nsi,nij,nsj->ns", difference, np.linalg.inv(covariance), difference)
     density = np.exp(-0.5 * distance) / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(covariance))[:, None]
-    return np.log((1.0 - STRAY) * density + STRAY / RANGE**3)
+    return np.log(density + STRAY)
 
 
 def _chain(score: NDArray, position: NDArray) -> NDArray:
     """(N, K) posterior of N neighbours' positions from log evidence (N, K), by the forward-backward recursion."""
-    move = np.exp(-0.5 * ((position[:, None] - position) / BEND) ** 2)
+    move = np.exp(-0.5 * ((position[:, None] - position) / BLUR) ** 2)
     move /= move.sum(1, keepdims=True)
     local = np.exp(score - score.max(1, keepdims=True))
     forward, backward = np.empty_like(local), np.ones_like(local)
