@@ -17,6 +17,8 @@ NORMAL = 1.4826
 """Standard deviation of a normal distribution over the median of its absolute value."""
 SURE = 4.0
 """Standard deviations beyond which a difference is surely no noise: 6 in 100,000 of a normal distribution."""
+INDEPENDENT = 0.1
+"""Part of the measurements of neighbouring points that count as measured on their own: their errors are alike."""
 
 
 def median_deviation(residuals: NDArray) -> float:

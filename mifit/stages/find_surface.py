@@ -25,7 +25,7 @@ from mifit.core.camera import Camera
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.metrics import median_deviation
+from mifit.core.metrics import INDEPENDENT, SURE, median_deviation
 from mifit.core.process import one_blas_thread
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.morphable.openings import leading_faces, skin_weights
@@ -66,10 +66,6 @@ SETTLED = 0.15
 """Part of a sweep's step below which the surface is at rest (root mean square over what is measured)."""
 SWEEPS, SWEEPS_OF_LIDS = 3, 2
 """Of a level, and of the two finest ones once more where lids have been closed."""
-INDEPENDENT = 0.1
-"""Part of the landmarks that count as measured on their own: neighbours are off alike."""
-OUTLIER_DEVIATIONS = 4.0
-"""Distance from the surface, in deviations, where a landmark counts as an outlier."""
 FORGET_MM = 150.0
 """Wavelength above which displacements fall back to the model where nothing is measured."""
 CONTACT_MM = 1.5
@@ -276,7 +272,7 @@ class Landmarks:
         ones = np.ones(len(index), np.float32)
         points = sp.csr_matrix((ones, index, np.arange(len(index) + 1)), shape=(len(index), self.n_vertices))
         precision = INDEPENDENT * np.concatenate(precisions)
-        far = OUTLIER_DEVIATIONS / np.sqrt(precision[:, None])
+        far = SURE / np.sqrt(precision[:, None])
         return Measurements(points, np.concatenate(directions), np.concatenate(offsets), precision, far)
 
 

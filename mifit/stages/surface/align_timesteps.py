@@ -22,12 +22,13 @@ from numpy.typing import NDArray
 
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate
-from mifit.core.metrics import median_deviation
+from mifit.core.metrics import INDEPENDENT, median_deviation
 from mifit.core.process import threads
 from mifit.core.uv import TexelMap
 from mifit.morphable import MorphableModel
 from mifit.stages.geometry.parameters import exponential
 from mifit.stages.surface.band import FeatureImage
+from mifit.stages.surface.epipolar import FEWEST
 from mifit.stages.surface.sweep import Posed
 
 POINTS = 3000
@@ -35,10 +36,6 @@ POINTS = 3000
 ITERATIONS = 10
 STILL_PIXELS = 0.02
 """Largest root mean square shift of an iteration's step that ends the iterations, pixels of the level."""
-FEWEST = 500
-"""Views of texels below which nothing is compared."""
-INDEPENDENT = 0.1
-"""Part of the texels that count as measured on their own."""
 LEAST_SPREAD = 1e-3
 """Of the features."""
 POSE = 0.03

@@ -20,6 +20,7 @@ from scipy.ndimage import uniform_filter1d
 
 from mifit.core.camera import Camera
 from mifit.core.mesh import interpolate, normalize, vertex_normals
+from mifit.core.metrics import INDEPENDENT
 from mifit.core.process import on_all_cores
 from mifit.render.gbuffer import GBuffer, SurfaceScene
 from mifit.sampling.visibility import DARKEST
@@ -44,8 +45,6 @@ BLUR = 0.5
 soft, and a silhouette of the mesh is known to half a pixel."""
 EDGE_ON = 0.5
 """Cosine between normal and line of sight above which the mesh ends there, as at the neck, rather than turns away."""
-INDEPENDENT = 0.1
-"""Part of the borders that count as measured on their own."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mifit.core.image import box
 from mifit.core.mesh import normalize
-from mifit.core.metrics import median_deviation
+from mifit.core.metrics import INDEPENDENT, median_deviation
 from mifit.core.process import threads
 from mifit.core.uv import TexelMap
 from mifit.stages.surface.band import FeatureImage
@@ -32,8 +32,6 @@ NEAR = 3
 """Side of the neighbourhood whose offsets are compared, cells; it and the next two: chosen on Emily, scan_city."""
 FINEST = 0.3
 """Deviation of an offset at best, in steps of the sweep."""
-INDEPENDENT = 0.088
-"""Part of the cells whose offsets count as measured on their own: windows overlap, and their errors are alike."""
 GLARE = 0.1
 """Least difference in log brightness between two views at which a match counts a quarter."""
 GLARE_DEVIATIONS = 3.5
