@@ -32,7 +32,6 @@ from scipy.spatial.transform import Rotation
 from mifit.core.arrays import Recent
 from mifit.core.camera import Camera, inverse, rigid
 from mifit.core.image import to_8_bit
-from mifit.core.limits import MAX_FILE_BYTES
 from mifit.errors import InputError
 from mifit.output.deferred import render_local
 from mifit.output.relight import relit
@@ -45,6 +44,8 @@ if TYPE_CHECKING:
 
 ROWS = (160, 600)
 """Rows of a picture while something moves, and when it rests."""
+MAX_UPLOAD_BYTES = 256 * 2**20
+"""An environment that a browser sends: 16384 x 8192 pixels in a Radiance file, half of that in an EXR."""
 MAX_CLIENTS = 8
 """Browsers that are answered at once."""
 LABELS = {"pca": "morphable model", "diffuse": "without specular", "full": "everything"}
@@ -267,8 +268,8 @@ class LiveView:
         self._woken.set()
 
     def _upload(self, name: str, content: bytes) -> None:
-        if Path(name).suffix.lower() not in (".hdr", ".exr") or len(content) > MAX_FILE_BYTES:
-            self.say(f"**expected a file .hdr or .exr of at most {MAX_FILE_BYTES >> 20} MiB**")
+        if Path(name).suffix.lower() not in (".hdr", ".exr") or len(content) > MAX_UPLOAD_BYTES:
+            self.say(f"**expected a file .hdr or .exr of at most {MAX_UPLOAD_BYTES >> 20} MiB**")
             return
         path = Path(self._folder.name) / f"{time.monotonic_ns()}{Path(name).suffix.lower()}"
         path.write_bytes(content)

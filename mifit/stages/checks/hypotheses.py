@@ -18,6 +18,8 @@ from mifit.stages.checks.landmark_model import Shot
 
 Matrix = NDArray[np.float64]
 Change = Callable[[Shot], Shot]
+LARGEST_DELAY = 3
+"""Timesteps that a camera may lag behind the others."""
 
 
 @dataclass(frozen=True)
@@ -210,9 +212,8 @@ def hypotheses(shots: Sequence[Shot], later: Sequence[Shot] = ()) -> Iterator[Hy
         text = f"landmarks of camera {name} lie (x, y) pixels off where the other cameras' put them"
         remedy = "the camera was turned after calibration, or its principal point or landmarks are off; calibrate again"
         yield Hypothesis("camera-turned", text, remedy, tuple(shots), name, name)
-    count = len({shot.step for shot in later or shots})
     for name in names[1:] if len(names) == 2 else names:
-        for late in range(1 - count, count):
+        for late in range(-LARGEST_DELAY, LARGEST_DELAY + 1):
             moved = tuple(
                 replace(shot, step=shot.step - late) if shot.camera.name == name else shot for shot in later or shots
             )

@@ -25,7 +25,7 @@ from mifit.morphable import MorphableModel
 from mifit.morphable.topology import INNER
 from mifit.stages.geometry.initial import pose_candidates, reprojection, triangulate
 
-MODES = 25
+IDENTITY_MODES, EXPRESSION_MODES = 25, 8
 """Principal directions of the landmarks that are kept; what is left out is below a millimetre."""
 EXPRESSION_DEVIATION = 0.3
 """Standard deviation of an expression weight, which is 0..1."""
@@ -76,17 +76,17 @@ class FaceStatistics:
         """Of a model, for a capture whose unit of length is ``unit_mm`` millimetres."""
         scale = model.unit_mm / unit_mm
 
-        def modes(basis: NDArray) -> NDArray[np.float64]:
+        def modes(basis: NDArray, count: int) -> NDArray[np.float64]:
             rows = scale * basis[model.landmarks].astype(np.float64).reshape(68 * 3, -1).T
             if not rows.size:
                 return np.zeros((0, 68, 3))
             _, size, directions = np.linalg.svd(rows, full_matrices=False)
-            return (size[:, None] * directions)[:MODES].reshape(-1, 68, 3)
+            return (size[:, None] * directions)[:count].reshape(-1, 68, 3)
 
         return cls(
             scale * model.mean[model.landmarks].astype(np.float64),
-            modes(model.identity),
-            modes(EXPRESSION_DEVIATION * model.expression),
+            modes(model.identity, IDENTITY_MODES),
+            modes(EXPRESSION_DEVIATION * model.expression, EXPRESSION_MODES),
             unit_mm,
         )
 
@@ -236,7 +236,7 @@ def _project(
     count, camera = len(face.shared), shot.camera
     mean, identities, expressions = face.inner
     size = float(np.exp(np.clip(shared[count], -30, 30)))
-    shape = mean + identities @ shared[:MODES] + expressions @ own[:-6]
+    shape = mean + identities @ shared[:count] + expressions @ own[:-6]
     turned = size * shape @ pose[0].T
     seen = camera.to_camera(turned + pose[1])
     depth = np.where(seen[:, 2] > 1e-9, seen[:, 2], np.nan)
