@@ -55,7 +55,7 @@ STEP_PIXELS = 0.7
 LAYERS = (6, 4, 2)
 """Offsets to either side in each sweep of a level."""
 ROBUST_STEPS = ((2.8, 1.4), (1.4, 0.7), (0.7,))
-"""Distance from the surface, in steps, where an offset counts as an outlier: each time that a sweep's are weighted."""
+"""Distance in steps of a sweep where an offset counts as an outlier: per sweep of a level, one for each weighting."""
 WINDOW = 5
 """Side of the windows that are compared, cells of two by two texels; a texel is about a pixel of the level."""
 COARSEST = 3

@@ -56,7 +56,7 @@ class Measurements:
     offsets, precision : (N,)
         And their inverse variance; 0 where nothing is measured.
     robust : (N, R)
-        Residual where Geman and McClure's penalty turns, for each time that they are weighted.
+        Residual where Geman and McClure's penalty turns, one for each weighting.
     """
 
     points: sp.csr_matrix
@@ -222,8 +222,7 @@ def solve_surface(
         along_modes = stiffness * (bent.T @ x.ravel().astype(np.float32)).astype(np.float64)
         return np.asarray(bent @ la.cho_solve(inner, along_modes).astype(np.float32), np.float64)
 
-    change, size = np.zeros_like(start), (start.size, start.size)
-    goal = None
+    change, size, goal = np.zeros_like(start), (start.size, start.size), None
     for robust in measured.robust.T:
         residual = measured.offsets - ((points @ change) * normals).sum(1)
         weight = precision / (1.0 + (residual / robust) ** 2) ** 2
@@ -239,7 +238,7 @@ def solve_surface(
 
         right = transposed @ ((weight * target)[:, None] * normals + along * held)
         left = right.ravel() - apply(start + change)
-        goal = RELATIVE * float(np.linalg.norm(left)) if goal is None else goal
+        goal = RELATIVE * float(np.linalg.norm(left)) if goal is None else goal  # all weightings are equally exact
         step, _ = spl.cg(
             spl.LinearOperator(size, matvec=apply),
             left,

@@ -20,6 +20,8 @@ FARTHEST = 4
 """Pixels that are searched to either side."""
 FEWEST = 200
 """Cells or points that must match for their residuals to say something."""
+FACING = 0.4
+"""Cosine of the angle of view above which two views are compared as they are."""
 
 
 def epipolar_residual(
@@ -71,7 +73,7 @@ def epipolar_residual(
 def likeness(step: Posed, pair: tuple[int, int]) -> float | None:
     """Correlation of the features that a pair of views shows on a surface; None where few texels face both."""
     first, second = (step.images[view].sample(step.position, step.normal, np.zeros(1))[0] for view in pair)
-    used = (first[:, 1] > 0.99) & (second[:, 1] > 0.99) & (step.seen[list(pair)].min(axis=0) > 0)
+    used = (first[:, 1] > 0.99) & (second[:, 1] > 0.99) & (step.seen[list(pair)].min(axis=0) > FACING)
     both = np.stack([first[used, 0], second[used, 0]])
     if used.sum() < FEWEST or not both.std(axis=1).all():
         return None
