@@ -261,6 +261,13 @@ class ReflectanceConfig:
         most=10_000,
     )
     specular: bool = flag(True, "find specular reflection; false: all is diffuse")
+    specular_albedo: float = number(
+        0.03,
+        "most specular albedo to expect; more for what outshines skin",
+        source="measured index of refraction of skin",
+        above=0,
+        most=2,
+    )
     specular_difference_weight: float = number(0.1, "the paper's lambda_S", source="paper", least=0, most=WEIGHT)
     smoothness_weight: float = number(0.001, "the paper's lambda_H", source="paper", least=0, most=WEIGHT)
     specular_smoothness: float = number(

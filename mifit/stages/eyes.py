@@ -12,20 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.estimate import GeometryEstimate
-from mifit.core.mesh import vertex_normals
+from mifit.core.mesh import normalize
 from mifit.core.process import blocks, on_all_cores
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import GAP_MM, RADIUS_MM, eyeballs, leading_faces
-
-PASSES = 2
-"""Vertices that have moved have other normals, along which a few more stand out."""
 
 
 def behind_lids(model: MorphableModel, geometry: GeometryEstimate) -> GeometryEstimate:
     """The geometry with those parts of the eyeballs that stand out of the skin moved behind it.
 
-    A vertex stands out where the way from it towards the eyeball's inside meets the skin's front. It moves along its
-    normal; what shows between the lids stays.
+    A vertex stands out where the way from it to the eyeball's middle meets the skin's front. It moves along that way;
+    what shows between the lids stays.
     """
     eyes = eyeballs(model)
     if not eyes:
@@ -37,28 +34,35 @@ def behind_lids(model: MorphableModel, geometry: GeometryEstimate) -> GeometryEs
 
     def place(world: NDArray[np.float32]) -> None:
         """Move one timestep's eyeballs, in place."""
-        for _ in range(PASSES):
-            normals = vertex_normals(world, model.faces)
-            for eye in eyes:
-                points = world[eye].astype(np.float64)
-                own = np.isin(model.faces[:, 0], eye)
-                near = np.linalg.norm(world - points.mean(axis=0), axis=1) < np.ptp(points, axis=0).max()
-                covering = ~own & near[model.faces].any(axis=1)
-                skin = model.faces[covering if lids is None else covering & lids]
-                depth = _depth_outside(points, normals[eye], world.astype(np.float64), skin, RADIUS_MM * unit)
-                # Its neighbours go with a vertex: an edge from one behind the skin to one at it may cut the skin.
-                inner = np.searchsorted(eye, model.faces[own])
-                deepest = depth.copy()
-                np.maximum.at(deepest, inner, depth[inner].max(axis=1, keepdims=True))
-                moved = np.where(deepest > 0, deepest + GAP_MM * unit, 0.0)
-                world[eye] = (points - moved[:, None] * normals[eye]).astype(np.float32)
+        for eye in eyes:
+            points = world[eye].astype(np.float64)
+            outward = normalize(points - _middle(points))
+            own = np.isin(model.faces[:, 0], eye)
+            near = np.linalg.norm(world - points.mean(axis=0), axis=1) < np.ptp(points, axis=0).max()
+            covering = ~own & near[model.faces].any(axis=1)
+            skin = model.faces[covering if lids is None else covering & lids]
+            depth = _depth_outside(points, outward, world.astype(np.float64), skin, RADIUS_MM * unit)
+            # Its neighbours go with a vertex: an edge from one behind the skin to one at it may cut the skin.
+            inner = np.searchsorted(eye, model.faces[own])
+            deepest = depth.copy()
+            np.maximum.at(deepest, inner, depth[inner].max(axis=1, keepdims=True))
+            moved = np.where(deepest > 0, deepest + GAP_MM * unit, 0.0)
+            world[eye] = (points - moved[:, None] * outward).astype(np.float32)
 
     on_all_cores(place, list(vertices))
     return replace(geometry, vertices=vertices)
 
 
+def _middle(points: NDArray) -> NDArray[np.float64]:
+    """(3,) middle of the sphere that points (n, 3) lie on, by least squares."""
+    origin = points.mean(axis=0)
+    local = points - origin
+    rows = np.column_stack([2.0 * local, np.ones(len(local))])
+    return np.asarray(origin + np.linalg.lstsq(rows, (local**2).sum(axis=1), rcond=None)[0][:3])
+
+
 def _depth_outside(points: NDArray, normals: NDArray, vertices: NDArray, faces: NDArray, reach: float) -> NDArray:
-    """(n,) distance from points along minus their normals to the deepest front of the faces within reach; 0: none.
+    """(n,) distance from points against their unit directions to the deepest front of the faces within reach; 0: none.
 
     Moeller and Trumbore (1997) for rays from p along -n, its triple products taken apart into what belongs to the ray
     and what to the face: all rays against all faces are products of matrices.

@@ -22,7 +22,7 @@ from mifit.stages.reflectance.forward import Forward
 from tests.reference import specular_brdf
 from tests.shaded import appearance, light_columns, shade_points
 
-CONFIG = ReflectanceConfig(texture_size=SIZE, bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
+CONFIG = ReflectanceConfig(texture_size=SIZE, bands=4, exponent=EXPONENT, specular_albedo=1.0, smoothness_weight=1e-5)
 KEY = DistantLight(normalize(np.array([0.75, 0.2, 0.6])), 0.02, np.array([4.0, 3.6, 3.0]))
 FILL = DistantLight(normalize(np.array([-0.7, 0.35, 0.5])), 0.02, np.array([2.0, 2.4, 3.0]))
 CAMERAS = ("left", "right")

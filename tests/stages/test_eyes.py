@@ -54,6 +54,9 @@ def test_an_eyeball_that_stands_out_goes_behind_the_lids(head: MorphableModel) -
     after = behind_lids(head, before)
     moved = np.flatnonzero(np.abs(after.vertices[0] - before.vertices[0]).max(axis=1) > 0)
     assert len(moved) and np.isin(moved, eye).all()
+    edges = head.faces[np.isin(head.faces[:, 0], eye)][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    longest = (np.linalg.norm(np.diff(v[edges], axis=1), axis=-1).max() for v in (after.vertices[0], pushed))
+    assert next(longest) < 2.0 * next(longest) * before.scale
     again = behind_lids(head, after)
     left = np.abs(again.vertices[0] - after.vertices[0]).max(axis=1) > 0
     assert left.sum() < 0.1 * len(moved), (left.sum(), len(moved))

@@ -10,13 +10,14 @@ from stages.reflectance_scene import EXPONENT, SIZE, render, turning_dome
 
 from mifit.config import ReflectanceConfig
 from mifit.errors import InputError
-from mifit.morphable.pigment import SPECULAR
 from mifit.sampling.observations import Surface
 from mifit.stages.infer_reflectance import infer_reflectance
-from mifit.stages.reflectance.lighting_equations import expected_specular, specular_pull
+from mifit.stages.reflectance.lighting_equations import specular_pull
 from mifit.stages.reflectance.maps import TexelSystems, laplacian, solve_maps
 
-CONFIG = ReflectanceConfig(texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
+CONFIG = ReflectanceConfig(
+    texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, specular_albedo=1.0, smoothness_weight=1e-5
+)
 
 
 @pytest.fixture(scope="module")
@@ -255,13 +256,6 @@ def test_weights_ignore_the_map_size(dome):
         surface = Surface(dome, dome.model, dome.geometry, ("left",), size)
         sums.append(surface.observe(np.arange(len(surface))).weight.sum())
     assert abs(sums[0] / sums[1] - 1) < 0.1
-
-
-def test_few_images_leave_the_specular_albedo_to_what_skin_has():
-    found = np.full(9, 0.2)
-    assert expected_specular(found, np.full(9, 2)) == SPECULAR
-    assert expected_specular(found, np.full(9, 8)) == pytest.approx(0.2)
-    assert expected_specular(found / 20, np.full(9, 2)) == pytest.approx(0.01)
 
 
 def test_noise_decides_how_far_the_specular_albedo_is_told_by_the_images():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -25,6 +27,13 @@ def problem() -> LightingProblem:
     colour, weight, diffuse, specular = (v.astype(np.float32) for v in values)
     clipped = rng.random(len(texel)) > 0.9
     return LightingProblem(texel, colour, weight, clipped, diffuse, specular, np.full((N, 3), 0.5, np.float32), ORDER)
+
+
+def test_no_more_specular_albedo_is_expected_than_is_given(problem):
+    found = np.full(9, 0.2)
+    assert problem.expected_specular(found) == pytest.approx(0.2)
+    assert replace(problem, gloss=0.03).expected_specular(found) == 0.03
+    assert replace(problem, gloss=0.03).expected_specular(found / 20) == pytest.approx(0.01)
 
 
 class State:

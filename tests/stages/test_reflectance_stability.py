@@ -27,7 +27,9 @@ from mifit.stages.reflectance.lighting_equations import LightingPriors
 from mifit.stages.reflectance.maps import TexelSystems, laplacian, solve_maps
 
 SIZE = 24
-CONFIG = ReflectanceConfig(texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, smoothness_weight=1e-5)
+CONFIG = ReflectanceConfig(
+    texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, specular_albedo=1.0, smoothness_weight=1e-5
+)
 
 
 @pytest.fixture(scope="module")

@@ -93,7 +93,8 @@ def find_forward(
     model = models.get("shadowed" if config.shading == "auto" else config.shading)
     given = config.exponent or model.exponent
     lobe = Lobe(given or EXPONENT, model.fresnel, model.normalized)
-    forward = replace(Forward.of(model, model.bands or config.bands, lobe, surface.meshes), glossy=config.specular)
+    forward = Forward.of(model, model.bands or config.bands, lobe, surface.meshes)
+    forward = replace(forward, gloss=config.specular_albedo if config.specular else 0.0)
     some = surface.sample(max(1, OBSERVATIONS // surface.image_count), np.random.default_rng(seed))
     seen, expected, robust, found = surface.observe(some), albedo[some], config.robust, None
     estimated = given is None and config.specular

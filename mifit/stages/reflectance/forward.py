@@ -26,13 +26,13 @@ class Forward:
         Model and lobe; its illumination says how many bands and which compact lights there are, not how bright.
     meshes : tuple of OccludingMesh
         One per timestep.
-    glossy : bool
-        Whether there is a specular reflection at all.
+    gloss : float
+        The most that is expected of the specular albedo; 0 without specular reflection.
     """
 
     appearance: Appearance
     meshes: tuple[OccludingMesh, ...] = field(default=(), repr=False)
-    glossy: bool = True
+    gloss: float = 1.0
 
     @classmethod
     def of(cls, model: ShadingModel, order: int, lobe: Lobe, meshes: tuple[OccludingMesh, ...] = ()) -> Forward:
@@ -101,7 +101,7 @@ class Forward:
         return diffuse, self._gloss(specular)
 
     def _gloss(self, specular: NDArray[np.float32]) -> NDArray[np.float32]:
-        return specular if self.glossy else np.zeros_like(specular)
+        return specular if self.gloss else np.zeros_like(specular)
 
     def occlusion(self, seen: Observations) -> Occlusion:
         """Shadows at the observations that count, image after image of each texel."""

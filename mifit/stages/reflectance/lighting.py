@@ -29,7 +29,6 @@ from mifit.stages.reflectance.lighting_equations import (
     LightingPriors,
     LightingProblem,
     bounded_step,
-    expected_specular,
 )
 
 SLACK = 1.02
@@ -131,7 +130,7 @@ class Residuals:
         k, order = problem.specular.shape[1], problem.order
         expected = (
             problem.albedo,
-            expected_specular(self.maps[1], np.diff(problem.start)),
+            problem.expected_specular(self.maps[1]),
         )
         directions = np.pad(_sphere(order), ((0, 0), (0, k - order * order)))
         system.add_priors(priors, self.light, self.maps, expected, _stiffness(order, k), directions, self.sigma)
@@ -202,7 +201,7 @@ def solve_lighting(
     return LightingSolution(
         best.light,
         *best.maps,
-        expected_specular(best.maps[1], np.diff(problem.start)),
+        problem.expected_specular(best.maps[1]),
         best.sigma,
         best.unexplained(problem),
         energy,
@@ -291,6 +290,7 @@ def lighting_problem(
         specular,
         albedo,
         forward.order,
+        forward.gloss,
     )
 
 
@@ -306,7 +306,7 @@ def fit_lighting(
     """Lighting and the subset's albedos; a model that turns with the lighting is linearised anew."""
     problem = lighting_problem(seen, forward, forward.dark, albedo, robust)
     if not forward.model.turns:
-        specular = specular if forward.glossy else 0.0
+        specular = specular if forward.gloss else 0.0
         return solve_lighting(problem, specular=specular, priors=priors, robust=robust, iterations=iterations)
     # Without highlights first, so that there is lighting to linearise about.
     problem = replace(problem, specular=np.zeros_like(problem.specular))

@@ -12,12 +12,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mifit.core.process import BLOCK, blocks, on_all_cores
-from mifit.morphable.pigment import SPECULAR
 
 SPECULAR_SPREAD = 0.15
 """Standard deviation of the specular albedo over a face, relative to its median."""
-FEW_IMAGES = 4
-"""Images of a texel from which its four albedos are told by the images."""
 PATCHES = 100
 """Independent measurements that a face is worth: about as many patches have an error of their own."""
 
@@ -40,6 +37,8 @@ class LightingProblem:
         Diffuse albedo expected by the morphable model.
     order : int
         Bands B of the smooth light: the first B*B of the K; the others are the compact lights.
+    gloss : float
+        The most that is expected of the specular albedo.
     """
 
     texel: NDArray[np.intp]
@@ -50,6 +49,14 @@ class LightingProblem:
     specular: NDArray[np.float32]
     albedo: NDArray[np.float32]
     order: int
+    gloss: float = 1.0
+
+    def expected_specular(self, specular: NDArray) -> float:
+        """Specular albedo to expect of a texel, given those of others (n,).
+
+        What tells how much of a broad reflection is specular is little, and errors of the mesh look like it.
+        """
+        return min(float(np.median(specular)), self.gloss)
 
     @cached_property
     def start(self) -> NDArray[np.intp]:
@@ -102,15 +109,6 @@ def _per_texel(start: NDArray) -> sp.csr_matrix:
 def specular_pull(expected: float, sigma: float) -> float:
     """Weight that ties a texel's specular albedo to the expected one, beside squared residuals of deviation `sigma`."""
     return (sigma / (SPECULAR_SPREAD * max(expected, 1e-3))) ** 2
-
-
-def expected_specular(specular: NDArray, images: NDArray) -> float:
-    """Specular albedo to expect of a texel, given those of others (n,) and how many images show each (n,).
-
-    Two or three images of a still head leave it open how much of the broad reflection is specular.
-    """
-    found = float(np.median(specular))
-    return found if float(np.median(images)) >= FEW_IMAGES else min(found, SPECULAR)
 
 
 @dataclass(frozen=True)
