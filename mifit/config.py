@@ -209,7 +209,7 @@ class SurfaceConfig:
     enabled: bool = flag(True, "move the surface to where all views agree; false: it stays in the model's span")
     reach: float = number(
         8.0,
-        "distance from the surface that the first sweep searches",
+        "distance from the surface that is searched first",
         "millimetres",
         source="set by hand",
         above=0,

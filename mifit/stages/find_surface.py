@@ -1,10 +1,10 @@
 """Stage 1b: the surface that the images of all views and timesteps show together.
 
 The surface is the model's modes, the head's pose and a smooth displacement under one Gaussian prior
-(`surface.displace`). It is measured by sweeps along its normals, which find where the views agree best
-(`surface.sweep`), and by the outlines of the head (`surface.outline`). Sweeps and solutions take turns, coarse to
-fine: coarse levels reach far in few samples, and the prior holds what they don't measure. A solution weights the
-offsets of its sweep anew as outliers come apart from them. Stage 1 is only a start.
+(`surface.displace`). It is measured along its normals, by optical flow between views that are painted on it
+(`surface.flow`), and by the outlines of the head (`surface.outline`). Measurements and solutions take turns, coarse to
+fine: coarse levels reach far in few texels, and the prior holds what they don't measure. A solution weights its
+offsets anew as outliers come apart from them. Stage 1 is only a start.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from mifit.stages.surface.align_timesteps import align_timesteps
 from mifit.stages.surface.close_openings import LIDS, LIPS, close_again, close_openings
 from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surface
 from mifit.stages.surface.epipolar import epipolar_residual, likeness
+from mifit.stages.surface.flow import FARTHEST, Found, Posed, across_time, match
 from mifit.stages.surface.outline import REACH, Borders, find_borders, joined
-from mifit.stages.surface.sweep import Found, Posed, across_time, sweep
 from mifit.stages.surface.views import Resolution, pose_texels, texture_size
 
 if TYPE_CHECKING:
@@ -51,20 +51,17 @@ NARROWEST = 0.03
 NEIGHBOURS = 2
 """Views that each view is compared with, those whose directions are nearest."""
 STEP_PIXELS = 0.7
-"""Parallax between neighbouring offsets of a sweep, pixels of the level."""
-LAYERS = (6, 4, 2)
-"""Offsets to either side in each sweep of a level."""
-ROBUST_STEPS = ((2.8, 1.4), (1.4, 0.7), (0.7,))
-"""Distance in steps of a sweep where an offset counts as an outlier: per sweep of a level, one for each weighting."""
-WINDOW = 5
-"""Side of the windows that are compared, cells of two by two texels; a texel is about a pixel of the level."""
+"""Parallax of a step, the unit of offsets, pixels of the level."""
+ROBUST_STEPS = ((2.8, 1.4), (2.0, 1.0), (1.0,))
+"""Distance in steps where an offset counts as an outlier: per round at a level, one for each weighting. Chosen on gloss
+and heads of Table 1 with the built-in model, Emily c3,c4, scan_city."""
 COARSEST = 3
 """Times that the images are halved at most."""
 LARGEST_MAP = 720
 """Texels along a side at most; a level with more than twice as many pixels is left out. Chosen on Emily c3,c4."""
 SETTLED = 0.15
-"""Part of a sweep's step below which the surface is at rest (root mean square over what is measured)."""
-SWEEPS, SWEEPS_OF_LIDS = 3, 2
+"""Part of a step below which the surface is at rest (root mean square over what is measured)."""
+ROUNDS, ROUNDS_OF_LIDS = 3, 2
 """Of a level, and of the two finest ones once more where lids have been closed."""
 FORGET_MM = 150.0
 """Wavelength above which displacements fall back to the model where nothing is measured."""
@@ -124,7 +121,7 @@ def find_surface(
     while texture_size(model, world[0], resolution.pixel * 2.0**finest, 4 * LARGEST_MAP) > 2 * LARGEST_MAP:
         finest += 1
     coarsest = finest
-    while coarsest < COARSEST and LAYERS[0] * level_step * 2**coarsest * capture.unit_mm < config.reach:
+    while coarsest < COARSEST and FARTHEST * level_step * 2**coarsest * capture.unit_mm < config.reach:
         coarsest += 1
 
     # The prior: modes and plate on the skin, which pieces that were added to the model, such as eyes, go along with.
@@ -146,24 +143,24 @@ def find_surface(
         geometry, model, pairs, skin, prior, motion, landmarks, sight, level_step, config.stiffness, progress
     )
 
-    # Sweep and solve in turn, coarse to fine.
+    # Measure and solve in turn, coarse to fine.
     rest = Rest(State.of(model, geometry))
     for level in range(coarsest, finest - 1, -1):
-        rest = search.settle(rest, level, SWEEPS)
+        rest = search.settle(rest, level, ROUNDS)
     # Lids that have just closed lie where they fade into the skin around them: the finest levels measure them.
     lips, lids = LIPS * config.close_lips, LIDS * config.close_lids
     shut, closed = close_openings(capture, model, rest.state.estimate(geometry, model), cameras, lids)
     if any(opening["closed"] for opening in closed.values()):
         rest = replace(rest, state=State.of(model, shut))
         for level in range(min(coarsest, finest + 1), finest - 1, -1):
-            rest = search.settle(rest, level, SWEEPS_OF_LIDS)
+            rest = search.settle(rest, level, ROUNDS_OF_LIDS)
     progress("find surface", len(rest.levels), len(rest.levels))
 
     # Closed mouths and eyes.
     result = close_again(model, rest.state.estimate(geometry, model), closed, lids)
     result, closed_lips = close_openings(capture, model, result, cameras, lips)
     world = result.vertices.astype(np.float64)
-    residuals = sight.epipolar_residuals(views, pairs, result.timesteps, world, max(finest, 1))
+    residuals = sight.epipolar_residuals(pairs, result.timesteps, world, result.rotation, max(finest, 1))
     likenesses = sight.likenesses(pairs, result.timesteps[0], world[0], max(finest, 1))
     seconds = time.perf_counter() - began
     moved = np.linalg.norm(rest.state.displacement, axis=1)[np.unique(model.faces[model.face_mask])] * model.unit_mm
@@ -366,7 +363,7 @@ class Motion:
 class Sight:
     """The views of the surface at the levels of the image pyramid.
 
-    ``start`` (V, 3) is the first timestep's surface before all sweeps, ``pixel`` the world length of a pixel of level 0
+    ``start`` (V, 3) is the first timestep's surface at the start, ``pixel`` the world length of a pixel of level 0
     at the face, ``reach`` how far borders are looked for, world length, at all levels but the finest.
     """
 
@@ -402,19 +399,14 @@ class Sight:
         return found.moved(scene.faces, vertices - scene.vertices)
 
     def epipolar_residuals(
-        self,
-        views: Sequence[Camera],
-        pairs: Sequence,
-        timesteps: Sequence[int],
-        world: NDArray,
-        level: int,
+        self, pairs: Sequence, timesteps: Sequence[int], world: NDArray, rotation: NDArray, level: int
     ) -> dict[str, float | None]:
         """Median distance from one another's epipolar lines for each pair of views, pixels of the images."""
-        texels, cells = self.texels(level)
-        posed = [self.posed(timesteps[k], world[k], texels, level) for k in sorted({0, len(world) - 1})]
+        texels, steps = self.texels(level)[0], sorted({0, len(world) - 1})
+        posed = [self.posed(timesteps[k], world[k], texels, level) for k in steps]
         found: dict[str, float | None] = {}
         for a, b in pairs:
-            residual = epipolar_residual(texels, cells, posed, views, (a, b), self.pixel * 2.0**level, WINDOW)
+            residual = epipolar_residual(texels, posed, rotation[steps], self.pixel * 2.0**level, (a, b))
             found[f"{self.cameras[a]}, {self.cameras[b]}"] = None if residual is None else residual * 2.0**level
         return found
 
@@ -426,7 +418,7 @@ class Sight:
 
 @dataclass(frozen=True)
 class Rest:
-    """Where sweeps have ended: ``moved`` is the root mean square of the last one's change, world length."""
+    """Where rounds have ended: ``moved`` is the root mean square of the last one's change, world length."""
 
     state: State
     levels: tuple[int, ...] = ()
@@ -437,7 +429,7 @@ class Rest:
 
 @dataclass(frozen=True)
 class Search:
-    """What stays the same from sweep to sweep; ``level_step`` is the step between offsets at level 0, world length."""
+    """What stays the same in all rounds; ``level_step`` is a step of level 0, world length."""
 
     geometry: GeometryEstimate
     model: MorphableModel
@@ -451,16 +443,16 @@ class Search:
     stiffness: float
     progress: Progress
 
-    def settle(self, rest: Rest, level: int, sweeps: int) -> Rest:
-        """Sweep one level."""
+    def settle(self, rest: Rest, level: int, rounds: int) -> Rest:
+        """Measure and solve at one level."""
         model, sight, skin = self.model, self.sight, self.skin
         step = self.level_step * 2.0**level
         state, factor = rest.state, None
         texels, cells = sight.texels(level)
-        swept = state.world(model)
-        for number in range(sweeps):
+        before = state.world(model)
+        for number in range(rounds):
             world = state.world(model)
-            if number < SWEEPS - 1:
+            if number < ROUNDS - 1:
                 posed = [sight.posed(t, at, texels, level) for t, at in zip(state.timesteps, world, strict=True)]
                 further: Sequence = ()
                 if len(posed) > 1:
@@ -470,13 +462,12 @@ class Search:
                     world = state.world(model)
                     further = across_time(posed, state.rotation)
                 borders = [sight.borders(t, at, level) for t, at in zip(state.timesteps, world, strict=True)]
-            else:  # the last sweep moves the surface by too little to change which parts of it are visible
-                posed = moved_with(model, texels, posed, world - swept)
-                borders = [b.moved(model.faces, way) for b, way in zip(borders, world - swept, strict=True)]
-            swept = world
-            half = LAYERS[number]
+            else:  # the last round moves the surface by too little to change which parts of it are visible
+                posed = moved_with(model, texels, posed, world - before)
+                borders = [b.moved(model.faces, way) for b, way in zip(borders, world - before, strict=True)]
+            before = world
             joint = [((k, a), (k, b)) for k in range(len(posed)) for a, b in self.pairs]
-            found = sweep(texels, cells, posed, step * np.arange(-half, half + 1), WINDOW, [*joint, *further])
+            found = match(texels, cells, posed, state.rotation, step, [*joint, *further])
             if not (found.precision > 0).any():
                 break
 
@@ -502,7 +493,7 @@ class Search:
             moved = along_normals(state.world(model) - world, world, model.faces, measured)
             outcome = Outcome.CONVERGED if moved < SETTLED * step else Outcome.MAX_ITERATIONS
             rest = Rest(state, (*rest.levels, level), float((found.precision > 0).mean()), moved, outcome)
-            self.progress("find surface", len(rest.levels), len(rest.levels) + SWEEPS * level + sweeps - number - 1)
+            self.progress("find surface", len(rest.levels), len(rest.levels) + ROUNDS * level + rounds - number - 1)
         return rest
 
     def _bounds(self, state: State) -> NDArray[np.float64]:
@@ -525,7 +516,7 @@ def measurements(
     marks: Measurements,
     robust: NDArray,
 ) -> Measurements:
-    """Offsets that a sweep found, outlines and landmarks, all in object space."""
+    """Offsets that were found, outlines and landmarks, all in object space."""
     scale = state.scale
     of_vertices = [vertex_normals(at, model.faces) @ r for at, r in zip(world, state.rotation, strict=True)]
     normals = interpolate(np.mean(of_vertices, axis=0), model.faces, cells.face, cells.weights)

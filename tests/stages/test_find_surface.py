@@ -24,8 +24,8 @@ from mifit.stages.fit_geometry import fit_geometry, fit_pose_expression
 from mifit.stages.geometry.parameters import exponential
 from mifit.stages.geometry.surfaces import Scenes, displaced
 from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surface
+from mifit.stages.surface.flow import GLARE_DEVIATIONS, _precision, _without_glare
 from mifit.stages.surface.outline import joined
-from mifit.stages.surface.sweep import GLARE_DEVIATIONS, _precision, _without_glare
 from tests.morphable.intersections import intersections
 from tests.test_pipeline import without_eyes
 
@@ -289,7 +289,7 @@ def test_offsets_that_scatter_and_lone_matches_are_less_precise_by_scatter():
     band = np.minimum(texels.index // size // 20, 2)
     steps = np.where(band == 1, rng.uniform(-3.0, 3.0, len(band)), 0.5).astype(np.float32)
     matched = (band < 2) | (rng.uniform(size=len(band)) < 0.1)
-    precision = _precision(texels, np.where(matched, steps, np.float32(0.0)), matched, 1.0)
+    precision = _precision(texels, np.where(matched, steps, np.float32(0.0)), matched, np.zeros(len(band)), 1.0)
     assert (precision[~matched] == 0).all() and (precision[matched] > 0).all()
     even, anywhere, lone = (np.median(precision[matched & (band == b)]) for b in range(3))
     assert even > 15 * anywhere and even > 15 * lone

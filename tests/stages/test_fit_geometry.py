@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from memory_capture import SHADING, make_capture
+from scipy.spatial.transform import Rotation
 
 from mifit.config import GeometryConfig, SurfaceConfig
 from mifit.core.mesh import face_cross, vertex_normals
@@ -346,7 +347,10 @@ def test_contour_points_slide_to_the_silhouette(model):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["soft", "hard"])
 def test_path_traced_captures(shared, ict_path, variant, name):
-    """Under a millimetre and half a degree in world space without alignment; truth is only compared with."""
+    """Under a millimetre in world space without alignment, the face turned by a quarter of a degree at most.
+
+    How much of a turn is the head's and how much its shape's is a convention.
+    """
     from mifit.capture import Capture
 
     capture = Capture.load(shared / "captures" / name)
@@ -357,6 +361,7 @@ def test_path_traced_captures(shared, ict_path, variant, name):
         facial = int(data["face_area_vertices"])
     for k, timestep in enumerate(estimate.timesteps):
         with np.load(shared / "captures" / name / "truth" / f"{timestep:04d}.npz") as truth:
-            distance = np.linalg.norm(estimate.vertices[k] - truth["vertices"], axis=1)[:facial]
-            assert 10.0 * distance.mean() < 1.0
-            assert rotation_angle(estimate.rotation[k], truth["R"]) < 0.5
+            found, true = (v[:facial].astype(np.float64) for v in (estimate.vertices[k], truth["vertices"]))
+            assert 10.0 * np.linalg.norm(found - true, axis=1).mean() < 1.0
+            turn = Rotation.align_vectors(true - true.mean(axis=0), found - found.mean(axis=0))[0]
+            assert np.degrees(turn.magnitude()) < 0.25

@@ -28,8 +28,7 @@ from mifit.core.uv import TexelMap
 from mifit.morphable import MorphableModel
 from mifit.stages.geometry.parameters import exponential
 from mifit.stages.surface.band import FeatureImage
-from mifit.stages.surface.epipolar import FEWEST
-from mifit.stages.surface.sweep import Posed
+from mifit.stages.surface.flow import FEWEST, Posed
 
 POINTS = 3000
 """Texels that are compared at the most."""

@@ -35,7 +35,7 @@ CONTACT_WEIGHT = 30.0
 OPPOSED = -0.2
 """Cosine between the normals of sheets that face each other."""
 RELATIVE = 0.1
-"""Residual at which conjugate gradients stop, of that at the start: more sweeps follow."""
+"""Residual at which conjugate gradients stop, of that at the start: more rounds follow."""
 MOST_ITERATIONS = 60
 ACROSS = 0.7
 """Cosine of the angle between the normals and the way from one sheet to the other."""

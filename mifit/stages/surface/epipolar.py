@@ -1,73 +1,30 @@
-"""Whether two views show one surface: how far off one another's epipolar lines it lies, and how alike it looks.
-
-Along its normal a texel is moved until the views agree; across the plane through it and both cameras no depth moves
-it, so that a shift which remains there is no matter of the surface.
-"""
+"""Whether two views show one surface: how far off one another's epipolar lines it lies, and how alike it looks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mifit.core.camera import Camera
-from mifit.core.mesh import normalize
 from mifit.core.uv import TexelMap
-from mifit.stages.surface.sweep import Posed, sweep
+from mifit.stages.surface.flow import FEWEST, Posed, matches
 
-FARTHEST = 4
-"""Pixels that are searched to either side."""
-FEWEST = 200
-"""Cells or points that must match for their residuals to say something."""
 FACING = 0.4
 """Cosine of the angle of view above which two views are compared as they are."""
 
 
 def epipolar_residual(
-    texels: TexelMap,
-    cells: TexelMap,
-    steps: Sequence[Posed],
-    cameras: Sequence[Camera],
-    pair: tuple[int, int],
-    pixel: float,
-    window: int,
+    texels: TexelMap, steps: Sequence[Posed], rotation: NDArray, step: float, pair: tuple[int, int]
 ) -> float | None:
-    """Median distance from the epipolar lines of a pair of views, pixels of the level.
+    """Median distance from the epipolar lines of a pair of views, pixels of the level; None where too few match.
 
-    Parameters
-    ----------
-    texels, cells : TexelMap
-    steps : sequence of Posed
-        Texels where the views agree best, per timestep.
-    cameras : sequence of Camera
-    pair : (int, int)
-    pixel : float
-        World length of a pixel at the face.
-    window : int
-        As for `sweep`.
-
-    Returns
-    -------
-    float or None
-        None where too few cells match, or they do only beyond ``FARTHEST``.
+    No depth explains it. Parameters as for `flow.match`; the pair is compared at each of the steps.
     """
-    a, b = pair
-    moved = []
-    for step in steps:
-        across = np.cross(cameras[a].position - step.position, cameras[b].position - step.position)
-        shift = np.zeros((len(cameras), *step.position.shape))
-        shift[b] = normalize(across)
-        moved.append(replace(step, shift=shift))
-    pairs = [((k, pair[0]), (k, pair[1])) for k in range(len(moved))]
-    found = sweep(texels, cells, moved, pixel * np.arange(-FARTHEST, FARTHEST + 1), window, pairs)
-    used = found.precision > 0
-    if used.sum() < FEWEST:
-        return None
-    distance, weight = np.abs(found.offset[used]) / pixel, found.precision[used]
-    order = np.argsort(distance)
-    total = np.cumsum(weight[order])
-    return float(distance[order][np.searchsorted(total, 0.5 * total[-1])])
+    pairs = [((k, pair[0]), (k, pair[1])) for k in range(len(steps))]
+    across = [found.across for *_, found in matches(texels, steps, rotation, step, pairs)]
+    every = np.concatenate([np.zeros(0), *across])
+    return float(np.median(every)) if len(every) >= FEWEST else None
 
 
 def likeness(step: Posed, pair: tuple[int, int]) -> float | None:

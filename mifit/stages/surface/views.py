@@ -16,7 +16,7 @@ from mifit.core.process import on_all_cores
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.surface.band import feature_image
-from mifit.stages.surface.sweep import Posed
+from mifit.stages.surface.flow import Posed
 
 if TYPE_CHECKING:
     from mifit.capture import Capture, Frame

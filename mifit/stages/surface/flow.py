@@ -1,0 +1,322 @@
+"""Where the surface lies along its own normals: what one view shows of it is found again in another.
+
+Every view is painted on the current surface. Two such textures differ by what the surface lacks, no longer by
+perspective, and optical flow between them (dense inverse search, Kroeger et al. 2016) says where the second shows a
+texel of the first. The point that moves along the first view's ray until the second shows it there gives an offset
+along the normal. What then remains lies across the epipolar line: an error of the flow or of the cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mifit.core.camera import Camera
+from mifit.core.image import box
+from mifit.core.mesh import normalize
+from mifit.core.metrics import INDEPENDENT, median_deviation
+from mifit.core.process import threads
+from mifit.core.uv import TexelMap
+from mifit.stages.surface.band import FeatureImage, look_up
+
+CONTRAST = 400.0
+"""Steps of an 8-bit texture per unit of a feature."""
+PATCH, STRIDE, DESCENTS = 8, 4, 12
+"""Side and spacing of the patches, texels, and their iterations."""
+NOISE = 0.012
+"""Standard deviation of a feature that is noise: patches with less contrast say nothing."""
+CLOSED = 1.0
+"""Texels by which flow forth and back may miss its start."""
+ACROSS = 1.0
+"""Pixels of the level by which a match may miss the epipolar line."""
+FARTHEST = 6.0
+"""Steps from the surface within which a match counts."""
+NEAR = 3
+"""Side of the neighbourhood whose offsets are compared, cells; it and the next two: chosen on Emily, scan_city."""
+FINEST = 0.3
+"""Deviation of an offset at best, steps."""
+GLARE = 0.1
+"""Least difference in log brightness between two views at which a match counts a quarter."""
+GLARE_DEVIATIONS = 3.5
+"""The same in units of the differences' deviation over the face, where that is more; for views of one timestep."""
+LEAST_APART, BEST_APART, FARTHEST_APART = 5.0, 25.0, 50.0
+"""Angle between views of different timesteps that are compared, degrees."""
+MOST_PAIRS = 6
+"""Of views of different timesteps; chosen on scan_city."""
+FEWEST = 200
+"""Texels or points that must match for their residuals to say something."""
+
+View = tuple[int, int]
+Pair = tuple[View, View]
+
+
+@dataclass(frozen=True)
+class Posed:
+    """The texels of one timestep and the views of it.
+
+    Attributes
+    ----------
+    position, normal : (N, 3)
+        World space.
+    images : sequence of FeatureImage
+    seen : (views, N) float32
+        Cosine of the angle of view; 0 where hidden or grazing.
+    """
+
+    position: NDArray
+    normal: NDArray
+    images: Sequence[FeatureImage]
+    seen: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Found:
+    """Offsets of cells along the normals, (N,) world units, and their inverse variance, 0 where nothing was found."""
+
+    offset: NDArray[np.float64]
+    precision: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Matches:
+    """What one view shows, found in another.
+
+    Attributes
+    ----------
+    texel : (n,) int
+        Of the first view.
+    offset : (n,)
+        Along the normal, steps.
+    information : (n,)
+        Squared pixels by which the second view moves it per step.
+    across : (n,)
+        Pixels off the epipolar line.
+    darker : (n,)
+        Log brightness in the first view less that in the second.
+    """
+
+    texel: NDArray[np.intp]
+    offset: NDArray[np.float64]
+    information: NDArray[np.float64]
+    across: NDArray[np.float64]
+    darker: NDArray[np.float32]
+
+
+def match(
+    texels: TexelMap, cells: TexelMap, steps: Sequence[Posed], rotation: NDArray, step: float, pairs: Sequence[Pair]
+) -> Found:
+    """Find each cell's offset.
+
+    Parameters
+    ----------
+    texels : TexelMap
+        Where views are painted.
+    cells : TexelMap
+        Map of half the side, whose offsets are found.
+    steps : sequence of Posed
+        At the texels.
+    rotation : (T, 3, 3)
+        Of the head, per step.
+    step : float
+        World length that moves the surface by a good half of a pixel in one view against another.
+    pairs : sequence of pairs of (int, int)
+        Views to compare, each named by its step and its place in it.
+    """
+    # Per texel: weight, and weighted glare, offset and its square.
+    sums = np.zeros((4, len(texels.index)))
+    for (k, i), (m, _), found in matches(texels, steps, rotation, step, pairs):
+        at, offset = found.texel, found.offset
+        good = (found.across < ACROSS) & (np.abs(offset) < FARTHEST)
+        glare = _without_glare(found.darker, good, GLARE_DEVIATIONS if k == m else 0.0)
+        weight = np.where(good, found.information * steps[k].seen[i][at], 0.0)
+        for one, value in zip(sums, (np.ones_like(glare), glare, glare * offset, glare * offset**2), strict=True):
+            one[at] += weight * value
+    sums[0] = sums[1] / np.maximum(sums[0], 1e-9)  # a cell of which one texel matches is worth a quarter
+    maps, side = (texels.to_map(one.astype(np.float32)) for one in sums), (cells.size, cells.size)
+    trust, weight, first, second = (cells.from_map(cv2.resize(one, side, interpolation=cv2.INTER_AREA)) for one in maps)
+    there = weight > 1e-6
+    mean = np.where(there, first / np.maximum(weight, 1e-9), np.float32(0))
+    within = np.where(there, np.maximum(second / np.maximum(weight, 1e-9) - mean**2, 0), np.float32(0))
+    precision = trust * _precision(cells, mean, there, within, step)
+    return Found((mean * step).astype(np.float64), precision.astype(np.float64))
+
+
+def matches(
+    texels: TexelMap, steps: Sequence[Posed], rotation: NDArray, step: float, pairs: Sequence[Pair]
+) -> Iterator[tuple[View, View, Matches]]:
+    """What each view of a pair shows, found in the other one; parameters as for `match`."""
+    number = np.full(texels.size**2, -1, np.intp)
+    number[texels.index] = np.arange(len(texels.index))
+    with ThreadPoolExecutor(threads()) as pool:
+        named = list(dict.fromkeys(view for pair in pairs for view in pair))
+        shown = dict(
+            zip(named, pool.map(lambda view: _Painted.of(texels, steps[view[0]], view[1]), named), strict=True)
+        )
+
+        def both_ways(pair: Pair) -> list[tuple[View, View, Matches]]:
+            one, other = (shown[view] for view in pair)
+            both = (one.look[..., 0] > 0) & (other.look[..., 0] > 0)
+            if not both.any():
+                return []
+            part = box(both, PATCH)
+            rows = number.reshape(both.shape)[part]
+            forth, back = _flow(one.texture[part], other.texture[part]), _flow(other.texture[part], one.texture[part])
+            found = []
+            for (a, b), ways in zip((pair, pair[::-1]), ((forth, back), (back, forth)), strict=True):
+                turn = rotation[a[0]] @ rotation[b[0]].T  # of row vectors
+                found.append((a, b, _matches(shown[a].cut(part), shown[b].cut(part), rows, ways, turn, step)))
+            return found
+
+        for found in pool.map(both_ways, pairs):
+            yield from found
+
+
+@dataclass(frozen=True)
+class _Painted:
+    """One view, painted on the surface.
+
+    Attributes
+    ----------
+    camera : Camera
+    factor : float
+        Pixels of the level per pixel of the camera.
+    texture : (S, S) uint8
+        Feature.
+    position, normal : (S, S, 3) float32
+        World space.
+    look : (S, S, 2) float32
+        1 where the view shows the surface and contrast on it, else 0, and its log brightness.
+    """
+
+    camera: Camera
+    factor: float
+    texture: NDArray[np.uint8]
+    position: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    look: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, texels: TexelMap, step: Posed, view: int) -> _Painted:
+        """A view of the texels."""
+        image = step.images[view]
+        feature, valid, bright = image.sample(step.position, step.normal, np.zeros(1))[0].T
+        shown = (step.seen[view] > 0) & (valid > 0.99)
+        texture = texels.to_map(np.where(shown, feature, np.float32(0)))
+        mean, square = (cv2.blur(each, (PATCH, PATCH)) for each in (texture, texture**2))
+        shown &= texels.from_map(square - mean**2) > NOISE**2
+        texture = np.clip(128.0 + CONTRAST * texture, 0, 255)
+        look = texels.to_map(np.stack([shown, bright], axis=1).astype(np.float32))
+        place, normal = (texels.to_map(value.astype(np.float32)) for value in (step.position, step.normal))
+        return cls(image.camera, image.factor, texture.astype(np.uint8), place, normal, look)
+
+    def cut(self, part: tuple[slice, slice]) -> _Painted:
+        """A part of the maps."""
+        maps = {name: getattr(self, name)[part] for name in ("texture", "position", "normal", "look")}
+        return replace(self, **maps)
+
+
+def _flow(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(H, W, 2) way in texels from each texel of a texture to the same skin in another."""
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    search.setFinestScale(0)
+    search.setPatchSize(PATCH)
+    search.setPatchStride(STRIDE)
+    search.setGradientDescentIterations(DESCENTS)
+    search.setVariationalRefinementIterations(0)
+    if min(one.shape) < 2 * PATCH:
+        return np.zeros((*one.shape, 2), np.float32)
+    return np.asarray(search.calc(np.ascontiguousarray(one), np.ascontiguousarray(other), None), np.float32)  # type: ignore[call-overload]
+
+
+def _matches(
+    one: _Painted, other: _Painted, rows: NDArray, ways: tuple[NDArray, NDArray], turn: NDArray, step: float
+) -> Matches:
+    """What one view shows, found in another: where flow there and back ends at its start.
+
+    ``rows`` (H, W) are the numbers of the texels, ``turn`` takes directions of the first world to the second.
+    """
+    y, x = np.nonzero(one.look[..., 0] > 0)
+    start = np.stack([x, y], axis=1)
+    end = start + ways[0][y, x]
+    look = look_up(other.look, end)
+    used = (look[:, 0] > 0.99) & (np.linalg.norm(end + look_up(ways[1], end) - start, axis=1) < CLOSED)
+    y, x, end, look = y[used], x[used], end[used], look[used]
+    ray = normalize(one.position[y, x] - one.camera.position)
+    way = step * (ray / (ray * one.normal[y, x]).sum(axis=1, keepdims=True)) @ turn
+    origin = other.position[y, x].astype(np.float64)
+    here, moved, there = (
+        other.factor * other.camera.project(at) for at in (origin, origin + way, look_up(other.position, end))
+    )
+    slope, shift = moved - here, there - here
+    information = np.maximum((slope**2).sum(axis=1), 1e-12)
+    offset = (slope * shift).sum(axis=1) / information
+    across = np.linalg.norm(shift - slope * offset[:, None], axis=1)
+    darker = one.look[y, x, 1] - look[:, 1]
+    good = np.isfinite(across)
+    return Matches(rows[y, x][good], offset[good], information[good], across[good], darker[good])
+
+
+def across_time(steps: Sequence[Posed], rotation: NDArray) -> list[Pair]:
+    """Pairs of views of different timesteps that see a rigid head (T, 3, 3) from directions fairly apart.
+
+    A head that turns shows each camera what two cameras show at once, and more: the flank of a nose that one of them
+    never sees.
+    """
+    towards = {
+        (k, i): normalize(image.camera.position - step.position.mean(axis=0)) @ rotation[k]
+        for k, step in enumerate(steps)
+        for i, image in enumerate(step.images)
+    }
+    angles = {
+        (a, b): float(np.degrees(np.arccos(np.clip(towards[a] @ towards[b], -1.0, 1.0))))
+        for a, b in combinations(towards, 2)
+        if a[0] != b[0]
+    }
+    left = {pair: abs(angle - BEST_APART) for pair, angle in angles.items() if LEAST_APART <= angle <= FARTHEST_APART}
+    chosen: list[Pair] = []
+    uses = dict.fromkeys(towards, 0)
+    while left and len(chosen) < MOST_PAIRS:
+        a, b = min(left, key=lambda pair: (uses[pair[0]] + uses[pair[1]], left[pair]))
+        del left[a, b]
+        chosen.append((a, b))
+        uses[a] += 1
+        uses[b] += 1
+    return chosen
+
+
+def _without_glare(difference: NDArray, valid: NDArray, deviations: float) -> NDArray[np.float32]:
+    """How far texels look as bright in one view as in the other, 0..1, from differences of log brightness.
+
+    What is painted on skin does; a highlight lies elsewhere on it in every view, and matches itself at the depth of
+    what it mirrors. Light on a head that turns moves over its skin as a highlight does.
+    """
+    if not valid.any():
+        return np.ones(difference.shape, np.float32)
+    difference = difference - np.median(difference[valid])
+    spread = median_deviation(difference[valid]) if deviations else 0.0
+    return (1.0 / (1.0 + (difference / max(GLARE, deviations * spread)) ** 2) ** 2).astype(np.float32)
+
+
+def _precision(cells: TexelMap, offset: NDArray, there: NDArray, within: NDArray, step: float) -> NDArray[np.float64]:
+    """(N,) inverse variance of cells' offsets in steps, 0 where there are none.
+
+    Offsets of neighbours are alike where they measure the surface, and scatter where they don't: their variance around
+    a cell is the variance of its offset, beside that ``within`` the cell.
+    """
+
+    def near(values: NDArray) -> NDArray[np.float32]:
+        """Mean over a cell's neighbourhood."""
+        return cells.from_map(cv2.blur(cells.to_map(values.astype(np.float32)), (NEAR, NEAR)))
+
+    found = there.astype(np.float32)
+    count = np.maximum(near(found), np.float32(1e-6))
+    mean = near(offset * found) / count
+    scatter = np.maximum(near(offset**2 * found) / count - mean**2, 0.0) + (offset - mean) ** 2 + within
+    share = count / np.maximum(near(np.ones_like(found)), np.float32(1e-6))
+    return INDEPENDENT * found * share**2 / ((FINEST**2 + scatter) * step**2)
