@@ -24,8 +24,9 @@ from mifit.stages.fit_geometry import fit_geometry, fit_pose_expression
 from mifit.stages.geometry.parameters import exponential
 from mifit.stages.geometry.surfaces import Scenes, displaced
 from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surface
-from mifit.stages.surface.flow import GLARE_DEVIATIONS, _precision, _without_glare
+from mifit.stages.surface.flow import GLARE_DEVIATIONS, _precision, _without_glare, match
 from mifit.stages.surface.outline import joined
+from mifit.stages.surface.views import pose_texels
 from tests.morphable.intersections import intersections
 from tests.test_pipeline import without_eyes
 
@@ -333,6 +334,39 @@ def test_expressions_stay_within_their_bounds(model, found):
     low, high = model.expression_bounds.T
     assert np.isfinite(low).any()
     assert (found.expression >= low - 1e-6).all() and (found.expression <= high + 1e-6).all()
+
+
+@pytest.mark.parametrize("pair", [((0, 0), (0, 1)), ((0, 0), (1, 0)), ((0, 1), (1, 0))])
+def test_a_known_offset_is_found_between_views_and_over_time(model, bumpy, pair):
+    """The true surface, moved outwards by 1.5 mm: views of one timestep, or of two, tell by how much."""
+    texels = rasterize_uv(model.uv, model.faces_uv, 240, model.face_mask)
+    cells = rasterize_uv(model.uv, model.faces_uv, 120, model.face_mask)
+    steps = []
+    for timestep, vertices in enumerate(bumpy.vertices):
+        moved = vertices + 0.15 * vertex_normals(vertices, model.faces)
+        scene = SurfaceScene(moved, model.faces)
+        steps.append(pose_texels(bumpy, scene, moved, model.faces, texels, BOTH, timestep, 1.0))
+    found = match(texels, cells, steps, bumpy.rotation, 0.06, [pair])
+    good = found.precision > np.quantile(found.precision[found.precision > 0], 0.5)
+    assert good.sum() > 200
+    assert np.median(found.offset[good]) == pytest.approx(-0.15, abs=0.02)
+
+
+def test_a_match_off_the_epipolar_line_does_not_count(model, bumpy):
+    """One camera turned by three pixels: nothing is found, rather than something wrong."""
+    texels = rasterize_uv(model.uv, model.faces_uv, 240, model.face_mask)
+    cells = rasterize_uv(model.uv, model.faces_uv, 120, model.face_mask)
+    vertices, right = bumpy.vertices[0], bumpy.camera("right")
+    turn = np.eye(4)
+    turn[:3, :3] = exponential(np.array([3.0 / right.fy, 0.0, 0.0]))
+    turned = replace(right, world_to_camera=turn @ right.world_to_camera)
+    off = replace(bumpy, cameras_by_name={**bumpy.cameras_by_name, "right": turned})
+    scene, counts = SurfaceScene(vertices, model.faces), []
+    for capture in (bumpy, off):
+        step = pose_texels(capture, scene, vertices, model.faces, texels, BOTH, 0, 1.0)
+        found = match(texels, cells, [step], bumpy.rotation[:1], 0.06, [((0, 0), (0, 1))])
+        counts.append((found.precision > 0).sum())
+    assert counts[1] < 0.2 * counts[0]
 
 
 def test_the_report_says_whether_the_surface_rests(model, bumpy, first, found, monkeypatch):
