@@ -230,7 +230,7 @@ def _flow(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.float3
     search.setGradientDescentIterations(DESCENTS)
     search.setVariationalRefinementIterations(0)
     if min(one.shape) < 2 * PATCH:
-        return np.zeros((*one.shape, 2), np.float32)
+        return np.full((*one.shape, 2), -4.0 * max(one.shape), np.float32)  # nowhere
     return np.asarray(search.calc(np.ascontiguousarray(one), np.ascontiguousarray(other), None), np.float32)  # type: ignore[call-overload]
 
 
