@@ -52,7 +52,7 @@ NEIGHBOURS = 2
 """Views that each view is compared with, those whose directions are nearest."""
 STEP_PIXELS = 0.7
 """Parallax of a step, the unit of offsets, pixels of the level."""
-ROBUST_STEPS = ((2.8, 1.4), (2.0, 1.0), (1.0,))
+ROBUST_STEPS = ((4.0, 2.0), (2.8, 1.4), (1.4,))
 """Distance in steps where an offset counts as an outlier: per round at a level, one for each weighting. Chosen on gloss
 and heads of Table 1 with the built-in model, Emily c3,c4, scan_city."""
 COARSEST = 3

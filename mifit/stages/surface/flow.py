@@ -31,8 +31,8 @@ PATCH, STRIDE, DESCENTS = 8, 4, 12
 """Side and spacing of the patches, texels, and their iterations."""
 NOISE = 0.012
 """Standard deviation of a feature that is noise: patches with less contrast say nothing."""
-CLOSED = 1.0
-"""Texels by which flow forth and back may miss its start."""
+CLOSED = 1.5
+"""Texels by which flow forth and back may miss its start. Chosen on scan_city, gloss and `ict_301`."""
 ACROSS = 1.0
 """Pixels of the level by which a match may miss the epipolar line."""
 FARTHEST = 6.0
