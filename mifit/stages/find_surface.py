@@ -37,8 +37,7 @@ from mifit.stages.geometry.surfaces import Scenes
 from mifit.stages.surface.align_timesteps import align_timesteps
 from mifit.stages.surface.close_openings import LIDS, LIPS, close_again, close_openings
 from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surface
-from mifit.stages.surface.epipolar import epipolar_residual, likeness
-from mifit.stages.surface.flow import FARTHEST, Found, Posed, across_time, match
+from mifit.stages.surface.flow import FARTHEST, Found, Posed, across_time, epipolar_residual, likeness, match
 from mifit.stages.surface.outline import REACH, Borders, find_borders, joined
 from mifit.stages.surface.views import Resolution, pose_texels, texture_size
 

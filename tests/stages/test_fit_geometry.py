@@ -347,9 +347,9 @@ def test_contour_points_slide_to_the_silhouette(model):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["soft", "hard"])
 def test_path_traced_captures(shared, ict_path, variant, name):
-    """Under a millimetre in world space without alignment, the face turned by a quarter of a degree at most.
+    """Under a millimetre and half a degree in world space without alignment; truth is only compared with.
 
-    How much of a turn is the head's and how much its shape's is a convention.
+    How much of a turn is the head's and how much its shape's is a convention: the face itself is turned by less.
     """
     from mifit.capture import Capture
 
@@ -363,5 +363,6 @@ def test_path_traced_captures(shared, ict_path, variant, name):
         with np.load(shared / "captures" / name / "truth" / f"{timestep:04d}.npz") as truth:
             found, true = (v[:facial].astype(np.float64) for v in (estimate.vertices[k], truth["vertices"]))
             assert 10.0 * np.linalg.norm(found - true, axis=1).mean() < 1.0
+            assert rotation_angle(estimate.rotation[k], truth["R"]) < 0.5
             turn = Rotation.align_vectors(true - true.mean(axis=0), found - found.mean(axis=0))[0]
             assert np.degrees(turn.magnitude()) < 0.25

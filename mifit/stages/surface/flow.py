@@ -32,7 +32,7 @@ PATCH, STRIDE, DESCENTS = 8, 4, 12
 NOISE = 0.012
 """Standard deviation of a feature that is noise: patches with less contrast say nothing."""
 CLOSED = 1.5
-"""Texels by which flow forth and back may miss its start. Chosen on scan_city, gloss and `ict_301`."""
+"""Texels by which flow there and back may miss its start. Chosen on scan_city, gloss and `ict_301`."""
 ACROSS = 1.0
 """Pixels of the level by which a match may miss the epipolar line."""
 FARTHEST = 6.0
@@ -49,6 +49,8 @@ LEAST_APART, BEST_APART, FARTHEST_APART = 5.0, 25.0, 50.0
 """Angle between views of different timesteps that are compared, degrees."""
 MOST_PAIRS = 6
 """Of views of different timesteps; chosen on scan_city."""
+FACING = 0.4
+"""Cosine of the angle of view above which two views are compared as they are."""
 FEWEST = 200
 """Texels or points that must match for their residuals to say something."""
 
@@ -223,14 +225,14 @@ class _Painted:
 
 def _flow(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(H, W, 2) way in texels from each texel of a texture to the same skin in another."""
+    if min(one.shape) < 2 * PATCH:
+        return np.full((*one.shape, 2), -4.0 * max(one.shape), np.float32)  # nowhere
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(0)
     search.setPatchSize(PATCH)
     search.setPatchStride(STRIDE)
     search.setGradientDescentIterations(DESCENTS)
     search.setVariationalRefinementIterations(0)
-    if min(one.shape) < 2 * PATCH:
-        return np.full((*one.shape, 2), -4.0 * max(one.shape), np.float32)  # nowhere
     return np.asarray(search.calc(np.ascontiguousarray(one), np.ascontiguousarray(other), None), np.float32)  # type: ignore[call-overload]
 
 
@@ -288,6 +290,29 @@ def across_time(steps: Sequence[Posed], rotation: NDArray) -> list[Pair]:
         uses[a] += 1
         uses[b] += 1
     return chosen
+
+
+def epipolar_residual(
+    texels: TexelMap, steps: Sequence[Posed], rotation: NDArray, step: float, pair: tuple[int, int]
+) -> float | None:
+    """Median distance from the epipolar lines of a pair of views, pixels of the level; None where too few match.
+
+    No depth explains it. Parameters as for `match`; the pair is compared at each of the steps.
+    """
+    pairs = [((k, pair[0]), (k, pair[1])) for k in range(len(steps))]
+    across = [found.across for *_, found in matches(texels, steps, rotation, step, pairs)]
+    every = np.concatenate([np.zeros(0), *across])
+    return float(np.median(every)) if len(every) >= FEWEST else None
+
+
+def likeness(step: Posed, pair: tuple[int, int]) -> float | None:
+    """Correlation of the features that a pair of views shows on a surface; None where few texels face both."""
+    first, second = (step.images[view].sample(step.position, step.normal, np.zeros(1))[0] for view in pair)
+    used = (first[:, 1] > 0.99) & (second[:, 1] > 0.99) & (step.seen[list(pair)].min(axis=0) > FACING)
+    both = np.stack([first[used, 0], second[used, 0]])
+    if used.sum() < FEWEST or not both.std(axis=1).all():
+        return None
+    return float(np.corrcoef(both)[0, 1])
 
 
 def _without_glare(difference: NDArray, valid: NDArray, deviations: float) -> NDArray[np.float32]:
