@@ -57,6 +57,11 @@ def lengths(v: NDArray) -> NDArray:
     return np.sqrt(x * x + y * y + z * z)
 
 
+def dot(a: NDArray, b: NDArray) -> NDArray:
+    """(N,) products of vectors (N, 3)."""
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+
+
 def interpolate(values: NDArray, faces: NDArray, face: NDArray, weights: NDArray) -> NDArray:
     """Vertex values (V, C) at points given by face index (N,) and barycentric weights (N, 3) -> (N, C)."""
     # As one sparse product: the corners' values are added up on the fly instead of being gathered first.

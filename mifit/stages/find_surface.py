@@ -60,8 +60,6 @@ LARGEST_MAP = 720
 """Texels along a side at most; a level with more than twice as many pixels is left out. Chosen on Emily c3,c4."""
 SETTLED = 0.15
 """Part of a step below which the surface is at rest (root mean square over what is measured)."""
-ROUNDS, ROUNDS_OF_LIDS = 3, 2
-"""Of a level, and of the two finest ones once more where lids have been closed."""
 FORGET_MM = 150.0
 """Wavelength above which displacements fall back to the model where nothing is measured."""
 CONTACT_MM = 1.5
@@ -142,21 +140,20 @@ def find_surface(
         geometry, model, pairs, skin, prior, motion, landmarks, sight, level_step, config.stiffness, progress
     )
 
-    # Measure and solve in turn, coarse to fine.
+    # Measure and solve in turn, coarse to fine. The finest level measures lids that have closed.
     rest = Rest(State.of(model, geometry))
-    for level in range(coarsest, finest - 1, -1):
-        rest = search.settle(rest, level, ROUNDS)
-    # Lids that have just closed lie where they fade into the skin around them: the finest levels measure them.
     lips, lids = LIPS * config.close_lips, LIDS * config.close_lids
-    shut, closed = close_openings(capture, model, rest.state.estimate(geometry, model), cameras, lids)
-    if any(opening["closed"] for opening in closed.values()):
-        rest = replace(rest, state=State.of(model, shut))
-        for level in range(min(coarsest, finest + 1), finest - 1, -1):
-            rest = search.settle(rest, level, ROUNDS_OF_LIDS)
+    closed: dict = {}
+    for level in range(coarsest, finest - 1, -1):
+        if level == finest:
+            shut, closed = close_openings(capture, model, rest.state.estimate(geometry, model), cameras, lids)
+            if any(opening["closed"] for opening in closed.values()):
+                rest = replace(rest, state=State.of(model, shut))
+        rest = search.settle(rest, level)
     progress("find surface", len(rest.levels), len(rest.levels))
 
     # Closed mouths and eyes.
-    result = close_again(model, rest.state.estimate(geometry, model), closed, lids)
+    result = close_again(model, rest.state.without_motion(model, skin).estimate(geometry, model), closed, lids)
     result, closed_lips = close_openings(capture, model, result, cameras, lips)
     world = result.vertices.astype(np.float64)
     residuals = sight.epipolar_residuals(pairs, result.timesteps, world, result.rotation, max(finest, 1))
@@ -307,6 +304,21 @@ class State:
             translation=np.asarray(geometry.translation, np.float64),
         )
 
+    def without_motion(self, model: MorphableModel, skin: Skin) -> State:
+        """The same surface, but what the face's displacement holds of a rigid motion is the pose's."""
+        face = np.unique(model.faces[model.face_mask])
+        shape = model.shape(self.identity, self.expression.mean(axis=0)).astype(np.float64)
+        moved = shape + self.displacement
+        before, after = shape[face].mean(axis=0), moved[face].mean(axis=0)
+        turn = Rotation.align_vectors(moved[face] - after, shape[face] - before)[0].as_matrix()
+        shift = after - turn @ before
+        return replace(
+            self,
+            rotation=self.rotation @ turn,
+            translation=self.translation + self.scale * self.rotation @ shift,
+            displacement=skin.spread(((moved - shift) @ turn - shape)[: skin.count]),
+        )
+
     def world(self, model: MorphableModel) -> NDArray[np.float64]:
         """(T, V, 3) vertices."""
         shapes = [model.shape(self.identity, e).astype(np.float64) + self.displacement for e in self.expression]
@@ -442,20 +454,21 @@ class Search:
     stiffness: float
     progress: Progress
 
-    def settle(self, rest: Rest, level: int, rounds: int) -> Rest:
+    def settle(self, rest: Rest, level: int) -> Rest:
         """Measure and solve at one level."""
         model, sight, skin = self.model, self.sight, self.skin
         step = self.level_step * 2.0**level
         state, factor = rest.state, None
         texels, cells = sight.texels(level)
         before = state.world(model)
-        for number in range(rounds):
+        for number, outlier in enumerate(ROBUST_STEPS, 1):
             world = state.world(model)
-            if number < ROUNDS - 1:
+            if number < len(ROBUST_STEPS):
                 posed = [sight.posed(t, at, texels, level) for t, at in zip(state.timesteps, world, strict=True)]
                 further: Sequence = ()
                 if len(posed) > 1:
-                    aligned = align_timesteps(model, state.estimate(self.geometry, model), texels, posed)
+                    estimate = state.estimate(self.geometry, model)
+                    aligned = align_timesteps(model, estimate, texels, posed, expected=self.geometry.expression)
                     state = state.posed_as(aligned)
                     posed = moved_with(model, texels, posed, state.world(model) - world)
                     world = state.world(model)
@@ -473,7 +486,7 @@ class Search:
             # Object space, all timesteps alike: the surface that explains offsets, outlines and landmarks.
             marks = self.landmarks.at(world, state.rotation)
             outlines = joined([b.turned(r) for b, r in zip(borders, state.rotation, strict=True)])
-            robust = step * np.array(ROBUST_STEPS[number])
+            robust = step * np.array(outlier)
             rows = measurements(state, model, cells, world, found, outlines, marks, robust)
             if skin.weights is not None:
                 rows = replace(rows, points=rows.points @ skin.weights)
@@ -492,7 +505,8 @@ class Search:
             moved = along_normals(state.world(model) - world, world, model.faces, measured)
             outcome = Outcome.CONVERGED if moved < SETTLED * step else Outcome.MAX_ITERATIONS
             rest = Rest(state, (*rest.levels, level), float((found.precision > 0).mean()), moved, outcome)
-            self.progress("find surface", len(rest.levels), len(rest.levels) + ROUNDS * level + rounds - number - 1)
+            left = len(ROBUST_STEPS) * (level - sight.finest + 1) - number
+            self.progress("find surface", len(rest.levels), len(rest.levels) + left)
         return rest
 
     def _bounds(self, state: State) -> NDArray[np.float64]:

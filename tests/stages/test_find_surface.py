@@ -10,6 +10,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 from memory_capture import make_capture
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from mifit.config import GeometryConfig, SurfaceConfig
 from mifit.core.camera import Camera
@@ -19,7 +20,7 @@ from mifit.morphable import MorphableModel
 from mifit.morphable.openings import skin_weights, with_eyes
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.eyes import eyeballs
-from mifit.stages.find_surface import find_surface, neighbours
+from mifit.stages.find_surface import Skin, State, find_surface, neighbours
 from mifit.stages.fit_geometry import fit_geometry, fit_pose_expression
 from mifit.stages.geometry.parameters import exponential
 from mifit.stages.geometry.surfaces import Scenes, displaced
@@ -162,6 +163,23 @@ def test_the_estimate_is_consistent_in_itself(model, found):
         shape = carried.shape(found.identity, found.expression[k])
         expected = found.scale * shape @ found.rotation[k].T + found.translation[k]
         np.testing.assert_allclose(found.vertices[k], expected, atol=1e-4)
+
+
+def test_a_displacement_holds_no_rigid_motion(model, start):
+    """What bends stays a displacement, what turns and shifts the face becomes its pose, and the surface is the same."""
+    rng = np.random.default_rng(3)
+    turn = Rotation.from_rotvec(np.radians([0.4, -0.6, 0.3])).as_matrix()
+    state = State.of(model, start)
+    shapes = model.shape(state.identity, state.expression.mean(axis=0)).astype(np.float64)
+    bent = shapes + 0.02 * rng.normal(size=shapes.shape)
+    off = replace(state, displacement=bent @ turn.T + (0.1, 0.0, -0.2) - shapes)
+    skin = Skin.of(model)
+    found, own = off.without_motion(model, skin), slice(skin.count)
+    assert np.abs(found.displacement[own]).max() < 0.15 < np.abs(off.displacement[own]).max()
+    assert np.degrees(Rotation.from_matrix(found.rotation[0].T @ state.rotation[0] @ turn).magnitude()) < 0.05
+    np.testing.assert_allclose(
+        found.world(model)[:, own], off.world(model)[:, own], atol=0.01
+    )  # cm: expressions differ a little
 
 
 def test_the_skin_does_not_intersect_itself(model, bumpy, first):

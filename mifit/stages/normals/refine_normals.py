@@ -31,7 +31,7 @@ from mifit.config import NormalsConfig
 from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, NormalsEstimate, ReflectanceEstimate, Report
-from mifit.core.mesh import interpolate, normalize
+from mifit.core.mesh import dot, interpolate, normalize
 from mifit.core.process import one_blas_thread
 from mifit.core.uv import TexelMap, bend, bend_jacobian, rasterize_uv, tangent_plane, texel_neighbours
 from mifit.errors import InputError
@@ -376,11 +376,6 @@ class NormalSystem:
         right = np.where(free, -(self.gradient if gradient is None else gradient), 0.0).astype(self.turns.dtype)
         matrix, near = (ssl.LinearOperator((size, size), each, dtype=right.dtype) for each in (apply, precondition))
         return np.asarray(ssl.cg(matrix, right, rtol=SOLVED, maxiter=60, M=near)[0], np.float64)
-
-
-def dot(a: NDArray, b: NDArray) -> NDArray:
-    """(N,) products of vectors (N, 3)."""
-    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
 def graph_laplacian(neighbours: NDArray) -> sp.csr_matrix:

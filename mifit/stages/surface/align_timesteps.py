@@ -27,7 +27,7 @@ from mifit.core.process import threads
 from mifit.core.uv import TexelMap
 from mifit.morphable import MorphableModel
 from mifit.stages.geometry.parameters import exponential
-from mifit.stages.surface.band import FeatureImage
+from mifit.stages.surface.band import FeatureImage, look_up
 from mifit.stages.surface.flow import FEWEST, Posed
 
 POINTS = 3000
@@ -37,6 +37,8 @@ STILL_PIXELS = 0.02
 """Largest root mean square shift of an iteration's step that ends the iterations, pixels of the level."""
 LEAST_SPREAD = 1e-3
 """Of the features."""
+ASIDE = np.array([[-0.5, 0.0], [0.0, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]], np.float32)
+"""Where a view is read for its value and slope, pixels of the level."""
 POSE = 0.03
 """Deviation of turns beforehand, radians, and of shifts in terms of the head's size."""
 EXPRESSION = 0.3
@@ -78,6 +80,7 @@ def align_timesteps(
     texels: TexelMap,
     posed: Sequence[Posed],
     still: Sequence[Look] = (),
+    expected: NDArray | None = None,
 ) -> GeometryEstimate:
     """Move timesteps to where their views agree with those of the others.
 
@@ -92,6 +95,8 @@ def align_timesteps(
     still : sequence of Look, optional
         What views of other timesteps, which stay, show of the same texels (`looks_at`); without them what all
         timesteps do alike is left out.
+    expected : (T, Ke), optional
+        Expressions beforehand, the fit's own by default. Without ``still`` their mean says nothing.
 
     Returns
     -------
@@ -111,6 +116,10 @@ def align_timesteps(
     turns = np.tile(np.eye(3), (len(posed), 1, 1))
     shifts, changes = np.zeros((len(posed), 3)), np.zeros((len(posed), model.n_expression))
     spent = np.zeros((len(posed), len(wide)))
+    if expected is not None:
+        spent[:, 6:] = geometry.expression - expected
+    if not still:
+        spent -= spent.mean(axis=0)
     views = _views(posed, rows)
     owner = np.array([view.step for view in views])
     for _ in range(ITERATIONS):
@@ -167,13 +176,13 @@ def _look(image: FeatureImage, points: NDArray, seen: NDArray) -> Look:
     u, v, depth = camera.to_camera(points).T
     depth = np.maximum(depth, 1e-12)
     right, down, ahead = camera.rotation
-    across = image.sample(points, right * (depth / fx)[:, None], np.array([-0.5, 0.0, 0.5]))
-    along = image.sample(points, down * (depth / fy)[:, None], np.array([-0.5, 0.5]))
-    known = (across[..., 1] > 0.99).all(axis=0) & (along[..., 1] > 0.99).all(axis=0)
-    x, y = (across[2] - across[0])[:, 0] * fx / depth, (along[1] - along[0])[:, 0] * fy / depth
+    pixels = image.place(points)
+    left, middle, beside, above, below = (look_up(image.values, pixels + way) for way in ASIDE)
+    known = np.min([one[:, 1] for one in (left, middle, beside, above, below)], axis=0) > 0.99
+    x, y = (beside - left)[:, 0] * fx / depth, (below - above)[:, 0] * fy / depth
     slope = x[:, None] * right + y[:, None] * down - ((x * u + y * v) / depth)[:, None] * ahead
     weight = np.where(known, seen, 0.0).astype(np.float64)
-    return Look(across[1, :, 0].astype(np.float64), weight, slope, float(np.median(depth)) / fx)
+    return Look(middle[:, 0].astype(np.float64), weight, slope, float(np.median(depth)) / fx)
 
 
 def _steps(

@@ -17,9 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.camera import Camera
 from mifit.core.image import box
-from mifit.core.mesh import normalize
+from mifit.core.mesh import dot, normalize
 from mifit.core.metrics import INDEPENDENT, median_deviation
 from mifit.core.process import threads
 from mifit.core.uv import TexelMap
@@ -104,9 +103,9 @@ class Matches:
     """
 
     texel: NDArray[np.intp]
-    offset: NDArray[np.float64]
-    information: NDArray[np.float64]
-    across: NDArray[np.float64]
+    offset: NDArray[np.float32]
+    information: NDArray[np.float32]
+    across: NDArray[np.float32]
     darker: NDArray[np.float32]
 
 
@@ -185,41 +184,42 @@ class _Painted:
 
     Attributes
     ----------
-    camera : Camera
-    factor : float
-        Pixels of the level per pixel of the camera.
+    image : FeatureImage
     texture : (S, S) uint8
         Feature.
     position, normal : (S, S, 3) float32
         World space.
+    pixel : (S, S, 2) float32
+        Where the view shows it.
     look : (S, S, 2) float32
         1 where the view shows the surface and contrast on it, else 0, and its log brightness.
     """
 
-    camera: Camera
-    factor: float
+    image: FeatureImage
     texture: NDArray[np.uint8]
     position: NDArray[np.float32]
     normal: NDArray[np.float32]
+    pixel: NDArray[np.float32]
     look: NDArray[np.float32]
 
     @classmethod
     def of(cls, texels: TexelMap, step: Posed, view: int) -> _Painted:
         """A view of the texels."""
         image = step.images[view]
-        feature, valid, bright = image.sample(step.position, step.normal, np.zeros(1))[0].T
+        pixel = image.place(step.position)
+        feature, valid, bright = look_up(image.values, pixel).T
         shown = (step.seen[view] > 0) & (valid > 0.99)
         texture = texels.to_map(np.where(shown, feature, np.float32(0)))
         mean, square = (cv2.blur(each, (PATCH, PATCH)) for each in (texture, texture**2))
         shown &= texels.from_map(square - mean**2) > NOISE**2
         texture = np.clip(128.0 + CONTRAST * texture, 0, 255)
         look = texels.to_map(np.stack([shown, bright], axis=1).astype(np.float32))
-        place, normal = (texels.to_map(value.astype(np.float32)) for value in (step.position, step.normal))
-        return cls(image.camera, image.factor, texture.astype(np.uint8), place, normal, look)
+        position, normal, pixel = (texels.to_map(x.astype(np.float32)) for x in (step.position, step.normal, pixel))
+        return cls(image, texture.astype(np.uint8), position, normal, pixel, look)
 
     def cut(self, part: tuple[slice, slice]) -> _Painted:
         """A part of the maps."""
-        maps = {name: getattr(self, name)[part] for name in ("texture", "position", "normal", "look")}
+        maps = {name: getattr(self, name)[part] for name in ("texture", "position", "normal", "pixel", "look")}
         return replace(self, **maps)
 
 
@@ -247,18 +247,17 @@ def _matches(
     start = np.stack([x, y], axis=1)
     end = start + ways[0][y, x]
     look = look_up(other.look, end)
-    used = (look[:, 0] > 0.99) & (np.linalg.norm(end + look_up(ways[1], end) - start, axis=1) < CLOSED)
+    missed = end + look_up(ways[1], end) - start
+    used = (look[:, 0] > 0.99) & (np.hypot(*missed.T) < CLOSED)
     y, x, end, look = y[used], x[used], end[used], look[used]
-    ray = normalize(one.position[y, x] - one.camera.position)
-    way = step * (ray / (ray * one.normal[y, x]).sum(axis=1, keepdims=True)) @ turn
-    origin = other.position[y, x].astype(np.float64)
-    here, moved, there = (
-        other.factor * other.camera.project(at) for at in (origin, origin + way, look_up(other.position, end))
-    )
-    slope, shift = moved - here, there - here
-    information = np.maximum((slope**2).sum(axis=1), 1e-12)
-    offset = (slope * shift).sum(axis=1) / information
-    across = np.linalg.norm(shift - slope * offset[:, None], axis=1)
+    ray = one.position[y, x] - np.float32(one.image.camera.position)
+    way = (ray * (np.float32(step) / dot(ray, one.normal[y, x]))[:, None]) @ np.float32(turn)
+    here = other.pixel[y, x]
+    slope, shift = other.image.place(other.position[y, x] + way) - here, look_up(other.pixel, end) - here
+    (u, v), (du, dv) = slope.T, shift.T
+    information = np.maximum(u * u + v * v, np.float32(1e-12))
+    offset = (u * du + v * dv) / information
+    across = np.hypot(du - u * offset, dv - v * offset)
     darker = one.look[y, x, 1] - look[:, 1]
     good = np.isfinite(across)
     return Matches(rows[y, x][good], offset[good], information[good], across[good], darker[good])
@@ -307,7 +306,7 @@ def epipolar_residual(
 
 def likeness(step: Posed, pair: tuple[int, int]) -> float | None:
     """Correlation of the features that a pair of views shows on a surface; None where few texels face both."""
-    first, second = (step.images[view].sample(step.position, step.normal, np.zeros(1))[0] for view in pair)
+    first, second = (step.images[view].sample(step.position) for view in pair)
     used = (first[:, 1] > 0.99) & (second[:, 1] > 0.99) & (step.seen[list(pair)].min(axis=0) > FACING)
     both = np.stack([first[used, 0], second[used, 0]])
     if used.sum() < FEWEST or not both.std(axis=1).all():
