@@ -18,6 +18,7 @@ from mifit.config import ReflectanceConfig
 from mifit.core.mesh import interpolate
 from mifit.core.uv import sample_map
 from mifit.errors import InputError
+from mifit.optim import Outcome
 from mifit.sampling.observations import Surface
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.reflectance import lighting
@@ -86,6 +87,17 @@ def test_lighting_has_one_minimum_whatever_the_specular_start(dome):
         assert abs(end.unexplained / ends[0].unexplained - 1) < 0.05
         assert np.linalg.norm(end.light - ends[0].light) < 0.02 * np.linalg.norm(ends[0].light)
         assert rms(end.specular - ends[0].specular) < 0.01 and rms(end.diffuse - ends[0].diffuse) < 0.01
+
+
+def test_albedos_at_their_bound_keep_the_lighting_converging(dome):
+    """Texels five times as bright as others: the gauge scales what a step has bounded."""
+    _, seen, forward, albedo = problem_of(dome)
+    problem = lighting_problem(seen, forward, np.zeros((16, 3)), albedo, True)
+    bright = (problem.texel % 8 == 0)[:, None]
+    lit = replace(problem, colour=np.where(bright, 5.0, 1.0) * problem.colour)
+    found = solve_lighting(lit, robust=False, iterations=60)
+    assert found.diffuse.max() == 1.5
+    assert found.outcome is Outcome.CONVERGED
 
 
 def test_maps_have_one_minimum_whatever_the_start(dome):

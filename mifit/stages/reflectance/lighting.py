@@ -194,10 +194,10 @@ def solve_lighting(
         lowest = np.where(np.arange(len(best.light))[:, None] < problem.order**2, -np.inf, -best.light)
         light, x, y = system.solve(damping, lowest)
         light = best.light + light
-        diffuse = np.clip(best.maps[0] + x, 0.0, 1.5).astype(np.float32)
-        specular_albedo = np.clip(best.maps[1] + y, 0.0, 1.0).astype(np.float32)
-        gain = gauge(diffuse, problem.albedo, seen)
-        state = light * gain, (diffuse / gain).astype(np.float32), (specular_albedo / gain).astype(np.float32)
+        diffuse, specular_albedo = np.maximum(best.maps[0] + x, 0.0), np.maximum(best.maps[1] + y, 0.0)
+        gain = gauge(np.minimum(diffuse, 1.5), problem.albedo, seen)
+        diffuse, specular_albedo = np.minimum(diffuse / gain, 1.5), np.minimum(specular_albedo / gain, 1.0)
+        state = light * gain, diffuse.astype(np.float32), specular_albedo.astype(np.float32)
     return LightingSolution(
         best.light,
         *best.maps,
