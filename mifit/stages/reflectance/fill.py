@@ -20,6 +20,11 @@ BLEND = 0.05
 """Confidence at which a texel's own estimate counts as much as its surroundings'."""
 ALIKE = 0.01
 """Distance over which skin is alike on both halves of a face, relative to the map: chosen on scan_city."""
+SHEEN = 0.02
+"""Standard deviation of the surroundings that show a skin's colour, relative to the map: chosen on scan_city, and
+on its head under two other suns."""
+CONTRAST = 0.1
+"""Contrast of skin in the logarithm: what differs by more from its surroundings says less of their colour."""
 TYPICAL = 3e-4
 """Weight of the typical value of skin beside that of a texel of confidence 1: it decides far from what was seen."""
 STIFFNESS = 0.02
@@ -69,8 +74,8 @@ def blend_unseen(
         no lobe points at a light.
     lit : (N,), optional
         Share of the images in the diffuse albedo where visibility is full (`light_error.light_known`). With it the
-        albedo is skin's under any light: both halves share what they show (`bilateral_change`). Without it the albedo
-        stays as the capture's own light shows it.
+        albedo is skin's under any light: without sheen (`sheen_left`), and both halves share what they show
+        (`bilateral_change`). Without it the albedo stays as the capture's own light shows it.
     """
     expected = np.maximum(interpolate(model.mean_albedo, model.faces, texels.face, texels.weights), DARKEST)
     found = texels.from_map(maps).astype(np.float64)
@@ -83,6 +88,10 @@ def blend_unseen(
     variance = 1.0 / np.maximum(confidence, 1e-9) + (1.0 / np.maximum(light, 1e-9) - 1.0) / BLEND
     confidence = confidence * light
     known = np.where(confidence > 0, 1.0 / variance, 0.0)
+    if lit is not None:
+        albedo = expected * np.exp(found[:, :3])
+        sheen = sheen_left(texels, albedo, expected, skin * known)
+        found[:, :3] = np.log(np.maximum(albedo - sheen[:, None], DARKEST) / expected)
     if model.symmetry is not None:
         opposite = mirrored_coordinates(model, texels)
         if lit is not None:
@@ -103,6 +112,33 @@ def blend_unseen(
     image = texels.to_map(np.clip(blended, 0.0, 1.0).astype(np.float32))
     both = (texels.to_map(np.asarray(x, np.float32)) for x in (confidence, confidence * observability))
     return Filled(image[..., :3], image[..., 3], *both)
+
+
+def sheen_left(texels: TexelMap, albedo: NDArray, expected: NDArray, known: NDArray) -> NDArray[np.float64]:
+    """(N,) what of a diffuse albedo (N, 3) is sheen: brighter than the skin around a texel, and as much paler.
+
+    Highlights that the lobe or the mesh doesn't place right are left in the diffuse albedo. They have the light's
+    colour, skin of another brightness keeps its own. ``expected`` (N, 3) is the mean face's albedo, ``known`` (N,) the
+    weight of each texel.
+    """
+
+    def smooth(of: NDArray) -> NDArray:
+        return texels.from_map(cv2.GaussianBlur(texels.to_map(of.astype(np.float32)), (0, 0), SHEEN * texels.size))
+
+    found = np.full(len(albedo), np.inf)
+    for like in (expected, np.ones_like(expected)):  # lips and brows end where the mean face's do, or where they do
+        factor, weight = np.log(np.maximum(albedo, DARKEST) / like), known
+        for _ in range(3):
+            around = smooth(weight[:, None] * factor) / np.maximum(smooth(weight), 1e-9)[:, None]
+            weight = known / (1.0 + ((factor - around).mean(axis=1) / CONTRAST) ** 2)
+        skin = like * np.exp(around)
+        # albedo = part of the skin's + sheen, least squares over the channels; sheen beforehand is as bright as skin.
+        square, total = (skin**2).sum(axis=1), skin.sum(axis=1)
+        determinant = (3.0 + CONTRAST**2) * square - total**2
+        sheen = (square * albedo.sum(axis=1) - total * (albedo * skin).sum(axis=1)) / determinant
+        brighter = (albedo - skin).mean(axis=1)
+        found = np.minimum(found, np.minimum(sheen, brighter))
+    return np.where(known > 0, np.maximum(found, 0.0), 0.0)
 
 
 def bilateral_change(texels: TexelMap, values: NDArray, known: NDArray, opposite: NDArray) -> NDArray[np.float64]:
