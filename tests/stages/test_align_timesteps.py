@@ -15,7 +15,7 @@ from mifit.stages.fit_geometry import fit_geometry
 from mifit.stages.geometry.parameters import exponential
 from mifit.stages.geometry.surfaces import moved_by
 from mifit.stages.surface.align_timesteps import align_timesteps
-from mifit.stages.surface.band import FeatureImage
+from mifit.stages.surface.band import FeatureImage, feature_image
 from mifit.stages.surface.flow import BEST_APART, MOST_PAIRS, Posed, across_time
 from mifit.stages.surface.kept_texture import KeptTexture
 from mifit.stages.surface.views import pose_texels
@@ -180,3 +180,18 @@ def test_a_level_of_an_image_is_read_where_the_camera_sees_a_point():
     points = np.array([[1.0, 2, 3], [-2, 0.5, 1]])
     np.testing.assert_allclose(image.sample(points)[:, [0, 2]], camera.project(points), atol=1e-3)
     assert not image.sample(2.0 * camera.position[None] - points).any()  # behind the camera
+
+
+def test_coarse_levels_leave_sheen_out_and_keep_what_is_painted():
+    """A white highlight and a dark mark of the same contrast, on skin."""
+    skin = np.tile(np.float32([0.4, 0.22, 0.15]), (64, 64, 1))
+    glossy, marked = skin.copy(), skin.copy()
+    glossy[28:36, 28:36] += 0.12
+    marked[28:36, 28:36] *= 1.5
+    valid, camera = np.ones((64, 64), bool), ball_camera(size=64)
+
+    def contrast(image, factor):
+        return float(np.ptp(feature_image(camera, image, valid, factor).values[..., 0]))
+
+    assert contrast(glossy, 0.5) < 0.6 * contrast(marked, 0.5)
+    assert contrast(glossy, 1.0) == pytest.approx(contrast(marked, 1.0), rel=0.15)
