@@ -128,7 +128,8 @@ class ReflectanceEstimate:
     what images of the fit show (`core.estimate.Label`), each of the camera and timestep in ``labelled``; empty where
     that wasn't looked for. ``residual_shading`` (S, S, 3) is the factor of the diffuse light of the capture that mesh
     and lighting don't explain: relief finer than the mesh, edges of shadows. It is None where nothing was parted from
-    the albedo, and under any other light.
+    the albedo, and under any other light. ``hair`` is the colour of the hair that is painted on the scalp; None where
+    images show none.
     """
 
     diffuse: NDArray
@@ -142,6 +143,7 @@ class ReflectanceEstimate:
     labelled: tuple[tuple[str, int], ...] = ()
     residual_shading: NDArray | None = None
     specular_confidence: NDArray | None = None
+    hair: tuple[float, ...] | None = None
 
     @property
     def lit_diffuse(self) -> NDArray:

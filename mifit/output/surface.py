@@ -27,6 +27,7 @@ from mifit.core.mesh import (
 from mifit.core.mesh_solve import membrane
 from mifit.core.uv import TexelMap, rasterize_uv, sample_map
 from mifit.morphable import MorphableModel
+from mifit.morphable.scalp import scalp_depth
 from mifit.result import Reconstruction
 
 
@@ -109,11 +110,14 @@ def vertex_materials(result: Reconstruction, skin: bool = False) -> NDArray[np.f
     """(V, 4) diffuse and specular albedo at the vertices: the maps' where there are maps, continued over the other
     faces.
 
-    Linear, 0..1. The diffuse part is the fitted model's albedo plus an offset that is a membrane over the mesh.
-    ``skin`` as in `surface_maps`.
+    Linear, 0..1. The diffuse part is the fitted model's albedo plus an offset that is a membrane over the mesh, and on
+    a scalp with hair that colour alone. ``skin`` as in `surface_maps`.
     """
     model, geometry, reflectance = result.model, result.geometry, result.reflectance
-    albedo = np.asarray(geometry.vertex_albedo, dtype=np.float64)
+    albedo, scalp = np.array(geometry.vertex_albedo, dtype=np.float64), np.zeros(model.n_vertices, bool)
+    if reflectance is not None and reflectance.hair is not None:
+        scalp = np.minimum(*scalp_depth(model)) > 0
+        albedo[scalp] = reflectance.hair
     expected = np.column_stack([albedo, np.zeros(len(albedo))])
     if reflectance is None:
         return np.clip(expected, 0.0, 1.0).astype(np.float32)
@@ -123,7 +127,7 @@ def vertex_materials(result: Reconstruction, skin: bool = False) -> NDArray[np.f
     diffuse = reflectance.diffuse if skin else reflectance.lit_diffuse
     values = _padded(np.concatenate([diffuse, reflectance.specular[..., None]], axis=2), nearest)
     offset = sample_map(values, uv) - expected[known]
-    expected += continued(offset)
+    expected += np.where(scalp[:, None], 0.0, continued(offset))  # what skin departs by isn't hair's
     expected[known] = offset + np.column_stack([albedo, np.zeros(len(albedo))])[known]
     return np.clip(expected, 0.0, 1.0).astype(np.float32)
 

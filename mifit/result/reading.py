@@ -299,6 +299,7 @@ def _reflectance(folder: Path, document: Document) -> ReflectanceEstimate | None
         labelled=tuple(labels),
         residual_shading=optional("residual_shading", 3),
         specular_confidence=optional("specular_confidence", 1),
+        hair=tuple(_array(document["hair"], (3,), "hair").tolist()) if "hair" in document else None,
     )
 
 

@@ -102,6 +102,7 @@ def _document(result: Reconstruction) -> Document:
             "shading_model": reflectance.shading_model,
             **reflectance.lobe.parameters(),
         }
+    hair = {} if reflectance is None or reflectance.hair is None else {"hair": reflectance.hair}
     found = {
         "format_version": FORMAT_VERSION,
         "mifit_version": mifit.__version__,
@@ -124,6 +125,7 @@ def _document(result: Reconstruction) -> Document:
             "displaced": geometry.displacement is not None,
         },
         "lighting": lighting,
+        **hair,
         "timesteps": [
             {
                 "timestep": t,

@@ -19,8 +19,9 @@ from mifit.optim import Outcome
 from mifit.progress import Progress, silent
 from mifit.sampling.observations import Surface
 from mifit.stages.reflectance.als import find_forward, fit_als
-from mifit.stages.reflectance.fill import blend_unseen
+from mifit.stages.reflectance.fill import BLEND, blend_unseen
 from mifit.stages.reflectance.forward import Forward
+from mifit.stages.reflectance.hair import find_hair, paint
 from mifit.stages.reflectance.light_error import light_error, light_known, light_level
 from mifit.stages.reflectance.paper_energy import energies, fit_paper
 from mifit.stages.segment import segment
@@ -53,7 +54,7 @@ def infer_reflectance(
     the product of albedo and lighting alone. A convention fixes the scale between the two: the mean
     diffuse albedo over the visible texels and channels is stage 1's, which has the level of the morphable model's mean
     face. Texels that no image shows or no light reaches are filled from the mean face's albedo, in proportion to their
-    surroundings, and have confidence 0.
+    surroundings, and have confidence 0. Where images show hair on the scalp, all of it gets one colour (`find_hair`).
 
     Parameters
     ----------
@@ -124,12 +125,21 @@ def infer_reflectance(
         light = illumination.unknowns, illumination.ambient
         terms = energies(surface, forward, *light, solved.maps, albedo, config)
         details["objective"] = {**terms, "total": sum(terms.values())}
-    residual_shading = None
+    residual_shading = hair = None
     if first is not None and config.residual_shading:
         # Skin under any light; what the images show beside it belongs to the capture's own.
-        level = surface.texels.from_map(light_level(surface.texels.to_map(surface.brightness())))
-        lit = light_known(level, light_error(model, surface.texels, solved.maps, quality, level))
+        brightness = surface.brightness()
+        level = surface.texels.from_map(light_level(surface.texels.to_map(brightness)))
+        error = light_error(model, surface.texels, solved.maps, quality, level)
+        lit = light_known(level, error)
         filled = blend_unseen(model, surface.texels, solved.maps, quality, solved.observability, lit)
+        hair = find_hair(model, surface.texels, solved.maps, quality, brightness, error)
+        if hair is not None:
+            # Under the capture's own light hair stays as images show it.
+            shown = paint(surface.texels, shown, hair, BLEND / (quality + BLEND))
+            filled = paint(surface.texels, filled, hair)
+            text = "images show hair on the scalp, which is painted in one colour"
+            warnings = (*warnings, Diagnostic("hair-painted", text, "note"))
         factor = shown.diffuse / np.maximum(filled.diffuse, 1e-3)
         residual_shading = np.where(surface.texels.mask[..., None], factor, 1.0).astype(np.float32)
     return ReflectanceEstimate(
@@ -138,6 +148,7 @@ def infer_reflectance(
         specular=filled.specular,
         confidence=filled.confidence,
         specular_confidence=filled.specular_confidence,
+        hair=None if hair is None else tuple(hair.colour.tolist()),
         illumination=illumination,
         lobe=fitted.appearance.lobe,
         shading_model=fitted.appearance.model.name,

@@ -12,11 +12,13 @@ import pytest
 import trimesh
 
 from mifit.core.arrays import write_ply
-from mifit.core.mesh import split_at_seams, tangents, vertex_normals
+from mifit.core.mesh import interpolate, split_at_seams, tangents, vertex_normals
 from mifit.core.photometry import Photometry
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
+from mifit.morphable.scalp import scalp_depth
 from mifit.output.report import picture_maps
+from mifit.output.surface import vertex_materials
 from mifit.result import Reconstruction
 
 
@@ -217,3 +219,28 @@ def test_folders_that_are_no_results(tmp_path):
     (tmp_path / "result.json").write_text("{")
     with pytest.raises(InputError, match="not readable as JSON"):
         Reconstruction.load(tmp_path)
+
+
+def test_hair_round_trips_and_goes_on_where_there_are_no_maps(ball, tmp_path):
+    """Its colour covers the scalp beyond the face area; elsewhere the head stays as it is without."""
+    model, wanted = ball.model, {17: (-0.4, 0.3, 0.9), 26: (0.4, 0.3, 0.9), 33: (0.0, -0.2, 1.0)}
+    wanted |= {k: wanted[17] for k in range(18, 26)} | {0: (-1.0, 0.1, 0.2), 16: (1.0, 0.1, 0.2)}
+    landmarks = model.landmarks.copy()
+    unit = model.mean / np.linalg.norm(model.mean, axis=1, keepdims=True)
+    landmarks[list(wanted)] = [np.argmax(unit @ direction) for direction in wanted.values()]
+    marked = dataclasses.replace(model, landmarks=landmarks)
+    size, hair = len(ball.reflectance.diffuse), (0.04, 0.03, 0.02)
+    texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
+    scalp = interpolate(np.minimum(*scalp_depth(marked))[:, None], model.faces, texels.face, texels.weights) > -0.3
+    diffuse = texels.to_map(np.where(scalp, np.float32(hair), texels.from_map(ball.reflectance.diffuse)))
+    reflectance = dataclasses.replace(ball.reflectance, diffuse=diffuse, hair=hair)
+    haired = dataclasses.replace(ball, model=marked, reflectance=reflectance)
+    haired.save(tmp_path / "result")
+    again = Reconstruction.load(tmp_path / "result", marked)
+    assert again.reflectance.hair == reflectance.hair
+    bald = dataclasses.replace(haired, reflectance=dataclasses.replace(reflectance, hair=None))
+    before, after = (vertex_materials(result)[:, :3] for result in (bald, again))
+    back = unit @ (0.0, 0.7, -0.7) > 0.8
+    assert before[back].mean() > 0.1 and np.abs(after[back] - hair).max() < 1e-6
+    face = np.unique(model.faces[model.face_mask])
+    np.testing.assert_allclose(after[face], before[face], atol=1e-6)

@@ -76,7 +76,7 @@ def test_maps_are_finite_in_the_box_and_confident_where_seen(found):
     for image in (found.diffuse, found.specular, found.confidence, found.specular_confidence):
         assert image.dtype == np.float32 and np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
     assert found.diffuse.shape == (SIZE, SIZE, 3) and found.specular.shape == (SIZE, SIZE)
-    assert found.illumination.radiance.shape == (16, 3)
+    assert found.illumination.radiance.shape == (16, 3) and found.hair is None
     assert (found.specular_confidence <= found.confidence).all() and found.specular_confidence.max() > 0.3
 
 
