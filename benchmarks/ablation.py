@@ -36,6 +36,8 @@ from mifit.core.process import one_blas_thread
 from mifit.errors import MifitError
 from mifit.output.truth import relit_truths, true_passes
 from mifit.progress import silent
+from mifit.stages.reflectance.compact_lights import ITERATIONS
+from mifit.stages.reflectance.lighting import LightingSolution, fit_lighting
 from mifit.stages.surface.outline import joined
 
 SEED, SIZE, LIGHTS = 0, 256, 2
@@ -97,6 +99,11 @@ def _prior_alone(colour: Any, weight: Any, wrong: Any, *rest: Any) -> Any:
     return (1.0 - wrong).astype(np.float32)
 
 
+def _smooth_light_alone(seen: Any, forward: Any, expected: Any) -> tuple[tuple[()], LightingSolution]:
+    """In place of `compact_lights.find_lights`."""
+    return (), fit_lighting(seen, forward, expected, True, ITERATIONS)
+
+
 FIND, INFER = "mifit.stages.find_surface", "mifit.stages.infer_reflectance"
 PARTS = (
     Part(BASE),
@@ -114,7 +121,7 @@ PARTS = (
     Part("stage 1: albedo prior of skin's contrast", {"geometry.albedo_prior": 1.0}),
     Part(
         "light: compact lights",
-        patches={"mifit.stages.reflectance.als.find_lights": lambda *given: ()},
+        patches={"mifit.stages.reflectance.als.find_lights": _smooth_light_alone},
         step="reflectance",
     ),
     Part("light: shadows", {"reflectance.shading": "prefiltered"}),
