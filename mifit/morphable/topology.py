@@ -16,8 +16,11 @@ from mifit.core.mesh import edges
 from mifit.errors import InputError
 
 EYES_AND_MOUTH = (range(36, 42), range(42, 48), range(60, 68))
-BROWS = (range(17, 22), range(22, 27))
 """iBUG landmarks around the three openings of a face."""
+BROWS = (range(17, 22), range(22, 27))
+"""iBUG landmarks of the brows."""
+FOREHEAD = 0.75
+"""Heights of forehead and ears, in thirds of a face."""
 
 INNER = np.arange(17, 68)
 """Those inside the face: the first ones lie on its contour, and slide over it as the head turns."""
@@ -122,3 +125,21 @@ def oriented_outwards(mean: NDArray, faces: NDArray) -> NDArray:
     n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     front = corners[:, :, 2].mean(1) > np.median(mean[:, 2])
     return faces if n[front, 2].sum() >= 0 else faces[:, [1, 0, 2]]
+
+
+def scalp_depth(points: NDArray, landmarks: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(V,) how far points (V, 3) lie behind the hairline, and above the ears, in thirds of a face; negative outside.
+
+    A third reaches from the base of the nose to the brows. Seen from the side the hairline is straight: from `FOREHEAD`
+    above the brows to the upper end of the jaw. Ears reach up to the outer ends of the brows, and back as far behind
+    the jaw. Behind them the scalp ends as low as the nose. ``landmarks`` (68,) are indices of points.
+    """
+    points = points.astype(np.float64)
+    marks = points[landmarks]
+    nose, brow, jaw = marks[33, 1], marks[17:27, 1].max(), marks[[0, 16], 1:].mean(axis=0)
+    third = max(brow - nose, 1e-9)
+    height = min(brow + FOREHEAD * third, points[:, 1].max())
+    line = np.array([height, points[points[:, 1] >= height, 2].max()]) - jaw
+    behind = (points[:, 1:] - jaw) @ np.array([line[1], -line[0]]) / max(np.linalg.norm(line) * third, 1e-9)
+    beyond = np.minimum(points[:, 1] - nose, jaw[1] - FOREHEAD * third - points[:, 2])
+    return behind, np.maximum(points[:, 1] - marks[[17, 26], 1].mean(), beyond) / third

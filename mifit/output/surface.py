@@ -27,7 +27,7 @@ from mifit.core.mesh import (
 from mifit.core.mesh_solve import membrane
 from mifit.core.uv import TexelMap, rasterize_uv, sample_map
 from mifit.morphable import MorphableModel
-from mifit.morphable.scalp import scalp_depth
+from mifit.morphable.topology import scalp_depth
 from mifit.result import Reconstruction
 
 
@@ -116,7 +116,7 @@ def vertex_materials(result: Reconstruction, skin: bool = False) -> NDArray[np.f
     model, geometry, reflectance = result.model, result.geometry, result.reflectance
     albedo, scalp = np.array(geometry.vertex_albedo, dtype=np.float64), np.zeros(model.n_vertices, bool)
     if reflectance is not None and reflectance.hair is not None:
-        scalp = np.minimum(*scalp_depth(model)) > 0
+        scalp = np.minimum(*scalp_depth(model.mean, model.landmarks)) > 0
         albedo[scalp] = reflectance.hair
     expected = np.column_stack([albedo, np.zeros(len(albedo))])
     if reflectance is None:

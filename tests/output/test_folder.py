@@ -16,7 +16,7 @@ from mifit.core.mesh import interpolate, split_at_seams, tangents, vertex_normal
 from mifit.core.photometry import Photometry
 from mifit.core.uv import rasterize_uv
 from mifit.errors import InputError
-from mifit.morphable.scalp import scalp_depth
+from mifit.morphable.topology import scalp_depth
 from mifit.output.report import picture_maps
 from mifit.output.surface import vertex_materials
 from mifit.result import Reconstruction
@@ -231,7 +231,8 @@ def test_hair_round_trips_and_goes_on_where_there_are_no_maps(ball, tmp_path):
     marked = dataclasses.replace(model, landmarks=landmarks)
     size, hair = len(ball.reflectance.diffuse), (0.04, 0.03, 0.02)
     texels = rasterize_uv(model.uv, model.faces_uv, size, model.face_mask)
-    scalp = interpolate(np.minimum(*scalp_depth(marked))[:, None], model.faces, texels.face, texels.weights) > -0.3
+    depth = np.minimum(*scalp_depth(marked.mean, marked.landmarks))[:, None]
+    scalp = interpolate(depth, model.faces, texels.face, texels.weights) > -0.3
     diffuse = texels.to_map(np.where(scalp, np.float32(hair), texels.from_map(ball.reflectance.diffuse)))
     reflectance = dataclasses.replace(ball.reflectance, diffuse=diffuse, hair=hair)
     haired = dataclasses.replace(ball, model=marked, reflectance=reflectance)

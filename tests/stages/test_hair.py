@@ -6,7 +6,7 @@ import pytest
 from mifit.core.mesh import interpolate
 from mifit.core.uv import rasterize_uv
 from mifit.morphable import MorphableModel
-from mifit.morphable.scalp import scalp_depth
+from mifit.morphable.topology import scalp_depth
 from mifit.stages.reflectance.fill import Filled
 from mifit.stages.reflectance.hair import MARGIN, find_hair, paint
 
@@ -20,7 +20,7 @@ def head():
     model = MorphableModel.load("builtin:coarse")
     texels = rasterize_uv(model.uv, model.faces_uv, 128, model.mapped)
     at = model.faces, texels.face, texels.weights
-    behind, above = (interpolate(depth[:, None], *at)[:, 0] for depth in scalp_depth(model))
+    behind, above = (interpolate(depth[:, None], *at)[:, 0] for depth in scalp_depth(model.mean, model.landmarks))
     point = interpolate(model.mean.astype(float) * model.unit_mm, *at)
     seen = (point[:, 2] > 0.0).astype(np.float32)
     return model, texels, interpolate(model.mean_albedo, *at), seen, behind, above, point[:, 0]
@@ -79,7 +79,7 @@ def test_a_bald_head_has_none(head):
     assert found(head, shaved) is None
     beard = np.where(((above < 0) & (np.abs(side) < 60.0))[:, None], 0.1 * skin, skin)
     assert found(head, beard) is None
-    assert (scalp_depth(model)[0][model.landmarks[17:]] < -MARGIN).all()
+    assert (scalp_depth(model.mean, model.landmarks)[0][model.landmarks[17:]] < -MARGIN).all()
 
 
 def test_a_shadow_on_one_side_is_no_hair(head):

@@ -12,7 +12,7 @@ from mifit.core.mesh_solve import membrane
 from mifit.core.uv import TexelMap
 from mifit.morphable import MorphableModel
 from mifit.morphable.pigment import SPREAD
-from mifit.morphable.scalp import scalp_depth
+from mifit.morphable.topology import scalp_depth
 from mifit.sampling.visibility import DARKEST
 from mifit.stages.geometry.points import corner_matrix
 from mifit.stages.reflectance.fill import BLEND, Filled
@@ -64,7 +64,9 @@ def find_hair(
     error : float
     """
     at = texels.face, texels.weights
-    behind, above = (interpolate(depth[:, None], model.faces, *at)[:, 0] for depth in scalp_depth(model))
+    behind, above = (
+        interpolate(depth[:, None], model.faces, *at)[:, 0] for depth in scalp_depth(model.mean, model.landmarks)
+    )
     side = interpolate(model.mean, model.faces, *at)[:, 0]
     albedo = np.maximum(texels.from_map(maps)[:, :3].astype(np.float64), DARKEST)
     face = model.face_mask[texels.face] & (behind < -MARGIN) & (confidence > 0.5 * confidence.max(initial=0.0))
