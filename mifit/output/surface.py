@@ -127,7 +127,7 @@ def vertex_materials(result: Reconstruction, skin: bool = False) -> NDArray[np.f
     diffuse = reflectance.diffuse if skin else reflectance.lit_diffuse
     values = _padded(np.concatenate([diffuse, reflectance.specular[..., None]], axis=2), nearest)
     offset = sample_map(values, uv) - expected[known]
-    expected += np.where(scalp[:, None], 0.0, continued(offset))  # what skin departs by isn't hair's
+    expected += np.where(scalp[:, None], 0.0, continued(offset))  # the offset is skin's
     expected[known] = offset + np.column_stack([albedo, np.zeros(len(albedo))])[known]
     return np.clip(expected, 0.0, 1.0).astype(np.float32)
 

@@ -126,7 +126,7 @@ def sheen_left(texels: TexelMap, albedo: NDArray, expected: NDArray, known: NDAr
         return texels.from_map(cv2.GaussianBlur(texels.to_map(of.astype(np.float32)), (0, 0), SHEEN * texels.size))
 
     found = np.full(len(albedo), np.inf)
-    for like in (expected, np.ones_like(expected)):  # lips and brows end where the mean face's do, or where they do
+    for like in (expected, np.ones_like(expected)):  # what the mean face or the skin around explains isn't sheen
         factor, weight = np.log(np.maximum(albedo, DARKEST) / like), known
         for _ in range(3):
             around = smooth(weight[:, None] * factor) / np.maximum(smooth(weight), 1e-9)[:, None]

@@ -24,7 +24,7 @@ SHARE = 0.15
 """Dark part of what was seen of either side of the scalp, where there is hair: chosen between 0.35 and more on emily
 c3,c4 and 0.03 and less on scan_city and gloss."""
 SEEN = 0.01
-"""Part of a side of the scalp that tells of it."""
+"""Part of a side of the scalp that must be seen for that side to count."""
 MARGIN = 0.25
 """How far before `scalp_depth`'s hairline images may show hair, in thirds of a face: chosen on emily c3,c4."""
 SOFT = 1e-5
@@ -51,7 +51,7 @@ def find_hair(
 
     Hair is much darker than the face's own skin in the light that falls there, which is the brightness of images over
     the albedo. An ``error`` of that light (`light_error`) must not explain it, and it must be there on either side that
-    was seen: a shadow falls on one. The hairline is where images show it. Where they show nothing it is the canon's.
+    was seen: a shadow falls on one. The hairline is where images show it, elsewhere that of `scalp_depth`.
 
     Parameters
     ----------
@@ -77,8 +77,8 @@ def find_hair(
     depth = -np.log(albedo / skin).mean(axis=1)
     dark, scalp = depth > DARK, (behind > 0) & (above > 0)
     halves = [scalp & half for half in (side < 0, side > 0)]
-    told = [half for half in halves if (known[half] > BLEND).sum() > SEEN * half.sum()]
-    if not told or min(known[half & dark].sum() / known[half].sum() for half in told) < SHARE:
+    seen = [half for half in halves if (known[half] > BLEND).sum() > SEEN * half.sum()]
+    if not seen or min(known[half & dark].sum() / known[half].sum() for half in seen) < SHARE:
         return None
     reach = (behind > -MARGIN) & (above > 0)
     # Most of it is mixed with skin: at the hairline, and by the smoothness of maps where there is little light.
