@@ -1,10 +1,8 @@
-"""What primary rays meet, kept while neither they nor the meshes move."""
+"""What primary rays meet, kept while neither their camera nor the meshes move."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from mifit.core.files import Document
 from mifit.render.gbuffer import MESH_BUFFERS
@@ -16,14 +14,6 @@ KEPT_RAYS = 2**22
 """Rays whose hits are kept at most, a dozen views of 680 x 480: a gigabyte."""
 
 
-def _number_of(pointer: mi.ShapePtr) -> int:
-    """The number by which kernels know a shape or a sensor."""
-    import drjit as dr
-    import mitsuba as mi
-
-    return int(np.array(dr.reinterpret_array(mi.UInt32, pointer))[0])
-
-
 def recording() -> bool:
     """Are operations noted down for later, so that no value can be looked at?"""
     import drjit as dr
@@ -32,15 +22,16 @@ def recording() -> bool:
 
 
 class FirstHits:
-    """What primary rays meet, kept for as long as neither they nor the meshes move.
+    """What primary rays meet, kept for as long as neither their camera nor the meshes move.
 
-    Optimisers of light and skin look from the same few cameras at the same surface again and again. Rays are
-    compared one by one, which costs a fiftieth of tracing them. Hits hold no derivatives; the point that is made
-    of them does.
+    Optimisers of light and skin look from the same few cameras at the same surface again and again. Nothing is
+    read back to compare, so that a view is prepared while the last one is computed. Hits hold no derivatives; the
+    point that is made of them does.
     """
 
     def __init__(self) -> None:
-        self.sensor: mi.Sensor = None
+        self.last: tuple[mi.Sensor, mi.Ray3f] | None = None
+        """The camera whose rays were sampled last, and these rays."""
         self.kept: dict[tuple[int, int], Document] = {}
 
     def find(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.UInt32 | None, mi.SurfaceInteraction3f]:
@@ -48,27 +39,28 @@ class FirstHits:
         import drjit as dr
         import mitsuba as mi
 
-        shapes = scene.shapes()
+        shapes, last, self.last = scene.shapes(), self.last, None
         plain = dr.is_jit_v(mi.Float) and all(shape.is_mesh() for shape in shapes)
-        if not plain or recording() or self.sensor is None:
+        camera = _state(last[0]) if plain and last is not None and last[1] is ray and not recording() else None
+        if camera is None or last is None:
             return None, scene.ray_intersect(ray, active)
         with dr.suspend_grad():
             still = mi.Ray3f(dr.detach(ray))
             meshes = [mi.traverse(shape) for shape in shapes]
             buffers = [mesh[key] for mesh in meshes for key in MESH_BUFFERS if key in mesh]
-            moved = (*(_number_of(mi.ShapePtr(shape)) for shape in shapes), *(buffer.index for buffer in buffers))
-            name = _number_of(mi.SensorPtr(self.sensor)), dr.width(still.d)
+            moved = (*(shape.ptr for shape in shapes), *(v.index if dr.is_jit_v(v) else v for v in buffers + camera))
+            name = last[0].ptr, dr.width(still.d)
             kept = self.kept.get(name)
-            if kept is None or kept["moved"] != moved or not _same_rays(kept["ray"], still):
+            if kept is None or kept["moved"] != moved:
                 hits = scene.ray_intersect_preliminary(still, coherent=True)
                 index: mi.UInt32 = dr.compress(hits.is_valid())
-                kept = {"ray": still, "moved": moved, "index": index}
+                kept = {"moved": moved, "index": index}
                 if dr.width(index) > 0:
                     kept["hits"] = dr.gather(type(hits), hits, index)
                     kept["si"] = kept["hits"].compute_surface_interaction(dr.gather(mi.Ray3f, still, index))
                 dr.eval(kept)
-                # While a buffer is kept, no other one can have its index. The scene is not kept: it holds us.
-                kept["buffers"] = buffers
+                # While an array is kept, no other one can have its index. The scene is not kept: it holds us.
+                kept["arrays"] = buffers, camera
                 self.kept.pop(name, None)
                 self.kept[name] = kept
                 while sum(rays for _, rays in self.kept) > KEPT_RAYS and len(self.kept) > 1:
@@ -92,13 +84,14 @@ class FirstHits:
         return met
 
 
-def _same_rays(one: mi.Ray3f, other: mi.Ray3f) -> bool:
-    """Are two sets of rays equal, each ray and number of them?"""
+def _state(sensor: mi.Sensor) -> list[Any] | None:
+    """What a camera's rays follow from; None for a plugin that may not show all of it."""
     import drjit as dr
     import mitsuba as mi
 
-    pairs = ((one.o, other.o), (one.d, other.d), (one.maxt, other.maxt))
-    equal = mi.Bool(True)
-    for a, b in pairs:
-        equal &= dr.all(a == b) if dr.depth_v(a) > 1 else a == b
-    return bool(dr.all(equal))
+    if sensor.class_name() != "PerspectiveCamera" and type(sensor).__name__ != "Pinhole":
+        return None
+    matrix = sensor.world_transform().matrix
+    values = [value for _, value in mi.traverse(sensor) if not isinstance(value, mi.Transform4f)]
+    values = [value if dr.is_jit_v(value) else str(value) for value in values]
+    return values + [matrix[row, column] for row in range(4) for column in range(4)]

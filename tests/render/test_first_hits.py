@@ -80,6 +80,52 @@ def test_what_moves_is_looked_at_again(what: str) -> None:
     assert np.abs(after - before).max() > 0.01
 
 
+@pytest.mark.parametrize("what", ["to_world", "fx", "x_fov", "near_clip"])
+def test_a_camera_that_changes_looks_again(what: str) -> None:
+    import mitsuba as mi
+
+    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
+    pose = mi.ScalarTransform4f().look_at([0.3, 0, 4], [0, 0, 0], [0, 1, 0])
+    kind = {"type": "pinhole", "fx": 40.0, "fy": 44.0, "cx": 16.0, "cy": 15.0}
+    if what in ("x_fov", "near_clip"):
+        kind = {"type": "perspective", "fov": 40}
+    scene = textured()
+    sensor = mi.load_dict({**kind, "to_world": pose, "film": film})
+
+    def seen(integrator) -> np.ndarray:
+        return np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=1))
+
+    before = seen(scene.integrator())
+    if what == "to_world" and type(sensor).__name__ == "Pinhole":
+        sensor = mi.load_dict({**kind, "to_world": mi.ScalarTransform4f().translate([0.3, 0, 0]) @ pose, "film": film})
+    else:
+        params = mi.traverse(sensor)
+        params[what] = {"fx": 30.0, "x_fov": 55.0, "near_clip": 3.5}[what]
+        params.update()
+    after = seen(scene.integrator())
+    np.testing.assert_array_equal(after, seen(mi.load_dict({"type": "shdirect"})))
+    assert np.abs(after - before).max() > 0.01
+
+
+@pytest.mark.parametrize(("pixels", "spp"), [("rgba", 1), ("rgba", 4), ("rgb", 4), ("luminance", 1)])
+def test_pixels_written_at_once_are_those_that_mitsuba_adds_up(pixels: str, spp: int) -> None:
+    import mitsuba as mi
+    from mitsuba.python.ad.integrators.common import ADIntegrator
+
+    scene = textured(hide=True)
+    film = {"type": "hdrfilm", "width": 32, "height": 24, "pixel_format": pixels, "rfilter": {"type": "box"}}
+    film |= {"crop_width": 20, "crop_height": 15, "crop_offset_x": 5, "crop_offset_y": 2}
+    pose = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    sensor = mi.load_dict({"type": "perspective", "fov": 40, "to_world": pose, "film": film})
+    ours = np.array(scene.integrator().render(scene, sensor, 0, spp))
+    theirs = np.array(ADIntegrator.render(scene.integrator(), scene, sensor, 0, spp))
+    assert ours.shape == theirs.shape
+    assert 0 < ours.max()
+    np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
+    kept = sensor.film().bitmap(raw=False).convert(component_format=mi.Struct.Type.Float32)
+    np.testing.assert_allclose(np.array(kept).reshape(theirs.shape), theirs, atol=1e-2)
+
+
 def test_a_second_image_traces_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     import mitsuba as mi
 
