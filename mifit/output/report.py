@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +32,8 @@ STAGES = {
 }
 SHOWN_TIMESTEPS = 4
 """Timesteps whose pictures a report holds, so that it stays small enough for a phone."""
+LAID_OVER = 640
+"""Pixels along the longer side of the renders that are laid over photographs."""
 
 
 def write_report(
@@ -216,11 +219,14 @@ def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]
         figures, vertices = [], result.geometry.vertices[result.index(timestep)]
         for camera in (c.name for c in result.cameras):
             view, frame, label = capture.camera(camera), capture.frame(camera, timestep), html.escape(camera)
-            photograph = to_8_bit(frame.image)
-            render = rgba_8_bit(render_view(result, view, timestep, result.methods[-1], samples=1))
+            photograph, size = to_8_bit(frame.image), (view.width, view.height)
+            small = view.resized(min(1.0, LAID_OVER / max(size)))
+            render = rgba_8_bit(render_view(result, small, timestep, result.methods[-1], samples=1))
+            render = cv2.resize(render, size)
             box = draw.bounding_box(render[..., 3] > 0)
             marked = draw.draw_landmarks(photograph, view, frame.landmarks, frame.visible, vertices[model.landmarks])
-            area = face_area(vertices, model.faces, model.face_mask, view) & frame.valid
+            area = face_area(vertices, model.faces, model.face_mask, small).astype(np.uint8)
+            area = cv2.resize(area, size, interpolation=cv2.INTER_NEAREST).astype(bool) & frame.valid
             clipped = frame.clipped & area
             labels = None if result.reflectance is None else result.reflectance.label(camera, timestep)
             areas = [(clipped, draw.TINTS[0][1])]
