@@ -221,12 +221,12 @@ def _inputs(result: Reconstruction, capture: Capture, timesteps: tuple[int, ...]
             view, frame, label = capture.camera(camera), capture.frame(camera, timestep), html.escape(camera)
             photograph, size = to_8_bit(frame.image), (view.width, view.height)
             small = view.resized(min(1.0, LAID_OVER / max(size)))
-            render = rgba_8_bit(render_view(result, small, timestep, result.methods[-1], samples=1))
-            render = cv2.resize(render, size)
+            shown = rgba_8_bit(render_view(result, small, timestep, result.methods[-1], samples=1))
+            render = cv2.resize(shown, size).astype(np.uint8)
             box = draw.bounding_box(render[..., 3] > 0)
             marked = draw.draw_landmarks(photograph, view, frame.landmarks, frame.visible, vertices[model.landmarks])
-            area = face_area(vertices, model.faces, model.face_mask, small).astype(np.uint8)
-            area = cv2.resize(area, size, interpolation=cv2.INTER_NEAREST).astype(bool) & frame.valid
+            face = face_area(vertices, model.faces, model.face_mask, small).astype(np.uint8)
+            area = (cv2.resize(face, size, interpolation=cv2.INTER_NEAREST) > 0) & frame.valid
             clipped = frame.clipped & area
             labels = None if result.reflectance is None else result.reflectance.label(camera, timestep)
             areas = [(clipped, draw.TINTS[0][1])]
