@@ -41,8 +41,7 @@ class FirstHits:
 
         shapes, last, self.last = scene.shapes(), self.last, None
         plain = dr.is_jit_v(mi.Float) and all(shape.is_mesh() for shape in shapes)
-        camera = _state(last[0]) if plain and last is not None and last[1] is ray and not recording() else None
-        if camera is None or last is None:
+        if not plain or recording() or last is None or last[1] is not ray or (camera := _state(last[0])) is None:
             return None, scene.ray_intersect(ray, active)
         with dr.suspend_grad():
             still = mi.Ray3f(dr.detach(ray))

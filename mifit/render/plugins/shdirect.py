@@ -117,7 +117,7 @@ def make() -> type:
             develop: bool = True,
             evaluate: bool = True,
         ) -> mi.TensorXf:
-            """An image. Under a box filter each pixel is written once, a fifth of the cost of adding samples to it."""
+            """An image. Under a box filter each pixel is written once, which costs a fifth of adding samples to it."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             film = sensor.film()
             if not develop or not self._is_plain(film):
