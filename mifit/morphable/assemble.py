@@ -22,8 +22,8 @@ from mifit.morphable.pigment import skin_model
 from mifit.morphable.topology import adjacency, mirror_map, opening_faces, read_landmark_file
 from mifit.morphable.unwrap import unwrap
 
-_HERE = Path(__file__).parent
-_CODE = b"".join((_HERE / f).read_bytes() for f in ("assemble.py", "gaussian_process.py", "pigment.py", "unwrap.py"))
+VERSION = 1
+"""Of what is made here. Raise it when that changes: results made with a model of another version can't be read."""
 N_ALBEDO = 60
 """Albedo modes of the pigment model where a file has no albedo."""
 
@@ -86,8 +86,8 @@ def complete(  # noqa: PLR0913
         unit_mm=unit_mm,
         expression_names=expression_names,
         expression_bounds=expression_bounds,  # type: ignore[arg-type]
-        # What was read, and the code that computes the rest from it.
-        fingerprint=content_key(_CODE, mean, faces, identity, expression, landmarks, *given).hex()[:32]
+        # What was read; the rest is computed from it.
+        fingerprint=content_key(VERSION, mean, faces, identity, expression, landmarks, *given).hex()[:32]
         if computed
         else "",
     )

@@ -14,7 +14,7 @@ from intersections import intersections
 
 from mifit.core.mesh import edges, face_cross
 from mifit.core.uv import rasterize_uv
-from mifit.morphable import MorphableModel
+from mifit.morphable import MorphableModel, assemble
 from mifit.morphable.builtin import head, sculpt
 from mifit.morphable.builtin.head import make_head
 from mifit.morphable.builtin.template import make_template
@@ -103,6 +103,43 @@ def test_identity_modes_are_orthogonal_with_human_spread(coarse):
     assert np.abs(correlation).max() < 0.01
     spread = 10 * np.sqrt((coarse.identity**2).sum((1, 2)))[np.unique(coarse.faces[coarse.face_mask])]
     assert 4 < spread.mean() < 9  # mm
+
+
+def summary(model: MorphableModel) -> list[float]:
+    """Root mean squares of what a model holds, and sums of its indices."""
+    arrays = model.mean, model.identity, model.expression, model.mean_albedo, model.albedo_modes, model.uv
+    sizes = [float(np.sqrt((np.asarray(a, float) ** 2).mean())) for a in arrays]
+    return [*sizes, model.n_vertices, int(model.landmarks.sum()), int(model.face_mask.sum())]
+
+
+VERSIONS = {
+    "coarse": (1, [6.1108528, 0.03046862, 0.04135586, 0.3468852, 0.00945451, 0.5430817, 9441, 281336, 9152]),
+    "full": (1, [6.1173436, 0.03059462, 0.04191954, 0.3398031, 0.00983755, 0.5608336, 15367, 496712, 16162]),
+    "completed": (1, [6.1108528, 0.03046862, 0.04135586, 0.3279984, 0.01346702, 0.5698451, 9441, 281336, 9268]),
+}
+"""Of each computed model: its version, and what it holds then. Where the second changes, raise the first."""
+
+
+@pytest.mark.parametrize("made", VERSIONS)
+def test_a_model_that_is_computed_otherwise_has_another_version(coarse, made):
+    if made == "completed":
+        version, args = assemble.VERSION, (coarse.mean, coarse.faces, coarse.identity, coarse.expression)
+        model = assemble.complete("head", *args, coarse.unit_mm)
+    else:
+        version, model = head.VERSION, make_head(coarse=made == "coarse")
+    expected = VERSIONS[made]
+    assert (version, summary(model)) == (expected[0], pytest.approx(expected[1], rel=1e-5))
+
+
+def test_results_are_read_after_code_changes_that_change_no_head(tmp_path, monkeypatch, coarse):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(head, "make_head", lambda c: coarse)
+    now = head.builtin_model.__wrapped__(True).digest
+    monkeypatch.setattr(head, "_DIGEST", "0" * 16)  # of other sources
+    assert head.builtin_model.__wrapped__(True).digest == now
+    monkeypatch.setattr(head, "_DIGEST", "1" * 16)
+    monkeypatch.setattr(head, "VERSION", head.VERSION + 1)
+    assert head.builtin_model.__wrapped__(True).digest != now
 
 
 def test_made_again_is_the_same_model(coarse):
@@ -239,7 +276,7 @@ def test_jaw_opens_the_mouth_and_smile_widens_it(coarse):
 
 _TIMING = """
 import time
-from mifit.morphable import MorphableModel
+from mifit.morphable import MorphableModel, assemble
 m = MorphableModel.load("builtin:coarse")
 identity, expression, albedo = m.sample(0)
 times = []

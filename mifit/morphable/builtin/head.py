@@ -26,6 +26,8 @@ from mifit.morphable.pigment import skin_model
 
 DENSITY = 0.66
 """Part of the drawn lines; with all of them surfaces are no better, at twice the cost: scan_city and Emily."""
+VERSION = 1
+"""Of the head that is computed. Raise it when the head changes: results hold coefficients of one version only."""
 
 
 @cache
@@ -34,7 +36,8 @@ def builtin_model(coarse: bool = False) -> MorphableModel:
 
     It has about 15 000 vertices, or 9 000 when ``coarse``.
     """
-    path = cache_folder() / f"builtin-{'coarse' if coarse else 'full'}-{_DIGEST}.npz"
+    name = f"builtin-{'coarse' if coarse else 'full'}"
+    path = cache_folder() / f"{name}-{_DIGEST}.npz"
     if path.is_file():
         try:
             model = load_own(path)
@@ -44,9 +47,9 @@ def builtin_model(coarse: bool = False) -> MorphableModel:
             with contextlib.suppress(OSError):
                 os.utime(path)
             return model
-    model = replace(make_head(coarse), fingerprint=path.stem)
+    model = replace(make_head(coarse), fingerprint=f"{name}-{VERSION}")
     try:
-        for other in path.parent.glob(f"{path.name.rsplit('-', 1)[0]}-*.npz"):
+        for other in path.parent.glob(f"{name}-*.npz"):
             if time.time() - other.stat().st_mtime > 30 * 86400:  # of other versions, unused for a month
                 other.unlink(missing_ok=True)
         save_model(model, path)
