@@ -17,13 +17,11 @@ from mifit.core.arrays import content_key
 from mifit.core.image import srgb_to_linear
 from mifit.core.mesh import vertex_normals
 from mifit.errors import InputError
-from mifit.morphable.model import MorphableModel
+from mifit.morphable.model import VERSION, MorphableModel
 from mifit.morphable.pigment import skin_model
 from mifit.morphable.topology import adjacency, mirror_map, opening_faces, read_landmark_file
 from mifit.morphable.unwrap import unwrap
 
-VERSION = 1
-"""Of what is made here. Raise it when that changes: results made with a model of another version can't be read."""
 N_ALBEDO = 60
 """Albedo modes of the pigment model where a file has no albedo."""
 

@@ -30,6 +30,11 @@ def provide(method: str, function: Callable[..., object]) -> None:
     _PROVIDED[method] = function
 
 
+VERSION = 1
+"""Of what is computed for a model: the built-in head, added eyes, what a file lacks. Raise it when that changes, since
+results made with another version can't be read."""
+
+
 @dataclass(frozen=True, eq=False)
 class MorphableModel:
     """A linear model of face shape and albedo; immutable and validated on construction.

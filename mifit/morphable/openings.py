@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 
 from mifit.core.mesh import face_cross
 from mifit.errors import InputError
-from mifit.morphable.model import MorphableModel
+from mifit.morphable.model import VERSION, MorphableModel
 from mifit.morphable.topology import EYES_AND_MOUTH, adjacency, closed_borders
 
 RADIUS_MM = 12.0
@@ -118,7 +118,7 @@ def with_eyes(model: MorphableModel) -> MorphableModel:
         face_mask=np.concatenate([model.face_mask, np.zeros(len(faces), bool)]),
         symmetry=None if model.symmetry is None else np.concatenate([model.symmetry, *mirror]),
         # The ball's centre is searched for, whose last digit differs between machines.
-        fingerprint=f"{model.digest}-eyes4",
+        fingerprint=f"{model.digest}-eyes{VERSION}",
     )
     if model.source:
         found._set("_source", model.source + SUFFIX)

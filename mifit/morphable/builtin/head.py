@@ -20,14 +20,12 @@ from mifit.morphable.builtin.landmarks import landmark_vertices
 from mifit.morphable.builtin.template import Template, make_template
 from mifit.morphable.formats.own import load_own, save_model
 from mifit.morphable.gaussian_process import deformation_modes
-from mifit.morphable.model import MorphableModel
+from mifit.morphable.model import VERSION, MorphableModel
 from mifit.morphable.openings import with_eyes
 from mifit.morphable.pigment import skin_model
 
 DENSITY = 0.66
 """Part of the drawn lines; with all of them surfaces are no better, at twice the cost: scan_city and Emily."""
-VERSION = 1
-"""Of the head that is computed. Raise it when the head changes: results hold coefficients of one version only."""
 
 
 @cache
@@ -37,7 +35,7 @@ def builtin_model(coarse: bool = False) -> MorphableModel:
     It has about 15 000 vertices, or 9 000 when ``coarse``.
     """
     name = f"builtin-{'coarse' if coarse else 'full'}"
-    path = cache_folder() / f"{name}-{_DIGEST}.npz"
+    path = cache_folder() / f"{name}-{VERSION}-{_DIGEST}.npz"
     if path.is_file():
         try:
             model = load_own(path)
