@@ -93,8 +93,8 @@ def infer_reflectance(
         labels = segment(surface, capture, model, forward, first.light)
         surface = surface.without([hidden(image) for image in labels])
     progress("Reflectance lighting", 1, 2)
-    solve = fit_als if config.robust else fit_paper
-    fitted = solve(surface, forward, albedo, config, seed, progress)
+    given = surface, forward, albedo, config, seed, progress
+    fitted = fit_paper(*given) if first is None else fit_als(*given, first.sigma)
     solved = fitted.solved
     warnings: tuple[Diagnostic, ...] = ()
     illumination = fitted.appearance.illumination

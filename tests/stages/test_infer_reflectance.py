@@ -12,7 +12,7 @@ from mifit.config import ReflectanceConfig
 from mifit.errors import InputError
 from mifit.sampling.observations import Surface
 from mifit.stages.infer_reflectance import infer_reflectance
-from mifit.stages.reflectance.lighting_equations import specular_pull
+from mifit.stages.reflectance.albedo_priors import specular_pull
 from mifit.stages.reflectance.maps import TexelSystems, laplacian, solve_maps
 
 CONFIG = ReflectanceConfig(

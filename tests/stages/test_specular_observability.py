@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mifit.core.uv import TexelMap
+from mifit.stages.reflectance.albedo_priors import SPECULAR_SPREAD
 from mifit.stages.reflectance.als import residual_sizes, specular_observability
-from mifit.stages.reflectance.lighting_equations import SPECULAR_SPREAD
 from mifit.stages.reflectance.maps import TexelSystems
 
 SIZE, EXPECTED, NOISE = 128, 0.03, 0.01

@@ -18,11 +18,11 @@ from mifit.core.uv import TexelMap
 from mifit.optim import Outcome
 from mifit.progress import Progress
 from mifit.sampling.observations import Surface
+from mifit.stages.reflectance.albedo_priors import specular_pull
 from mifit.stages.reflectance.compact_lights import EXPONENT, ITERATIONS, OBSERVATIONS, best_exponent, find_lights
 from mifit.stages.reflectance.fill import ALIKE
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution, active_weight, fit_lighting, noise_weight
-from mifit.stages.reflectance.lighting_equations import specular_pull
 from mifit.stages.reflectance.maps import TexelSystems, solve_maps
 
 LIGHTING_TEXELS = 6000
@@ -109,7 +109,13 @@ def find_forward(
 
 
 def fit_als(
-    surface: Surface, forward: Forward, albedo: NDArray, config: ReflectanceConfig, seed: int, progress: Progress
+    surface: Surface,
+    forward: Forward,
+    albedo: NDArray,
+    config: ReflectanceConfig,
+    seed: int,
+    progress: Progress,
+    noise: float,
 ) -> Fitted:
     """Find the lighting on a subset of the texels, then all maps.
 
@@ -124,19 +130,28 @@ def fit_als(
     seed : int
         Chooses the subset.
     progress : Progress
+    noise : float
+        Robust standard deviation of the first lighting's residuals.
     """
-    found, prior = lighting_of_subset(surface, forward, albedo, config, seed)
+    found, prior = lighting_of_subset(surface, forward, albedo, config, seed, noise)
     solved = solve_texels(surface, forward, found, prior, config, progress)
     energy = {"lighting": found.energy, "data": solved.energy}
     return Fitted(forward.under(found.light, found.ambient), solved, energy, found.outcome)
 
 
 def lighting_of_subset(
-    surface: Surface, forward: Forward, albedo: NDArray, config: ReflectanceConfig, seed: int
+    surface: Surface,
+    forward: Forward,
+    albedo: NDArray,
+    config: ReflectanceConfig,
+    seed: int,
+    noise: float | None = None,
 ) -> tuple[LightingSolution, NDArray[np.float32]]:
     """The lighting, and the maps (S, S, 4) that are expected of all texels."""
     subset = surface.sample(LIGHTING_TEXELS, np.random.default_rng(seed))
-    found = fit_lighting(surface.observe(subset), forward, albedo[subset], config.robust, config.max_iterations)
+    found = fit_lighting(
+        surface.observe(subset), forward, albedo[subset], config.robust, config.max_iterations, noise=noise
+    )
     prior = np.full((surface.texels.size, surface.texels.size, 4), found.expected, np.float32)
     prior[..., :3] = surface.texels.to_map(np.asarray(albedo, np.float32))
     return found, prior

@@ -12,9 +12,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mifit.core.process import BLOCK, blocks, on_all_cores
+from mifit.stages.reflectance.albedo_priors import Tie, borders, row_sum
+from mifit.stages.reflectance.maps import TexelSystems
 
-SPECULAR_SPREAD = 0.15
-"""Standard deviation of the specular albedo over a face, relative to its median."""
 PATCHES = 100
 """Independent measurements that a face is worth: about as many patches have an error of their own."""
 
@@ -38,7 +38,7 @@ class LightingProblem:
     order : int
         Bands B of the smooth light: the first B*B of the K; the others are the compact lights.
     gloss : float
-        The most that is expected of the specular albedo.
+        The most that is expected of the specular albedo; below 1, at least half of it is.
     """
 
     texel: NDArray[np.intp]
@@ -51,12 +51,39 @@ class LightingProblem:
     order: int
     gloss: float = 1.0
 
-    def expected_specular(self, specular: NDArray) -> float:
-        """Specular albedo to expect of a texel, given those of others (n,).
+    def shade(self, light: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(M, 3) diffuse and specular radiance at unit albedo under a lighting (K, 3)."""
+        single = light.astype(np.float32)
+        return self.diffuse @ single, self.specular @ single
 
-        What tells how much of a broad reflection is specular is little, and errors of the mesh look like it.
-        """
-        return min(float(np.median(specular)), self.gloss)
+    @cached_property
+    def seen(self) -> NDArray[np.float32]:
+        """(n, 3) weight of each texel's observations."""
+        return self.sums(self.weight)
+
+    @cached_property
+    def share(self) -> NDArray[np.float64]:
+        """(n, 3) part of the observations that each texel has."""
+        seen = self.sums(self.weight).astype(np.float64)
+        return seen / max(float(seen.sum()), 1e-12)
+
+    @cached_property
+    def freedom(self) -> float:
+        """Part of the observations that is left to judge by, once each texel has its four albedos."""
+        count = 3 * np.diff(self.start)
+        return max(float(np.maximum(count - 4, 0).sum()), 1.0) / max(int(count.sum()), 1)
+
+    @cached_property
+    def level(self) -> float:
+        """Mean colour of what is observed."""
+        return float((self.weight * self.colour).sum() / max(float(self.weight.sum()), 1e-12))
+
+    @cached_property
+    def scale(self) -> float:
+        """Mean curvature of the smooth light's coefficients under the expected albedo, beside which priors count."""
+        smooth = self.diffuse[:, : self.order**2]
+        bright = (self.weight * self.albedo[self.texel] ** 2).sum(axis=1)
+        return float(bright @ np.einsum("mk,mk->m", smooth, smooth)) / (3 * self.order**2)
 
     @cached_property
     def start(self) -> NDArray[np.intp]:
@@ -106,25 +133,20 @@ def _per_texel(start: NDArray) -> sp.csr_matrix:
     return sp.csr_matrix((np.ones(count, np.float32), np.arange(count), start - start[0]), shape=shape)
 
 
-def specular_pull(expected: float, sigma: float) -> float:
-    """Weight that ties a texel's specular albedo to the expected one, beside squared residuals of deviation `sigma`."""
-    return (sigma / (SPECULAR_SPREAD * max(expected, 1e-3))) ** 2
-
-
 @dataclass(frozen=True)
 class LightingPriors:
-    """Weights of what is assumed where the images are silent, relative to the data's own scale.
+    """What is assumed where the images are silent.
 
     Attributes
     ----------
     roughness : float
-        Penalty on (l (l + 1))^2 times the squared coefficients of band l.
+        Penalty on (l (l + 1))^2 times the squared coefficients of band l, relative to `LightingProblem.scale`.
     negative : float
-        Penalty on squared negative radiance.
+        Penalty on squared negative radiance, relative to the same.
     albedo : float
-        Pull of the diffuse albedo to the expected one.
+        Pull of the diffuse albedo to the expected one, relative to the median texel's curvature.
     specular : float
-        Pull of each texel's specular albedo to the expected one, at the least; see `SPECULAR_SPREAD`.
+        Pull of each texel's specular albedo to the expected one, relative to the same, at the least.
     """
 
     roughness: float = 1e-7
@@ -137,7 +159,18 @@ PRIORS = LightingPriors()
 """The usual weights."""
 
 
-@dataclass
+def texel_systems(
+    problem: LightingProblem, shading: tuple[NDArray, NDArray], weight: NDArray, target: NDArray
+) -> TexelSystems:
+    """Blocks of the n texels: what two shadings (M, 3), each times an albedo, have to add up to."""
+    by_diffuse, by_specular = weight * shading[0], weight * shading[1]
+    products = by_diffuse * shading[0], by_diffuse * shading[1], by_diffuse * target
+    glossy = np.stack([(by_specular * shading[1]).sum(axis=1), (by_specular * target).sum(axis=1)], axis=1)
+    own = problem.sums(np.concatenate([*products, glossy], axis=1)).astype(np.float64)
+    return TexelSystems(own[:, :3], own[:, 3:6], own[:, 6:9], own[:, 9], own[:, 10])
+
+
+@dataclass(frozen=True)
 class LightingEquations:
     """Normal equations: lighting (3K) against the texels' own blocks of three diffuse albedos and one specular one.
 
@@ -145,23 +178,23 @@ class LightingEquations:
 
     Attributes
     ----------
-    system : (3, K, K), right : (3, K)
+    light : (3, K, K), right : (3, K)
         Of the lighting, by channel.
-    diffuse, both : (n, 3), specular : (n,)
-        Blocks: curvature of the diffuse albedos, theirs with the specular one, and its own.
-    own_right : (n, 4)
+    texels : TexelSystems
+        Of the n texels.
+    ties : list of Tie, stiffness : float
+        Rows that tie texels together, and the second one's own curvature.
     diffuse_cross : (3, n, K)
         Diffuse albedos against the light of their channel.
     specular_cross : (n, 3K)
         Specular albedo against the light.
     """
 
-    system: NDArray[np.float64]
+    light: NDArray[np.float64]
     right: NDArray[np.float64]
-    diffuse: NDArray[np.float64]
-    both: NDArray[np.float64]
-    specular: NDArray[np.float64]
-    own_right: NDArray[np.float64]
+    texels: TexelSystems
+    ties: list[Tie]
+    stiffness: float
     diffuse_cross: NDArray[np.float32]
     specular_cross: NDArray[np.float32]
 
@@ -177,11 +210,6 @@ class LightingEquations:
         """Sums over the observations, linearised about maps (n, 3), (n,) and diffuse and specular shading (M, 3)."""
         (diffuse, specular_albedo), (diffuse_light, specular_light) = maps, shading
         n, k = len(diffuse), problem.specular.shape[1]
-        by_diffuse, by_specular = weight * diffuse_light, weight * specular_light
-        products = by_diffuse * diffuse_light, by_diffuse * specular_light, by_specular * specular_light
-        forces = by_diffuse * residual, by_specular * residual
-        own = problem.sums(np.concatenate([*products, *forces], axis=1)).astype(np.float64)
-        dd, ds, ss, dr, sr = (own[:, 3 * i : 3 * i + 3] for i in range(5))
         system, right = np.zeros((3, k, k)), np.zeros((3, k))
         diffuse_cross, specular_cross = np.empty((3, n, k), np.float32), np.empty((n, 3 * k), np.float32)
         root = np.sqrt(weight)
@@ -207,113 +235,58 @@ class LightingEquations:
         for square, side in on_all_cores(add, problem.blocks):
             system += square
             right += side
-        own_right = np.concatenate([dr, sr.sum(1, keepdims=True)], axis=1)
-        return cls(system, right, dd, ds, ss.sum(1), own_right, diffuse_cross, specular_cross)
+        texels = texel_systems(problem, shading, weight, residual)
+        return cls(system, right, texels, [], 0.0, diffuse_cross, specular_cross)
 
-    def add_priors(
-        self,
-        priors: LightingPriors,
-        light: NDArray,
-        maps: tuple[NDArray, NDArray],
-        expected: tuple[NDArray, float],
-        stiffness: NDArray,
-        sphere_basis: NDArray,
-        sigma: float,
-    ) -> None:
-        """Add the quadratic penalties of `LightingPriors` beside residuals of standard deviation `sigma`.
-
-        ``maps`` (n, 3) and (n,) are pulled to the expected ones.
-        """
-        k = len(stiffness)
-        scale = float(np.trace(self.system, axis1=1, axis2=2).mean()) / k
-        pull = priors.albedo * np.median(self.diffuse, axis=0)
-        self.diffuse += pull
-        self.own_right[:, :3] += pull * (expected[0] - maps[0])
-        strong = max(priors.specular * float(np.median(self.specular)), specular_pull(expected[1], sigma))
-        self.specular += strong
-        self.own_right[:, 3] += strong * (expected[1] - maps[1])
-        radiance = sphere_basis @ light
-        smooth, force = priors.roughness * scale * stiffness, priors.negative * scale * 4.0 * np.pi / len(sphere_basis)
-        for c in range(3):
-            rows = sphere_basis[radiance[:, c] < 0]
-            self.system[c] += force * rows.T @ rows + np.diag(smooth)
-            self.right[c] -= force * rows.T @ (rows @ light[:, c]) + smooth * light[:, c]
-
-    def eliminate(self, damping: float) -> Eliminated:
-        """What remains for the light once the texels follow it."""
+    def eliminate(self, damping: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(3K, 3K) and (3K,) what remains for the light once the texels follow it."""
         n, k = self.diffuse_cross.shape[1:]
-        floor = 1e-6 * float(np.median(np.concatenate([self.diffuse, self.specular[:, None]], axis=1))) + 1e-12
-        pivot = (1.0 + damping) * self.diffuse + floor
-        slope = self.both / pivot
-        last = (1.0 + damping) * self.specular + floor - (slope * self.both).sum(1)
-        own = self.own_right[:, :3] / pivot
-        left = (self.own_right[:, 3] - (slope * self.own_right[:, :3]).sum(1)) / last
+        texels, slope, last = self.texels, self.texels.ds / self.texels.dd, self.texels.specular_information
+        own, left = texels.dr / texels.dd, (texels.sr - (slope * texels.dr).sum(1)) / last
 
-        def take(texels: slice) -> tuple[NDArray, NDArray]:
+        def take(part: slice) -> tuple[NDArray, NDArray]:
             """What some of the texels take from the light's system and from its right-hand side."""
-            cross, steep = self.specular_cross[texels], slope[texels].astype(np.float32)
+            cross, steep = self.specular_cross[part], slope[part].astype(np.float32)
             rest, squares, side = np.empty_like(cross), np.empty((3, k, k), cross.dtype), np.empty(3 * k)
             for c in range(3):
-                block, own_cross = slice(c * k, (c + 1) * k), self.diffuse_cross[c, texels]
+                block, own_cross = slice(c * k, (c + 1) * k), self.diffuse_cross[c, part]
                 np.multiply(own_cross, -steep[:, c, None], out=rest[:, block])
                 rest[:, block] += cross[:, block]
-                part = own_cross / np.sqrt(pivot[texels, c, None]).astype(np.float32)
-                np.matmul(part.T, part, out=squares[c])
-                side[block] = own[texels, c].astype(np.float32) @ own_cross
-            side += left[texels].astype(np.float32) @ rest
-            rest /= np.sqrt(last[texels]).astype(np.float32)[:, None]
+                scaled = own_cross / np.sqrt(texels.dd[part, c, None]).astype(np.float32)
+                np.matmul(scaled.T, scaled, out=squares[c])
+                side[block] = own[part, c].astype(np.float32) @ own_cross
+            side += left[part].astype(np.float32) @ rest
+            rest /= np.sqrt(last[part]).astype(np.float32)[:, None]
             square = rest.T @ rest
             for c in range(3):
                 block = slice(c * k, (c + 1) * k)
                 square[block, block] += squares[c]
             return square, side
 
-        reduced, right = sl.block_diag(*self.system), self.right.ravel().copy()
+        reduced, right = sl.block_diag(*self.light), self.right.ravel().copy()
         diagonal = np.diag(reduced).copy()
         for square, side in on_all_cores(take, blocks(n, 2 * k)):
             reduced -= square
             right -= side
+        if self.ties:
+            moves, core = borders(texels, self.ties, self.stiffness)
+            along = np.stack([self._across(*move) for move in moves], axis=1)
+            force = np.array([row_sum((texels.dr, texels.sr), move) for move in moves])
+            reduced -= along @ np.linalg.solve(core, along.T)
+            right -= along @ np.linalg.solve(core, force)
         reduced[np.diag_indices(3 * k)] += damping * diagonal + 1e-8 * diagonal.mean()
-        return Eliminated(pivot, slope, last, reduced, right)
+        return reduced, right
 
-    def solve(
-        self, damping: float, lowest: NDArray | None = None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
-        """Steps of lighting (K, 3), diffuse (n, 3) and specular albedo (n,).
+    def _across(self, diffuse: NDArray, specular: NDArray) -> NDArray[np.float64]:
+        """(3K,) forces of moved albedos (n, 3), (n,) on the light."""
+        force = np.einsum("cnk,nc->ck", self.diffuse_cross, diffuse.astype(np.float32)).ravel()
+        return (force + specular.astype(np.float32) @ self.specular_cross).astype(np.float64)
 
-        ``lowest`` (K, 3) bounds the light's step from below.
-        """
-        remaining = self.eliminate(damping)
-        least = np.full(len(remaining.right), -np.inf) if lowest is None else lowest.T.ravel()
-        light = bounded_step(remaining.reduced, remaining.right, least)
-        single = light.astype(np.float32).reshape(3, -1)
-        left = self.own_right.copy()
-        for c in range(3):
-            left[:, c] -= self.diffuse_cross[c] @ single[c]
-        left[:, 3] -= self.specular_cross @ single.ravel()
-        specular = (left[:, 3] - (remaining.slope * left[:, :3]).sum(1)) / remaining.last
-        diffuse = left[:, :3] / remaining.pivot - remaining.slope * specular[:, None]
-        return light.reshape(3, -1).T, diffuse.astype(np.float32), specular.astype(np.float32)
-
-
-@dataclass(frozen=True)
-class Eliminated:
-    """`LightingEquations` with the texels eliminated.
-
-    Attributes
-    ----------
-    pivot, slope : (n, 3), last : (n,)
-        Of the texels' blocks: curvature of the diffuse albedos, how they follow the specular one, and its curvature
-        once they do.
-    reduced : (3K, 3K), right : (3K,)
-        What remains for the lighting.
-    """
-
-    pivot: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    last: NDArray[np.float64]
-    reduced: NDArray[np.float64]
-    right: NDArray[np.float64]
+    def solve(self, damping: float, lowest: NDArray | None = None) -> NDArray[np.float64]:
+        """Step (K, 3) of the lighting; ``lowest`` (K, 3) bounds it from below."""
+        reduced, right = self.eliminate(damping)
+        least = np.full(len(right), -np.inf) if lowest is None else lowest.T.ravel()
+        return bounded_step(reduced, right, least).reshape(3, -1).T
 
 
 def bounded_step(system: NDArray, right: NDArray, lowest: NDArray) -> NDArray[np.float64]:

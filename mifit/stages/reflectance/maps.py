@@ -37,11 +37,11 @@ class TexelSystems:
     ss, sr : (N,)
     """
 
-    dd: NDArray[np.float32]
-    ds: NDArray[np.float32]
-    dr: NDArray[np.float32]
-    ss: NDArray[np.float32]
-    sr: NDArray[np.float32]
+    dd: NDArray[np.floating]
+    ds: NDArray[np.floating]
+    dr: NDArray[np.floating]
+    ss: NDArray[np.floating]
+    sr: NDArray[np.floating]
 
     @classmethod
     def accumulate(
@@ -81,8 +81,20 @@ class TexelSystems:
             return parts[0]
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
+    def with_priors(self, pulls: tuple[NDArray, float], diffuse: NDArray, specular: NDArray | float) -> TexelSystems:
+        """With ``pull (x - expected)^2`` added for diffuse (N, 3) and specular albedo (N,)."""
+        pull, gloss = pulls
+        dr, sr = self.dr + pull * diffuse, self.sr + gloss * specular
+        return replace(self, dd=self.dd + pull, dr=dr, ss=self.ss + gloss, sr=sr)
+
+    def inverse(self, diffuse: NDArray, specular: NDArray | float) -> tuple[NDArray, NDArray]:
+        """The blocks' inverses times vectors of diffuse (N, 3) and specular parts (N,)."""
+        slope = self.ds / self.dd
+        y = (specular - (slope * diffuse).sum(axis=1)) / np.maximum(self.specular_information, 1e-12)
+        return diffuse / self.dd - slope * y[:, None], y
+
     @property
-    def specular_information(self) -> NDArray[np.float32]:
+    def specular_information(self) -> NDArray[np.floating]:
         """(N,) curvature of the specular albedo once the diffuse ones follow it."""
         taken = self.ds**2 / np.maximum(self.dd, np.float32(1e-12))
         return np.maximum(self.ss - taken.sum(1), np.float32(0.0))
