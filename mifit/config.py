@@ -263,7 +263,7 @@ class ReflectanceConfig:
     specular: bool = flag(True, "find specular reflection; false: all is diffuse")
     specular_albedo: float = number(
         0.03,
-        "most specular albedo to expect; more for what outshines skin",
+        "most specular albedo to expect, below 1 at most twice the least; more for what outshines skin",
         source="measured index of refraction of skin",
         above=0,
         most=2,

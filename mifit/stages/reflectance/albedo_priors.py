@@ -1,8 +1,8 @@
 """What is assumed of albedos while the lighting is found, and the albedos that follow a lighting.
 
 Light and albedo share a scale, which the mean diffuse albedo fixes. Bands of the light that only the specular lobe
-shows share another with the specular albedo; so what is expected of that is relative to an unknown e, common to all
-texels. Both tie texels together that else are alone, each by one row beside their blocks.
+shows share another with the specular albedo; so the specular albedo is expected relative to an unknown e, which is the
+same for all texels. Texels that else are independent are tied by both: each is one row beside their blocks.
 """
 
 from __future__ import annotations

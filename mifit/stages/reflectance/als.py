@@ -261,7 +261,7 @@ def solve_texels(
                 residual = shaded.residual(maps.reshape(-1, 4)[index[shaded.texel]])
                 if number == passes - 1:
                     sizes.append(residual_sizes(shaded, weight, residual))
-                weight, deviation = active_weight(shaded.weight, shaded.clipped, residual, True)
+                weight, deviation = active_weight(shaded.weight, shaded.clipped, residual)
                 data += float((weight * residual**2).sum())
                 sigmas.append(deviation)
             systems.append(shaded.systems(weight, surface.pairs, config.specular_difference_weight))

@@ -84,12 +84,18 @@ def find_lights(
     return lights, found
 
 
+def _wider(problem: LightingProblem, found: LightingSolution, columns: Sequence[NDArray]) -> tuple[NDArray, NDArray]:
+    """Normal equations of the light with further unknowns that are zero so far; ``columns`` are two of (M, G)."""
+    more = np.zeros((columns[0].shape[1], 3))
+    wider, light = problem.with_columns(*columns), np.concatenate([found.light, more])
+    left = Residuals.of(wider, light, (found.diffuse, found.specular), found.expected).rescaled(wider)
+    return left.equations(wider).eliminate(1e-4)
+
+
 def _gains(problem: LightingProblem, found: LightingSolution, columns: Sequence[NDArray]) -> NDArray[np.float64]:
     """(G,) by how much light from each direction lowers the sum, to first order; ``columns`` are two of (M, G)."""
     k, count = problem.diffuse.shape[1], columns[0].shape[1]
-    wider, light = problem.with_columns(*columns), np.concatenate([found.light, np.zeros((count, 3))])
-    left = Residuals.of(wider, light, (found.diffuse, found.specular), found.expected).rescaled(wider)
-    reduced, right = left.equations(wider).eliminate(1e-4)
+    reduced, right = _wider(problem, found, columns)
     old = np.arange(3 * (k + count)) % (k + count) < k
     cross = reduced[np.ix_(old, ~old)]
     across = np.linalg.solve(reduced[np.ix_(old, old)], cross)
@@ -149,9 +155,7 @@ def _moved(light: DistantLight, step: NDArray) -> DistantLight:
 def _place_steps(problem: LightingProblem, found: LightingSolution, slopes: Sequence[NDArray]) -> NDArray[np.float64]:
     """(L, 3) steps of the places of L lights: ``slopes`` are two of (M, 3L), at unit irradiance."""
     k, m = problem.diffuse.shape[1], slopes[0].shape[1]
-    wider, light = problem.with_columns(*slopes), np.concatenate([found.light, np.zeros((m, 3))])
-    left = Residuals.of(wider, light, (found.diffuse, found.specular), found.expected).rescaled(wider)
-    reduced, right = left.equations(wider).eliminate(1e-4)
+    reduced, right = _wider(problem, found, slopes)
     colour = np.repeat(found.light[k - m // 3 :], 3, axis=0)
     tied = np.zeros((3, k + m, 3 * k + m))
     for c in range(3):

@@ -117,15 +117,16 @@ class Residuals:
         maps: tuple[NDArray, NDArray],
         expected: float,
         scale: float = np.inf,
+        shading: tuple[NDArray, NDArray] | None = None,
     ) -> Residuals:
-        """Residuals of a lighting (K, 3) and albedos (n, 3), (n,)."""
-        shading = problem.shade(light)
+        """Residuals of a lighting (K, 3) and albedos (n, 3), (n,); ``shading`` where it is known."""
+        shading = problem.shade(light) if shading is None else shading
         albedo = maps[0][problem.texel], maps[1][problem.texel, None]
         residual = problem.colour - form_image(np.float32(0.0), albedo[0], shading[0], albedo[1], shading[1])
         return cls(light, maps, expected, shading, residual, *robust_squares(problem, residual, scale), scale)
 
     def rescaled(self, problem: LightingProblem, least: float | None = None) -> Residuals:
-        """The same with the scale of its own residuals, at least this, by default a `GROSS` one."""
+        """The same with the scale of its own residuals, or ``least`` if that is more: by default `GROSS`."""
         least = GROSS * problem.level if least is None else least
         deviation = robust_deviation(problem.weight, problem.clipped, self.residual)
         scale = max(CAUCHY * deviation / problem.freedom**0.5, least, 1e-12)
@@ -134,12 +135,12 @@ class Residuals:
 
     def following(self, problem: LightingProblem, light: NDArray, albedos: AlbedoPriors) -> Residuals:
         """Those under another lighting, once the albedos have followed it."""
-        texels = texel_systems(problem, problem.shade(light), self.weight, problem.colour)
-        diffuse, specular, expected = albedos.solve(texels)
-        return Residuals.of(problem, light, (diffuse, specular), expected, self.scale)
+        shading = problem.shade(light)
+        diffuse, specular, expected = albedos.solve(texel_systems(problem, shading, self.weight, problem.colour))
+        return Residuals.of(problem, light, (diffuse, specular), expected, self.scale, shading)
 
     def unexplained(self, problem: LightingProblem) -> float:
-        """Root of the mean square of the residuals, those beyond a `GROSS` scale counting less."""
+        """Root of the mean square of the residuals; those beyond `GROSS` count less."""
         data = robust_squares(problem, self.residual, max(GROSS * problem.level, 1e-12))[1]
         return float(np.sqrt(data / max(float(problem.weight.sum()), 1e-12)))
 
@@ -195,13 +196,19 @@ class Residuals:
 def robust_squares(problem: LightingProblem, residual: NDArray, scale: float) -> tuple[NDArray[np.float32], float]:
     """(M, 3) weights of residuals and their sum, Cauchy's of this scale; clipped ones count where they are too dark."""
     bound = problem.clipped[:, None]
-    weight = np.where(bound & (residual <= 0), np.float32(0.0), problem.weight).astype(np.float32)
+    weight = robust_weight(problem.weight, bound, residual, scale)
     if not np.isfinite(scale):
         return weight, float((weight * residual**2).sum())
-    # Bounds are no outliers: a highlight far below its bound is missing.
     square = (residual / np.float32(scale)) ** 2
-    data = float((weight * np.where(bound, square, np.log1p(square))).sum())
-    return (weight / np.where(bound, 1.0, 1.0 + square)).astype(np.float32), scale**2 * data
+    counted = np.where(bound & (residual <= 0), np.float32(0.0), problem.weight)
+    return weight, scale**2 * float((counted * np.where(bound, square, np.log1p(square))).sum())
+
+
+def robust_weight(weight: NDArray, bound: NDArray, residual: NDArray, scale: float) -> NDArray[np.float32]:
+    """Weights of residuals: where clipped, those that are too dark alone; else outliers less (Cauchy)."""
+    part = np.where(bound & (residual <= 0), np.float32(0.0), weight)
+    # Bounds are no outliers: a highlight far below its bound is missing.
+    return np.where(bound, part, part / (1.0 + (residual / np.float32(scale)) ** 2)).astype(np.float32)
 
 
 def light_weights(problem: LightingProblem, priors: LightingPriors) -> tuple[NDArray[np.float64], float]:
@@ -237,8 +244,8 @@ def solve_lighting(
     tolerance : float
         Stop when the energy changes by less than this part.
     noise : float, optional
-        Robust standard deviation of the residuals of an earlier fit; by default residuals are taken for outliers from a
-        `GROSS` one on. A scale that follows the residuals alone shrinks with them.
+        Robust standard deviation of the residuals of an earlier fit, from which Cauchy's scale follows; by default that
+        is `GROSS`. A scale that follows the residuals alone shrinks with them.
     """
     if start is None:
         maps = problem.albedo.astype(np.float32), np.full(len(problem.albedo), specular, np.float32)
@@ -304,20 +311,14 @@ def robust_deviation(weight: NDArray, clipped: NDArray, residual: NDArray) -> fl
     return median_deviation(residual.reshape(-1)[measured[:: max(1, len(measured) // 200_000)]])
 
 
-def active_weight(
-    weight: NDArray, clipped: NDArray, residual: NDArray, robust: bool
-) -> tuple[NDArray[np.float32], float]:
-    """Weights of this iteration: clipped observations count only where the model is too dark, outliers less."""
+def active_weight(weight: NDArray, clipped: NDArray, residual: NDArray) -> tuple[NDArray[np.float32], float]:
+    """Robust weights beside residuals of unknown size, and their robust standard deviation."""
     sigma = robust_deviation(weight, clipped, residual)
     active = np.empty(np.broadcast_shapes(weight.shape, residual.shape), np.float32)
 
     def fill(rows: slice) -> None:
-        bound, off = clipped[rows, ..., None], residual[rows]
-        part = np.where(bound & (off <= 0), np.float32(0.0), weight[rows])
-        if robust:
-            # Not for bounds: a highlight far below its bound is missing, not an outlier.
-            part = np.where(bound, part, part / (1.0 + (off / max(CAUCHY * sigma, 1e-4)) ** 2))
-        active[rows] = part
+        scale = max(CAUCHY * sigma, 1e-4)
+        active[rows] = robust_weight(weight[rows], clipped[rows, ..., None], residual[rows], scale)
 
     on_all_cores(fill, blocks(len(active), 4 * active.size // max(len(active), 1)))
     return active, sigma
