@@ -14,7 +14,8 @@ from pathlib import Path
 
 from benchmarks.record import RESULTS, SHARED, renew_tables
 
-REDUCED = (
+Runs = tuple[tuple[str, list[str]], ...]
+REDUCED: Runs = (
     ("foreign", ["--reduced"]),
     ("foreign", ["--own", "--reduced", "--rows", "full", "refit"]),
     (
@@ -25,7 +26,7 @@ REDUCED = (
     ("speed", ["--reduced"]),
     ("hard_cases", []),
 )
-FULL = (
+FULL: Runs = (
     ("foreign", []),
     ("foreign", ["--own"]),
     ("table1", ["--relight", "--jobs", "2"]),

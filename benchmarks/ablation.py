@@ -94,11 +94,6 @@ class Part:
                 each.stop()
 
 
-def _prior_alone(colour: Any, weight: Any, wrong: Any, *rest: Any) -> Any:
-    """In place of `visibility.inlier_probability`: an observation's own probability, whatever other cameras see."""
-    return (1.0 - wrong).astype(np.float32)
-
-
 def _smooth_light_alone(seen: Any, forward: Any, expected: Any) -> tuple[tuple[()], LightingSolution]:
     """In place of `compact_lights.find_lights`."""
     return (), fit_lighting(seen, forward, expected, True, ITERATIONS)
@@ -129,11 +124,6 @@ PARTS = (
     Part("light: bands beyond three", {"reflectance.bands": 3}),
     Part("light: exponent (20)", {"reflectance.exponent": 20.0}),
     Part("stage 2: segmentation", {"reflectance.segment": False}),
-    Part(
-        "stage 2: agreement of the observations of a point",
-        patches={"mifit.sampling.observations.inlier_probability": _prior_alone},
-        step="reflectance",
-    ),
     Part("stage 2: robust weights and what needs them", {"reflectance.robust": False}),
     Part("stage 2: residual shading", {"reflectance.residual_shading": False}),
     Part(
@@ -165,6 +155,7 @@ HEADS = {
     "emily 2, 5": Case("emily", ICT, ("c2", "c5"), ("c3", "c4"), (0,)),
     "soft": Case("soft", ICT, timesteps=(0,)),
     "hard": Case("hard", ICT, timesteps=(0,)),
+    **{name: Case(name, timesteps=(0,)) for name in ("table1_5", "table1_6", "table1_7", "table1_8")},
 }
 PHOTOGRAPHED = {
     f"scan_studio, {change or 'as it is'}": Case("scan_studio", timesteps=TWO, changed=change)
@@ -195,7 +186,8 @@ class Fits:
             touched = touched or step.name == part.step
             key = keys[step.name] + (part.label if touched else "")
             if key not in self._kept:
-                began, inputs = time.process_time(), {name: found[name] for name in step.inputs}
+                inputs: Any = {name: found[name] for name in step.inputs}
+                began = time.process_time()
                 done = step.run(source.seen(inputs), inputs, silent, *step.settings)
                 self._kept[key] = done, time.process_time() - began
             found[step.part], seconds = self._kept[key]

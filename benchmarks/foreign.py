@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -201,7 +202,11 @@ def _millimetres(case: dict[str, Any], row: str) -> str:
 def _relit(case: dict[str, Any], row: str) -> str:
     """Path traced where that was done, else by local shading."""
     how = "path" if f"{row}, path" in case.get("relit", {}) else "local"
-    return _figure(case, 1, "relit", f"{row}, {how}", "mean")
+    return _mean_relit(case, f"{row}, {how}")
+
+
+def _mean_relit(case: dict[str, Any], row: str) -> str:
+    return _figure(case, 1, "relit", row, "mean")
 
 
 def _unconverged(case: dict[str, Any]) -> str:
@@ -234,7 +239,7 @@ SURFACE: Columns = {
     "unconverged": _unconverged,
 }
 RELIT: Columns = {
-    f"{title}, {how}": lambda c, row=row, how=how: _figure(c, 1, "relit", f"{row}, {how}", "mean")
+    f"{title}, {how}": partial(_mean_relit, row=f"{row}, {how}")
     for how in ("local", "path")
     for title, row in (("`full`", "full"), ("refitted", "refit"), ("one albedo", "constant albedo"), ("paper", "paper"))
     if how == "local" or row in ("full", "refit")
@@ -392,7 +397,7 @@ def main() -> int:
     whole = all(getattr(a, key) == parser.get_default(key) for key in vars(a) if key not in free)
     found: list[dict[str, Any]] = []
     for case in cases:
-        if case.capture.startswith("ict_"):
+        if case.made:
             mifit.set_variant("auto")
             _ = case.path  # rendered once, before processes ask for it
     with ProcessPoolExecutor(a.jobs, multiprocessing.get_context("spawn")) as pool:

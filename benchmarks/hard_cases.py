@@ -62,7 +62,7 @@ def traced(
 
     def make(base: Path, out: Path) -> None:
         model = MorphableModel.load(MODEL)
-        subject = compose._draw_subject(model, SkinStyle.draw(SEED), TIMESTEPS, 512, "poses", head.OUTSIDE)
+        subject = compose._draw_subject(model, SkinStyle.draw(SEED), TIMESTEPS, 512, head.OUTSIDE, 0.0)
         rotation = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
         subject = dataclasses.replace(
             subject,
@@ -101,7 +101,7 @@ def recoloured(albedo: Callable[[NDArray], NDArray], **others: float) -> Callabl
     """Skin with another albedo, and other maps set to one value."""
 
     def change(maps: SkinMaps) -> SkinMaps:
-        flat = {name: np.full_like(maps.specular, value) for name, value in others.items()}
+        flat: dict[str, Any] = {name: np.full_like(maps.specular, value) for name, value in others.items()}
         return dataclasses.replace(maps, albedo=albedo(maps.albedo).astype(np.float32), **flat)
 
     return change

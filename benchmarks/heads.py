@@ -33,8 +33,8 @@ class Case:
     Attributes
     ----------
     capture : str
-        A folder, the name of one of the shared captures, or ``ict_SEED``: a head made of the ICT model, outside its
-        span by a few millimetres, with landmarks as a detector gives them.
+        A folder, the name of one of the shared captures, ``ict_SEED``: a head made of the ICT model, outside its
+        span by a few millimetres, with landmarks as a detector gives them, or ``table1_NUMBER``: a head of Table 1.
     model : str
         The model that is fitted.
     fitted, held_out : tuple of str
@@ -59,16 +59,21 @@ class Case:
         """The capture's folder; one that is made on the spot is made now."""
         shared = SHARED / "captures" / self.capture
         path = shared if shared.is_dir() else Path(self.capture)
-        if self.capture.startswith("ict_") and not path.is_dir():
+        if self.made and not path.is_dir():
             path = made(self.capture)
         return changed(path, self.changed, self.fitted) if self.changed else path
+
+    @property
+    def made(self) -> bool:
+        """Whether it is made on the spot."""
+        return self.capture.startswith(("ict_", "table1_"))
 
     @property
     def missing(self) -> str:
         """What isn't there of the capture or its model; nothing where the case can run."""
         wanted = [] if self.model == "builtin" else [Path(self.model)]
-        if self.capture.startswith("ict_"):
-            wanted += [Path(ICT), SHARED / "hdri"]
+        if self.made:
+            wanted += [SHARED / "hdri", *[Path(ICT)] * self.capture.startswith("ict_")]
         elif not (SHARED / "captures" / self.capture).is_dir():
             wanted.append(Path(self.capture))
         return next((str(path) for path in wanted if not path.exists()), "")
@@ -108,18 +113,49 @@ OWN = (Case("gloss", ICT, development=True), Case("soft", ICT), Case("hard", ICT
 
 LIGHTS = ("apartment", "studio", "softbox", "city", "sunset")
 OUTSIDE, BIAS = 2.0, 1.9
-"""Millimetres by which made heads leave the model's span, and of a detector's bias per landmark."""
+"""Millimetres by which heads of the ICT model leave its span, and of a detector's bias per landmark: 5 pixels."""
 
 
-def made(name: str, width: int = 680, height: int = 480, spp: int = 64) -> Path:
-    """Folder of an ``ict_SEED`` head, path traced once; another model is fitted to it."""
+@dataclass(frozen=True)
+class Subject:
+    """A head of Table 1 by its number; three lights and five tones meet once in fifteen."""
+
+    number: int
+
+    @property
+    def seed(self) -> int:
+        """Of its identity and skin."""
+        return 100 + self.number
+
+    @property
+    def tone(self) -> float:
+        """Of its skin, fair to deep."""
+        return 0.25 * (self.number % 5)
+
+    @property
+    def outside(self) -> float:
+        """Millimetres by which it leaves the model's span; every third one by more."""
+        return 2.5 if self.number % 3 == 2 else 0.5
+
+    def light(self, further: int = 0) -> Path:
+        """Its environment, or another one of the three."""
+        return SHARED / "hdri" / f"{LIGHTS[(self.number + further) % 3]}.hdr"
+
+
+def made(name: str, size: tuple[int, int] = (680, 480), spp: int = 64) -> Path:
+    """Folder of a head of one timestep with a detector's landmarks, path traced once."""
     from mifit.synth import synthesize
 
-    folder, seed = WORK / name, int(name.rpartition("_")[2])
+    folder, kind, number = WORK / name, name.rpartition("_")[0], int(name.rpartition("_")[2])
     if not (folder / "transforms.json").exists():
         shutil.rmtree(folder, ignore_errors=True)
-        light = SHARED / "hdri" / f"{LIGHTS[seed % len(LIGHTS)]}.hdr"
-        synthesize(folder, 1, 1, light, ICT, seed, width, height, spp, outside=OUTSIDE, landmark_bias=BIAS)
+        if kind == "ict":
+            given = SHARED / "hdri" / f"{LIGHTS[number % len(LIGHTS)]}.hdr", ICT, number
+            synthesize(folder, 1, 1, *given, *size, spp, outside=OUTSIDE, landmark_bias=BIAS)
+        else:
+            one = Subject(number)
+            given = one.light(), "builtin", one.seed
+            synthesize(folder, 1, 1, *given, *size, spp, one.tone, one.outside, landmark_bias=BIAS)
     return folder
 
 

@@ -238,10 +238,12 @@ def scan_maps(capture: Capture) -> tuple[dict[str, NDArray], NDArray | None]:
         return {}, None
     with np.load(folder / "maps.npz") as stored:
         maps = {key: stored[key].astype(np.float32) for key in ("albedo", "specular")}
-    uv = getattr(trimesh.load(meshes[0], process=False).visual, "uv", None)
+    stored_mesh: Any = trimesh.load(meshes[0], process=False)
+    uv = getattr(stored_mesh.visual, "uv", None)
     source = SHARED / "models" / "lee_perry_smith" / "LeePerrySmith.glb"
     if uv is None and source.exists():
-        head = next(iter(trimesh.load(source, process=False).geometry.values()))
+        scene: Any = trimesh.load(source, process=False)
+        head = next(iter(scene.geometry.values()))
         # The file's v counts from the bottom, unlike glTF's, whose v is turned when it is read.
         uv = head.visual.uv * (1, -1) + (0, 1)
     return maps, None if uv is None else np.asarray(uv)

@@ -11,7 +11,7 @@ import platform
 import re
 import subprocess
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -180,7 +180,7 @@ def renew_tables(page: Path, results: Path) -> list[str]:
 
 @contextmanager
 def figure(
-    path: Path, size: tuple[float, float], columns: int = 1, style: Mapping[str, Any] | None = None
+    path: Path, size: tuple[float, float], columns: int = 1, style: dict[Any, Any] | None = None
 ) -> Iterator[Any]:
     """Axes (an array of them for several columns) to draw on; written to `path` at the end, in inches of `size`."""
     import matplotlib

@@ -61,7 +61,7 @@ def by_step(config: FitConfig, timesteps: int, until: Any = "normals") -> tuple[
     source = fitting.Source(capture, capture.digest(CAMERAS, steps), model, CAMERAS, steps, 0)
     found, costs = dict[Any, Any](), {}
     for step in fitting.steps(config, until):
-        inputs = {part: found[part] for part in step.inputs}
+        inputs: Any = {part: found[part] for part in step.inputs}
         with measured(history=False) as cost:
             found[step.part] = step.run(source.seen(inputs), inputs, silent, *step.settings)
         costs[step.name] = cost.figures()

@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 
 import mifit
 from benchmarks.foreign import replace_size, without_specular
-from benchmarks.heads import DEVELOPMENT_SUBJECTS
-from benchmarks.record import RESULTS, SHARED, conditions, machine, record
+from benchmarks.heads import BIAS, DEVELOPMENT_SUBJECTS, Subject
+from benchmarks.record import RESULTS, conditions, machine, record
 from benchmarks.truth import truth_errors
 from mifit import Capture, FitConfig, MorphableModel, Reconstruction
 from mifit.core.files import write_text
@@ -40,10 +40,6 @@ from mifit.errors import InputError
 from mifit.output.evaluate import evaluate, face_area
 from mifit.result import Method
 
-ENVIRONMENTS = ("apartment", "studio", "softbox")
-TONES = (0.0, 0.25, 0.5, 0.75, 1.0)  # fair to deep; three lights and five tones meet once in fifteen subjects
-SEED = 100
-"""Of subject 0; the others follow."""
 ROWS = {
     "pca": "stage 1's model",
     "image_based": "image-based rendering on our mesh, the best of three blends",
@@ -53,10 +49,6 @@ ROWS = {
     "paper": "the paper as written (`--preset paper`)",
     "perfect": "`full` from perfect landmarks",
 }
-OUTSIDE, OUTSIDE_FAR = 0.5, 2.5
-"""Millimetres by which heads leave the model's span; every third one by more."""
-LANDMARK_BIAS = 1.9
-"""Millimetres: 5 pixels at 680 x 480."""
 CAMERAS = ("left", "right")
 MEASURES = {"psnr": ("PSNR dB", 2), "rmse": ("RMSE of 255", 2), "ssim": ("SSIM", 4), "flip": ("FLIP", 4)}
 TRUTHS = {
@@ -91,16 +83,17 @@ def run_subject(subject: int, work: Path, size: dict[str, int], model: str, texe
     """Synthesise, fit and judge one subject in a process of its own; what is done already is kept."""
     folder = work / f"subject_{subject:02d}"
     figures = folder / "figures.json"
-    environment = SHARED / "hdri" / f"{ENVIRONMENTS[subject % len(ENVIRONMENTS)]}.hdr"
+    made = Subject(subject)
+    environment = made.light()
     light = ["--env", environment] if environment.exists() else []
-    for name, bias in (("capture", LANDMARK_BIAS), ("perfect", 0.0)):
+    for name, bias in (("capture", BIAS), ("perfect", 0.0)):
         if not (folder / name / "transforms.json").exists():
             if name == "perfect":  # the same images: only the landmarks are other ones
                 perfect_landmarks(folder / "capture", folder / name, size, model, subject)
                 continue
             options = [part for key, value in size.items() for part in (f"--{key}", value)]
-            command("synth", "--out", folder / name, "--seed", SEED + subject, "--model", model, "--force",
-                  "--tone", TONES[subject % len(TONES)], "--outside", outside(subject), "--landmark-bias", bias,
+            command("synth", "--out", folder / name, "--seed", made.seed, "--model", model, "--force",
+                  "--tone", made.tone, "--outside", made.outside, "--landmark-bias", bias,
                   *options, *light)  # fmt: skip
     if not figures.exists():
         done = subprocess.run(
@@ -114,8 +107,8 @@ def run_subject(subject: int, work: Path, size: dict[str, int], model: str, texe
         "subject": subject,
         "set": "development" if subject < DEVELOPMENT_SUBJECTS else "locked",
         "light": environment.stem if light else "procedural",
-        "tone": TONES[subject % len(TONES)],
-        "outside_mm": outside(subject),
+        "tone": made.tone,
+        "outside_mm": made.outside,
         **json.loads(figures.read_text()),
     }
 
@@ -168,11 +161,6 @@ def fit_subject(folder: Path, model: str, texels: int, paper: bool) -> None:
     write_text(folder / "figures.json", json.dumps(judge(folder, found), indent=2) + "\n")
 
 
-def outside(subject: int) -> float:
-    """Millimetres by which a subject's head leaves the model."""
-    return OUTSIDE_FAR if subject % 3 == 2 else OUTSIDE
-
-
 def perfect_landmarks(capture: Path, out: Path, size: dict[str, int], model: str, subject: int) -> None:
     """The same capture with landmarks at the true vertices, a detector's noise on top."""
     from mifit.capture.landmark_files import Landmarks, write_landmarks
@@ -185,7 +173,7 @@ def perfect_landmarks(capture: Path, out: Path, size: dict[str, int], model: str
     for (camera, timestep), shot in loaded.shots.items():
         with np.load(out / "truth" / f"{timestep:04d}.npz") as truth:
             points = loaded.camera(camera).project(truth["vertices"][vertices].astype(np.float64))
-        rng = np.random.default_rng([SEED + subject, timestep, len(camera), 23])
+        rng = np.random.default_rng([Subject(subject).seed, timestep, len(camera), 23])
         points += LANDMARK_NOISE * size["width"] / 680 * rng.standard_normal(points.shape)
         found = loaded.landmarks(camera, timestep)
         assert found is not None and shot.landmarks is not None
@@ -296,7 +284,7 @@ def run(
     figures: dict[str, Any] = {
         "size": {**size, "texels": texels},
         "model": model,
-        "landmark_bias_mm": LANDMARK_BIAS,
+        "landmark_bias_mm": BIAS,
         "region": "true geometry",
         "subjects": rows,
         "failures": failures,
@@ -305,7 +293,7 @@ def run(
     if rows:
         figures["summary"] = summary(rows)
     write_text(RESULTS / f"{name}.md", markdown(rows, failures))
-    record(name, figures, seeds=[SEED + i for i in range(subjects)])
+    record(name, figures, seeds=[Subject(i).seed for i in range(subjects)])
     return figures
 
 
@@ -314,11 +302,11 @@ def relight(subjects: Iterable[int], work: Path, model: str, size: dict[str, int
     mifit.set_variant("auto")
     rows = []
     for subject in subjects:
-        environment = SHARED / "hdri" / f"{ENVIRONMENTS[(subject + 1) % len(ENVIRONMENTS)]}.hdr"
-        folder = work / f"subject_{subject:02d}"
+        made = Subject(subject)
+        environment, folder = made.light(1), work / f"subject_{subject:02d}"
         if not (folder / "relit" / "transforms.json").exists():
-            command("synth", "--out", folder / "relit", "--seed", SEED + subject, "--model", model,
-                    "--env", environment, "--tone", TONES[subject % len(TONES)], "--outside", outside(subject),
+            command("synth", "--out", folder / "relit", "--seed", made.seed, "--model", model,
+                    "--env", environment, "--tone", made.tone, "--outside", made.outside,
                     "--timesteps", RELIT_TIMESTEPS, "--width", size["width"], "--height", size["height"],
                     "--spp", size["spp"], "--force")  # fmt: skip
         result, capture = Reconstruction.load(folder / "result"), Capture.load(folder / "relit")
@@ -326,7 +314,7 @@ def relight(subjects: Iterable[int], work: Path, model: str, size: dict[str, int
             integrator: evaluate_relit(result, environment, capture, "third", integrator=integrator)["methods"]
             for integrator in ("local", "path")
         }
-        kinds = {"fitted_under": ENVIRONMENTS[subject % len(ENVIRONMENTS)], "relit_by": environment.stem}
+        kinds = {"fitted_under": made.light().stem, "relit_by": environment.stem}
         rows.append({"subject": subject, **kinds, **judged})
     return rows
 
@@ -417,7 +405,9 @@ def main() -> int:
     print((RESULTS / f"{name}.md").read_text())
     if a.relight:
         rows = relight([row["subject"] for row in figures["subjects"]], a.work, a.model, size)
-        record("relight", {"subjects": rows, "reduced": a.reduced}, seeds=[SEED + row["subject"] for row in rows])
+        record(
+            "relight", {"subjects": rows, "reduced": a.reduced}, seeds=[Subject(row["subject"]).seed for row in rows]
+        )
         write_text(RESULTS / "relight.md", relit_markdown(rows))
     return 1 if figures["failures"] else 0
 

@@ -113,7 +113,9 @@ def normal_errors(result: Reconstruction, capture: Path, bump_unit: float) -> di
     for i, timestep in enumerate(result.timesteps):
         true = bumped_normals(model, capture, timestep, texels, bump_unit)
         before.append(angle(_smooth_normals(model, result.geometry.vertices[i].astype(np.float64), texels), true))
-        refined = texels.from_map(result.refined_normal(timestep)) @ result.geometry.rotation[i].T
+        normals = result.refined_normal(timestep)
+        assert normals is not None
+        refined = texels.from_map(normals) @ result.geometry.rotation[i].T
         after.append(angle(refined, true))
     return {
         "normal_degrees_stage1": round(float(np.mean(before)), 3),

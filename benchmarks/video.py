@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 
 import mifit as mi
-from benchmarks.heads import Case
+from benchmarks.heads import BIAS, Case, Subject
 from benchmarks.judge import Row, judge_mesh, judge_surface, judge_views
 from benchmarks.record import SHARED, record
-from benchmarks.table1 import BUMP_UNIT, ENVIRONMENTS, LANDMARK_BIAS, SEED, TONES, command, outside
+from benchmarks.table1 import BUMP_UNIT, command
 from benchmarks.truth import truth_errors
 from mifit import Capture, FitConfig, MorphableModel, Reconstruction
 from mifit.core.files import write_text
@@ -50,11 +50,12 @@ def video(subject: int, frames: int, work: Path) -> Path:
     """Folder of a head's video, rendered once."""
     folder = work / f"subject_{subject:02d}" / "capture"
     if not (folder / "transforms.json").exists():
-        environment = SHARED / "hdri" / f"{ENVIRONMENTS[subject % len(ENVIRONMENTS)]}.hdr"
+        made = Subject(subject)
+        environment = made.light()
         light = ["--env", environment] if environment.exists() else []
         options = [part for key, value in SIZE.items() for part in (f"--{key}", value)]
-        command("synth", "--out", folder, "--seed", SEED + subject, "--force", "--tone", TONES[subject % len(TONES)],
-              "--outside", outside(subject), "--landmark-bias", LANDMARK_BIAS, "--timesteps", frames, *options,
+        command("synth", "--out", folder, "--seed", made.seed, "--force", "--tone", made.tone,
+              "--outside", made.outside, "--landmark-bias", BIAS, "--timesteps", frames, *options,
               *light)  # fmt: skip
     return folder
 
@@ -178,7 +179,7 @@ def main() -> None:
     figures = {"size": SIZE, "texels": arguments.texels, "rows": rows, "means": means(rows)}
     if arguments.scan:
         figures["scan"] = run_video("scan", Capture.load(scan_video(*given[:2])), judge_scan, *given)
-    record("video", figures, [SEED + i for i in range(arguments.subjects)])
+    record("video", figures, [Subject(i).seed for i in range(arguments.subjects)])
 
 
 if __name__ == "__main__":

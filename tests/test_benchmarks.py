@@ -12,7 +12,7 @@ import pytest
 from benchmarks import ablation, mutations
 from benchmarks.mutations import Mutation
 from benchmarks.record import RESULTS, renew_tables
-from mifit.sampling import observations
+from mifit.stages import find_surface
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
@@ -72,11 +72,11 @@ def test_parts_are_told_against_the_base_of_their_head_and_set():
 
 
 def test_a_part_is_off_only_while_its_row_is_fitted():
-    (part,) = (part for part in ablation.PARTS if "mifit.sampling.observations.inlier_probability" in part.patches)
-    before = observations.inlier_probability
+    (part,) = (part for part in ablation.PARTS if "mifit.stages.find_surface.align_timesteps" in part.patches)
+    before = find_surface.align_timesteps
     with part.applied():
-        assert observations.inlier_probability is not before
-    assert observations.inlier_probability is before
+        assert find_surface.align_timesteps is not before
+    assert find_surface.align_timesteps is before
 
 
 def test_a_part_that_there_is_no_more_is_named(monkeypatch):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks import table1
+from benchmarks import heads, table1
 from benchmarks.truth import truth_errors
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.uv import rasterize_uv
@@ -142,4 +142,4 @@ def test_one_table_has_one_commit(tmp_path, monkeypatch):
 
 
 def test_every_third_head_is_far_outside_the_model():
-    assert [table1.outside(i) > 2 for i in range(15)].count(True) == 5
+    assert [heads.Subject(i).outside > 2 for i in range(15)].count(True) == 5

@@ -20,18 +20,10 @@ from mifit.appearance.occlusion import OccludingMesh
 from mifit.core.camera import Camera
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, hidden
 from mifit.core.mesh import interpolate, normalize, vertex_normals
-from mifit.core.process import BLOCK, blocks, on_all_cores
+from mifit.core.process import BLOCK, on_all_cores
 from mifit.core.uv import TexelMap, bilinear, rasterize_uv
 from mifit.errors import InputError
-from mifit.sampling.visibility import (
-    FacePixels,
-    background,
-    facing,
-    footprint,
-    inlier_probability,
-    outlier_prior,
-    texel_area,
-)
+from mifit.sampling.visibility import FacePixels, background, facing, footprint, outlier_prior, texel_area
 
 if TYPE_CHECKING:
     from mifit.capture import Capture, Frame
@@ -333,7 +325,8 @@ class Surface:
         face, weights = self.texels.face[texel], self.texels.weights[texel]
         n, j, t = len(texel), len(self._images), len(self.vertices)
         colour, view = (np.zeros((n, j, 3), dtype=np.float32) for _ in range(2))
-        weight, outlier, cosine = (np.zeros((n, j), dtype=np.float32) for _ in range(3))
+        weight, cosine = (np.zeros((n, j), dtype=np.float32) for _ in range(2))
+        inlier = np.ones((n, j), dtype=np.float32)
         clipped = np.zeros((n, j), dtype=bool)
         point, normal = (np.zeros((n, t, 3), dtype=np.float32) for _ in range(2))
         for i in range(t):
@@ -363,7 +356,8 @@ class Surface:
             clipped[rows, k] = bilinear(image.clipped, *pixel) > 0.0
             if self.robust:
                 depth = (point[rows, image.step] - camera.position) @ camera.rotation[2]
-                outlier[rows, k] = outlier_prior(cosine[rows, k], bilinear(image.outline, *pixel) * depth / camera.fx)
+                millimetres = bilinear(image.outline, *pixel) * depth / camera.fx
+                inlier[rows, k] = 1.0 - outlier_prior(cosine[rows, k], millimetres)
 
         places = on_all_cores(place, range(j))
         for k, (image, (rows, pixel, lost)) in enumerate(zip(self._images, places, strict=True)):
@@ -372,14 +366,7 @@ class Surface:
             weight[rows[~visible], k] = 0.0
             places[k] = rows[visible], pixel[:, visible], lost[visible]
         on_all_cores(read, range(j))
+        weight *= inlier
         step = np.array([image.step for image in self._images])
-        inlier = np.float32(1.0) - outlier
-        if self.robust:
-            parts = blocks(n, 32 * j)
-            compared = on_all_cores(
-                lambda r: inlier_probability(colour[r], weight[r], outlier[r], clipped[r], step), parts
-            )
-            inlier = np.concatenate(compared) if compared else inlier
-            weight *= np.minimum(inlier, 1.0 - outlier)  # confirmed or not, a twin of a view adds nothing new
         camera = np.array([image.camera_index for image in self._images])
         return Observations(step, camera, texel, face, weights, colour, weight, clipped, inlier, point, normal, view)

@@ -3,8 +3,7 @@
 A fitted mesh is a few millimetres off. Seen head on that shifts a colour a little; near the outline of the mesh in an
 image it puts the background, an ear or the far cheek where the point should be, in full sharpness and at any
 brightness. So each sample has a prior probability of showing something else, which rises with the view angle and
-towards the outline, and cameras that see a point at the same time judge one another: where two disagree, the one that
-was less likely an inlier gives way. A colour that no other camera confirms keeps its prior.
+towards the outline.
 """
 
 from __future__ import annotations
@@ -35,10 +34,6 @@ OUTLINE_MM = 3.0
 4 mm off real heads."""
 OUTLIER = (0.01, 0.5)
 """Prior probability of showing something else: head on (hair, a strap, a stray hand), and at the outline."""
-SPREAD, RANGE = 0.2, 4.0
-"""Scale of log colour ratios of two cameras at one point (Cauchy: specular reflection and shifted texture), and width
-of the range in which something else may show any."""
-ROUNDS = 4
 DARKEST = 0.004
 """Linear colour, of images or of albedo, below which ratios are noise: one step of 8-bit codes."""
 ALIKE = 0.15
@@ -176,58 +171,3 @@ def outlier_prior(cosine: NDArray, millimetres: NDArray) -> NDArray[np.float32]:
     edge = np.exp(-np.maximum(millimetres, 0.0) / OUTLINE_MM)
     least, most = map(np.float32, OUTLIER)
     return least + (most - least) * np.maximum(angle, edge).astype(np.float32)
-
-
-def inlier_probability(
-    colour: NDArray, weight: NDArray, outlier: NDArray, clipped: NDArray, step: NDArray[np.int64]
-) -> NDArray[np.float32]:
-    """Probability that each sample shows its point, given what others show at the same time.
-
-    Parameters
-    ----------
-    colour : (N, J, 3)
-        Linear.
-    weight : (N, J)
-        0 where not observed.
-    outlier : (N, J)
-        `outlier_prior` of each.
-    clipped : (N, J) bool
-        Lower bounds: they neither judge nor are judged.
-    step : (J,)
-        Images of one step show the same pose and light, so a point's Lambertian colour is the same in all of them.
-
-    Returns
-    -------
-    (N, J) float32
-        Posterior of a mixture of a Cauchy distribution about the multi-view mean and an even one, per point and step.
-
-    Notes
-    -----
-    The mean starts at the colour of the sample with the largest weight times prior, so that of two that contradict
-    each other the likelier one stands.
-    """
-    inlier = (1.0 - outlier).astype(np.float32)
-    level = np.log(np.maximum(colour, DARKEST)).astype(np.float32)
-    for s in np.unique(step):
-        images = np.flatnonzero(step == s)
-        use = (weight[:, images] > 0) & ~clipped[:, images]
-        rows = np.flatnonzero(use.sum(axis=1) > 1)
-        if not len(rows):
-            continue
-        here = np.ix_(rows, images)
-        use, prior = use[rows], inlier[here]
-        channels = [level[..., channel][here] for channel in range(3)]  # sums along three neighbours are slow
-        share = np.where(use, weight[here] * prior, 0.0)
-        best = share.argmax(axis=1)
-        centre = [channel[np.arange(len(rows)), best] for channel in channels]
-        posterior = prior
-        for _ in range(ROUNDS):
-            squares = [(channel - c[:, None]) ** 2 for channel, c in zip(channels, centre, strict=True)]
-            departure = (squares[0] + squares[1] + squares[2]) / np.float32(3)
-            likely = prior / (np.pi * SPREAD * (1.0 + departure / SPREAD**2))
-            posterior = likely / (likely + (1.0 - prior) / RANGE)
-            own = share * posterior
-            total = own.sum(axis=1)
-            centre = [(own * channel).sum(axis=1) / total for channel in channels]
-        inlier[here] = np.where(use, posterior, inlier[here])
-    return inlier

@@ -5,51 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mifit.sampling.visibility import (
-    OUTLIER,
-    background,
-    footprint,
-    inlier_probability,
-    outlier_prior,
-    outline_distance,
-)
+from mifit.sampling.visibility import OUTLIER, background, footprint, outlier_prior, outline_distance
 from tests.output.conftest import ball_camera
 
-SKIN, BACKGROUND = (0.5, 0.3, 0.25), (0.02, 0.02, 0.03)
-
-
-def judge(colours, wrong, weight=None, clipped=None, step=None):
-    colour = np.array(colours, dtype=np.float32)[None]
-    n = colour.shape[1]
-    return inlier_probability(
-        colour,
-        np.ones((1, n), np.float32) if weight is None else np.array([weight], np.float32),
-        np.array([wrong], dtype=np.float32),
-        np.zeros((1, n), bool) if clipped is None else np.array([clipped]),
-        np.zeros(n, dtype=np.int64) if step is None else np.array(step),
-    )[0]
-
-
-def test_the_view_at_its_outline_gives_way_to_the_one_head_on() -> None:
-    right = judge([SKIN, BACKGROUND], [0.02, 0.4])
-    assert right[0] > 0.95 and right[1] < 0.1
-    assert judge([BACKGROUND, SKIN], [0.4, 0.02]) == pytest.approx(right[::-1])
-
-
-def test_views_that_agree_confirm_one_another() -> None:
-    right = judge([SKIN, tuple(1.1 * c for c in SKIN)], [0.02, 0.4])
-    assert right[1] > 0.8 > 1 - 0.4
-
-
-def test_a_highlight_seen_head_on_stays() -> None:
-    right = judge([(0.8, 0.6, 0.55), SKIN], [OUTLIER[0]] * 2)
-    assert right.min() > 0.9
-
-
-def test_a_lone_a_clipped_and_another_steps_observation_keep_their_own_probability() -> None:
-    assert judge([BACKGROUND, SKIN], [0.4, 0.02], weight=[1, 0]) == pytest.approx([0.6, 0.98])
-    assert judge([BACKGROUND, SKIN], [0.4, 0.02], clipped=[True, False]) == pytest.approx([0.6, 0.98])
-    assert judge([BACKGROUND, SKIN], [0.4, 0.02], step=[0, 1]) == pytest.approx([0.6, 0.98])
+SKIN = (0.5, 0.3, 0.25)
 
 
 def test_doubt_rises_to_the_outline_and_with_the_angle() -> None:
