@@ -258,7 +258,7 @@ FITTING = {
     "view": ("clipped", "no pixel of the face", "exposure", "noise", "no camera measures"),
 }
 """What a warning must speak of to fit a mesh that is wrong, or a view that is wrong though the mesh isn't."""
-UNITS, MARKS = ("unit", "scale", "too large", "too small"), ("landmarks scatter", "detector", "order", "in one place")
+UNITS, MARKS = ("unit", "scale", "too large", "too small"), ("landmarks scatter", "landmarks of the left side")
 SAME_MM = 0.01
 """Vertices of two results that are the same."""
 

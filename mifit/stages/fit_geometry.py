@@ -75,7 +75,7 @@ def fit_geometry(
     Raises
     ------
     InputError
-        No camera or timestep, or a timestep with fewer than six visible landmarks.
+        No camera or timestep, or a timestep with fewer than six visible landmarks off the jaw.
     ConvergenceError
         No usable fit.
 

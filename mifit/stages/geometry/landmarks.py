@@ -208,7 +208,7 @@ def landmark_views(
     noise: float,
     fewest: int = MIN_VISIBLE,
 ) -> tuple[LandmarkView, ...]:
-    """Visible landmarks of all images; raises InputError for a timestep with fewer than ``fewest`` in total."""
+    """Visible landmarks of all images; raises InputError for a timestep with fewer than ``fewest`` within the face."""
     views = []
     for step, timestep in enumerate(timesteps):
         counts = {}
@@ -221,7 +221,7 @@ def landmark_views(
             # far outside the image is no detection but an error of whatever wrote the file
             near = (np.abs(pixels) < FARTHEST_PIXEL * max(frame.image.shape)).all(1)
             index = np.flatnonzero(frame.visible & near)
-            counts[name] = len(index)
+            counts[name] = int((index >= INNER[0]).sum())
             if len(index):
                 vertices = model.landmarks[index]
                 basis = PointBasis.at_vertices(model, vertices)
@@ -231,8 +231,8 @@ def landmark_views(
         if sum(counts.values()) < fewest:
             found = ", ".join(f"{n} in camera {name}" for name, n in counts.items())
             raise InputError(
-                f"timestep {timestep}: found {sum(counts.values())} visible landmarks ({found}), expected at "
-                f"least {fewest} in total; detect them with `mifit landmarks` or leave the timestep out"
+                f"timestep {timestep}: found {sum(counts.values())} visible landmarks of brows, eyes, nose and mouth "
+                f"({found}), expected at least {fewest}; detect them with `mifit landmarks` or leave the timestep out"
             )
     return tuple(views)
 
