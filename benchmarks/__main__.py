@@ -16,18 +16,18 @@ from benchmarks.record import RESULTS, SHARED, renew_tables
 
 Runs = tuple[tuple[str, list[str]], ...]
 REDUCED: Runs = (
-    ("foreign", ["--reduced"]),
+    ("foreign", ["--reduced", "--seeds", "--rows", "full", "refit"]),
     ("foreign", ["--own", "--reduced", "--rows", "full", "refit"]),
     (
         "table1",
         ["--reduced", "--subjects", "8", "--no-paper", "--relight", "--jobs", "2", "--work", "out/table1_reduced"],
     ),
-    ("ablation", ["--heads", "scan_sun", "scan_studio", "gloss"]),
+    ("ablation", ["--heads", "scan_studio"]),
     ("speed", ["--reduced"]),
     ("hard_cases", []),
 )
 FULL: Runs = (
-    ("foreign", []),
+    ("foreign", ["--seeds"]),
     ("foreign", ["--own"]),
     ("table1", ["--relight", "--jobs", "2"]),
     ("ablation", []),

@@ -44,6 +44,8 @@ RELIT_SAMPLES = 64
 SCALE_DEVIATION = 0.2
 """Of the paper's scale, which it estimates: logarithm."""
 SEED = 0
+FURTHER_SEEDS = 1, 2
+"""Of fits whose spread is shown; the tables are the first seed's."""
 REDUCED_TEXELS = 256
 
 
@@ -120,6 +122,22 @@ def replace_size(config: FitConfig, size: int) -> FitConfig:
 # -- judging ------------------------------------------------------------
 
 
+def over_seeds(case: Case, first: dict[str, Any], config: FitConfig) -> list[dict[str, float]]:
+    """Error over skin and against the scan of `full`: the first seed's, which is known, and that of further ones."""
+    capture, model, found = Capture.load(case.path), MorphableModel.load(case.model), [first]
+    for seed in FURTHER_SEEDS:
+        row = {"full": Row.of(mifit.fit(capture, model, case.fitted, case.timesteps, config, seed=seed))}
+        one: dict[str, Any] = {"held_out": judge.judge_views(case, capture, row, case.held_out)}
+        if "mesh" in first:
+            one["mesh"] = {"full": judge.judge_mesh(case, capture, row["full"])}
+        found.append(one)
+    return [
+        {"skin": one["held_out"]["full"]["skin"]["psnr"]}
+        | ({"mean_mm": one["mesh"]["full"]["mean_mm"]} if "mesh" in one else {})
+        for one in found
+    ]
+
+
 def judge_case(
     case: Case, rows: Mapping[str, Row], integrators: Sequence[str], samples: int, lights: int
 ) -> dict[str, Any]:
@@ -166,6 +184,8 @@ def run_case(case: Case, arguments: argparse.Namespace, config: FitConfig) -> di
         fitted = time.process_time() - used
         integrators = ("local",) if arguments.reduced else ("local", "path")
         figures = judge_case(case, rows, integrators, RELIT_SAMPLES, 2 if arguments.reduced else 9)
+        if arguments.seeds:
+            figures["seeds"] = over_seeds(case, figures, config)
     except MifitError as error:
         return {**named, "failed": str(error)}
     spent = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - used, "fit_cpu": fitted}
@@ -199,6 +219,12 @@ def _millimetres(case: dict[str, Any], row: str) -> str:
     return " / ".join(_figure(case, 2, "mesh", row, key) for key in ("median_mm", "mean_mm", "p90_mm"))
 
 
+def _spread(case: dict[str, Any], key: str, digits: int) -> str:
+    """Largest less smallest of a figure over the seeds."""
+    values = [seed[key] for seed in case.get("seeds", ()) if key in seed]
+    return f"{max(values) - min(values):.{digits}f}" if len(values) > 1 else "-"
+
+
 def _relit(case: dict[str, Any], row: str) -> str:
     """Path traced where that was done, else by local shading."""
     how = "path" if f"{row}, path" in case.get("relit", {}) else "local"
@@ -217,6 +243,7 @@ def _unconverged(case: dict[str, Any]) -> str:
 
 HELD_OUT: Columns = {
     "`full`": lambda c: _psnr(c, "full"),
+    "spread over seeds": lambda c: _spread(c, "skin", 1),
     "`full`, model alone": lambda c: _psnr(c, "model alone"),
     "refitted without specular": lambda c: _psnr(c, "refit"),
     "one albedo": lambda c: _psnr(c, "constant albedo"),
@@ -229,6 +256,7 @@ HELD_OUT: Columns = {
 }
 SURFACE: Columns = {
     "scan to mesh, median / mean / 90 % mm": lambda c: _millimetres(c, "full"),
+    "mean's spread over seeds": lambda c: _spread(c, "mean_mm", 2),
     "paper, literal": lambda c: _millimetres(c, "paper"),
     "paper, normalised": lambda c: _millimetres(c, "paper, normalised"),
     "normals °": lambda c: _figure(c, 1, "surface", "full", "normal_degrees"),
@@ -384,6 +412,7 @@ def main() -> int:
     parser.add_argument("--held-out", type=names, help="cameras to judge by")
     parser.add_argument("--model", help="builtin, ict or a file, instead of each case's")
     parser.add_argument("--config", type=Path, help="settings of the fit")
+    parser.add_argument("--seeds", action="store_true", help="three seeds, whose spread the tables show")
     parser.add_argument("--jobs", type=int, default=2, help="cases at a time, each in a process of its own")
     parser.add_argument("--json", type=Path, help="write the figures to a file of one's own")
     a = parser.parse_args()
@@ -393,7 +422,7 @@ def main() -> int:
     cases, skipped = cases_of(a)
     for text in skipped:
         print(f"left out: {text}", file=sys.stderr, flush=True)
-    free = ("own", "reduced", "jobs", "json", "rows")
+    free = ("own", "reduced", "jobs", "json", "rows", "seeds")
     whole = all(getattr(a, key) == parser.get_default(key) for key in vars(a) if key not in free)
     found: list[dict[str, Any]] = []
     for case in cases:
