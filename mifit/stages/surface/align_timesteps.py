@@ -1,8 +1,7 @@
 """Pose and expression of each timestep, by what its views show of one surface.
 
-Landmarks that share a bias leave a head's expressions apart by tenths of a millimetre and its poses by a degree, which
-shifts all that is painted on the skin from one timestep to the next by pixels. Every view's texture is compared with
-the mean of all views of all timesteps, and each timestep follows its gradient:
+Landmarks leave what is painted on the skin pixels apart from one timestep to the next. Every view's texture is compared
+with the mean of all views of all timesteps, and each timestep follows its gradient:
 
     sum_ki w_ki (f_i(x_k(r_k, t_k, e_k)) - mean)^2 / s^2 + |e_k|^2 / EXPRESSION^2 + |r_k, t_k / size|^2 / POSE^2
 
@@ -14,7 +13,6 @@ that stay agree with it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +21,7 @@ from numpy.typing import NDArray
 from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate
 from mifit.core.metrics import INDEPENDENT, median_deviation
-from mifit.core.process import threads
+from mifit.core.process import on_all_cores
 from mifit.core.uv import TexelMap
 from mifit.morphable import MorphableModel
 from mifit.stages.geometry.parameters import exponential
@@ -63,15 +61,6 @@ class Look:
     weight: NDArray[np.float64]
     slope: NDArray[np.float64]
     pixel: float
-
-
-@dataclass(frozen=True)
-class _View:
-    """One view: its timestep's position among those aligned, its image, and how well it sees each point."""
-
-    step: int
-    image: FeatureImage
-    seen: NDArray[np.float32]
 
 
 def align_timesteps(
@@ -120,12 +109,11 @@ def align_timesteps(
         spent[:, 6:] = geometry.expression - expected
     if not still:
         spent -= spent.mean(axis=0)
-    views = _views(posed, rows)
-    owner = np.array([view.step for view in views])
+    owner = np.repeat(np.arange(len(posed)), [len(p.images) for p in posed])
     for _ in range(ITERATIONS):
         at = start + scale * np.einsum("nck,tk->tnc", basis, changes)
         at = at @ turns.transpose(0, 2, 1) + shifts[:, None]
-        looks = _looks(views, [c + x @ r.T for x, c, r in zip(at, middles, rotation, strict=True)])
+        looks = _looks(posed, rows, [c + x @ r.T for x, c, r in zip(at, middles, rotation, strict=True)])
         steps = _steps(looks, still, owner, at, rotation, turns, scale * basis, wide, spent)
         if steps is None:
             return geometry
@@ -146,7 +134,7 @@ def align_timesteps(
 def looks_at(texels: TexelMap, posed: Sequence[Posed]) -> list[Look]:
     """What all views show of the points that `align_timesteps` compares."""
     rows = _points(texels)
-    return _looks(_views(posed, rows), [p.position[rows] for p in posed])
+    return _looks(posed, rows, [p.position[rows] for p in posed])
 
 
 def _points(texels: TexelMap) -> NDArray[np.intp]:
@@ -157,16 +145,11 @@ def _points(texels: TexelMap) -> NDArray[np.intp]:
     return rows
 
 
-def _views(posed: Sequence[Posed], rows: NDArray) -> list[_View]:
-    return [
-        _View(k, image, seen[rows]) for k, p in enumerate(posed) for image, seen in zip(p.images, p.seen, strict=True)
-    ]
-
-
-def _looks(views: Sequence[_View], world: Sequence[NDArray]) -> list[Look]:
-    """What each view shows of its timestep's points (n, 3)."""
-    with ThreadPoolExecutor(threads()) as pool:
-        return list(pool.map(lambda view: _look(view.image, world[view.step], view.seen), views))
+def _looks(posed: Sequence[Posed], rows: NDArray, world: Sequence[NDArray]) -> list[Look]:
+    """What each view shows of its timestep's points (n, 3), which are texels' ``rows``."""
+    steps = zip(posed, world, strict=True)
+    given = [(image, at, seen[rows]) for p, at in steps for image, seen in zip(p.images, p.seen, strict=True)]
+    return on_all_cores(lambda view: _look(*view), given)
 
 
 def _look(image: FeatureImage, points: NDArray, seen: NDArray) -> Look:
@@ -215,8 +198,7 @@ def _steps(
         jacobian = np.concatenate([np.cross(at[k, some], slope), slope, bent], axis=1)
         system[k] += (jacobian * counts[some, None]).T @ jacobian
         gradient[k] += jacobian.T @ (counts[some] * off[some])
-    found: NDArray[np.float64] = -np.linalg.solve(system, gradient[..., None])[..., 0].astype(np.float64)
-    return found
+    return np.asarray(-np.linalg.solve(system, gradient[..., None])[..., 0], np.float64)
 
 
 def _moved(

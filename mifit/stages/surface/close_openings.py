@@ -97,7 +97,6 @@ def close_openings(
     cameras : sequence of str
         Cameras to read; no other camera of the capture is touched.
     openings : sequence of Opening
-        What to look at.
 
     Returns
     -------
@@ -127,11 +126,10 @@ def close_openings(
                 found.lines[k] = line
             elif closed is False and opening.blinks:
                 open_eyed.add(k)
-    for (opening, _), found in zip(known, seen, strict=True):
-        if opening.blinks:
-            found.lines = {k: line for k, line in found.lines.items() if k not in open_eyed}
     details = {}
     for (opening, margins), found in zip(known, seen, strict=True):
+        if opening.blinks:
+            found.lines = {k: line for k, line in found.lines.items() if k not in open_eyed}
         details[opening.name] = {
             "closed": [int(geometry.timesteps[k]) for k in found.lines],
             "opening_mm": dict(zip(map(str, geometry.timesteps), found.heights_mm, strict=True)),
@@ -177,7 +175,7 @@ def _closed(
     expression = geometry.expression.copy()
     for k in range(len(shapes)):
         rest = region.fade(wanted[k] - mean) if k in wanted else -shared
-        expression[k] = region.adjusted(model, expression[k], rest)
+        expression[k] = region.adjusted(expression[k], rest)
     return moved_by(model, replace(geometry, expression=expression), shared)
 
 
@@ -224,7 +222,7 @@ def _closed_line(
             continue
         votes.append(read.closed)
         # Depth moves what a view shows at a height: by how much, across the line.
-        at, up, deep = (camera.project(world(middle + d * 0.1 / unit_mm)) for d in (0.0 * UP, UP, FORWARD))
+        at, up, deep = (camera.project(world(middle + d * STEP_MM / unit_mm)) for d in (0.0 * UP, UP, FORWARD))
         tangent = np.gradient(at, axis=0)
         across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
         rows.append((read.height, read.weight, ((deep - at) * across).sum(1) / ((up - at) * across).sum(1)))

@@ -146,11 +146,8 @@ def read_strip(
     nothing = ClosedLine(None, np.zeros(len(strip)), np.zeros(len(strip)))
     if seen.mean() < 0.5:
         return nothing
-    colour = gaussian_filter(
-        np.log(np.maximum(np.asarray(strip, dtype=np.float64), DARKEST)),
-        (STEP_MM / column_mm, 1.0, 0.0),
-        mode="nearest",
-    )
+    log = np.log(np.maximum(np.asarray(strip, dtype=np.float64), DARKEST))
+    colour = gaussian_filter(log, (STEP_MM / column_mm, 1.0, 0.0), mode="nearest")
     dark, red = 0.5 * (colour[..., 1] + colour[..., 2]), colour[..., 0] - colour[..., 1]
     apart = round(LINE_MM / STEP_MM)
     depth = np.full(dark.shape, -np.inf)

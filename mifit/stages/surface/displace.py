@@ -94,12 +94,7 @@ class SurfacePrior:
 
     @classmethod
     def of(
-        cls,
-        vertices: NDArray,
-        faces: NDArray,
-        modes: NDArray,
-        longest: float,
-        contact: float = 0.0,
+        cls, vertices: NDArray, faces: NDArray, modes: NDArray, longest: float, contact: float = 0.0
     ) -> SurfacePrior:
         """Of a rest mesh (V, 3), (F, 3) and modes (V, 3, K).
 
@@ -107,11 +102,8 @@ class SurfacePrior:
         ``contact``, such as closed lips, move together.
         """
         rest = np.asarray(vertices, dtype=np.float64)
-        laplacian = cotangent_laplacian(rest, faces)
-        size = np.linalg.norm(face_cross(rest, faces), axis=1) / 6.0
-        area = np.bincount(faces.ravel(), np.repeat(size, 3), minlength=len(rest))
-        area = np.maximum(area, 1e-3 * max(float(np.median(area)), 1e-12))
-        plate = laplacian.T @ sp.diags(1.0 / area) @ laplacian + (2.0 * np.pi / longest) ** 4 * sp.diags(area)
+        bending, area = bending_energy(rest, faces)
+        plate = bending + (2.0 * np.pi / longest) ** 4 * sp.diags(area)
         if contact > 0:
             plate = plate + CONTACT_WEIGHT / contact**2 * _contacts(rest, faces, contact)
         plate = plate.tocsr()
@@ -124,12 +116,8 @@ class SurfacePrior:
         """Of the plate and the measurements with decoupled axes, in single precision: it steers the iterations."""
         points = measured.points
         matrix = stiffness * self.plate + points.T @ sp.diags(measured.precision) @ points
-        return spl.splu(
-            matrix.tocsc().astype(np.float32),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        how = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+        return spl.splu(matrix.tocsc().astype(np.float32), **how)
 
     def move(self, coefficients: NDArray) -> NDArray[np.float64]:
         """(V, 3) change of the vertices by coefficients (K,)."""
@@ -152,6 +140,15 @@ class SurfacePrior:
                 break
             found, free = within, free & ~beyond
         return found, free
+
+
+def bending_energy(vertices: NDArray, faces: NDArray) -> tuple[sp.csr_matrix, NDArray[np.float64]]:
+    """(V, V) matrix of a thin plate's bending energy, and the area (V,) that belongs to each vertex."""
+    laplacian = cotangent_laplacian(vertices, faces)
+    size = np.linalg.norm(face_cross(vertices, faces), axis=1) / 6.0
+    area: NDArray = np.bincount(faces.ravel(), np.repeat(size, 3), minlength=len(vertices))
+    area = np.maximum(area, 1e-3 * max(float(np.median(area)), 1e-12))
+    return laplacian.T @ sp.diags(1.0 / area) @ laplacian, area
 
 
 def _contacts(vertices: NDArray, faces: NDArray, distance: float) -> sp.csr_matrix:
@@ -239,14 +236,8 @@ def solve_surface(
         right = transposed @ ((weight * target)[:, None] * normals + along * held)
         left = right.ravel() - apply(start + change)
         goal = RELATIVE * float(np.linalg.norm(left)) if goal is None else goal  # all weightings are equally exact
-        step, _ = spl.cg(
-            spl.LinearOperator(size, matvec=apply),
-            left,
-            rtol=0.0,
-            atol=goal,
-            maxiter=MOST_ITERATIONS,
-            M=spl.LinearOperator(size, matvec=precondition),
-        )
+        matrix, near = (spl.LinearOperator(size, matvec=each) for each in (apply, precondition))
+        step, _ = spl.cg(matrix, left, rtol=0.0, atol=goal, maxiter=MOST_ITERATIONS, M=near)
         change += step.reshape(-1, 3)
     surface = start + change + held_modes
     coefficients, _ = prior.coefficients(surface, stiffness, bounds)

@@ -26,17 +26,7 @@ LEVELS = (2, 1, 0)
 
 
 class KeptTexture:
-    """What the views of fitted timesteps show of the surface.
-
-    Parameters
-    ----------
-    capture, model
-        Images, and the model that was fitted.
-    geometry : GeometryEstimate
-        The fitted timesteps.
-    cameras : sequence of str
-        Cameras to read; no other camera of the capture is touched.
-    """
+    """What the views of the timesteps that ``geometry`` fits show of the surface; no other camera is read."""
 
     def __init__(
         self, capture: Capture, model: MorphableModel, geometry: GeometryEstimate, cameras: Sequence[str]
@@ -68,13 +58,8 @@ class KeptTexture:
         apart, share = self._compared(replace(posed, position=posed.position + by))
         if not (apart < self._compared(posed)[0] and share > 0.5):
             return geometry
-        return replace(
-            moved,
-            **{
-                name: getattr(moved, name).astype(getattr(geometry, name).dtype)
-                for name in ("rotation", "translation", "expression")
-            },
-        )
+        names = ("rotation", "translation", "expression")
+        return replace(moved, **{n: getattr(moved, n).astype(getattr(geometry, n).dtype) for n in names})
 
     def _compared(self, posed: Posed) -> tuple[float, float]:
         """Median difference of what a timestep's views show from what is kept, and how much of that they show.

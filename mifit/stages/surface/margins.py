@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 from scipy.spatial import cKDTree
 
-from mifit.core.mesh import edges, face_cross, vertex_normals
-from mifit.core.mesh_solve import cotangent_laplacian
+from mifit.core.mesh import edges, vertex_normals
 from mifit.morphable.topology import closed_borders
+from mifit.stages.surface.displace import bending_energy
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
@@ -43,6 +43,11 @@ class Margins:
 
     upper: NDArray[np.int64]
     lower: NDArray[np.int64]
+
+    @property
+    def both(self) -> NDArray[np.int64]:
+        """Vertices of the upper margin, and then of the lower one."""
+        return np.concatenate([self.upper, self.lower])
 
     @classmethod
     def of(cls, model: MorphableModel, marks: slice) -> Margins | None:
@@ -114,28 +119,22 @@ class Region:
     ----------
     vertices : (V, 3)
         Object space, with the margins apart.
-    shown : (F', 3) int
-        Faces of the face area.
+    model : MorphableModel
     skin, inside : (n,) int
         Vertices within reach of the margins, in the face area and behind it.
     ends : (n, 2) int
         Vertices where what lies behind the margins ends, each with the vertex of the margins that it moves with.
     touching : (n, 2) int
         Vertices of other pieces of the mesh that touch the margins or what lies behind, each with what it touches.
-    held, clear : float
-        `HELD_MM` and `CLEAR_MM` in the model's units.
     """
 
     vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
-    shown: NDArray[np.int64]
+    model: MorphableModel
     margins: Margins
     skin: NDArray[np.int64]
     inside: NDArray[np.int64]
     ends: NDArray[np.int64]
     touching: NDArray[np.int64]
-    held: float
-    clear: float
 
     @classmethod
     def of(cls, vertices: NDArray, model: MorphableModel, margins: Margins) -> Region:
@@ -143,11 +142,10 @@ class Region:
         links, count = edges(model.faces)
         length = np.linalg.norm(vertices[links[:, 0]] - vertices[links[:, 1]], axis=1) * model.unit_mm
         graph = sp.csr_matrix((length, (links[:, 0], links[:, 1])), (len(vertices),) * 2)
-        margin = np.concatenate([margins.upper, margins.lower])
+        margin = margins.both
         distance = sp.csgraph.dijkstra(graph, directed=False, indices=margin, min_only=True, limit=REACH_MM)
-        shown = model.faces[model.face_mask].astype(np.int64)
         in_face = np.zeros(len(vertices), bool)
-        in_face[shown] = True
+        in_face[model.faces[model.face_mask]] = True
         skin = np.flatnonzero(in_face & (distance < REACH_MM))
         behind = np.flatnonzero(~in_face & (distance < NEAR_MM))
         inside = np.setdiff1d(behind, links[count == 1])
@@ -157,8 +155,7 @@ class Region:
         away, nearest = cKDTree(model.mean[near]).query(model.mean)
         touching = np.flatnonzero((away < CLEAR_MM / model.unit_mm) & np.isinf(distance))
         touching = np.stack([touching, near[nearest[touching]]], axis=1)
-        held, clear = HELD_MM / model.unit_mm, CLEAR_MM / model.unit_mm
-        return cls(vertices, model.faces.astype(np.int64), shown, margins, skin, inside, ends, touching, held, clear)
+        return cls(vertices, model, margins, skin, inside, ends, touching)
 
     def movement(self, shape: NDArray, gap: Gap, line: NDArray, apart: float) -> NDArray[np.float64]:
         """(m, 3) what takes the margins, upper and then lower, onto a line (C, 3) along the opening."""
@@ -181,7 +178,7 @@ class Region:
         that the sheets behind lips, whose way from one to the other may narrow before it widens, don't cross.
         """
         out = np.zeros_like(self.vertices)
-        out[self.margin] = moved
+        out[self.margins.both] = moved
         out[self._free] = self._bend(-(self._bending[0] @ out).ravel()).reshape(-1, 3)
         place = self.vertices + out
         place[self.ends[:, 0]] += out[self.ends[:, 1]] + self._out_of_the_way(out)
@@ -201,57 +198,54 @@ class Region:
         before, after = (Gap.of(v, self.margins).height(1.0) for v in (self.vertices, self.vertices + moved))
         closed = float(np.clip(1.0 - after / before, 0.0, 1.0)) if before > 0 else 0.0
         sign = np.where(np.isin(self.ends[:, 1], self.margins.upper), 1.0, -1.0)
-        past = self.clear - sign * ((self.vertices[self.ends[:, 0]] - self.vertices[self.ends[:, 1]]) @ UP)
-        past = np.maximum(past, 0.0)
+        apart = (self.vertices[self.ends[:, 0]] - self.vertices[self.ends[:, 1]]) @ UP
+        past = np.maximum(CLEAR_MM / self.model.unit_mm - sign * apart, 0.0)
         return (closed * sign * past)[:, None] * UP
 
     @cached_property
-    def margin(self) -> NDArray[np.int64]:
-        """Vertices of both margins, upper and then lower."""
-        return np.concatenate([self.margins.upper, self.margins.lower])
+    def _shown(self) -> NDArray[np.int64]:
+        """(F', 3) faces of the face area."""
+        return self.model.faces[self.model.face_mask].astype(np.int64)
 
     @cached_property
     def _free(self) -> NDArray[np.int64]:
-        return np.setdiff1d(self.skin, self.margin)
+        return np.setdiff1d(self.skin, self.margins.both)
 
     @cached_property
     def _bending(self) -> tuple[sp.csr_matrix, NDArray[np.float64]]:
         """Rows of the bending energy's matrix at the free vertices, and the area of each."""
-        laplacian = cotangent_laplacian(self.vertices, self.shown)
-        size = np.linalg.norm(face_cross(self.vertices, self.shown), axis=1) / 6.0
-        area = np.bincount(self.shown.ravel(), np.repeat(size, 3), minlength=len(self.vertices))
-        area = np.maximum(area, 1e-3 * max(float(np.median(area)), 1e-12))
-        held: NDArray[np.float64] = area[self._free].astype(np.float64)
-        return (laplacian.T @ sp.diags(1.0 / area) @ laplacian).tocsr()[self._free], held
+        matrix, area = bending_energy(self.vertices, self._shown)
+        return matrix.tocsr()[self._free], area[self._free]
 
     @cached_property
     def _bend(self) -> Callable[[NDArray], NDArray]:
         """Solver of the bending of the surface, held along its normals."""
         free, (bending, area) = self._free, self._bending
-        normal = vertex_normals(self.vertices, self.shown)[free]
+        normal = vertex_normals(self.vertices, self._shown)[free]
         rows = sp.csr_matrix(
             (normal.ravel(), np.arange(3 * len(free)), np.arange(0, 3 * len(free) + 1, 3)),
             shape=(len(free), 3 * len(free)),
         )
-        held = rows.T @ sp.diags((2.0 * np.pi / self.held) ** 4 * area) @ rows
+        held = rows.T @ sp.diags((2.0 * np.pi / (HELD_MM / self.model.unit_mm)) ** 4 * area) @ rows
         return spl.factorized((sp.kron(bending[:, free], sp.identity(3)) + held).tocsc())
 
     @cached_property
     def _net(self) -> tuple[NDArray[np.int64], sp.csr_matrix, Callable[[NDArray], NDArray]]:
         """Vertices of the net behind the margins, rows of its springs, and their solver."""
-        net = np.setdiff1d(self.inside, self.margin)
-        links, _ = edges(self.faces)
+        net = np.setdiff1d(self.inside, self.margins.both)
+        links, _ = edges(self.model.faces.astype(np.int64))
         length = np.linalg.norm(self.vertices[links[:, 0]] - self.vertices[links[:, 1]], axis=1)
         half = sp.coo_matrix((1.0 / np.maximum(length, 1e-9), (links[:, 0], links[:, 1])), (len(self.vertices),) * 2)
         tied = (half + half.T).tocsr()
         springs = (sp.diags(np.asarray(tied.sum(axis=1)).ravel()) - tied).tocsr()[net]
         return net, springs, spl.factorized(springs[:, net].tocsc()) if len(net) else np.copy
 
-    def adjusted(self, model: MorphableModel, expression: NDArray, movement: NDArray) -> NDArray[np.float64]:
+    def adjusted(self, expression: NDArray, movement: NDArray) -> NDArray[np.float64]:
         """Expression coefficients that move the surface by (V, 3) as well as they can."""
+        model = self.model
         rows = np.unique(model.faces[model.face_mask])
         weight = np.full(model.n_vertices, ELSEWHERE)
-        weight[self.margin] = 1.0
+        weight[self.margins.both] = 1.0
         scale = model.unit_mm * np.repeat(weight[rows], 3)
         basis = model.expression[rows].reshape(3 * len(rows), -1) * scale[:, None]
         wanted = movement[rows].ravel() * scale

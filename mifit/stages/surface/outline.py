@@ -82,18 +82,9 @@ class Borders:
 
 
 def find_borders(capture: Capture, scene: SurfaceScene, names: Sequence[str], timestep: int, factor: float) -> Borders:
-    """Borders of the surface that ``scene`` holds in the images of one timestep.
+    """Borders of the surface that ``scene`` holds, world space, in the images of some cameras at one timestep.
 
-    Parameters
-    ----------
-    capture : Capture
-    scene : SurfaceScene
-        World space.
-    names : sequence of str
-        Cameras.
-    timestep : int
-    factor : float
-        Pixels of the level per pixel of the image, at most 1.
+    ``factor`` is the level's pixels per pixel of the image, at most 1.
     """
     normals = vertex_normals(scene.vertices, scene.faces)
     views = [(capture.camera(name).resized(factor), capture.frame(name, timestep)) for name in names]
@@ -127,11 +118,8 @@ def _borders(camera: Camera, frame: Frame, buffer: GBuffer, scene: SurfaceScene,
         # A border that may be anywhere within the reach has a deviation of 0.58 of it.
         known = turned & (2.0 * deviation < REACH) & (length > 0.5)
         precision = INDEPENDENT / ((deviation**2 + BLUR**2) * pixel**2)
-        found.append(
-            Borders(
-                face[known], weights[known], position[known], normal[known], (shift * pixel)[known], precision[known]
-            )
-        )
+        every = face, weights, position, normal, shift * pixel, precision
+        found.append(Borders(*(values[known] for values in every)))
     return joined(found)
 
 

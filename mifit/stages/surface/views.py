@@ -15,6 +15,7 @@ from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
 from mifit.core.process import on_all_cores
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.render.gbuffer import SurfaceScene
+from mifit.sampling.visibility import texel_area
 from mifit.stages.surface.band import feature_image
 from mifit.stages.surface.flow import Posed
 
@@ -98,20 +99,20 @@ class Resolution:
     @classmethod
     def of(cls, cameras: Sequence[Camera], centre: NDArray, pairs: Sequence[tuple[int, int]]) -> Resolution:
         """Of cameras that look at a point."""
-        pixels = [
-            float(np.linalg.norm(centre - camera.position)) / np.sqrt(camera.fx * camera.fy) for camera in cameras
-        ]
         towards = normalize(np.array([camera.position - centre for camera in cameras]))
         angles = [np.arccos(np.clip(towards[a] @ towards[b], -1.0, 1.0)) for a, b in pairs]
-        return cls(float(np.mean(pixels)), float(np.mean(2.0 * np.sin(np.array(angles) / 2.0))))
+        return cls(pixel_length(cameras, centre), float(np.mean(2.0 * np.sin(np.array(angles) / 2.0))))
+
+
+def pixel_length(cameras: Sequence[Camera], centre: NDArray) -> float:
+    """Mean world length of a pixel of cameras that look at a point (3,)."""
+    return float(np.mean([np.linalg.norm(centre - c.position) / np.sqrt(c.fx * c.fy) for c in cameras]))
 
 
 def texture_size(model: MorphableModel, vertices: NDArray, length: float, largest: int) -> int:
     """Side of the map whose texels are about as large as ``length`` on a surface with these vertices (V, 3)."""
     area = np.linalg.norm(face_cross(vertices, model.faces[model.face_mask]), axis=1).sum()
-    a, b, c = (model.uv[model.faces_uv[model.face_mask, k]].astype(np.float64) for k in range(3))
-    u, v = b - a, c - a
-    covered = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum()
+    covered = 2.0 * texel_area(model.uv, model.faces_uv[model.face_mask], 1).sum()
     return int(np.clip(np.sqrt(area / max(covered, 1e-12)) / length, 64, largest))
 
 
@@ -125,8 +126,6 @@ def texels_of_pixels(
     texels, pixels per pixel of the images (1 but for large ones), world length of such a pixel at the face
     """
     factor = min(1.0, LONGEST_SIDE / max(max(view.width, view.height) for view in cameras))
-    centre = vertices.mean(axis=0)
-    lengths = [float(np.linalg.norm(centre - view.position)) / np.sqrt(view.fx * view.fy) for view in cameras]
-    pixel = float(np.mean(lengths)) / factor
+    pixel = pixel_length(cameras, vertices.mean(axis=0)) / factor
     size = texture_size(model, vertices, pixel, LARGEST_TEXTURE)
     return rasterize_uv(model.uv, model.faces_uv, size, model.face_mask), factor, pixel
