@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mifit.capture import Frame
 from mifit.core.camera import Camera
@@ -14,6 +15,11 @@ from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.geometry.parameters import exponential
 
 SHADING = np.array([4.0, 0.0, 0.8, -0.7, 0.0, 0.0, 0.3, 0.0, 0.0])  # the same for every channel
+
+
+def rotation_angle(a, b):
+    """Angle between two rotations, in degrees."""
+    return np.degrees(Rotation.from_matrix(a.T @ b).magnitude())
 
 
 @dataclass

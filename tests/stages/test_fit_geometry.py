@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from memory_capture import SHADING, make_capture
+from memory_capture import SHADING, make_capture, rotation_angle
 from scipy.spatial.transform import Rotation
 
 from mifit.config import GeometryConfig, SurfaceConfig
@@ -26,7 +26,7 @@ from mifit.stages.geometry.landmarks import (
     slide_contour,
     world_vertices,
 )
-from mifit.stages.geometry.parameters import Layout, exponential, rotation_angle
+from mifit.stages.geometry.parameters import Layout, exponential
 from mifit.stages.geometry.place_head import SIZES
 from mifit.stages.geometry.rendering import refine_by_rendering
 from mifit.tracking import Follower

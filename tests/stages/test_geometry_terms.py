@@ -8,15 +8,16 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from memory_capture import rotation_angle
 
 from mifit.core.camera import Camera
 from mifit.core.mesh import normalize
 from mifit.core.sh import basis
 from mifit.stages.geometry.appearance import AppearanceProblem, fit_appearance
 from mifit.stages.geometry.images import PixelView, SmoothImage
-from mifit.stages.geometry.initial import align, pose_candidates, reprojection, triangulate
+from mifit.stages.geometry.initial import align, best_pose, triangulate
 from mifit.stages.geometry.landmarks import LandmarkProblem, LandmarkTerm, LandmarkView
-from mifit.stages.geometry.parameters import Frames, Layout, exponential, left_jacobian, rotation_angle
+from mifit.stages.geometry.parameters import Frames, Layout, exponential, left_jacobian
 from mifit.stages.geometry.points import PointBasis
 from mifit.stages.geometry.rendering import RenderingProblem
 
@@ -258,7 +259,5 @@ def test_triangulation_and_pose_are_exact_without_noise():
     np.testing.assert_allclose(r, rotation, atol=1e-9)
     np.testing.assert_allclose(t, translation, atol=1e-8)
     for cams, pix in ((cameras, pixels), (cameras[1:], pixels[1:])):
-        candidates = pose_candidates(cams, 10 * points, pix, 0.1)
-        error = [reprojection(cams, 10 * points, pix, 0.1, pose) for pose in candidates]
-        best = candidates[int(np.argmin(error))]
+        best = best_pose(cams, 10 * points, pix, 0.1, 50.0)
         assert rotation_angle(best[0], rotation) < 1e-3 and np.abs(best[1] - translation).max() < 1e-3

@@ -113,15 +113,7 @@ def landmark_offsets(
 
 
 def landmark_diagnostics(shots: Sequence[Shot], later: Sequence[Shot], face: FaceStatistics) -> list[Diagnostic]:
-    """What landmarks say of images, poses and lengths.
-
-    Parameters
-    ----------
-    shots : sequence of Shot
-    later : sequence of Shot
-        Of consecutive timesteps, for delays.
-    face : FaceStatistics
-    """
+    """What landmarks say of images, poses and lengths; those of ``later``, consecutive timesteps, of delays."""
     if not shots:
         return []
     given = explain(shots, face)

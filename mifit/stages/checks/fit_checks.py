@@ -25,27 +25,15 @@ INCONSISTENT = "inconsistent"
 def check_fit(
     capture: Capture, model: MorphableModel, geometry: GeometryEstimate, cameras: Sequence[str]
 ) -> list[Diagnostic]:
-    """Contradictions between a fitted face and the landmarks of the images that it was fitted to.
-
-    Parameters
-    ----------
-    capture, model, geometry
-    cameras : sequence of str
-        The cameras fitted; no other is read.
-    """
+    """Contradictions between a fitted face and the landmarks of the images that it was fitted to; no other is read."""
     shots = landmark_shots(capture, cameras, geometry.timesteps)
     if not shots:
         return []
-    off = []
-    for name in cameras:
-        mine = [
-            shot.pixels[INNER] - shot.camera.project(geometry.vertices[shot.step][model.landmarks[INNER]])
-            for shot in shots
-            if shot.camera.name == name
-        ]
-        if mine:
-            off.append(np.nanmedian(np.concatenate(mine), axis=0))
-    x, y = np.mean(off, axis=0)
+    off: dict[str, list] = {name: [] for name in cameras}
+    for shot in shots:
+        fitted = shot.camera.project(geometry.vertices[shot.step][model.landmarks[INNER]])
+        off[shot.camera.name].append(shot.pixels[INNER] - fitted)
+    x, y = np.mean([np.nanmedian(np.concatenate(mine), axis=0) for mine in off.values() if mine], axis=0)
     allowed = SHIFTED * noise_of(shots)
     if np.hypot(x, y) <= allowed:
         return []
@@ -59,12 +47,7 @@ def check_fit(
 def judged(estimates: Mapping[Any, Any], found: Sequence[Diagnostic]) -> dict[Any, Any]:
     """The estimates; all end `INCONSISTENT` where the capture has a named fault or the fit contradicts its images.
 
-    Parameters
-    ----------
-    estimates : mapping
-        By part, ``"geometry"`` among them.
-    found : sequence of Diagnostic
-        Of the capture and of the fit.
+    ``estimates`` are by part, ``"geometry"`` among them; diagnostics of capture and fit have been ``found``.
     """
     found = (*found, *estimates["geometry"].report.warnings)
     if not any(one.severity == "fault" or one.code in CONTRADICTIONS for one in found):

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.core.camera import OPENGL_FROM_OPENCV, Camera
+from mifit.core.camera import OPENGL_FROM_OPENCV, Camera, rigid
 from mifit.morphable.topology import IBUG_MIRROR
 from mifit.stages.checks.landmark_model import Shot
 
@@ -41,58 +42,29 @@ class Hypothesis:
 # ----------------------------------------------------------------------------------------------------------------------
 
 
-def _points(change: Callable[[NDArray, Camera], NDArray], mirror: bool = False) -> Change:
-    def undone(shot: Shot) -> Shot:
-        pixels = change(shot.pixels, shot.camera)
-        return replace(shot, pixels=pixels[IBUG_MIRROR] if mirror else pixels)
-
-    return undone
+def _points(change: Callable[[NDArray, Camera], NDArray]) -> Change:
+    return lambda shot: replace(shot, pixels=change(shot.pixels, shot.camera))
 
 
 def _flipped(pixels: NDArray, camera: Camera) -> NDArray:
     return pixels * (-1, 1) + (camera.width, 0)
 
 
-def _turned(pixels: NDArray, camera: Camera) -> NDArray:
-    return (camera.width, camera.height) - pixels
-
-
-def _as_is(pixels: NDArray, camera: Camera) -> NDArray:
-    return pixels
+def _camera(change: Callable[[Camera], Camera]) -> Change:
+    return lambda shot: replace(shot, camera=change(shot.camera))
 
 
 def _pose(change: Callable[[Matrix], Matrix]) -> Change:
-    def undone(shot: Shot) -> Shot:
-        return replace(shot, camera=replace(shot.camera, world_to_camera=change(shot.camera.world_to_camera)))
-
-    return undone
+    return _camera(lambda camera: replace(camera, world_to_camera=change(camera.world_to_camera)))
 
 
-def _location_as_translation(pose: Matrix) -> Matrix:
-    """The file has [R | location] in place of [R | translation]."""
-    out = pose.copy()
-    out[:3, 3] = -pose[:3, :3] @ pose[:3, 3]
-    return out
-
-
-def _translation_as_location(pose: Matrix) -> Matrix:
-    """The file has the translation in place of the location."""
-    out = pose.copy()
-    out[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return out
-
-
-def _intrinsics(factor: float) -> Change:
-    def undone(shot: Shot) -> Shot:
-        c = shot.camera
-        return replace(shot, camera=replace(c, fx=factor * c.fx, fy=factor * c.fy, cx=factor * c.cx, cy=factor * c.cy))
-
-    return undone
+def _intrinsics(by: float) -> Change:
+    return _camera(lambda c: replace(c, fx=by * c.fx, fy=by * c.fy, cx=by * c.cx, cy=by * c.cy))
 
 
 IMAGES: dict[str, tuple[Change, str, str]] = {
     "mirrored": (
-        _points(_flipped, mirror=True),
+        _points(lambda pixels, camera: _flipped(pixels, camera)[IBUG_MIRROR]),
         "images are mirrored, as front cameras store them",
         "flip them left to right and run `mifit landmarks` again",
     ),
@@ -102,12 +74,12 @@ IMAGES: dict[str, tuple[Change, str, str]] = {
         "flip the images left to right and run `mifit landmarks` again",
     ),
     "landmarks-swapped": (
-        _points(_as_is, mirror=True),
+        _points(lambda pixels, camera: pixels[IBUG_MIRROR]),
         "landmarks of the left side have the names of the right",
         "run `mifit landmarks`, or exchange them: point 0 is at the ear of the person's right side",
     ),
     "upside-down": (
-        _points(_turned),
+        _points(lambda pixels, camera: (camera.width, camera.height) - pixels),
         "images are upside down",
         "turn them by 180 degrees and run `mifit landmarks` again, or turn the camera's pose",
     ),
@@ -145,12 +117,12 @@ IMAGES: dict[str, tuple[Change, str, str]] = {
 """Mistakes of the images of one camera, or of all: what undoes them, what they are, the remedy."""
 POSES: dict[str, tuple[Change, str, str]] = {
     "poses-location": (
-        _pose(_location_as_translation),
+        _pose(lambda pose: rigid(pose[:3, :3], -pose[:3, :3] @ pose[:3, 3])),
         "locations of the cameras are given where translations belong (t = -R C)",
         "write t = -R C",
     ),
     "poses-translation": (
-        _pose(_translation_as_location),
+        _pose(lambda pose: rigid(pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3])),
         "translations of the cameras are given where locations belong (C = -R' t)",
         "write C = -R' t into transform_matrix",
     ),
@@ -181,21 +153,15 @@ UNITS_MM = {
 def hypotheses(shots: Sequence[Shot], later: Sequence[Shot] = ()) -> Iterator[Hypothesis]:
     """Every mistake that may have been made with the images, landmarks and poses of some shots.
 
-    Parameters
-    ----------
-    shots : sequence of Shot
-        Of the timesteps that are judged.
-    later : sequence of Shot
-        Of consecutive timesteps, ``shots`` among them: where delays are looked for.
+    Delays are looked for in ``later`` ones, of consecutive timesteps, ``shots`` among them.
     """
     names = list(dict.fromkeys(shot.camera.name for shot in shots))
     cameras = {shot.camera.name: shot.camera for shot in shots}
-    for i, a in enumerate(names):
-        for b in names[i + 1 :]:
-            other = {a: cameras[b], b: cameras[a]}
-            undone = tuple(replace(shot, camera=other.get(shot.camera.name, shot.camera)) for shot in shots)
-            text = f"cameras {a} and {b} are exchanged"
-            yield Hypothesis("cameras-swapped", text, "exchange their images or their poses", undone)
+    for a, b in combinations(names, 2):
+        other = {a: cameras[b], b: cameras[a]}
+        undone = tuple(replace(shot, camera=other.get(shot.camera.name, shot.camera)) for shot in shots)
+        text = f"cameras {a} and {b} are exchanged"
+        yield Hypothesis("cameras-swapped", text, "exchange their images or their poses", undone)
     for code, (change, text, remedy) in IMAGES.items():
         for name in (None, *(names if len(names) > 1 else ())):
             undone = tuple(change(shot) if name in (None, shot.camera.name) else shot for shot in shots)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,9 @@ from scipy.spatial.transform import Rotation
 from mifit.core.camera import Camera
 from mifit.morphable import MorphableModel
 from mifit.morphable.topology import INNER
-from mifit.stages.geometry.initial import pose_candidates, reprojection, triangulate
+from mifit.stages.geometry.initial import best_pose, triangulate
+from mifit.stages.geometry.parameters import Pose
+from mifit.stages.geometry.points import project
 
 IDENTITY_MODES, EXPRESSION_MODES = 25, 8
 """Principal directions of the landmarks that are kept; what is left out is below a millimetre."""
@@ -49,12 +50,12 @@ class Shot:
 
 @dataclass(frozen=True)
 class FaceStatistics:
-    """Landmarks of faces in world units.
+    """Landmarks inside of faces, without the jaw, in world units.
 
     Attributes
     ----------
-    mean : (68, 3)
-    shared, local : (K, 68, 3)
+    mean : (51, 3)
+    shared, local : (51, 3, K)
         One standard deviation of identity, and of a timestep's expression.
     unit_mm : float
         Millimetres of a world unit.
@@ -65,12 +66,6 @@ class FaceStatistics:
     local: NDArray[np.float64]
     unit_mm: float
 
-    @cached_property
-    def inner(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Of the points inside the face: mean (51, 3), identities (51, 3, K) and expressions (51, 3, K)."""
-        shared, local = (np.ascontiguousarray(np.moveaxis(m[:, INNER], 0, 2)) for m in (self.shared, self.local))
-        return self.mean[INNER], shared, local
-
     @classmethod
     def of(cls, model: MorphableModel, unit_mm: float) -> FaceStatistics:
         """Of a model, for a capture whose unit of length is ``unit_mm`` millimetres."""
@@ -79,12 +74,13 @@ class FaceStatistics:
         def modes(basis: NDArray, count: int) -> NDArray[np.float64]:
             rows = scale * basis[model.landmarks].astype(np.float64).reshape(68 * 3, -1).T
             if not rows.size:
-                return np.zeros((0, 68, 3))
+                return np.zeros((len(INNER), 3, 0))
             _, size, directions = np.linalg.svd(rows, full_matrices=False)
-            return (size[:, None] * directions)[:count].reshape(-1, 68, 3)
+            found = (size[:, None] * directions)[:count].reshape(-1, 68, 3)
+            return np.ascontiguousarray(np.moveaxis(found[:, INNER], 0, 2))
 
         return cls(
-            scale * model.mean[model.landmarks].astype(np.float64),
+            scale * model.mean[model.landmarks[INNER]].astype(np.float64),
             modes(model.identity, IDENTITY_MODES),
             modes(EXPRESSION_DEVIATION * model.expression, EXPRESSION_MODES),
             unit_mm,
@@ -137,7 +133,7 @@ def explain(shots: Sequence[Shot], face: FaceStatistics, shifted: str | None = N
     sized = len({shot.camera.name for shot in shots}) > 1
     size = _size(shots, face) if sized else 1.0
     poses = [_pose([shot for shot in shots if shot.step == k], face, size) for k in range(len(steps))]
-    shared, local = len(face.shared), len(face.local) + 6
+    shared, local = face.shared.shape[2], face.local.shape[2] + 6
     free = shared + 1 + 2 * (shifted is not None)
     x = np.zeros(free + local * len(steps))
     x[shared] = np.log(size)
@@ -145,7 +141,7 @@ def explain(shots: Sequence[Shot], face: FaceStatistics, shifted: str | None = N
     prior[:shared] = 1.0
     prior[shared] = 0.0 if sized else 1e12
     for k in range(len(steps)):
-        prior[free + k * local : free + k * local + len(face.local)] = 1.0
+        prior[free + k * local : free + (k + 1) * local - 6] = 1.0
 
     rows = [free + shot.step * local + np.arange(local) for shot in shots]
     places = [np.r_[np.arange(free), own] for own in rows]
@@ -211,7 +207,7 @@ def _size(shots: Sequence[Shot], face: FaceStatistics) -> float:
         known = np.isfinite(points).all(1)
         if known.sum() < 6:
             continue
-        both = (points[known], face.mean[INNER][known])
+        both = (points[known], face.mean[known])
         spread = [float(np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1))) for p in both]
         found.append(spread[0] / spread[1])
     return float(np.clip(np.median(found), 1e-6, 1e6)) if found else 1.0
@@ -220,41 +216,22 @@ def _size(shots: Sequence[Shot], face: FaceStatistics) -> float:
 def _pose(shots: Sequence[Shot], face: FaceStatistics, scale: float) -> tuple[NDArray, NDArray]:
     """Pose of the mean face that reprojects best among closed forms."""
     cameras, pixels = [shot.camera for shot in shots], [shot.pixels[INNER] for shot in shots]
-    mean = face.mean[INNER]
-    poses = pose_candidates(cameras, mean, pixels, scale)
-    if not poses:
-        camera = cameras[0]
-        distance = 500.0 * scale / face.unit_mm
-        return camera.rotation.T @ np.diag([1.0, -1.0, -1.0]), camera.position + distance * camera.rotation[2]
-    return min(poses, key=lambda pose: reprojection(cameras, mean, pixels, scale, pose))
+    return best_pose(cameras, face.mean, pixels, scale, 500.0 * scale / face.unit_mm)
 
 
 def _project(
     shot: Shot, face: FaceStatistics, shared: NDArray, own: NDArray, pose: tuple[NDArray, NDArray], shifted: str | None
 ) -> tuple[NDArray, NDArray]:
     """Residuals (51, 2) in pixels and their derivatives (51, 2, n) by shared unknowns and the timestep's own."""
-    count, camera = len(face.shared), shot.camera
-    mean, identities, expressions = face.inner
+    count, camera = face.shared.shape[2], shot.camera
     size = float(np.exp(np.clip(shared[count], -30, 30)))
-    shape = mean + identities @ shared[:count] + expressions @ own[:-6]
-    turned = size * shape @ pose[0].T
-    seen = camera.to_camera(turned + pose[1])
-    depth = np.where(seen[:, 2] > 1e-9, seen[:, 2], np.nan)
-    ideal = seen[:, :2] / depth[:, None]
-    focal = np.array([camera.fx, camera.fy])
-    slope = np.zeros((len(INNER), 2, 3))
-    slope[:, 0, 0], slope[:, 1, 1] = camera.fx / depth, camera.fy / depth
-    slope[:, :, 2] = -ideal * focal / depth[:, None]
-    by_world = slope @ camera.rotation
-    by_object = by_world @ (size * pose[0])
-    pixels = ideal * focal + (camera.cx, camera.cy)
-    columns = [by_object @ identities, by_world @ turned[..., None]]
+    shape = face.mean + face.shared @ shared[:count] + face.local @ own[:-6]
+    found = project(camera, Pose(*pose, size, np.eye(3)), shape)
+    pixels = np.where(found.depth[:, None] > 0, found.pixels, np.nan)
+    columns = [found.by_object @ face.shared, found.by_log_scale[..., None]]
     if shifted is not None:
         mine = float(shifted == camera.name)
         pixels = pixels + mine * shared[count + 1 :]
         columns.append(np.broadcast_to(mine * np.eye(2), (len(INNER), 2, 2)))
-    cross = np.zeros((len(INNER), 3, 3))
-    for k, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):
-        cross[:, a, b], cross[:, b, a] = turned[:, k], -turned[:, k]
-    columns += [by_object @ expressions, by_world @ cross, by_world]
+    columns += [found.by_object @ face.local, found.by_pose]
     return pixels - shot.pixels[INNER], np.concatenate(columns, axis=2)

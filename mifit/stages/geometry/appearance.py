@@ -84,13 +84,8 @@ class AppearanceProblem:
         return WHITE * (np.float32(x[-1]) + albedo * shade - self.observed), albedo, shade
 
     def _priors(self) -> NDArray[np.float64]:
-        return np.concatenate(
-            [
-                np.full(self.albedo_size, self.albedo_prior),
-                np.full(27, SHADING_PRIOR),
-                [AMBIENT_PRIOR * WHITE**2],
-            ]
-        )
+        weights = [self.albedo_prior, SHADING_PRIOR, AMBIENT_PRIOR * WHITE**2]
+        return np.repeat(weights, [self.albedo_size, 27, 1])
 
     def energies(self, x: NDArray) -> dict[str, float]:
         """Energy per term."""
@@ -126,36 +121,21 @@ def gather(
     """Collect the pixels of all views; ``world`` (T, V, 3) is the held geometry."""
     flat = model.albedo_modes.reshape(len(model.mean), -1)
     normals = [vertex_normals(vertices, model.faces) for vertices in world]
-    parts = [
-        (
-            np.zeros((0, 3), np.float32),
-            np.zeros((0, 3, model.n_albedo), np.float32),
-            np.zeros((0, 9), np.float32),
-            np.zeros((0, 3), np.float32),
-            np.zeros(0),
-        )
-    ]
+    empty = [np.zeros((0, *shape), np.float32) for shape in ((3,), (3, model.n_albedo), (9,), (3,))]
+    parts = [(*empty, np.zeros(0))]
     for view in views:
         corner = corner_matrix(model.faces, view.face, view.weights, len(model.mean))
         normal = normalize(interpolate(normals[view.step], model.faces, view.face, view.weights))
         position = interpolate(world[view.step], model.faces, view.face, view.weights)
-        colour, _, inside = view.image.sample(view.camera.project(position), gradient=False)
+        colour, _, inside = view.image.sample(view.camera.project(position))
         modes = (corner @ flat).reshape(len(view.face), 3, -1)
         rows = corner @ model.mean_albedo, modes, basis(normal, 3).astype(np.float32), colour
         parts.append((*(each[inside] for each in rows), np.full(inside.sum(), 1.0 / max(inside.sum(), 1))))
     face = np.unique(model.faces[model.face_mask])
-    level = model.mean_albedo[face].mean(axis=0, dtype=np.float64)
+    level = np.maximum(model.mean_albedo[face].mean(axis=0, dtype=np.float64), DARKEST)
+    change = model.albedo_modes[face].mean(axis=0, dtype=np.float64) / level[:, None]
     mean, shifts, harmonics, observed, weight = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return AppearanceProblem(
-        mean,
-        shifts,
-        harmonics,
-        observed,
-        weight,
-        robust,
-        albedo_prior,
-        model.albedo_modes[face].mean(axis=0, dtype=np.float64) / np.maximum(level, DARKEST)[:, None],
-    )
+    return AppearanceProblem(mean, shifts, harmonics, observed, weight, robust, albedo_prior, change)
 
 
 def fit_appearance(problem: AppearanceProblem, max_iterations: int) -> Solution:

@@ -35,7 +35,7 @@ class SmoothImage:
     values: NDArray[np.float32]
     valid: NDArray[np.float32]
 
-    def sample(self, pixels: NDArray, gradient: bool = True) -> tuple[NDArray, NDArray | None, NDArray]:
+    def sample(self, pixels: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """Look up values at pixel coordinates.
 
         Parameters
@@ -46,7 +46,7 @@ class SmoothImage:
         Returns
         -------
         values : (N, C)
-        gradient : (N, C, 2) or None
+        gradient : (N, C, 2)
             Derivative by the pixel coordinate.
         inside : (N,) bool
             Whether all pixels that the spline touches exist and are valid.
@@ -71,11 +71,7 @@ class SmoothImage:
             weights = (a[:, :, None] * b[:, None, :]).reshape(-1, 1, 16).astype(dtype)
             return (weights @ patch)[:, 0]
 
-        values = blend(wy, wx)
-        if not gradient:
-            return values, None, inside
-        slope = np.stack([blend(wy, dx), blend(dy, wx)], axis=-1)
-        return values, slope, inside
+        return blend(wy, wx), np.stack([blend(wy, dx), blend(dy, wx)], axis=-1), inside
 
 
 def _bspline(f: NDArray) -> tuple[NDArray, NDArray]:
@@ -147,14 +143,7 @@ def blind_warnings(
 ) -> list[Diagnostic]:
     """What to say of images that show no usable pixel of the face, and of cameras that show none at any timestep.
 
-    Parameters
-    ----------
-    views : sequence of PixelView
-        Of the images that do.
-    cameras, timesteps
-        All that were fitted.
-    unit_mm : float
-        The capture's unit of length in millimetres.
+    ``views`` are of the images that do, among all ``cameras`` and ``timesteps`` that were fitted.
     """
     shown = {(view.camera.name, timesteps[view.step]) for view in views}
     blind = [(name, t) for t in timesteps for name in cameras if (name, t) not in shown]

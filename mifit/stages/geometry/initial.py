@@ -99,19 +99,26 @@ def pose_candidates(
     return out
 
 
-def reprojection(
+def best_pose(
     cameras: Sequence[Camera],
     points: NDArray,
     pixels: Sequence[NDArray],
     scale: float,
-    pose: tuple[NDArray, NDArray],
-) -> float:
-    """Median pixel distance of a pose over all views; infinite when nothing projects."""
-    world = scale * points @ pose[0].T + pose[1]
-    distance = [
-        np.linalg.norm(c.project(world) - p, axis=1)[np.isfinite(p[:, 0])] for c, p in zip(cameras, pixels, strict=True)
-    ]
-    together = np.concatenate(distance) if distance else np.zeros(0)
-    if not len(together):
-        return np.inf
-    return float(np.median(np.where(np.isfinite(together), together, np.inf)))
+    distance: float,
+    more: Sequence[tuple[NDArray, NDArray]] = (),
+) -> tuple[NDArray, NDArray]:
+    """The pose of least median pixel distance over all views; parameters and result as for `pose_candidates`.
+
+    One of its candidates, or of ``more``. Landmarks too thinly spread for any closed form: facing the first camera, at
+    a ``distance``, world length.
+    """
+
+    def apart(pose: tuple[NDArray, NDArray]) -> float:
+        world = scale * points @ pose[0].T + pose[1]
+        each = [np.linalg.norm(c.project(world) - p, axis=1) for c, p in zip(cameras, pixels, strict=True)]
+        shown = np.concatenate(each)[np.isfinite(np.concatenate(pixels)[:, 0])]
+        return float(np.median(np.where(np.isfinite(shown), shown, np.inf))) if len(shown) else np.inf
+
+    first = cameras[0]
+    facing = first.rotation.T @ np.diag([1.0, -1.0, -1.0]), first.position + distance * first.rotation[2]
+    return min([*(pose_candidates(cameras, points, pixels, scale) or [facing]), *more], key=apart)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mifit.capture import Capture
@@ -18,9 +19,9 @@ from mifit.errors import InputError
 from mifit.morphable import MorphableModel
 from mifit.morphable.topology import INNER
 from mifit.optim import DenseSystem, Solution, geman_mcclure, minimize
-from mifit.stages.geometry.initial import pose_candidates, reprojection
-from mifit.stages.geometry.parameters import Frames, Layout, NormalEquations, prior_energy
-from mifit.stages.geometry.points import PointBasis, geometry_columns, project
+from mifit.stages.geometry.initial import best_pose
+from mifit.stages.geometry.parameters import Frames, Layout, NormalEquations, Pose, prior_energy
+from mifit.stages.geometry.points import PointBasis, Projection, project
 
 FARTHEST_PIXEL = 10.0  # in image sizes
 CONTRADICTS = 0.025
@@ -36,10 +37,14 @@ class State:
     frames: Frames
     x: NDArray
 
+    @property
+    def poses(self) -> list[Pose]:
+        """Of all timesteps."""
+        return [self.frames.pose(self.layout, self.x, k) for k in range(self.layout.timesteps)]
+
     def recentred(self) -> State:
         """The same state with the rotation vectors at zero, where their derivatives are simplest."""
-        x = self.x.copy()
-        rotation = np.stack([self.frames.pose(self.layout, x, k).rotation for k in range(self.layout.timesteps)])
+        x, rotation = self.x.copy(), np.stack([pose.rotation for pose in self.poses])
         for k in range(self.layout.timesteps):
             x[self.layout.at("rotation", k)] = 0.0
         return State(self.layout, Frames(rotation, self.frames.scale), x)
@@ -112,27 +117,39 @@ class LandmarkTerm:
         """Value of the term."""
         total = 0.0
         for view in self.views:
-            squared = (self.distances(view, layout, frames, x) ** 2).sum(1)
+            squared = ((_project(view, layout, frames, x).pixels - view.pixels) ** 2).sum(1)
             total += view.weight * float(geman_mcclure(squared, self.scale)[0].sum())
         return total
-
-    def distances(self, view: LandmarkView, layout: Layout, frames: Frames, x: NDArray) -> NDArray:
-        """(n, 2) projected minus detected pixels."""
-        points = view.basis.evaluate(x[layout.at("identity")], x[layout.at("expression", view.step)])
-        pose = frames.pose(layout, x, view.step)
-        return project(view.camera, pose, points, derivatives=False).pixels - view.pixels
 
     def accumulate(self, equations: NormalEquations, layout: Layout, frames: Frames, x: NDArray) -> None:
         """Add the linearised term to the normal equations."""
         for view in self.views:
-            points = view.basis.evaluate(x[layout.at("identity")], x[layout.at("expression", view.step)])
-            projection = project(view.camera, frames.pose(layout, x, view.step), points)
+            projection = _project(view, layout, frames, x)
             distance = projection.pixels - view.pixels
             weight = view.weight * geman_mcclure((distance**2).sum(1), self.scale)[1]
-            by_pixel = np.broadcast_to(np.eye(2), (len(points), 2, 2))
-            rows = geometry_columns(layout, view.basis, projection, by_pixel)
+            rows = _columns(layout, view.basis, projection)
             root = np.sqrt(np.repeat(weight, 2))[:, None]
             equations.add(view.step, root * np.concatenate([*rows, distance.reshape(-1, 1)], axis=1))
+
+
+def _project(view: LandmarkView, layout: Layout, frames: Frames, x: NDArray) -> Projection:
+    """The view's points of the model."""
+    points = view.basis.evaluate(x[layout.at("identity")], x[layout.at("expression", view.step)])
+    return project(view.camera, frames.pose(layout, x, view.step), points)
+
+
+def _columns(layout: Layout, basis: PointBasis, projection: Projection) -> tuple[NDArray, NDArray]:
+    """(2n, shared size) and (2n, local size) derivatives of projected points, in the basis' precision."""
+    n, dtype = len(projection.pixels), basis.mean.dtype
+    columns = np.repeat(np.arange(3 * n).reshape(n, 1, 3), 2, axis=1).reshape(-1)
+    by_object = projection.by_object.astype(dtype).reshape(-1)
+    spread = sp.csr_matrix((by_object, columns, np.arange(0, 6 * n + 1, 3)), shape=(2 * n, 3 * n))
+    shared = np.zeros((2 * n, layout.shared_size), dtype=dtype)
+    shared[:, layout.at("identity")] = spread @ basis.identity
+    if layout.log_scale:
+        shared[:, layout.at("log_scale").start] = projection.by_log_scale.reshape(-1)
+    by_pose = projection.by_pose.reshape(2 * n, 6)
+    return shared, np.concatenate([spread @ basis.expression, by_pose], axis=1, dtype=dtype)
 
 
 @dataclass(frozen=True)
@@ -251,26 +268,13 @@ def initial_state(
     rotation = np.tile(np.eye(3), (timesteps, 1, 1))
     for step in range(timesteps):
         mine = [v for v in views if v.step == step]
-        cameras: list[Camera] = [v.camera for v in mine]
-        pixels = []
-        for view in mine:
-            full = np.full((68, 2), np.nan)
+        cameras = [v.camera for v in mine]
+        pixels = np.full((len(mine), 68, 2), np.nan)
+        for full, view in zip(pixels, mine, strict=True):
             full[view.index] = view.pixels
-            pixels.append(full)
-        candidates = pose_candidates(cameras, mean, pixels, scale)
-        if not candidates:  # landmarks too thinly spread for any closed form: in front of the camera, facing it
-            camera = cameras[0]
-            distance = 500.0 * scale
-            candidates = [
-                (camera.rotation.T @ np.diag([1.0, -1.0, -1.0]), camera.position + distance * camera.rotation[2])
-            ]
-        if warm is not None:
-            pose = warm.frames.pose(warm.layout, warm.x, step)
-            candidates.append((pose.rotation, pose.translation))
-        error = [reprojection(cameras, mean, pixels, scale, pose) for pose in candidates]
-        best = candidates[int(np.argmin(error))]
-        rotation[step] = best[0]
-        x[layout.at("translation", step)] = best[1]
+        more = [] if warm is None else [(warm.poses[step].rotation, warm.poses[step].translation)]
+        best = best_pose(cameras, mean, list(pixels), scale, 500.0 * scale, more)
+        rotation[step], x[layout.at("translation", step)] = best
     return State(layout, Frames(rotation, scale), x)
 
 
@@ -316,7 +320,6 @@ def fit_landmarks(
         held[layout.at("identity")] = not bends
         for k in range(layout.timesteps):
             held[layout.at("expression", k)] = not bends
-        low_now, high_now = np.where(held, state.x, low), np.where(held, state.x, high)
         if number >= 2:
             views = slide_contour(model, views, world_vertices(model, state))
         if number == 3:
@@ -324,22 +327,15 @@ def fit_landmarks(
             views = tuple(replace(view, weight=noise**-2) for view in views)
         term = LandmarkTerm(views, SURE * noise * widening)
         problem = LandmarkProblem(layout, state.frames, term, priors)
-        solution = minimize(
-            problem,
-            state.x,
-            lower=low_now,
-            upper=high_now,
-            max_iterations=30,
-            energy_tolerance=1e-5,
-        )
+        least, most = np.where(held, state.x, low), np.where(held, state.x, high)
+        solution = minimize(problem, state.x, lower=least, upper=most, max_iterations=30, energy_tolerance=1e-5)
         state = replace(state, x=solution.value)
     return LandmarkFit(state, solution, views, noise)
 
 
 def coordinate_deviation(state: State, views: tuple[LandmarkView, ...]) -> float:
     """Robust standard deviation of a landmark coordinate's residual, pixels."""
-    term = LandmarkTerm(views, np.inf)
-    residual = [term.distances(view, state.layout, state.frames, state.x).ravel() for view in views]
+    residual = [_project(view, state.layout, state.frames, state.x).pixels - view.pixels for view in views]
     return median_deviation(np.concatenate(residual))
 
 
@@ -353,5 +349,4 @@ def world_vertices(model: MorphableModel, state: State) -> NDArray[np.float64]:
     """(T, V, 3) vertices in world space."""
     layout, x = state.layout, state.x
     shapes = [model.shape(x[layout.at("identity")], x[layout.at("expression", k)]) for k in range(layout.timesteps)]
-    poses = [state.frames.pose(layout, x, k) for k in range(layout.timesteps)]
-    return np.stack([pose.apply(shape.astype(np.float64)) for pose, shape in zip(poses, shapes, strict=True)])
+    return np.stack([pose.apply(shape.astype(np.float64)) for pose, shape in zip(state.poses, shapes, strict=True)])

@@ -148,12 +148,6 @@ def left_jacobian(vector: NDArray) -> NDArray[np.float64]:
     return np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * k @ k
 
 
-def rotation_angle(a: NDArray, b: NDArray) -> float:
-    """Angle between two rotations, in degrees."""
-    cosine = (np.trace(a.T @ b) - 1.0) / 2.0
-    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-
-
 class NormalEquations:
     """J^T J and J^T r of rows that each touch the shared unknowns and one timestep's."""
 

@@ -26,7 +26,7 @@ from mifit.sampling.visibility import DARKEST, EDGE_PIXELS, OUTLINE_MM
 from mifit.stages.geometry.landmarks import LandmarkFit, LandmarkView, State, contradicts, world_vertices
 from mifit.stages.geometry.parameters import Frames
 from mifit.stages.surface.flow import likeness
-from mifit.stages.surface.views import LARGEST_TEXTURE, Resolution, pose_views, texture_size
+from mifit.stages.surface.views import LARGEST_TEXTURE, pixel_length, pose_views, texture_size
 
 SIZES = np.exp(0.01 * np.arange(-40, 41))
 """Sizes of a head, as factors of the model's, in steps of a hundredth: units of files differ by more than people do."""
@@ -44,18 +44,8 @@ def place_head(
     """The fit by landmarks where what all views show agrees, and the camera whose landmarks contradict it, if any.
 
     The fit as it is where the landmarks of cameras agree, where three or more have some, so that most decide, and where
-    no view shows which size is right.
-
-    Parameters
-    ----------
-    capture, model, cameras
-    timestep : int
-        The first one of the fit: it decides, since all share the size.
-    start : LandmarkFit
-        By the landmarks of all cameras.
-    fit : function
-        From the landmarks of some of them to such a fit.
-    progress : Progress
+    no view shows which size is right. ``start`` is by the landmarks of all cameras, ``fit`` makes one of the landmarks
+    of some. The first timestep of the fit decides, since all share the size.
     """
     views = {name: tuple(view for view in start.views if view.camera.name == name) for name in cameras}
     marked = [name for name, own in views.items() if own]
@@ -80,14 +70,16 @@ def _placed(
 ) -> tuple[State, float]:
     """A state scaled about the first camera so that the other views agree best, and by how much that stands out."""
     centre, world = capture.camera(names[0]).position, world_vertices(model, state)[0]
-    pixel = Resolution.of([capture.camera(name) for name in names], world.mean(axis=0), [(0, 1)]).pixel
+    pixel = pixel_length([capture.camera(name) for name in names], world.mean(axis=0))
     factor = min(1.0, pixel * capture.unit_mm / OUTLINE_MM)
     side = texture_size(model, world, 0.5 * pixel / factor, LARGEST_TEXTURE)
     texels = rasterize_uv(model.uv, model.faces_uv, side, model.face_mask)
     scene = SurfaceScene(world, model.faces)
     views = [(capture.camera(name), capture.frame(name, timestep)) for name in names]
     small = [camera.resized(factor) for camera, _ in views[1:]]
-    logs = [_log_image(camera, frame.image) for camera, (_, frame) in zip(small, views[1:], strict=True)]
+    sizes = [(camera.width, camera.height) for camera in small]
+    images = [cv2.resize(v[1].image, n, interpolation=cv2.INTER_AREA) for v, n in zip(views[1:], sizes, strict=True)]
+    logs = [np.log(image + np.float32(DARKEST)) for image in images]
 
     def evidence(size: float) -> list[float]:
         """Of each other view how much its skin is the first view's, and how far the outline stands out.
@@ -124,11 +116,6 @@ def _nearer(camera: Camera, centre: NDArray, factor: float) -> Camera:
     """The camera, its distance from a centre (3,) divided by a factor."""
     position = centre + (camera.position - centre) / factor
     return replace(camera, world_to_camera=rigid(camera.rotation, -camera.rotation @ position))
-
-
-def _log_image(camera: Camera, image: NDArray) -> NDArray[np.float32]:
-    """Logarithm of a linear image at a smaller camera's size."""
-    return np.log(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA) + np.float32(DARKEST))
 
 
 def outline_contrast(mask: NDArray[np.bool_], log: NDArray) -> float | None:

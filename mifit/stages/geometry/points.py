@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mifit.core.camera import Camera
 from mifit.morphable import MorphableModel
-from mifit.stages.geometry.parameters import Layout, Pose, cross_matrix
+from mifit.stages.geometry.parameters import Pose, cross_matrix
 
 
 @dataclass(frozen=True)
@@ -28,34 +28,10 @@ class PointBasis:
     expression: NDArray
 
     @classmethod
-    def at_vertices(cls, model: MorphableModel, vertices: NDArray) -> PointBasis:
+    def at_vertices(cls, model: MorphableModel, vertices: NDArray | slice) -> PointBasis:
         """Basis at some of the model's vertices."""
-        v = np.asarray(vertices)
-        return cls(
-            model.mean[v].reshape(-1),
-            model.identity[v].reshape(3 * len(v), -1),
-            model.expression[v].reshape(3 * len(v), -1),
-        )
-
-    @classmethod
-    def on_faces(cls, model: MorphableModel, face: NDArray, weights: NDArray) -> PointBasis:
-        """Basis at points given by face (N,) and barycentric weights (N, 3)."""
-        w = corner_matrix(model.faces, face, weights, len(model.mean))
-        w3 = sp.kron(w, sp.identity(3, dtype=np.float32), format="csr")
-        n = 3 * len(face)
-        return (
-            cls(
-                w3 @ model.mean.reshape(-1),
-                w3 @ model.identity.reshape(3 * len(model.mean), -1),
-                w3 @ model.expression.reshape(3 * len(model.mean), -1).reshape(-1, model.expression.shape[2]),
-            )
-            if n
-            else cls(
-                np.zeros(0, np.float32),
-                model.identity[:0].reshape(0, model.identity.shape[2]),
-                model.expression[:0].reshape(0, model.expression.shape[2]),
-            )
-        )
+        mean = model.mean[vertices].reshape(-1)
+        return cls(mean, *(modes[vertices].reshape(len(mean), -1) for modes in (model.identity, model.expression)))
 
     def evaluate(self, identity: NDArray, expression: NDArray) -> NDArray:
         """(N, 3) object-space points."""
@@ -97,16 +73,13 @@ class Projection:
     by_log_scale: NDArray
 
 
-def project(camera: Camera, pose: Pose, points: NDArray, derivatives: bool = True) -> Projection:
+def project(camera: Camera, pose: Pose, points: NDArray) -> Projection:
     """Project object-space points (N, 3); double precision throughout."""
     moved = pose.scale * (np.asarray(points, dtype=np.float64) @ pose.rotation.T)
     q = (moved + pose.translation) @ camera.rotation.T + camera.translation
     z = np.where(q[:, 2] > 1e-9, q[:, 2], 1e-9)
     u, v = camera.fx * q[:, 0] / z, camera.fy * q[:, 1] / z
     pixels = np.stack([u + camera.cx, v + camera.cy], axis=1)
-    empty = np.zeros(0)
-    if not derivatives:
-        return Projection(pixels, q[:, 2], empty, empty, empty)
     by_camera = np.zeros((len(q), 2, 3))
     by_camera[:, 0, 0], by_camera[:, 0, 2] = camera.fx / z, -u / z
     by_camera[:, 1, 1], by_camera[:, 1, 2] = camera.fy / z, -v / z
@@ -116,40 +89,3 @@ def project(camera: Camera, pose: Pose, points: NDArray, derivatives: bool = Tru
     by_pose[:, :, 3:] = by_world
     by_object = by_world @ (pose.scale * pose.rotation)
     return Projection(pixels, q[:, 2], by_object, by_pose, np.einsum("nij,nj->ni", by_world, moved))
-
-
-def geometry_columns(
-    layout: Layout, basis: PointBasis, projection: Projection, by_pixel: NDArray
-) -> tuple[NDArray, NDArray]:
-    """Jacobian of residuals that depend on where points project.
-
-    Parameters
-    ----------
-    by_pixel : (N, C, 2)
-        d residual / d pixel position, C residuals per point.
-
-    Returns
-    -------
-    shared : (N * C, shared_size), local : (N * C, local_size)
-        Columns in the layout's order, in the basis' precision; groups other than geometry are zero.
-    """
-    n, c = by_pixel.shape[:2]
-    dtype = basis.mean.dtype
-    by_object = (by_pixel @ projection.by_object).astype(dtype)
-    spread = sp.csr_matrix(
-        (
-            by_object.reshape(-1),
-            np.repeat(np.arange(3 * n).reshape(n, 1, 3), c, axis=1).reshape(-1),
-            np.arange(0, 3 * n * c + 1, 3),
-        ),
-        shape=(n * c, 3 * n),
-    )
-    shared = np.zeros((n * c, layout.shared_size), dtype=dtype)
-    shared[:, layout.at("identity")] = spread @ basis.identity
-    if layout.log_scale:
-        by_scale = np.einsum("nci,ni->nc", by_pixel, projection.by_log_scale)
-        shared[:, layout.at("log_scale").start] = by_scale.reshape(-1)
-    local = np.empty((n * c, layout.local_size), dtype=dtype)
-    local[:, : layout.expression] = spread @ basis.expression
-    local[:, layout.expression :] = (by_pixel @ projection.by_pose).reshape(n * c, 6)
-    return shared, local

@@ -36,20 +36,12 @@ class Surface:
     """The model's surface at one timestep in object space, with its vertex normals before and after normalising."""
 
     def __init__(self, model: MorphableModel, identity: NDArray, expression: NDArray) -> None:
-        size = 3 * len(model.mean)
-        dtype = model.mean.dtype
-        flat = model.mean.reshape(-1) + model.identity.reshape(size, len(identity)) @ identity.astype(dtype)
-        flat = flat + model.expression.reshape(size, len(expression)) @ expression.astype(dtype)
         self.model = model
-        self.vertices = flat.reshape(-1, 3).astype(np.float64)
-        cross = face_cross(self.vertices, model.faces)
-        normal_sum = np.stack(
-            [
-                np.bincount(model.faces.ravel(), np.repeat(cross[:, axis], 3), minlength=len(self.vertices))
-                for axis in range(3)
-            ],
-            axis=1,
-        )
+        every = PointBasis.at_vertices(model, slice(None))
+        self.vertices = every.evaluate(identity, expression).astype(np.float64)
+        cross, corners = face_cross(self.vertices, model.faces), model.faces.ravel()
+        sums = [np.bincount(corners, np.repeat(each, 3), minlength=len(self.vertices)) for each in cross.T]
+        normal_sum = np.stack(sums, axis=1)
         self.length = np.maximum(np.linalg.norm(normal_sum, axis=1), 1e-30)
         self.unit = normal_sum / self.length[:, None]
 
@@ -164,10 +156,10 @@ class RenderingProblem:
         model, out = self.model, []
         for view in self.views:
             n = len(view.face)
-            points = PointBasis.on_faces(model, view.face, view.weights)
-            position = np.concatenate([points.identity, points.expression], axis=1)
-            position = position.reshape(n, 3, position.shape[-1])
             mix = corner_matrix(model.faces, view.face, view.weights, len(model.mean))
+            ordered = mix.sorted_indices()
+            parts = [ordered @ modes.reshape(len(modes), -1) for modes in (model.identity, model.expression)]
+            position = np.concatenate([part.reshape(n, 3, -1) for part in parts], axis=2)
             modes = mix @ model.albedo_modes.reshape(len(model.mean), -1)
             out.append(PixelRows(position, mix @ model.mean_albedo, modes.reshape(n, 3, modes.shape[-1] // 3)))
         return out
@@ -199,7 +191,6 @@ class RenderingProblem:
         normal = surface.normals(view.face, w)[0] @ pose.rotation.T
         projection = project(view.camera, pose, points)
         values, slope, inside = view.image.sample(projection.pixels)
-        assert slope is not None
         harmonics, basis_slope = basis_gradient(normal, 3)
         shade = harmonics @ x[self.layout.at("shading")].reshape(9, 3)
         modes = rows.albedo_modes

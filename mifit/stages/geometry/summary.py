@@ -81,8 +81,7 @@ def pack(
     noise : float
         Standard deviation of a landmark coordinate that the fit used, pixels.
     """
-    layout, x, world = state.layout, state.x, world_vertices(model, state)
-    poses = [state.frames.pose(layout, x, k) for k in range(len(timesteps))]
+    layout, x, poses = state.layout, state.x, state.poses
     albedo, shading, ambient = np.split(appearance, [model.n_albedo, model.n_albedo + 27])
     expression = np.stack([x[layout.at("expression", k)] for k in range(len(timesteps))])
     if contradicts(state, views):
@@ -91,10 +90,8 @@ def pack(
         journal.warn(Diagnostic("landmarks-scatter", text))
     identity = x[layout.at("identity")].copy()
     if len(identity) and np.abs(identity).max() > FARTHEST_IDENTITY:
-        text = (
-            f"an identity coefficient is {np.abs(identity).max():.1f} standard deviations from the mean: the model "
-            "may not span this face, or the calibration is off"
-        )
+        far = f"an identity coefficient is {np.abs(identity).max():.1f} standard deviations from the mean"
+        text = f"{far}: the model may not span this face, or the calibration is off"
         journal.warn(Diagnostic("identity-far", text))
     return GeometryEstimate(
         timesteps=timesteps,
@@ -104,7 +101,7 @@ def pack(
         rotation=np.stack([pose.rotation for pose in poses]),
         translation=np.stack([pose.translation for pose in poses]),
         scale=poses[0].scale,
-        vertices=world.astype(np.float32),
+        vertices=world_vertices(model, state).astype(np.float32),
         vertex_albedo=model.albedo(albedo),
         shading=shading.reshape(9, 3).copy(),
         ambient=float(ambient[0]),
