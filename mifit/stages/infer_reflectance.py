@@ -19,10 +19,9 @@ from mifit.optim import Outcome
 from mifit.progress import Progress, silent
 from mifit.sampling.observations import Surface
 from mifit.stages.reflectance.als import find_forward, fit_als
-from mifit.stages.reflectance.fill import BLEND, blend_unseen
+from mifit.stages.reflectance.fill import BLEND, blend_unseen, light_error, light_known, light_level
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.hair import find_hair, paint
-from mifit.stages.reflectance.light_error import light_error, light_known, light_level
 from mifit.stages.reflectance.paper_energy import energies, fit_paper
 from mifit.stages.segment import segment
 
@@ -96,7 +95,7 @@ def infer_reflectance(
     given = surface, forward, albedo, config, seed, progress
     fitted = fit_paper(*given) if first is None else fit_als(*given, first.sigma)
     solved = fitted.solved
-    warnings: tuple[Diagnostic, ...] = ()
+    warnings: list[Diagnostic] = []
     illumination = fitted.appearance.illumination
     if not (np.isfinite(solved.maps).all() and np.isfinite(illumination.unknowns).all()):
         raise ConvergenceError("stage 2 (reflectance): the maps or the lighting are not finite; see the images' range")
@@ -104,13 +103,10 @@ def infer_reflectance(
     filled = shown = blend_unseen(model, surface.texels, solved.maps, quality, solved.observability)
     if fitted.outcome is Outcome.MAX_ITERATIONS:
         text = "the lighting had not converged when the iterations ran out; raise max_iterations"
-        warnings = (*warnings, Diagnostic("not-converged", text, "note"))
+        warnings.append(Diagnostic("not-converged", text, "note"))
+    shading = {"model": fitted.appearance.model.name, "exponent": fitted.appearance.lobe.exponent}
     details: dict = {
-        "shading": {
-            "model": fitted.appearance.model.name,
-            "exponent": fitted.appearance.lobe.exponent,
-            "lights": len(illumination.lights),
-        },
+        "shading": {**shading, "lights": len(illumination.lights)},
         "gauge": GAUGE,
         "residual": float(solved.sigma),
         "seen": float((quality[surface.facial] > 0).mean()),
@@ -139,7 +135,7 @@ def infer_reflectance(
             shown = paint(surface.texels, shown, hair, BLEND / (quality + BLEND))
             filled = paint(surface.texels, filled, hair)
             text = "images show hair on the scalp, which is painted in one colour"
-            warnings = (*warnings, Diagnostic("hair-painted", text, "note"))
+            warnings.append(Diagnostic("hair-painted", text, "note"))
         factor = shown.diffuse / np.maximum(filled.diffuse, 1e-3)
         residual_shading = np.where(surface.texels.mask[..., None], factor, 1.0).astype(np.float32)
     return ReflectanceEstimate(
@@ -152,7 +148,7 @@ def infer_reflectance(
         illumination=illumination,
         lobe=fitted.appearance.lobe,
         shading_model=fitted.appearance.model.name,
-        report=Report(fitted.outcome.value, fitted.energies, time.perf_counter() - started, warnings, details),
+        report=Report(fitted.outcome.value, fitted.energies, time.perf_counter() - started, tuple(warnings), details),
         labels=labels,
         labelled=tuple((c, t) for t in geometry.timesteps for c in cameras) if labels else (),
     )

@@ -9,8 +9,7 @@ from mifit.core.mesh import interpolate
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs
-from mifit.stages.reflectance.fill import blend_unseen, sheen_left
-from mifit.stages.reflectance.light_error import light_error, light_known, light_level
+from mifit.stages.reflectance.fill import blend_unseen, light_error, light_known, light_level, sheen_left
 
 
 @pytest.fixture(scope="module")

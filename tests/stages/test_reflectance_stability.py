@@ -24,7 +24,7 @@ from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.reflectance import lighting
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import fit_lighting, lighting_problem, solve_lighting
-from mifit.stages.reflectance.lighting_equations import LightingPriors
+from mifit.stages.reflectance.lighting_equations import LightingPriors, LightingProblem
 from mifit.stages.reflectance.maps import TexelSystems, laplacian, solve_maps
 
 SIZE = 24
@@ -222,8 +222,9 @@ WEAK = LightingPriors(roughness=1e-10, negative=0.0, albedo=1e-6, specular=1e-6)
 def recover(scene, shading, bands, exponent, fresnel, monkeypatch):
     """Lighting and maps from the fast solver's own start, both solved to the end."""
     monkeypatch.setattr(lighting, "solve_lighting", functools.partial(lighting.solve_lighting, tolerance=1e-7))
+    monkeypatch.setattr(lighting, "LightingProblem", functools.partial(LightingProblem, priors=WEAK))
     surface, seen, forward, albedo = problem_of(scene, shading, bands, exponent, fresnel, FINE)
-    light = fit_lighting(seen, forward, albedo, True, 100, priors=WEAK)
+    light = fit_lighting(seen, forward, albedo, True, 100)
     shade, glint = forward.shade(seen, light.light)
     weight = seen.measured[..., None] * np.ones(3, np.float32)
     systems = TexelSystems.accumulate(seen.colour, weight, shade, glint, surface.pairs, 0.1)

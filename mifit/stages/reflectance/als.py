@@ -117,21 +117,10 @@ def fit_als(
     progress: Progress,
     noise: float,
 ) -> Fitted:
-    """Find the lighting on a subset of the texels, then all maps.
+    """Find the lighting on a subset of the texels, which ``seed`` chooses, then all maps.
 
-    Parameters
-    ----------
-    surface : Surface
-    forward : Forward
-        Model, compact lights and lobe.
-    albedo : (N, 3)
-        Diffuse albedo of the fitted model.
-    config : ReflectanceConfig
-    seed : int
-        Chooses the subset.
-    progress : Progress
-    noise : float
-        Robust standard deviation of the first lighting's residuals.
+    ``forward`` has the model, compact lights and lobe; ``albedo`` (N, 3) is the fitted model's diffuse one, ``noise``
+    the robust standard deviation of the first lighting's residuals, linear colour.
     """
     found, prior = lighting_of_subset(surface, forward, albedo, config, seed, noise)
     solved = solve_texels(surface, forward, found, prior, config, progress)
@@ -149,9 +138,8 @@ def lighting_of_subset(
 ) -> tuple[LightingSolution, NDArray[np.float32]]:
     """The lighting, and the maps (S, S, 4) that are expected of all texels."""
     subset = surface.sample(LIGHTING_TEXELS, np.random.default_rng(seed))
-    found = fit_lighting(
-        surface.observe(subset), forward, albedo[subset], config.robust, config.max_iterations, noise=noise
-    )
+    given = forward, albedo[subset], config.robust, config.max_iterations, noise
+    found = fit_lighting(surface.observe(subset), *given)
     prior = np.full((surface.texels.size, surface.texels.size, 4), found.expected, np.float32)
     prior[..., :3] = surface.texels.to_map(np.asarray(albedo, np.float32))
     return found, prior
@@ -307,19 +295,12 @@ def specular_observability(
     a known size. In deep shade and at borders of what is modelled these come from the model instead of from noise, and
     neighbours share them; so their size is that of the surroundings, and no smaller than the usual one.
 
-    Parameters
-    ----------
-    texels : TexelMap
-    systems : TexelSystems
-    sizes : (N, 2), usual : float
-        Sum of the deviations of each texel's residuals at weight 1, and their number; deviation of all of them.
-    expected : float
-        Specular albedo expected beforehand.
+    ``sizes`` (N, 2) are the sum of the deviations of each texel's residuals at weight 1, and their number, ``usual`` is
+    the deviation of all; ``expected`` is the specular albedo beforehand.
     """
     side = 2 * max(1, round(ALIKE * texels.size)) + 1
-    around = cv2.boxFilter(
-        texels.to_map(sizes), cv2.CV_32F, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT
-    )
+    image, border = texels.to_map(sizes), cv2.BORDER_CONSTANT
+    around = cv2.boxFilter(image, cv2.CV_32F, (side, side), normalize=False, borderType=border)
     total, count = texels.from_map(around).T
     size = np.maximum(total / np.maximum(count, 1e-12), usual)
     information = systems.specular_information

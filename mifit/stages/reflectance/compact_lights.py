@@ -46,7 +46,7 @@ LIGHTS = 3
 """Compact lights at the most: a face shows a few lamps apart, and what more there are is smooth light to it."""
 EXPONENT = 40.0
 """Exponent of the lobe beforehand: as wide as a Beckmann roughness of 0.2."""
-EXPONENTS = 10.0, 80.0
+EXPONENTS = 0.25 * EXPONENT, 2.0 * EXPONENT
 """Exponents between which the lobe is looked for: Beckmann roughness 0.4 to 0.15."""
 ITERATIONS = 8
 """Gauss-Newton iterations of all light and albedos under lights in given places, and places that are tried."""
@@ -61,14 +61,8 @@ def find_lights(
 ) -> tuple[tuple[DistantLight, ...], LightingSolution]:
     """Compact lights beside smooth light, without colour, and all light; none where images show none.
 
-    Parameters
-    ----------
-    seen : Observations
-        n texels.
-    forward : Forward
-        Shading model, lobe and bands of the smooth light.
-    albedo : (n, 3)
-        Diffuse albedo that the morphable model expects.
+    ``forward`` has the shading model, the lobe and the bands of the smooth light; ``albedo`` (n, 3) is the diffuse one
+    that the morphable model expects of the n texels seen.
     """
     directions, lights = fibonacci_sphere(DIRECTIONS), tuple[DistantLight, ...]()
     columns = forward.columns(seen, directions)
@@ -89,7 +83,7 @@ def _wider(problem: LightingProblem, found: LightingSolution, columns: Sequence[
     more = np.zeros((columns[0].shape[1], 3))
     wider, light = problem.with_columns(*columns), np.concatenate([found.light, more])
     left = Residuals.of(wider, light, (found.diffuse, found.specular), found.expected).rescaled(wider)
-    return left.equations(wider).eliminate(1e-4)
+    return left.equations(wider, left.priors(wider)).eliminate(1e-4)
 
 
 def _gains(problem: LightingProblem, found: LightingSolution, columns: Sequence[NDArray]) -> NDArray[np.float64]:

@@ -1,4 +1,8 @@
-"""Skin where no image looked or no light came: like the other half of the face, or the mean face in proportion."""
+"""Skin where no image looked or no light came: like the other half of the face, or the mean face in proportion.
+
+Maps are solved with the mesh's normals and a smooth lighting. What both miss ends in the diffuse map, the more the less
+light there is: an error of the light moves the log albedo of a dim texel far.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +17,7 @@ from mifit.core.mesh_solve import membrane
 from mifit.core.uv import TexelMap, sample_map
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import skin_faces
+from mifit.morphable.pigment import SPREAD
 from mifit.sampling.visibility import DARKEST
 from mifit.stages.geometry.points import corner_matrix
 
@@ -29,6 +34,12 @@ TYPICAL = 3e-4
 """Weight of the typical value of skin beside that of a texel of confidence 1: it decides far from what was seen."""
 STIFFNESS = 0.02
 """Of the membrane, beside texels of confidence 1."""
+FEATURE = 0.06
+"""Extent of the widest dark feature of a face, relative to the map: brows."""
+BORDER = 0.03
+"""Width of the border of a shadow, relative to the map."""
+UNLIKE = 2.0 * SPREAD
+"""Difference of log albedo that no skin has: two standard deviations. Hair is as much darker than the face, or more."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +84,7 @@ def blend_unseen(
         How far images determine the specular albedo, 0..1: not at all for a well visible texel in deep shade, or where
         no lobe points at a light.
     lit : (N,), optional
-        Share of the images in the diffuse albedo where visibility is full (`light_error.light_known`). With it the
+        Share of the images in the diffuse albedo where visibility is full (`light_known`). With it the
         albedo is skin's under any light: without sheen (`sheen_left`), and both halves share what they show
         (`bilateral_change`). Without it the albedo stays as the capture's own light shows it.
     """
@@ -103,15 +114,28 @@ def blend_unseen(
         known = known + taken
     certain = known > 0.5 * known.max(initial=0.0)
     typical = np.median(found[certain], axis=0) if certain.any() else np.zeros(4)
-    where = corner_matrix(model.faces, texels.face, texels.weights, model.n_vertices)
     sheet = (known[:, None] * found + TYPICAL * typical) / (known + TYPICAL)[:, None]
-    smooth = where @ membrane(model.mean, model.faces, where, known + TYPICAL, STIFFNESS)(sheet)
+    smooth = continued(model, texels, sheet, known + TYPICAL, STIFFNESS)
     share = (known / (known + BLEND))[:, None]
     blended = share * found + (1.0 - share) * smooth
     blended[:, :3] = expected * np.exp(blended[:, :3])
     image = texels.to_map(np.clip(blended, 0.0, 1.0).astype(np.float32))
     both = (texels.to_map(np.asarray(x, np.float32)) for x in (confidence, confidence * observability))
     return Filled(image[..., :3], image[..., 3], *both)
+
+
+def continued(
+    model: MorphableModel, texels: TexelMap, values: NDArray, weight: NDArray, stiffness: float
+) -> NDArray[np.float64]:
+    """(N, C) values of texels, each known with a weight (N,), as a sheet over the mesh (`core.mesh_solve.membrane`)."""
+    where = corner_matrix(model.faces, texels.face, texels.weights, model.n_vertices)
+    return where @ membrane(model.mean, model.faces, where, weight, stiffness)(values)
+
+
+def _blurred(texels: TexelMap, values: NDArray, deviation: float) -> NDArray[np.float32]:
+    """Values (N, ...) of texels, blurred by a deviation relative to the map; 0 counts beside them."""
+    image = texels.to_map(values.astype(np.float32))
+    return texels.from_map(cv2.GaussianBlur(image, (0, 0), deviation * texels.size))
 
 
 def sheen_left(texels: TexelMap, albedo: NDArray, expected: NDArray, known: NDArray) -> NDArray[np.float64]:
@@ -121,15 +145,12 @@ def sheen_left(texels: TexelMap, albedo: NDArray, expected: NDArray, known: NDAr
     colour, skin of another brightness keeps its own. ``expected`` (N, 3) is the mean face's albedo, ``known`` (N,) the
     weight of each texel.
     """
-
-    def smooth(of: NDArray) -> NDArray:
-        return texels.from_map(cv2.GaussianBlur(texels.to_map(of.astype(np.float32)), (0, 0), SHEEN * texels.size))
-
     found = np.full(len(albedo), np.inf)
     for like in (expected, np.ones_like(expected)):  # what the mean face or the skin around explains isn't sheen
         factor, weight = np.log(np.maximum(albedo, DARKEST) / like), known
         for _ in range(3):
-            around = smooth(weight[:, None] * factor) / np.maximum(smooth(weight), 1e-9)[:, None]
+            count = np.maximum(_blurred(texels, weight, SHEEN), 1e-9)[:, None]
+            around = _blurred(texels, weight[:, None] * factor, SHEEN) / count
             weight = known / (1.0 + ((factor - around).mean(axis=1) / CONTRAST) ** 2)
         skin = like * np.exp(around)
         # albedo = part of the skin's + sheen, least squares over the channels; sheen beforehand is as bright as skin.
@@ -147,11 +168,7 @@ def bilateral_change(texels: TexelMap, values: NDArray, known: NDArray, opposite
     Skin is alike on both over distances of `ALIKE` and more, while light comes from one side; finer marks stay.
     ``opposite`` are the `mirrored_coordinates`.
     """
-
-    def smooth(of: NDArray) -> NDArray:
-        return texels.from_map(cv2.GaussianBlur(texels.to_map(of.astype(np.float32)), (0, 0), ALIKE * texels.size))
-
-    density, total = smooth(known), smooth(known[:, None] * values)
+    density, total = (_blurred(texels, of, ALIKE) for of in (known, known[:, None] * values))
     there, beyond = (_across(texels, of, opposite) for of in (density, total))
     both = (total + beyond) / np.maximum(density + there, 1e-12)[:, None]
     return np.asarray(np.where((density > 1e-9)[:, None], both - total / np.maximum(density, 1e-12)[:, None], 0.0))
@@ -174,3 +191,49 @@ def _across(texels: TexelMap, values: NDArray, opposite: NDArray) -> NDArray[np.
     out = np.zeros(values.shape)
     out[there] = sample_map(texels.to_map(values.astype(np.float32)), opposite[there])
     return out
+
+
+# How far the light that is found is wrong, and so which texels' albedo it leaves open
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def light_level(brightness: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(S, S) how bright the light on texels is, from the brightness (S, S) of their images.
+
+    Light changes over larger distances than brows and nostrils do: what is dark over less than `FEATURE` is itself dark
+    in the light of its surroundings. Near the border of a shadow it is as dark as inside.
+    """
+    closed, inner = (
+        np.ones((2 * round(0.5 * part * len(brightness)) + 1,) * 2, np.uint8) for part in (FEATURE, BORDER)
+    )
+    return np.asarray(cv2.erode(cv2.morphologyEx(brightness, cv2.MORPH_CLOSE, closed), inner), np.float32)
+
+
+def light_error(model: MorphableModel, texels: TexelMap, maps: NDArray, confidence: NDArray, level: NDArray) -> float:
+    """Error of the lighting, in the units of the (N,) ``level``: root of the mean square over dim texels.
+
+    An error e of the light on a texel of level L moves its log albedo by e / L. It is measured where L is below half of
+    the face's median, by how far the log albedo of ``maps`` (S, S, 4) deviates from the mean face's, skin's own
+    `SPREAD` taken off.
+    """
+    sure = confidence > 0.5 * confidence.max(initial=0.0)
+    if not sure.any():
+        return 0.0
+    middle = float(np.median(level[sure]))
+    expected, found = interpolate(model.mean_albedo, model.faces, texels.face, texels.weights), texels.from_map(maps)
+    deviation = np.log(np.maximum(found[:, :3], DARKEST) / np.maximum(expected, DARKEST)).mean(axis=1)
+    deviation -= np.median(deviation[sure & (level >= middle)])
+    dim = (confidence > BLEND) & (level > 0) & (level < 0.5 * middle)
+    if not dim.any():
+        return 0.0
+    excess = np.clip(deviation[dim] ** 2 - SPREAD**2, 0.0, 1.0)
+    return float(np.sqrt(np.mean(excess * level[dim] ** 2)))
+
+
+def light_known(level: NDArray, error: float) -> NDArray:
+    """(N,) share of the images in the albedo at a ``level`` of light (N,), from an ``error`` of it.
+
+    It is 0 where the error changes an albedo by `UNLIKE` or more.
+    """
+    dark = error / UNLIKE
+    return np.maximum(1.0 - (dark / np.maximum(level, 1e-12)) ** 2, 0.0)

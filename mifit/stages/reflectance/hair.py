@@ -8,18 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mifit.core.mesh import interpolate
-from mifit.core.mesh_solve import membrane
 from mifit.core.uv import TexelMap
 from mifit.morphable import MorphableModel
-from mifit.morphable.pigment import SPREAD
 from mifit.morphable.topology import scalp_depth
 from mifit.sampling.visibility import DARKEST
-from mifit.stages.geometry.points import corner_matrix
-from mifit.stages.reflectance.fill import BLEND, Filled
-from mifit.stages.reflectance.light_error import light_known
+from mifit.stages.reflectance.fill import BLEND, UNLIKE, Filled, continued, light_known
 
-DARK = 2.0 * SPREAD
-"""How far the log albedo of hair lies below the face's median: two standard deviations of skin, or more."""
 SHARE = 0.15
 """Dark part of what was seen of either side of the scalp, where there is hair: chosen between 0.35 and more on emily
 c3,c4 and 0.03 and less on scan_city and gloss."""
@@ -75,7 +69,7 @@ def find_hair(
     skin = np.median(albedo[face], axis=0)
     known = confidence * light_known(brightness * skin.mean() / albedo.mean(axis=1), error)
     depth = -np.log(albedo / skin).mean(axis=1)
-    dark, scalp = depth > DARK, (behind > 0) & (above > 0)
+    dark, scalp = depth > UNLIKE, (behind > 0) & (above > 0)
     halves = [scalp & half for half in (side < 0, side > 0)]
     seen = [half for half in halves if (known[half] > BLEND).sum() > SEEN * half.sum()]
     if not seen or min(known[half & dark].sum() / known[half].sum() for half in seen) < SHARE:
@@ -83,11 +77,10 @@ def find_hair(
     reach = (behind > -MARGIN) & (above > 0)
     # Most of it is mixed with skin: at the hairline, and by the smoothness of maps where there is little light.
     colour = np.percentile(albedo[reach & dark & (known > BLEND)], 10, axis=0)
-    step = np.clip(2.0 * depth / DARK - 1.0, 0.0, 1.0)
+    step = np.clip(2.0 * depth / UNLIKE - 1.0, 0.0, 1.0)
     weight = known + BLEND
     value = np.where(reach, (known * step + BLEND * scalp) / weight, 0.0)
-    where = corner_matrix(model.faces, *at, model.n_vertices)
-    smooth = where @ membrane(model.mean, model.faces, where, weight, SOFT * len(weight))(value[:, None])[:, 0]
+    smooth = continued(model, texels, value[:, None], weight, SOFT * len(weight))[:, 0]
     # Exactly none and exactly all away from the border.
     return Hair(colour, np.clip(1.25 * smooth - 0.125, 0.0, 1.0))
 

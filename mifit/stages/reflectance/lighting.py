@@ -25,14 +25,7 @@ from mifit.optim import Outcome
 from mifit.sampling.observations import Observations
 from mifit.stages.reflectance.albedo_priors import AlbedoPriors, specular_pull
 from mifit.stages.reflectance.forward import Forward
-from mifit.stages.reflectance.lighting_equations import (
-    PRIORS,
-    LightingEquations,
-    LightingPriors,
-    LightingProblem,
-    bounded_step,
-    texel_systems,
-)
+from mifit.stages.reflectance.lighting_equations import LightingEquations, LightingProblem, bounded_step, texel_systems
 
 GROSS = 0.4
 """Part of the mean colour beyond which a residual tells of something that no shading model here explains. Chosen on
@@ -144,8 +137,9 @@ class Residuals:
         data = robust_squares(problem, self.residual, max(GROSS * problem.level, 1e-12))[1]
         return float(np.sqrt(data / max(float(problem.weight.sum()), 1e-12)))
 
-    def priors(self, problem: LightingProblem, priors: LightingPriors) -> AlbedoPriors:
+    def priors(self, problem: LightingProblem) -> AlbedoPriors:
         """Priors of the albedos about these; least squares have the weak ones alone."""
+        priors = problem.priors
         texels = texel_systems(problem, self.shading, self.weight, self.residual)
         expected, robust = max(self.expected, 1e-4), np.isfinite(self.scale)
         noise = MISFIT * self.unexplained(problem) / problem.freedom**0.5 if robust else 0.0
@@ -162,21 +156,18 @@ class Residuals:
             mean=float((problem.share * problem.albedo).sum()),
         )
 
-    def energy(self, problem: LightingProblem, priors: LightingPriors, albedos: AlbedoPriors) -> float:
+    def energy(self, problem: LightingProblem, albedos: AlbedoPriors) -> float:
         """Robust sum of squares and priors."""
-        smooth, negative = light_weights(problem, priors)
+        smooth, negative = light_weights(problem)
         dark = np.minimum(_sphere(problem.order) @ self.light[: problem.order**2], 0.0)
         light = float((smooth[:, None] * self.light**2).sum()) + negative * float((dark**2).sum())
         return self.data + light + albedos.cost(*self.maps, self.expected)
 
-    def equations(
-        self, problem: LightingProblem, albedos: AlbedoPriors | None = None, priors: LightingPriors = PRIORS
-    ) -> LightingEquations:
+    def equations(self, problem: LightingProblem, albedos: AlbedoPriors) -> LightingEquations:
         """Normal equations about this state, priors included."""
-        albedos = self.priors(problem, priors) if albedos is None else albedos
         system = LightingEquations.accumulate(problem, self.maps, self.shading, self.residual, self.weight)
         off = problem.albedo - self.maps[0], albedos.wanted(self.expected) - self.maps[1]
-        smooth, negative = light_weights(problem, priors)
+        smooth, negative = light_weights(problem)
         directions = np.pad(_sphere(problem.order), ((0, 0), (0, len(smooth) - problem.order**2)))
         radiance, light, right = directions @ self.light, system.light.copy(), system.right.copy()
         for c in range(3):
@@ -211,17 +202,16 @@ def robust_weight(weight: NDArray, bound: NDArray, residual: NDArray, scale: flo
     return np.where(bound, part, part / (1.0 + (residual / np.float32(scale)) ** 2)).astype(np.float32)
 
 
-def light_weights(problem: LightingProblem, priors: LightingPriors) -> tuple[NDArray[np.float64], float]:
+def light_weights(problem: LightingProblem) -> tuple[NDArray[np.float64], float]:
     """(K,) penalty of each squared coefficient, and that of squared negative radiance per direction."""
-    smooth = priors.roughness * problem.scale * _stiffness(problem.order, problem.diffuse.shape[1])
-    return smooth, priors.negative * problem.scale * 4.0 * np.pi / DIRECTIONS
+    smooth = problem.priors.roughness * problem.scale * _stiffness(problem.order, problem.diffuse.shape[1])
+    return smooth, problem.priors.negative * problem.scale * 4.0 * np.pi / DIRECTIONS
 
 
 def solve_lighting(
     problem: LightingProblem,
     start: tuple[NDArray, NDArray, NDArray] | None = None,
     specular: float = SPECULAR,
-    priors: LightingPriors = PRIORS,
     robust: bool = True,
     iterations: int = 12,
     tolerance: float = 1e-3,
@@ -237,7 +227,6 @@ def solve_lighting(
         the best lighting for them.
     specular : float
         Specular albedo to start from. Zero is a stationary point of the bands that only the specular lobe sees.
-    priors : LightingPriors
     robust : bool
         Give outliers less weight (Cauchy).
     iterations : int
@@ -263,12 +252,12 @@ def solve_lighting(
         outcome, iterations = Outcome.DIVERGED, 0
     for _ in range(iterations):
         if system is None:
-            albedos = best.priors(problem, priors)
+            albedos = best.priors(problem)
             best = rescaled(best.following(problem, best.light, albedos))
-            system, before = best.equations(problem, albedos, priors), best.energy(problem, priors, albedos)
+            system, before = best.equations(problem, albedos), best.energy(problem, albedos)
             lowest = np.where(np.arange(len(best.light))[:, None] < problem.order**2, -np.inf, -best.light)
         trial = best.following(problem, best.light + system.solve(damping, lowest), albedos)
-        after = trial.energy(problem, priors, albedos)
+        after = trial.energy(problem, albedos)
         if after < before:
             best, system, damping = trial, None, max(0.1 * damping, 1e-5)
             energy.append(best.data)
@@ -282,15 +271,8 @@ def solve_lighting(
         if before - after < tolerance * before:
             outcome = Outcome.CONVERGED
             break
-    return LightingSolution(
-        best.light,
-        *best.maps,
-        best.expected,
-        robust_deviation(problem.weight, problem.clipped, best.residual),
-        best.unexplained(problem),
-        energy,
-        outcome,
-    )
+    sigma, unexplained = robust_deviation(problem.weight, problem.clipped, best.residual), best.unexplained(problem)
+    return LightingSolution(best.light, *best.maps, best.expected, sigma, unexplained, energy, outcome)
 
 
 @cache
@@ -355,44 +337,26 @@ def lighting_problem(
     diffuse, specular = forward.transfers(seen, light)
     weight = seen.weight[..., None] * noise_weight(seen.colour, robust)
     there = seen.weight > 0
-    return LightingProblem(
-        np.nonzero(there)[0],
-        seen.colour[there],
-        weight[there],
-        seen.clipped[there],
-        diffuse,
-        specular,
-        albedo,
-        forward.order,
-        forward.gloss,
-    )
+    shown = np.nonzero(there)[0], seen.colour[there], weight[there], seen.clipped[there]
+    return LightingProblem(*shown, diffuse, specular, albedo, forward.order, forward.gloss)
 
 
 def fit_lighting(
-    seen: Observations,
-    forward: Forward,
-    albedo: NDArray,
-    robust: bool,
-    iterations: int,
-    specular: float = SPECULAR,
-    priors: LightingPriors = PRIORS,
-    noise: float | None = None,
+    seen: Observations, forward: Forward, albedo: NDArray, robust: bool, iterations: int, noise: float | None = None
 ) -> LightingSolution:
     """Lighting and the subset's albedos; a model that turns with the lighting is linearised anew."""
     problem = lighting_problem(seen, forward, forward.dark, albedo, robust)
     if not forward.model.turns:
-        specular = specular if forward.gloss else 0.0
-        return solve_lighting(
-            problem, specular=specular, priors=priors, robust=robust, iterations=iterations, noise=noise
-        )
+        specular = SPECULAR if forward.gloss else 0.0
+        return solve_lighting(problem, specular=specular, robust=robust, iterations=iterations, noise=noise)
     # Without highlights first, so that there is lighting to linearise about.
     problem = replace(problem, specular=np.zeros_like(problem.specular))
-    found = solve_lighting(problem, specular=0.05, priors=priors, robust=robust, iterations=6, noise=noise)
+    found = solve_lighting(problem, specular=0.05, robust=robust, iterations=6, noise=noise)
     before, lowest, energy = found, np.inf, list(found.energy)
     for _ in range(max(iterations // 12, 1)):
         problem = lighting_problem(seen, forward, found.light, albedo, robust)
         start = found.light, found.diffuse, found.specular
-        trial = solve_lighting(problem, start, priors=priors, robust=robust, iterations=3, noise=noise)
+        trial = solve_lighting(problem, start, robust=robust, iterations=3, noise=noise)
         if not trial.energy[0] < lowest:
             return replace(before, energy=energy)  # what was found last is worse once linearised anew
         before, found, lowest = found, trial, trial.energy[0]

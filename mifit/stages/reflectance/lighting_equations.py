@@ -20,6 +20,28 @@ PATCHES = 100
 
 
 @dataclass(frozen=True)
+class LightingPriors:
+    """What is assumed where the images are silent.
+
+    Attributes
+    ----------
+    roughness : float
+        Penalty on (l (l + 1))^2 times the squared coefficients of band l, relative to `LightingProblem.scale`.
+    negative : float
+        Penalty on squared negative radiance, relative to the same.
+    albedo : float
+        Pull of the diffuse albedo to the expected one, relative to the median texel's curvature.
+    specular : float
+        Pull of each texel's specular albedo to the expected one, relative to the same, at the least.
+    """
+
+    roughness: float = 1e-7
+    negative: float = 0.5
+    albedo: float = 1e-2
+    specular: float = 2e-2
+
+
+@dataclass(frozen=True)
 class LightingProblem:
     """M observations of n texels, texel after texel, and K lighting coefficients.
 
@@ -39,6 +61,7 @@ class LightingProblem:
         Bands B of the smooth light: the first B*B of the K; the others are the compact lights.
     gloss : float
         The most that is expected of the specular albedo; below 1, at least half of it is.
+    priors : LightingPriors
     """
 
     texel: NDArray[np.intp]
@@ -50,16 +73,12 @@ class LightingProblem:
     albedo: NDArray[np.float32]
     order: int
     gloss: float = 1.0
+    priors: LightingPriors = LightingPriors()
 
     def shade(self, light: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(M, 3) diffuse and specular radiance at unit albedo under a lighting (K, 3)."""
         single = light.astype(np.float32)
         return self.diffuse @ single, self.specular @ single
-
-    @cached_property
-    def seen(self) -> NDArray[np.float32]:
-        """(n, 3) weight of each texel's observations."""
-        return self.sums(self.weight)
 
     @cached_property
     def share(self) -> NDArray[np.float64]:
@@ -131,32 +150,6 @@ def _per_texel(start: NDArray) -> sp.csr_matrix:
     count = int(start[-1] - start[0])
     shape = len(start) - 1, count
     return sp.csr_matrix((np.ones(count, np.float32), np.arange(count), start - start[0]), shape=shape)
-
-
-@dataclass(frozen=True)
-class LightingPriors:
-    """What is assumed where the images are silent.
-
-    Attributes
-    ----------
-    roughness : float
-        Penalty on (l (l + 1))^2 times the squared coefficients of band l, relative to `LightingProblem.scale`.
-    negative : float
-        Penalty on squared negative radiance, relative to the same.
-    albedo : float
-        Pull of the diffuse albedo to the expected one, relative to the median texel's curvature.
-    specular : float
-        Pull of each texel's specular albedo to the expected one, relative to the same, at the least.
-    """
-
-    roughness: float = 1e-7
-    negative: float = 0.5
-    albedo: float = 1e-2
-    specular: float = 2e-2
-
-
-PRIORS = LightingPriors()
-"""The usual weights."""
 
 
 def texel_systems(
@@ -290,16 +283,9 @@ class LightingEquations:
 
 
 def bounded_step(system: NDArray, right: NDArray, lowest: NDArray) -> NDArray[np.float64]:
-    """Step z (C,), at ``lowest`` or above, that minimises ``z' A z / 2 - b' z``.
+    """Step z (C,) that minimises ``z' A z / 2 - b' z``, at ``lowest`` (C,) or above, which may be -inf.
 
-    Parameters
-    ----------
-    system : (C, C)
-        A, positive definite.
-    right : (C,)
-        b.
-    lowest : (C,)
-        -inf where there is no bound.
+    ``system`` (C, C) is A, positive definite, ``right`` (C,) is b.
     """
     bounded = np.isfinite(lowest)
     if not bounded.any():

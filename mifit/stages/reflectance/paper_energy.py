@@ -77,23 +77,10 @@ def energies(
     albedo: NDArray,
     config: ReflectanceConfig,
 ) -> dict[str, float]:
-    """Data, specular difference and smoothness terms (paper, section 5), weighted by their lambdas.
+    """Data, specular difference and smoothness terms (paper, section 5), weighted by the lambdas of ``config``.
 
-    Every measured pixel has the weight of its area, clipped ones have none.
-
-    Parameters
-    ----------
-    surface : Surface
-    forward : Forward
-    light : (K, 3)
-        The lighting unknowns.
-    ambient : float
-    maps : (S, S, 4)
-        Diffuse and specular albedo.
-    albedo : (N, 3)
-        Diffuse albedo of the model, from which the offset is counted.
-    config : ReflectanceConfig
-        Its lambdas.
+    Every measured pixel has the weight of its area, clipped ones have none. ``light`` (K, 3) are the lighting unknowns,
+    ``maps`` (S, S, 4) diffuse and specular albedo; the offset is counted from the model's ``albedo`` (N, 3).
     """
     values = maps.reshape(-1, 4)[surface.texels.index]
     data = difference = 0.0
