@@ -193,8 +193,8 @@ MUTATIONS = (
       "tests/stages/test_fill.py"),
     M("brighter skin is sheen", "fill.sheen_left", "np.minimum(sheen, brighter)", "brighter",
       "tests/stages/test_fill.py"),
-    M("normals smoothed by a tenth", "refine_normals.frame_problem", "0.5 * config.laplacian_weight / STEPS",
-      "0.05 * config.laplacian_weight / STEPS", "tests/stages/test_refine_normals.py tests/test_paper.py"),
+    M("normals smoothed by a tenth", "refine_normals.frame_problem", "0.5 * config.laplacian_weight / WHITE",
+      "0.05 * config.laplacian_weight / WHITE", "tests/stages/test_refine_normals.py tests/test_paper.py"),
     # Calibration.
     M("a camera turns about the world's origin", "check_calibration.explain_matches",
       "np.cross(np.eye(3), start.cameras[c, :3, 3]).T", "0.0", "tests/extras/test_calibrate_densely.py -k wrong"),

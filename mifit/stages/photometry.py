@@ -70,11 +70,10 @@ class Factors:
     @classmethod
     def of(cls, camera: NDArray, step: NDArray) -> Factors:
         """All that images (J,) of cameras and timesteps may have; the first camera and timestep are the reference."""
-        columns: list[tuple[str, NDArray, NDArray]] = []
-        own = [(c, t) for c in np.unique(camera)[1:] for t in np.unique(step)[1:]]
-        columns += [("gain", camera == c, np.eye(3)[channel]) for c in np.unique(camera)[1:] for channel in range(3)]
-        columns += [("exposure", step == t, np.ones(3)) for t in np.unique(step)[1:]]
-        columns += [("own", (camera == c) & (step == t), np.ones(3)) for c, t in own]
+        others, later = np.unique(camera)[1:], np.unique(step)[1:]
+        columns = [("gain", camera == c, channel) for c in others for channel in np.eye(3)]
+        columns += [("exposure", step == t, np.ones(3)) for t in later]
+        columns += [("own", (camera == c) & (step == t), np.ones(3)) for c in others for t in later]
         design = np.stack([np.outer(images, channels) for _, images, channels in columns], axis=-1)
         return cls(design, np.array([name for name, _, _ in columns]))
 
@@ -149,21 +148,9 @@ def find_photometry(
 def estimate_photometry(
     seen: Observations, albedo: NDArray, cameras: Sequence[str], timesteps: Sequence[int]
 ) -> Photometry:
-    """Factors of images from observations of shared points.
+    """Gains where a camera's surely differ, and exposures where an image's surely does, from N points in J images.
 
-    Parameters
-    ----------
-    seen : Observations
-        N points in J images.
-    albedo : (N, 3)
-        What the model expects of the points, linear.
-    cameras, timesteps : sequences
-        Names of the observations' cameras and timesteps.
-
-    Returns
-    -------
-    Photometry
-        With gains where a camera's surely differ, and with exposures where an image's surely does.
+    ``albedo`` (N, 3) is what the model expects of the points, linear.
     """
     albedo = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float64)
     found = solve_factors(seen, albedo, Factors.of(seen.camera, seen.step))

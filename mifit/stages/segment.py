@@ -25,6 +25,7 @@ from mifit.core.image import box, to_8_bit
 from mifit.core.mesh import interpolate
 from mifit.core.metrics import NORMAL, SURE
 from mifit.core.process import on_all_cores
+from mifit.core.uv import TexelMap
 from mifit.morphable.topology import BROWS, EYES_AND_MOUTH
 from mifit.sampling.visibility import DARKEST
 
@@ -103,17 +104,10 @@ def common_albedos(surface: Surface, appearance: Forward, light: NDArray) -> Alb
     bare = known & ~no_skin(centre, skin)
     apart = np.abs(flat - centre[:, None])[(weight > 0) & bare[:, None]]
     deviation = np.maximum(NORMAL * np.median(apart, axis=0).astype(np.float64), FLOOR) if len(apart) else FLOOR
-    index, size = surface.texels.index[np.concatenate(texels)], surface.texels.size
-
-    def to_map(values: NDArray) -> NDArray[np.float32]:
-        out = np.zeros((size * size, 3), np.float32)
-        out[index[known]] = values[known]
-        return out.reshape(size, size, 3)
-
-    mask = np.zeros(size * size, np.float32)
-    mask[index[known]] = 1.0
-    maps = tuple(to_map(shading[:, j]) for j in range(surface.image_count))
-    return Albedos(to_map(centre), mask.reshape(size, size), maps, deviation, skin)
+    rows, of = np.concatenate(texels)[known], surface.texels
+    shown = TexelMap(of.size, of.index[rows], of.face[rows], of.weights[rows])
+    maps = tuple(shown.to_map(shading[known, j]) for j in range(surface.image_count))
+    return Albedos(shown.to_map(centre[known]), shown.mask.astype(np.float32), maps, deviation, skin)
 
 
 def opponent(colour: NDArray) -> NDArray[np.float32]:
@@ -138,22 +132,9 @@ def _median(values: NDArray, weights: NDArray) -> NDArray:
 def segment(
     surface: Surface, capture: Capture, model: MorphableModel, forward: Forward, light: NDArray
 ) -> tuple[NDArray[np.uint8], ...]:
-    """A label image for every image of a surface.
+    """(H, W) `Label` values for every image of a surface, in their order; ``light`` (K, 3) is what lights the face.
 
-    Parameters
-    ----------
-    surface : Surface
-    capture : Capture
-        Images are taken from it; those with a mask of their own are labelled by it and the mesh alone.
-    model : MorphableModel
-    forward : Forward
-    light : (K, 3)
-        What lights the face.
-
-    Returns
-    -------
-    tuple of (H, W) uint8
-        `Label` values, in the order of the surface's images.
+    Images of the ``capture`` with a mask of their own are labelled by it and the mesh alone.
     """
     albedos = common_albedos(surface, forward, light)
 
@@ -180,9 +161,8 @@ def _segment_image(
         rows, columns = box(facial)
         step = -(-max(rows.stop - rows.start, columns.stop - columns.start) // LONGEST)
         grid = slice(rows.start, rows.stop, step), slice(columns.start, columns.stop, step)
-        objects = _objects(
-            view, image[rows, columns], usable, grid, albedos, shading, model, facial, _plain(hit.shape, marks)
-        )
+        given = image[rows, columns], usable, grid, albedos, shading, model, facial, _plain(hit.shape, marks)
+        objects = _objects(view, *given)
         found = np.zeros(hit.shape, bool)
         shape = columns.stop - columns.start, rows.stop - rows.start
         found[rows, columns] = cv2.resize(objects.astype(np.uint8), shape, interpolation=cv2.INTER_NEAREST) > 0
@@ -236,18 +216,10 @@ def _objects(
     strange = no_skin(level - shaded, albedos.skin) & usable
     covered = no_skin(colour, albedos.skin) & strange
     picture = to_8_bit(image)
-    found = _outlines(
-        picture,
-        (departure > SURE) & inner,
-        departure > CLEAN,
-        (departure < CLEAN) & usable,
-        facial,
-        SMALLEST,
-        size,
-    )
-    return found | _outlines(
-        picture, covered & plain & inner, strange, ~strange & plain & usable, facial, LARGE, size, WIDE * REACH
-    )
+    started, clean = (departure > SURE) & inner, (departure < CLEAN) & usable
+    found = _outlines(picture, started, departure > CLEAN, clean, facial, SMALLEST, size)
+    started, clean = covered & plain & inner, ~strange & plain & usable
+    return found | _outlines(picture, started, strange, clean, facial, LARGE, size, WIDE * REACH)
 
 
 def _outlines(
@@ -282,9 +254,8 @@ def _outlines(
             out |= core.astype(bool)
             continue
         cv2.setRNGSeed(0)
-        behind, before = np.zeros((1, 65)), np.zeros((1, 65))
-        nowhere = (0, 0, 0, 0)
-        cv2.grabCut(np.ascontiguousarray(picture[about]), part, nowhere, behind, before, 2, cv2.GC_INIT_WITH_MASK)
+        image, models = np.ascontiguousarray(picture[about]), (np.zeros((1, 65)), np.zeros((1, 65)))
+        cv2.grabCut(image, part, (0, 0, 0, 0), *models, 2, cv2.GC_INIT_WITH_MASK)
         out[about] |= np.isin(part, (cv2.GC_FGD, cv2.GC_PR_FGD))
     return out
 

@@ -67,15 +67,7 @@ def refine_mesh(
 
 
 class MeshRefiner:
-    """Refines the meshes of one model; the system is factorised here, once.
-
-    Parameters
-    ----------
-    model : MorphableModel
-    size : int
-        Side of the normal maps.
-    config : MeshConfig
-    """
+    """Refines the meshes of one model by normal maps of ``size`` texels a side; the system is factorised here, once."""
 
     def __init__(self, model: MorphableModel, size: int, config: MeshConfig) -> None:
         self._faces = model.faces

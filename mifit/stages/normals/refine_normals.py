@@ -38,13 +38,12 @@ from mifit.errors import InputError
 from mifit.optim import Outcome, Solution, minimize
 from mifit.progress import Progress, silent
 from mifit.sampling.observations import Observations, Surface
+from mifit.stages.geometry.rendering import WHITE
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
-STEPS = 255.0
-"""Of 8-bit images and normal maps; a unit normal spans half of them to either side."""
 L1_FLOOR = 1e-4
 """Radians below which the L1 norm is rounded off: sqrt(c^2 + floor^2); its reweighting stays finite."""
 MOST = 1.0
@@ -216,7 +215,7 @@ def frame_problem(
         tangent_plane(base[rows]).astype(np.float32),
         texel_neighbours(patch),
         views,
-        0.5 * config.laplacian_weight / STEPS,
+        0.5 * config.laplacian_weight / WHITE,
         0.25 * config.magnitude_weight,
         None if prior is None else prior[rows],
     )
