@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mifit.appearance.lobe import Lobe, lobe_table, normalization
+from mifit.appearance.lobe import Lobe, normalization, tabulated_moments
 from mifit.core.sh import SHLighting, bands, basis, cosine_coefficients, order_of
 
 Array = NDArray[np.float64]
@@ -117,12 +117,12 @@ def lobe_about(normals: Array, view: Array, lobe: Lobe, order: int) -> tuple[Arr
     cosine = (normals * view).sum(1)
     mirror = 2.0 * cosine[:, None] * normals - view
     if lobe.fresnel is None:
-        moments = lobe_table(order)(cosine, lobe.exponent)
+        moments = tabulated_moments(order, cosine, lobe.exponent)
         axis = mirror + moments[1][:, None] * (normals - mirror)
         axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
         albedo = moments[0]
     else:
-        moments = lobe_table(order)(np.ones_like(cosine), lobe.exponent)
+        moments = tabulated_moments(order, np.ones_like(cosine), lobe.exponent)
         axis, albedo = mirror, moments[0] * (1.0 + lobe.fresnel * (1.0 - np.clip(cosine, 0.0, 1.0)) ** 5)
     scale = normalization(lobe.exponent, lobe.normalized) / normalization(lobe.exponent)
     return axis, scale * albedo * np.concatenate([np.ones((1, len(normals))), moments[2:]])

@@ -12,7 +12,6 @@ import heapq
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +20,7 @@ from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.kernels import diffuse_transfer, radiance
 from mifit.appearance.occlusion import MeshPoints
 from mifit.appearance.reception import reception
+from mifit.core.image import reduced
 from mifit.core.mesh import interpolate
 from mifit.core.sh import LUMINANCE, SHLighting, latlong_directions, latlong_solid_angles
 
@@ -42,14 +42,7 @@ def illumination_of(image: NDArray[np.float32], order: int) -> Illumination:
     bright = image - soft
     lamps = zip(*cut(bright), strict=True) if bright.any() else ()
     lights = tuple(DistantLight(toward, 0.0, power) for toward, power in lamps)
-    return Illumination(SHLighting.from_envmap(_reduced(soft), order).coefficients, lights)
-
-
-def _reduced(image: NDArray) -> NDArray[np.float32]:
-    """A lat-long environment of at most `SKY_ROWS` rows."""
-    if len(image) <= SKY_ROWS:
-        return image
-    return np.asarray(cv2.resize(image, (2 * SKY_ROWS, SKY_ROWS), interpolation=cv2.INTER_AREA), np.float32)
+    return Illumination(SHLighting.from_envmap(reduced(soft, SKY_ROWS), order).coefficients, lights)
 
 
 def smooth_part(image: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -62,21 +55,10 @@ def smooth_part(image: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def cut(image: NDArray, count: int = LAMPS) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Cut a lat-long environment into regions of equal power.
+    """Cut a lat-long environment (H, W, 3) into at most ``count`` regions of equal power; fewer where all are pixels.
 
-    Parameters
-    ----------
-    image : (H, W, 3)
-        Linear radiance, not negative; axes of ``core.sh.latlong_directions``.
-    count : int
-        Regions at the most; there are fewer where all are single pixels.
-
-    Returns
-    -------
-    directions : (R, 3)
-        Unit, towards the middle of each region's power.
-    power : (R, 3)
-        Radiance times solid angle.
+    ``image`` holds linear radiance, not negative, on the axes of ``core.sh.latlong_directions``. Returned are unit
+    directions (R, 3) towards the middle of each region's power, and that power (R, 3), radiance times solid angle.
     """
     height, width = image.shape[:2]
     angles = np.broadcast_to(np.reshape(latlong_solid_angles(height, width), (height, -1)), (height, width))
@@ -128,25 +110,12 @@ def diffuse_light(
 ) -> NDArray[np.float32]:
     """(N, 3) diffuse radiance at unit albedo of points on a mesh, but for what comes from the lamps directly.
 
-    Shadows belong to the mesh; bent normals change what an open surface would receive.
-
-    Parameters
-    ----------
-    image : (H, W, 3)
-        Lat-long environment of linear radiance.
-    rotation : (3, 3)
-        What came from d comes from R d.
-    lamps : sequence of DistantLight
-        Its bright part, turned.
-    scene : SurfaceScene
-    points : MeshPoints
-    normals : (N, 3)
-        Unit; they may be bent away from the mesh's.
-    albedo : (V, 3)
-        Of the mesh's vertices.
+    ``image`` (H, W, 3) is a lat-long environment of linear radiance; what came from d comes from R d with the rotation
+    R (3, 3). ``lamps`` are its bright part, turned. Unit ``normals`` (N, 3) may be bent away from the mesh's, which
+    changes what an open surface would receive: shadows belong to the mesh. ``albedo`` (V, 3) is that of its vertices.
     """
     mesh, soft = reception(scene), smooth_part(image)
-    small = _reduced(soft)
+    small = reduced(soft, SKY_ROWS)
     power = small * latlong_solid_angles(*small.shape[:2])[:, None, None]
     toward = latlong_directions(*small.shape[:2]).reshape(-1, 3)
     shaded = mesh.from_sky(toward @ rotation.T, power.reshape(-1, 3))

@@ -30,14 +30,7 @@ def form_image(ambient: Jit, albedo: Jit, diffuse: Jit, specular_albedo: Jit, sp
 
 @dataclass(frozen=True)
 class Appearance:
-    """An image-formation model with all of its parameters but albedos.
-
-    Attributes
-    ----------
-    model : ShadingModel
-    illumination : Illumination
-    lobe : Lobe
-    """
+    """An image-formation model with all of its parameters but albedos."""
 
     model: ShadingModel
     illumination: Illumination
@@ -57,22 +50,15 @@ class Appearance:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Diffuse and specular radiance (N, 3) of points at unit albedo, without ambient.
 
-        Parameters
-        ----------
-        normals, view : (N, 3)
-            Unit normals and unit directions towards the camera, world axes.
-        occlusion : Occlusion
-            Shadows at the points; models that need none and illumination without compact lights may do without.
-
-        Raises
-        ------
-        InputError
-            Arrays of unequal lengths or wrong shapes, or shadows that are missing.
+        ``normals`` and ``view`` (N, 3) are unit normals and unit directions towards the camera, world axes. Models that
+        need no shadows and illumination without compact lights do without ``occlusion``. InputError for arrays of
+        unequal lengths or wrong shapes, or shadows that are missing.
         """
         scene = _Scene(self, normals, view, occlusion)
         if not scene.count:
             return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
-        return scene.store(scene.with_lights(self._smooth(scene))(scene.n, scene.v))
+        shade = scene.with_lights(lambda n, v: self.model.shade(n, v, scene.lobe, scene.coefficients, scene.shadowed))
+        return scene.store(shade(scene.n, scene.v))
 
     def transfers(
         self, normals: ArrayLike, view: ArrayLike, occlusion: Occlusion = OPEN
@@ -100,14 +86,8 @@ class Appearance:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Diffuse and specular radiance (M, N) at unit albedo per unit of irradiance from single directions.
 
-        Parameters
-        ----------
-        normals, view : (N, 3)
-            As in `shade`.
-        directions : (M, 3)
-            Unit vectors.
-        visible : (M, N) bool
-            Which of them each point sees.
+        ``normals`` and ``view`` (N, 3) are as in `shade`, ``directions`` (M, 3) unit vectors; ``visible`` (M, N) bool
+        says which of them each point sees.
         """
         import drjit as dr
         import mitsuba as mi
@@ -127,46 +107,29 @@ class Appearance:
         both = stored(list(light_transfer(n, v, scene.lobe, [d], seen)), shape[0] * shape[1])
         return both[:, 0].reshape(shape), both[:, 1].reshape(shape)
 
-    def _smooth(self, scene: _Scene) -> Shade:
-        return lambda n, v: self.model.shade(n, v, scene.lobe, scene.coefficients, scene.shadowed)
 
+def shade_bent(
+    appearance: Appearance, base: ArrayLike, view: ArrayLike, occlusion: Occlusion, normals: ArrayLike
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Diffuse and specular radiance (N, 3) at unit albedo of points whose normals are bent away from the mesh's.
 
-class BentShading:
-    """Shading of points by their normals, which may be bent away from the mesh's, with all else held.
-
-    Parameters
-    ----------
-    appearance : Appearance
-    base, view : (N, 3)
-        The mesh's unit normals, where shadows were traced, and unit directions towards the camera.
-    occlusion : Occlusion
+    ``base`` (N, 3) are the mesh's unit normals, where shadows were traced, ``view`` (N, 3) unit directions towards the
+    camera, ``normals`` (N, 3) the bent ones.
     """
+    import mitsuba as mi
 
-    def __init__(self, appearance: Appearance, base: ArrayLike, view: ArrayLike, occlusion: Occlusion = OPEN) -> None:
-        self._scene = _Scene(appearance, base, view, occlusion)
-        self._shade = self._scene.shader() if self._scene.count else None
-
-    def __call__(self, normals: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Diffuse and specular radiance (N, 3) at unit albedo."""
-        import mitsuba as mi
-
-        scene, shape = self._scene, (self._scene.count, 3)
-        if self._shade is None:
-            return np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        return scene.store(self._shade(on_device(mi.Vector3f, expect(normals, shape, "normals")), scene.v))
+    scene = _Scene(appearance, base, view, occlusion)
+    if not scene.count:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
+    bent = on_device(mi.Vector3f, expect(normals, (scene.count, 3), "normals"))
+    return scene.store(scene.shader()(bent, scene.v))
 
 
 class BentImage:
     """The image of points by their normals, with all else held.
 
-    Parameters
-    ----------
-    appearance, base, view, occlusion
-        As for `BentShading`.
-    albedos : (N, 3), (N,)
-        Diffuse and specular.
-    rotation : (3, 3)
-        From the space of the normals that are given later to world space.
+    ``base``, ``view`` and ``occlusion`` are as for `shade_bent`, ``albedos`` (N, 3) and (N,) diffuse and specular;
+    ``rotation`` (3, 3) takes the normals that are given later to world space.
     """
 
     def __init__(

@@ -89,10 +89,7 @@ class DistantLight:
 def light_from(document: Document) -> DistantLight:
     """The light of `DistantLight.document`.
 
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        A value is missing, of the wrong kind or shape, or not finite.
+    KeyError, TypeError or ValueError for a value that is missing, of the wrong kind or shape, or not finite.
     """
     direction, colour = (np.array(document[name], dtype=np.float64) for name in ("direction", "irradiance"))
     radius = float(document["radius"])

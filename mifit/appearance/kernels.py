@@ -61,21 +61,12 @@ def diffuse_transfer(n: Jit, order: int) -> list[Jit]:
 
 @dataclass(frozen=True)
 class PreparedLobe:
-    """A lobe on the device, ready to be prefiltered.
+    """A lobe on the device, ready to be prefiltered to ``order`` bands.
 
-    Attributes
-    ----------
-    order : int
-        Number of bands.
-    polynomials : list of list
-        Per moment of ``lobe.lobe_moments`` its Chebyshev coefficients in ``2 n.v - 1``.
-    scale : float or Float
-        Factor on the albedo: 1 for the normalised lobe.
-    exponent, peak : float or Float
-        ``N (n . h)^m`` has the exponent m and the peak N.
-    fresnel : float, Float or None
-        None: Blinn-Phong as it is. A number: the lobe that a view along the normal has, carried about the mirror
-        direction whatever the view, times ``1 + fresnel (1 - n.v)^5``: what microfacet surfaces do.
+    ``polynomials`` has per moment of ``lobe.lobe_moments`` its Chebyshev coefficients in ``2 n.v - 1``; ``scale`` is a
+    factor on the albedo, 1 for the normalised lobe. ``N (n . h)^m`` has the ``exponent`` m and the ``peak`` N. Without
+    ``fresnel`` it is Blinn-Phong's; with a number it is the lobe that a view along the normal has, carried about the
+    mirror direction whatever the view, times ``1 + fresnel (1 - n.v)^5``: what microfacet surfaces do.
     """
 
     order: int
@@ -101,11 +92,11 @@ def prepare_exponent(exponent: Jit, order: int, normalized: bool = True, fresnel
     """Prepare the lobe of a Dr.Jit exponent, differentiable and of any width."""
     import drjit as dr
 
-    table = lobe_table(order).coefficients
+    table = lobe_table(order).tolist()
     m = dr.clip(exponent, EXPONENT_MIN, EXPONENT_MAX)
     y = dr.log(m) * (2.0 / float(np.log(EXPONENT_MAX))) - 1.0
-    t = _chebyshev(y, table.shape[2])
-    polynomials = [[_dot(row, t) for row in moment] for moment in table]
+    t = _chebyshev(y, len(table[0][0]))
+    polynomials = [[radiance(row, t) for row in moment] for moment in table]
     if dr.width(exponent) == 1 and not dr.grad_enabled(exponent):
         dr.eval(polynomials)  # computed once; with a gradient it is cheaper per point, with one sum at the end
     peak = normalization(exponent)
@@ -120,17 +111,6 @@ def _chebyshev(x: Jit, count: int) -> list[Jit]:
     for _ in range(2, count):
         t.append(2.0 * x * t[-1] - t[-2])
     return t[:count]
-
-
-def _dot(a: Sequence[Jit], t: Sequence[Jit]) -> Jit:
-    total = _scalar(a[0]) * t[0] + _scalar(a[1]) * t[1]
-    for ai, ti in zip(a[2:], t[2:], strict=True):
-        total = total + _scalar(ai) * ti
-    return total
-
-
-def _scalar(value: Jit) -> Jit:
-    return float(value) if isinstance(value, np.floating) else value
 
 
 def normalization(exponent: Jit) -> Jit:
@@ -150,10 +130,8 @@ def fresnel_factor(cosine: Jit, fresnel: Jit) -> Jit:
 def carried_lobe(wi: Jit, wo: Jit, n: Jit, exponent: Jit) -> tuple[Jit, Jit]:
     """The lobe about the mirror direction for single directions, see ``appearance.lobe``.
 
-    Returns
-    -------
-    value, density
-        ``f / (C_s N(m))`` without the Fresnel factor, and the density of wo when ``((1 + r.wo) / 2)^(m/2)`` is sampled.
+    Returned are ``f / (C_s N(m))`` without the Fresnel factor, and the density of wo when ``((1 + r.wo) / 2)^(m/2)`` is
+    sampled.
     """
     import drjit as dr
 
@@ -181,7 +159,7 @@ def lobe_axis(n: Jit, v: Jit, lobe: PreparedLobe) -> tuple[Jit, list[Jit]]:
         moments[0] = moments[0] * fresnel_factor(cosine, lobe.fresnel)
         return mirror, moments
     t = _chebyshev(2.0 * dr.clip(cosine, 0.0, 1.0) - 1.0, len(lobe.polynomials[0]))
-    moments = [_dot(row, t) for row in lobe.polynomials]
+    moments = [radiance(row, t) for row in lobe.polynomials]
     axis = mirror + moments[1] * (n - mirror)
     return axis * dr.rsqrt(dr.maximum(dr.squared_norm(axis), 1e-12)), moments
 
@@ -215,18 +193,8 @@ def light_transfer(n: Jit, v: Jit, lobe: PreparedLobe, directions: Sequence[Jit]
 
     Nothing is band limited here: cosine and lobe are those of the light's own directions, and shadows are traced.
 
-    Parameters
-    ----------
-    n, v : Vector3f
-    lobe : PreparedLobe
-    directions : sequence of Vector3f
-        Directions that stand for the light's extent, at most 32 (``DistantLight.samples``).
-    visible : UInt
-        Bit d is 1 where direction d is visible.
-
-    Returns
-    -------
-    diffuse, specular : Float
+    ``directions`` stand for the light's extent, at most 32 (``DistantLight.samples``); bit d of ``visible`` is 1 where
+    direction d is visible.
     """
     import drjit as dr
 

@@ -82,14 +82,10 @@ class Lobe:
     def zonal(self, order: int, cosines: Array) -> tuple[Array, Array, Array]:
         """The lobe as few numbers, for a viewer.
 
-        Returns
-        -------
-        albedo, tilt : like ``cosines``
-            Of views at these cosines from the normal, ascending to 1; see `lobe_moments`.
-        factors : (B,)
-            Legendre factors of the bands, those of a middling view.
+        Returned are its albedo and tilt (see `lobe_moments`) for views at ``cosines`` from the normal, ascending to 1,
+        and the Legendre factors (B,) of the bands, those of a middling view.
         """
-        moments = lobe_table(order)(cosines, self.exponent)
+        moments = tabulated_moments(order, cosines, self.exponent)
         albedo, tilt = moments[0], moments[1]
         middling = int(np.searchsorted(cosines, 0.7))
         if self.fresnel is not None:
@@ -111,18 +107,14 @@ def normalization(exponent: ArrayLike, normalized: bool = True) -> Array:
     return (m + 2.0) * (m + 4.0) / (8.0 * np.pi * (m + np.exp2(-0.5 * m)))
 
 
-def lobe_samples(cosine: float, exponent: float, count: int = 48) -> tuple[Array, Array]:
+def lobe_samples(cosine: float, exponent: float) -> tuple[Array, Array]:
     """Quadrature of the normalised lobe seen at one angle.
 
-    The half vectors follow their own density, so that the same count serves exponents of 1 and of 10000.
-
-    Returns
-    -------
-    directions : (N, 3)
-        Light directions in the frame with the normal along z and the view in the x-z plane.
-    weights : (N,)
-        ``f (n . l) dl``; their sum is the directional albedo.
+    Returned are light directions (N, 3), in the frame with the normal along z and the view in the x-z plane, and
+    weights (N,) ``f (n . l) dl``, whose sum is the directional albedo. The half vectors follow their own density, so
+    that the same count serves exponents of 1 and of 10000.
     """
+    count = 48
     x, w = np.polynomial.legendre.leggauss(count)
     u = 0.5 * (x + 1.0)
     # Substituting cos_h = u^(1/(m+1)) makes (n . h)^m d(cos_h) uniform, but steep at u = 0; squaring u smooths it.
@@ -143,13 +135,10 @@ def lobe_samples(cosine: float, exponent: float, count: int = 48) -> tuple[Array
 
 
 def lobe_moments(cosine: float, exponent: float, order: int) -> Array:
-    """Moments of the normalised lobe seen at the cosine mu from the normal.
+    """Moments (B + 1,) of the normalised lobe seen at the cosine mu from the normal.
 
-    Returns
-    -------
-    (B + 1,)
-        Directional albedo; tilt t of the mean direction ``normalize((1 - t) r + t n)`` from the mirror direction r
-        towards the normal n; Legendre factors of the bands 1 .. B - 1 about the mean direction.
+    They are the directional albedo; the tilt t of the mean direction ``normalize((1 - t) r + t n)`` from the mirror
+    direction r towards the normal n; and Legendre factors of the bands 1 .. B - 1 about the mean direction.
     """
     light, weight = lobe_samples(cosine, exponent)
     albedo = weight.sum()
@@ -169,32 +158,24 @@ def lobe_moments(cosine: float, exponent: float, order: int) -> Array:
     return np.array([albedo, b / (a + b), *(weight @ p / albedo for p in legendre[1:order])])
 
 
-@dataclass(frozen=True)
-class LobeTable:
-    """Chebyshev coefficients of ``lobe_moments`` over the cosine (0..1) and the exponent (1..10000, logarithmic).
-
-    Attributes
-    ----------
-    coefficients : (B + 1, K, J)
-        Moment, degree in ``2 mu - 1``, degree in ``2 log(m) / log(10000) - 1``.
-    """
-
-    coefficients: Array
-
-    def __call__(self, cosine: ArrayLike, exponent: ArrayLike) -> Array:
-        """Evaluate all moments at cosines and exponents (...) -> (B + 1, ...)."""
-        x = 2.0 * np.clip(np.asarray(cosine, dtype=np.float64), 0.0, 1.0) - 1.0
-        m = np.clip(np.asarray(exponent, dtype=np.float64), EXPONENT_MIN, EXPONENT_MAX)
-        y = 2.0 * np.log(m) / math.log(EXPONENT_MAX) - 1.0
-        x, y = np.broadcast_arrays(x, y)
-        return np.stack([np.polynomial.chebyshev.chebval2d(x, y, c) for c in self.coefficients])
+def tabulated_moments(order: int, cosine: ArrayLike, exponent: ArrayLike) -> Array:
+    """All of `lobe_moments` at cosines and exponents (...) -> (B + 1, ...), read off `lobe_table`."""
+    x = 2.0 * np.clip(np.asarray(cosine, dtype=np.float64), 0.0, 1.0) - 1.0
+    m = np.clip(np.asarray(exponent, dtype=np.float64), EXPONENT_MIN, EXPONENT_MAX)
+    y = 2.0 * np.log(m) / math.log(EXPONENT_MAX) - 1.0
+    x, y = np.broadcast_arrays(x, y)
+    return np.stack([np.polynomial.chebyshev.chebval2d(x, y, c) for c in lobe_table(order)])
 
 
 @functools.lru_cache(maxsize=8)
-def lobe_table(order: int) -> LobeTable:
-    """Tabulate the moments of the lobe for a number of bands; computed at first use, in a fraction of a second."""
+def lobe_table(order: int) -> Array:
+    """Chebyshev coefficients (B + 1, K, J) of `lobe_moments` over the cosine, 0..1, and the logarithm of the exponent.
+
+    Axes are the moment, the degree in ``2 mu - 1`` and the degree in ``2 log(m) / log(10000) - 1``. Computed at first
+    use, in a fraction of a second.
+    """
     k, j = _DEGREE_COSINE + 1, _DEGREE_EXPONENT + 1
     x, y = (np.cos((np.arange(n) + 0.5) * np.pi / n) for n in (k, j))  # Chebyshev nodes
     values = np.array([[lobe_moments(0.5 * (a + 1.0), EXPONENT_MAX ** (0.5 * (b + 1.0)), order) for b in y] for a in x])
     to_x, to_y = (np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, len(nodes) - 1)) for nodes in (x, y))
-    return LobeTable(np.einsum("ka,abq,jb->qkj", to_x, values, to_y))
+    return np.einsum("ka,abq,jb->qkj", to_x, values, to_y)

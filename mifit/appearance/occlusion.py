@@ -31,14 +31,9 @@ the folds of a face has come this way; without it their albedo has to be too bri
 
 @dataclass(frozen=True)
 class MeshPoints:
-    """N points on a mesh.
+    """N points on a mesh: ``position`` and the mesh's own unit ``normal`` (N, 3), world space, and where they lie.
 
-    Attributes
-    ----------
-    position, normal : (N, 3)
-        World space; the mesh's own unit normals.
-    face : (N,) int, barycentric : (N, 3)
-        Where on the mesh they lie.
+    ``face`` (N,) are faces, ``barycentric`` (N, 3) weights of their corners.
     """
 
     position: NDArray
@@ -48,13 +43,7 @@ class MeshPoints:
 
 
 class OccludingMesh:
-    """A mesh that shadows itself; what is traced at its vertices is kept.
-
-    Parameters
-    ----------
-    scene : SurfaceScene
-        The mesh as rays meet it.
-    """
+    """A mesh, as rays meet it, that shadows itself; what is traced at its vertices is kept."""
 
     def __init__(self, scene: SurfaceScene) -> None:
         self.scene = scene
@@ -73,19 +62,11 @@ class OccludingMesh:
 
 @dataclass(frozen=True)
 class VertexTransfer:
-    """Shadowed diffuse transfer of N points: what was traced at the corners of the faces that they lie on.
+    """Shadowed diffuse transfer of N points: ``values`` (V, B*B) that were traced at the vertices.
 
-    Shading reads the corners' values itself: those of every point are some hundred numbers, which take longer to write
-    down and read again than all that is done with them.
-
-    Attributes
-    ----------
-    values : (V, B*B) float32
-        At the vertices.
-    corners : (N, 3) int
-        Vertices.
-    weights : (N, 3) float32
-        Barycentric.
+    Shading reads those at the ``corners`` (N, 3) of the faces that the points lie on itself, with barycentric
+    ``weights`` (N, 3): those of every point are some hundred numbers, which take longer to write down and read again
+    than all that is done with them.
     """
 
     values: NDArray[np.float32]
@@ -125,18 +106,10 @@ class Occlusion:
         seed: int = 0,
         smooth: bool = True,
     ) -> Occlusion:
-        """Trace what points of a mesh see of an illumination.
+        """Trace what points of a mesh see of an illumination: of its bands, and of its compact lights.
 
-        Parameters
-        ----------
-        mesh : OccludingMesh
-        points : MeshPoints
-        illumination : Illumination
-            Its number of bands, and its compact lights.
-        seed : int
-            The same seed gives the same shadows.
-        smooth : bool
-            Whether smooth light is wanted: models without shadows do without.
+        The same ``seed`` gives the same shadows. ``smooth`` says whether smooth light is wanted: models without shadows
+        do without.
         """
         transfer = None
         if smooth:
@@ -176,29 +149,10 @@ def trace_transfer(
     mesh's own shadows. Rays estimate what is seen of the sky, and by as much of it as is seen what they make of the
     whole sky is replaced by its closed form: points that see all of it carry no noise, and those in deep folds little.
 
-    Parameters
-    ----------
-    scene : SurfaceScene
-        The mesh that casts shadows.
-    points, normals : (N, 3)
-        Points on it and their unit normals.
-    order : int
-        Number of bands B.
-    samples : int
-        Rays per point.
-    seed : int
-        The same seed gives the same result.
-    bounce_albedo : float, optional
-        Adds the light that reaches the points after one diffuse reflection off the mesh, with this albedo.
-
-    Returns
-    -------
-    (N, B*B) float32
-
-    Raises
-    ------
-    InputError
-        Points and normals of unequal shapes, no sample, or no band.
+    ``points`` and ``normals`` (N, 3) lie on the mesh that casts shadows; ``order`` is the number of bands B,
+    ``samples`` that of rays per point; the same ``seed`` gives the same result (N, B*B). ``bounce_albedo`` adds the
+    light that reaches the points after one diffuse reflection off the mesh, with this albedo. InputError for points and
+    normals of unequal shapes, no sample, or no band.
     """
     import drjit as dr
 
@@ -259,8 +213,7 @@ def _trace(
 ) -> NDArray[np.float32]:
     """One kernel: a thread per point, a loop over its rays, B*B sums in registers.
 
-    Where it is kept what the rays hit, light that is reflected there is a sparse product afterwards: gathering B*B
-    numbers at three corners for each ray takes six times as long as tracing it.
+    What the rays hit is kept, not gathered: B*B numbers at three corners for each take six times as long as tracing.
     """
     import drjit as dr
     import mitsuba as mi

@@ -30,17 +30,10 @@ _kept: WeakKeyDictionary[SurfaceScene, tuple[NDArray, Reception]] = WeakKeyDicti
 
 @dataclass(frozen=True)
 class Reception:
-    """What V vertices see of the sky and of one another.
+    """What V vertices, with unit ``normals`` (V, 3), see of the sky and of one another.
 
-    Attributes
-    ----------
-    directions : (D, 3)
-        Evenly spread over the sphere, world axes.
-    normals : (V, 3)
-    open_sky : (V, D / 32) uint32
-        Which of the directions each vertex sees, a bit each.
-    exchange : (V, V) sparse
-        Irradiance of the vertices per radiance that the vertices reflect.
+    ``directions`` (D, 3) are spread evenly over the sphere, world axes; a vertex sees those whose
+    bits are set in ``open_sky`` (V, D / 32). ``exchange`` (V, V) is irradiance of vertices per radiance of vertices.
     """
 
     directions: NDArray[np.float64]

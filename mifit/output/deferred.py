@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mifit.appearance import models
 from mifit.appearance.environment import diffuse_light
-from mifit.appearance.formation import Appearance, BentShading, form_image
+from mifit.appearance.formation import Appearance, form_image, shade_bent
 from mifit.appearance.occlusion import MeshPoints
 from mifit.core.camera import Camera
 from mifit.core.mesh import interpolate, normalize, vertex_normals
@@ -114,12 +114,12 @@ def shade_methods(
         points = MeshPoints(surface.points, base, surface.face, surface.weights)
         mesh = occluding_mesh(vertices, model.faces)
         given = base, surface.view, appearance.trace(mesh, points)
-        diffuse, specular_light = BentShading(appearance, *given)(material.normal)
+        diffuse, specular_light = shade_bent(appearance, *given, material.normal)
         measured = result.environment if appearance.lobe.fresnel is not None else None
         if measured is not None:
             illumination = appearance.illumination
             lamps = replace(illumination, radiance=np.zeros_like(illumination.radiance))
-            diffuse = BentShading(replace(appearance, illumination=lamps), *given)(material.normal)[0].copy()
+            diffuse = shade_bent(replace(appearance, illumination=lamps), *given, material.normal)[0].copy()
             turn = np.eye(3) if result.environment_rotation is None else result.environment_rotation
             place = mesh.scene, points, material.normal, vertex_materials(result)[:, :3]
             diffuse += diffuse_light(measured, turn, appearance.illumination.lights, *place)

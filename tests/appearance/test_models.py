@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mifit.appearance.formation import BentShading
+from mifit.appearance.formation import shade_bent
 from mifit.appearance.lobe import normalization
 from mifit.appearance.models import PaperModel
 from mifit.core import sh
@@ -156,7 +156,7 @@ def test_a_bent_normal_in_half_shade_sees_half_of_what_it_would_see_open(variant
     bent = n + 0.3 * np.random.default_rng(4).standard_normal(n.shape)
     bent /= np.linalg.norm(bent, axis=1, keepdims=True)
     look = appearance(c, 20.0, "shadowed")
-    half, whole = (BentShading(look, n, v, shadows(part * diffuse_matrix(n, 3)))(bent)[0] for part in (0.5, 1.0))
+    half, whole = (shade_bent(look, n, v, shadows(part * diffuse_matrix(n, 3)), bent)[0] for part in (0.5, 1.0))
     free, _ = appearance(c, 20.0, "prefiltered").shade(bent, v)
     lit = (np.abs(free) > 0.1).all(1) & (diffuse_matrix(n, 3) @ c > 0.1).all(1)
     assert lit.sum() > 100
