@@ -15,6 +15,7 @@ from benchmarks.heads import ICT, Case
 from benchmarks.record import SHARED
 from benchmarks.truth import angle
 from mifit import Capture, MorphableModel, Reconstruction
+from mifit.appearance.occlusion import MeshPoints
 from mifit.core.camera import Camera
 from mifit.core.image import to_8_bit
 from mifit.core.mesh import interpolate, normalize, vertex_normals
@@ -22,7 +23,6 @@ from mifit.core.metrics import psnr_from_rmse
 from mifit.core.uv import sample_map
 from mifit.output.compare import Errors, face_region, relit_region, scaled_psnr, skin_region
 from mifit.output.truth import (
-    SurfacePoints,
     TrueMesh,
     distance_figures,
     landmarks_of,
@@ -249,8 +249,8 @@ def scan_maps(capture: Capture) -> tuple[dict[str, NDArray], NDArray | None]:
     return maps, None if uv is None else np.asarray(uv)
 
 
-def _scan_uv(scan: TrueMesh, layout: NDArray, points: SurfacePoints) -> NDArray:
-    return interpolate(layout, scan.faces, points.face, points.weights)
+def _scan_uv(scan: TrueMesh, layout: NDArray, points: MeshPoints) -> NDArray:
+    return interpolate(layout, scan.faces, points.face, points.barycentric)
 
 
 def _rounded(figures: Mapping[str, float], digits: int = 4) -> dict[str, float]:

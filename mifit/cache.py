@@ -59,20 +59,17 @@ class Cache:
         """The estimate of this name and key as it is kept, or what ``make`` returns, which is kept then."""
         if self.folder is None:
             return make()
-        name = f"{name}_{key[:16]}" if self.shared else name
-        with self._alone(name):
+        lock: contextlib.AbstractContextManager = contextlib.nullcontext()
+        if self.shared:
+            name = f"{name}_{key[:16]}"
+            self.folder.mkdir(parents=True, exist_ok=True)
+            lock = filelock.FileLock(self.folder / f"{name}.lock")  # the system takes it back from a killed process
+        with lock:
             found = load(self.folder, name, cls, key)
             if found is None:
                 found = make()
                 save(self.folder, name, found, key)
         return found
-
-    def _alone(self, name: str) -> contextlib.AbstractContextManager:
-        """A lock between processes, which the system takes back from one that is killed."""
-        if self.folder is None or not self.shared:
-            return contextlib.nullcontext()
-        self.folder.mkdir(parents=True, exist_ok=True)
-        return filelock.FileLock(self.folder / f"{name}.lock")
 
 
 def save(folder: Path, stage: str, estimate: DataclassInstance, key: str) -> None:

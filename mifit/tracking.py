@@ -267,7 +267,10 @@ def track_into(
     if resume:
         timesteps = _not_yet(result, timesteps, digests)
     folder = Path(folder)
-    refiner = None if result.mesh is None or result.reflectance is None else mesh_refiner(result)
+    refiner = None
+    if result.mesh is not None and result.reflectance is not None:
+        settings = from_mapping(MeshConfig, result.config.get("mesh", {}), "result.json: config: mesh")
+        refiner = MeshRefiner(result.model, len(result.reflectance.diffuse), settings)
     with locked(folder):
         result, room = _with_room(result, [t for t in result.tracked if t in timesteps], len(timesteps))
         for frame in track(result.seen(capture), result, timesteps, config, seed=seed, progress=progress):
@@ -279,13 +282,6 @@ def track_into(
 def sequence_left(result: Reconstruction, capture: Capture, resume: bool) -> tuple[int, ...]:
     """Timesteps of a capture to track by default: those without geometry, and with ``resume`` the tracked ones."""
     return tuple(t for t in capture.timesteps if t not in result.timesteps or (resume and t in result.tracked))
-
-
-def mesh_refiner(result: Reconstruction) -> MeshRefiner:
-    """What refines the meshes of further timesteps as those of a result are."""
-    assert result.mesh is not None and result.reflectance is not None
-    settings = from_mapping(MeshConfig, result.config.get("mesh", {}), "result.json: config: mesh")
-    return MeshRefiner(result.model, len(result.reflectance.diffuse), settings)
 
 
 def _not_yet(result: Reconstruction, timesteps: Sequence[int], digests: Mapping[int, str]) -> list[int]:

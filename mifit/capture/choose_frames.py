@@ -160,11 +160,7 @@ def _disagreement(capture: Capture, cameras: Sequence[str], points: NDArray) -> 
 
 
 def _poses(points: NDArray) -> NDArray[np.float64]:
-    """(T, C * 2 * K) places of the landmarks that expressions move least, in widths of the face: they move with pose.
-
-    Frames are compared by the parallax between these points: where the head stands in the image doesn't count, how it
-    is turned does.
-    """
+    """(T, C * 2 * K) places of the landmarks that expressions move least, in widths of the face: they tell its turn."""
     rigid = points[:, :, list(RIGID)]
     size = np.nanmedian(np.linalg.norm(points[:, :, 36] - points[:, :, 45], axis=-1), axis=1)
     rigid = (rigid - rigid.mean(axis=2, keepdims=True)) / size[:, None, None, None]

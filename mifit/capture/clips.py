@@ -34,12 +34,9 @@ class Start:
     begin together. ``correlation`` is that of the two signals at that lag, -1..1.
     """
 
-    seconds: float
-    by: str
-    correlation: float
-
-
-FIRST = Start(0.0, "none", 1.0)
+    seconds: float = 0.0
+    by: str = "none"
+    correlation: float = 1.0
 
 
 def synchronise(videos: Sequence[Video], progress: Progress = silent) -> list[Start]:
@@ -51,14 +48,14 @@ def synchronise(videos: Sequence[Video], progress: Progress = silent) -> list[St
     if len(sounds) == len(videos):
         found = [lag(sounds[0], sound, SOUND_RATE) for sound in sounds[1:]]
         if min((r for _, r in found), default=1.0) >= 0.3:
-            return [FIRST, *(Start(-seconds, "sound", r) for seconds, r in found)]
+            return [Start(), *(Start(-seconds, "sound", r) for seconds, r in found)]
     motions = []
     for k, video in enumerate(videos):
         progress("Synchronising", k, len(videos))
         motions.append(_motion(video))
     progress("Synchronising", len(videos), len(videos))
     found = [lag(motions[0], motion, MOTION_RATE) for motion in motions[1:]]
-    return [FIRST, *(Start(-s, "motion", r) if r >= 0.6 else Start(0.0, "none", r) for s, r in found)]
+    return [Start(), *(Start(-s, "motion", r) if r >= 0.6 else Start(correlation=r) for s, r in found)]
 
 
 def lag(first: NDArray, second: NDArray, rate: float) -> tuple[float, float]:

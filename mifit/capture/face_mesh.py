@@ -142,14 +142,6 @@ class _Square:
         return cls(centre, margin * float((high - low).max()), angle)
 
 
-@dataclass(frozen=True)
-class _Box:
-    """What the finder takes for a face with this probability."""
-
-    score: float
-    square: _Square
-
-
 def _windows(image: NDArray) -> Iterator[list[_Square]]:
     """Where to look for faces: the image, the image turned, and parts of it."""
     height, width = image.shape[:2]
@@ -184,31 +176,28 @@ class FaceMesh:
         """The largest face of an RGB image (H, W, 3), or None."""
         image = np.ascontiguousarray(image)
         for windows in _windows(image):
-            boxes = [(w, box) for w in windows for box in self._boxes(image, w)]
-            faces = [(box.score, face) for w, box in boxes if (face := self._upright(image, w, box)) is not None]
+            boxes = [(w, *box) for w in windows for box in self._boxes(image, w)]
+            faces = [(score, face) for w, score, box in boxes if (face := self._upright(image, w, box)) is not None]
             if faces:
                 return max(faces, key=lambda pair: pair[0] * pair[1].area)[1]
         return None
 
-    def _upright(self, image: NDArray, window: _Square, box: _Box) -> Face | None:
-        """The face in a box; None where its eyes lie aslant in the window that it was found in.
-
-        The finder was trained on upright faces, and in one that lies it finds something else.
-        """
-        face = self._settle(image, box.square)
+    def _upright(self, image: NDArray, window: _Square, box: _Square) -> Face | None:
+        """The face in a box; None where it lies in its window: finders of upright faces find something else in one."""
+        face = self._settle(image, box)
         if face is None:
             return None
         turned = np.angle(np.exp(1j * (face.angle - window.angle)))
         return face if abs(turned) < np.radians(30.0) else None
 
-    def _boxes(self, image: NDArray, window: _Square) -> list[_Box]:
-        """The likeliest faces of a part of an image, at most two, of a probability of 0.3 and more."""
+    def _boxes(self, image: NDArray, window: _Square) -> list[tuple[float, _Square]]:
+        """The likeliest faces of a part of an image with their probabilities, at most two, of 0.3 and more."""
         size = self._find.size
         cells = size // 4  # one of the finder's anchors
         out = self._find(2.0 * window.cut(image, size) - 1.0)
         score = 1.0 / (1.0 + np.exp(-np.clip(out[cells * cells], -80, 80)))
         raw = out[cells * cells * 16].reshape(-1, 16)
-        found: list[_Box] = []
+        found: list[tuple[float, _Square]] = []
         taken: list[NDArray] = []
         for i in np.argsort(-score)[:50]:
             if score[i] < 0.3 or len(found) == 2:
@@ -225,15 +214,11 @@ class FaceMesh:
             # The box stands upright in the window, the square as the eyes do: about the box's centre and side.
             side = MARGIN * float(extent.max()) * window.side
             angle = float(np.arctan2(*(eyes[1] - eyes[0])[::-1]))
-            found.append(_Box(float(score[i]), _Square(corners.mean(axis=0), side, angle)))
+            found.append((float(score[i]), _Square(corners.mean(axis=0), side, angle)))
         return found
 
     def _settle(self, image: NDArray, square: _Square) -> Face | None:
-        """The mesh about a square, and again about its own points; None where it isn't a face.
-
-        The last round is a mean over the square a little turned and mirrored: the network's error is partly one of how
-        the face lies in its input.
-        """
+        """The mesh about a square, again about its own points, and a mean over turns of that; None for no face."""
         for _ in range(2):
             points, presence = self._look(image, square)
             if presence < 0.9:

@@ -1,17 +1,14 @@
 """Sparse linear systems on meshes: `MeshUpdater`, and `membrane` for values that are known on a part of one.
 
-Vertex positions from positions and normals by sparse least squares.
-
 After Nehab, Rusinkiewicz, Davis, Ramamoorthi, "Efficiently combining positions and normals for precise 3D geometry",
 2005: positions are trusted for the coarse shape, normals for the detail. Minimised over the free vertices p is
 
     sum_faces sum_edges w_e |(p_i - p_j) - P_f (p_i - p_j)|^2 + position_weight * sum_i a_i |p_i - q_i|^2
 
 with P_f the projection onto the plane across the wanted normal of face f, w_e the cotangent weights of a reference
-mesh, q the positions that are trusted and a_i the vertices' areas. Solving it with P_f (p_i - p_j) held from the last
-iterate leaves one matrix for x, y and z that knows the reference mesh only, not the normals: it is factorised once and
-serves all iterations, timesteps and expressions of a model. (Nehab's own form couples x, y, z and needs a new
-factorisation for every set of normals.)
+mesh, q the positions that are trusted and a_i the vertices' areas. With P_f (p_i - p_j) held from the last iterate one
+matrix, which knows the reference mesh only, is factorised once for all iterations, timesteps and expressions. (Nehab's
+own form couples x, y, z and needs a new factorisation for every set of normals.)
 """
 
 from __future__ import annotations
@@ -69,7 +66,7 @@ class MeshUpdater:
         p, change = trusted.copy(), np.inf
         for _ in range(iterations):
             before = p.copy()
-            right = self._divergence(p, wanted, own, silent) + self._anchor[:, None] * trusted
+            right = self._divergence(p, wanted) + self._anchor[:, None] * trusted
             p[self.free] = self._factor.solve(right[self.free] - self._fixed_part @ trusted[~self.free])
             displaced = float(np.linalg.norm(p - trusted))
             change = float(np.linalg.norm(p - before)) / displaced if displaced > 0 else 0.0
@@ -77,7 +74,7 @@ class MeshUpdater:
                 break
         return self._unfold(trusted, p, own), change
 
-    def _divergence(self, p: NDArray, wanted: NDArray, own: NDArray, silent: NDArray) -> NDArray:
+    def _divergence(self, p: NDArray, wanted: NDArray) -> NDArray:
         """Right-hand side: weighted sums of every face's edges, projected to the wanted plane."""
         out = np.zeros_like(p)
         for k in range(3):

@@ -225,10 +225,7 @@ def _assign(table: dict, key: str, value: object, where: str) -> None:
 
 
 def _points(sweep: object, where: Path) -> Iterator[Document]:
-    """The points of a sweep: the product of ``grid``'s lists, or the tables of ``list``; one point without a sweep.
-
-    A folder of captures stands for the list of them.
-    """
+    """The points of a sweep: the product of ``grid``'s lists, of which a folder of captures is one, or ``list``."""
     if not isinstance(sweep, dict) or set(sweep) - {"grid", "list"} or len(sweep) > 1:
         raise InputError(f"{where}: sweep: found {sweep!r}, expected one table 'grid' or one list 'list'")
     points = sweep.get("list", [{}])

@@ -166,10 +166,7 @@ def _relative_poses(watched: Sequence[Watched], board: Board) -> tuple[list[NDAr
 def _together(
     watched: Sequence[Watched], poses: Sequence[NDArray[np.float64]], board: Board
 ) -> tuple[list[Watched], list[NDArray[np.float64]]]:
-    """All lenses and poses at once, without the frames in which cameras contradict one another.
-
-    A board that moves while the cameras aren't quite in step fits each camera by itself.
-    """
+    """All lenses and poses at once, without the frames in which cameras contradict one another."""
     while True:
         watched, poses = adjust(watched, poses, board)
         kept = [_consistent(seen) for seen in watched]

@@ -117,10 +117,7 @@ def _adjust(
     points: NDArray,
     modes: NDArray,
 ) -> tuple[AdjustedBundle, int]:
-    """The adjusted bundle, and how many focal lengths were free: the first of its movements.
-
-    Points (N, 3) on the head that landmarks gave, and expression modes there (N, 3, K), are where it starts.
-    """
+    """The bundle adjusted from points (N, 3) and expression modes (N, 3, K) on the landmarks' head, and free focals."""
     side = np.array([max(view.width, view.height) for view in views], dtype=np.float64)
     numbers = np.full(len(views), -1)
     sides, numbers[unknown] = np.unique(side[unknown], return_inverse=True)

@@ -85,7 +85,7 @@ def refine(
     further = [t for t in wanted if t not in fitted]
     chosen = choose_frames(capture, names, MOST - len(fitted), further, fitted) if further else None
     left_out = {} if chosen is None else {t: why for t, why in chosen.left_out.items() if t in further}
-    geometry, failed = _followed(result, capture, () if chosen is None else chosen.timesteps, config, seed, progress)
+    geometry, failed = _followed(result, capture, () if chosen is None else chosen.timesteps, config, progress)
     if geometry.displacement is not None:
         found = find_surface(capture, model, geometry, names, config.surface, progress)
         geometry = behind_lids(model, found)
@@ -113,7 +113,7 @@ def refine(
 
 
 def _followed(
-    result: Reconstruction, capture: Capture, further: Sequence[int], config: FitConfig, seed: int, progress: Progress
+    result: Reconstruction, capture: Capture, further: Sequence[int], config: FitConfig, progress: Progress
 ) -> tuple[GeometryEstimate, dict[int, str]]:
     """Geometry of the fitted and of further timesteps, and why some of these are left out."""
     cameras, fitted = [camera.name for camera in result.cameras], result.fitted

@@ -192,10 +192,7 @@ def _flow(method: cv2.DISOpticalFlow, first: NDArray[np.uint8], second: NDArray[
 def _matched(
     one: Unwrapped, other: Unwrapped, there: NDArray, back: NDArray, row: NDArray, column: NDArray
 ) -> NDArray[np.intp]:
-    """Which of the texels the other image shows too.
-
-    The flow there and back ends within half a texel of its start, and windows of 11 texels correlate by 0.8.
-    """
+    """Texels that the other image shows: flow there and back ends within half a texel, windows of 11 agree by 0.8."""
     x, y = column + there[row, column, 0], row + there[row, column, 1]
     closed = np.abs(there[row, column] + bilinear(back, x, y)).max(axis=1) < 0.5
     closed &= bilinear(other.seen.astype(np.float32), x, y) > 0.99

@@ -69,18 +69,15 @@ class System(Protocol):
     @property
     def gradient(self) -> NDArray[np.float64]:
         """(n,) g = J^T r, half the gradient of the energy."""
-        ...
 
     def product(self, step: NDArray) -> NDArray[np.float64]:
         """H times a vector."""
-        ...
 
     def solve(self, damping: float, frozen: NDArray[np.bool_], gradient: NDArray | None = None) -> NDArray[np.float64]:
         """Damped step with the frozen parameters held, for another right-hand side if given.
 
         Raises numpy's LinAlgError when singular.
         """
-        ...
 
 
 class DenseSystem:
@@ -112,11 +109,9 @@ class Problem(Protocol):
 
     def energies(self, x: NDArray) -> dict[str, float]:
         """Energy per term."""
-        ...
 
     def linearize(self, x: NDArray) -> System:
         """Normal equations at x."""
-        ...
 
 
 def minimize(

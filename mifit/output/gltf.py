@@ -189,10 +189,7 @@ def write_glb(
 def _primitive(
     out: _Buffer, part: SplitMesh, base: NDArray, normals: NDArray, codes: NDArray, albedo: NDArray | None
 ) -> Document:
-    """One primitive: with texture coordinates and tangents, or with vertex albedo (V, 3) where there are no maps.
-
-    ``codes`` (V, 3, K) are the morph targets in steps.
-    """
+    """One primitive: with texture coordinates and tangents, or vertex albedo (V, 3); morph targets (V, 3, K)."""
     n = normals[part.origin]
     attributes = {"POSITION": out.accessor(base[part.origin], "<f4", bounds=True), "NORMAL": out.accessor(n, "<f4")}
     if albedo is None:

@@ -131,9 +131,9 @@ def _write_files(result: Reconstruction, files: Path, timestep: int, method: Met
 
 
 def _slopes(result: Reconstruction, timestep: int, normal_object: NDArray, shape: Shape) -> NDArray[np.float32]:
-    """(S, S, 3) refined normals as slopes along Mitsuba's shading frame; the third channel is 0.
+    """(S, S, 3) refined normals as slopes along Mitsuba's shading frame, 0 in the third channel.
 
-    That frame has s along dp/du of the triangle, made perpendicular to the interpolated normal n, and t = n x s.
+    That frame has s along dp/du, perpendicular to the interpolated normal n, and t = n x s.
     """
     model = result.model
     size = normal_object.shape[0]

@@ -168,10 +168,7 @@ def _texels(model: MorphableModel, size: int, whole: bool) -> tuple[TexelMap, ND
 
 @lru_cache(maxsize=2)
 def _continuation(model: MorphableModel, whole: bool) -> tuple[NDArray, NDArray, Callable[[NDArray], NDArray]]:
-    """Vertices of the faces with maps, where in the maps they are, and what continues values there over all vertices.
-
-    Every picture of a result asks for it, and it is the same for all of them.
-    """
+    """Vertices of the faces with maps, where in the maps they are, and what continues values there over the mesh."""
     inside, count = model.mapped if whole else model.face_mask, len(model.mean)
     known = np.unique(model.faces[inside])
     uv = np.zeros((count, 2))

@@ -23,6 +23,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mifit.appearance.occlusion import MeshPoints
 from mifit.capture import Capture
 from mifit.core.arrays import read_npz
 from mifit.core.files import read_bytes, read_json
@@ -114,22 +115,10 @@ def _checked(path: Path, vertices: NDArray, faces: NDArray, mask: NDArray | None
     return TrueMesh(vertices.astype(np.float64), faces.astype(np.int64), face_mask)
 
 
-@dataclass(frozen=True)
-class SurfacePoints:
-    """Points on a true mesh: position, smooth unit normal, face and barycentric weights."""
-
-    position: NDArray
-    normal: NDArray
-    face: NDArray
-    weights: NDArray
-
-
-def points_seen(
-    mesh: TrueMesh, capture: Capture, cameras: Sequence[str], timestep: int, seed: int = 0
-) -> SurfacePoints:
+def points_seen(mesh: TrueMesh, capture: Capture, cameras: Sequence[str], timestep: int) -> MeshPoints:
     """Points of the face, drawn evenly over the true surface, that all cameras see at a cosine of 0.25 or more."""
     whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    position, face = trimesh.sample.sample_surface(whole, 60000, seed=seed)
+    position, face = trimesh.sample.sample_surface(whole, 60000, seed=0)
     position, keep, scene = np.asarray(position), np.ones(len(face), bool), SurfaceScene(mesh.vertices, mesh.faces)
     for name in cameras:
         view = capture.camera(name)
@@ -143,7 +132,7 @@ def points_seen(
         raise InputError(f"{capture.path}: cameras {', '.join(cameras)} see no point of the true mesh together")
     weights = trimesh.triangles.points_to_barycentric(whole.triangles[face], position)
     normals = vertex_normals(mesh.vertices, mesh.faces)
-    return SurfacePoints(position, normalize(interpolate(normals, mesh.faces, face, weights)), face, weights)
+    return MeshPoints(position, normalize(interpolate(normals, mesh.faces, face, weights)), face, weights)
 
 
 def landmarks_of(capture: Capture, camera: str, timestep: int) -> NDArray[np.float32]:

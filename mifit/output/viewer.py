@@ -64,11 +64,7 @@ def viewer_data(result: Reconstruction, timestep: int) -> str:
 
 
 def _lighting(result: Reconstruction) -> Document:
-    """Recovered lighting as the view's shader wants it.
-
-    9 coefficients of what white reflects, and for the lobe a lat-long picture of the lighting that is convolved with
-    it at a middling angle; the lobe's albedo and tilt follow the angle by polynomials in the cosine.
-    """
+    """Recovered lighting for the view's shader: of the lobe a lat-long picture, and polynomials in the cosine."""
     irradiance = result.lighting.truncate(3).coefficients * (cosine_coefficients(3)[bands(3)] / np.pi)[:, None]
     order = result.lighting.order
     cosines = np.linspace(0.05, 1.0, 40)

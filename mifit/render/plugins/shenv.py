@@ -50,7 +50,7 @@ def make() -> type:
     import drjit as dr
     import mitsuba as mi
 
-    from mifit.appearance.kernels import sh_basis
+    from mifit.appearance import kernels
 
     class SHEnvironment(mi.Emitter):
         r"""
@@ -141,11 +141,8 @@ def make() -> type:
 
         def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
             """Clamped radiance from world directions."""
-            local = self._to_local(direction)
-            flat = self.coefficients.array
-            total = mi.Color3f(0.0)
-            for k, y in enumerate(sh_basis(local, self.order)):
-                total += y * mi.Color3f(*(_entry(flat, 3 * k + c) for c in range(3)))
+            basis_there = kernels.sh_basis(self._to_local(direction), self.order)
+            total = kernels.radiance(basis_there, kernels.colours(self.coefficients.array, self.order))
             return mi.Color3f(dr.maximum(total * self.scale, 0.0))
 
         def _to_local(self, direction: mi.Vector3f) -> mi.Vector3f:
@@ -241,11 +238,5 @@ def make() -> type:
                 f"  order = {self.order},\n  scale = {self.scale},\n  radius = {self.radius},\n"
                 f"  rotation = {self._rotation.tolist()}\n]"
             )
-
-    def _entry(flat: mi.Float, index: int) -> mi.Float:
-        if not dr.is_jit_v(mi.Float):
-            return flat[index]
-        # All points add to these few gradients: in copies per thread, or they would wait for one another.
-        return dr.gather(mi.Float, flat, mi.UInt32(index), mode=dr.ReduceMode.Expand)
 
     return SHEnvironment
