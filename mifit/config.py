@@ -208,12 +208,7 @@ class SurfaceConfig:
 
     enabled: bool = flag(True, "move the surface to where all views agree; false: it stays in the model's span")
     reach: float = number(
-        8.0,
-        "distance from the surface that is searched first",
-        "millimetres",
-        source="set by hand",
-        above=0,
-        most=100,
+        8.0, "distance from the surface that is searched first", "millimetres", source="set by hand", above=0, most=100
     )
     stiffness: float = number(
         4.0,

@@ -122,7 +122,7 @@ def diffuse_light(
     direct = shaded + _from_lamps(lamps, scene, mesh.normals)
     bounced = np.zeros_like(direct)
     for _ in range(BOUNCES):
-        bounced = mesh.from_mesh((direct + bounced) * albedo / np.float32(np.pi))
+        bounced = np.asarray(mesh.exchange @ ((direct + bounced) * albedo / np.float32(np.pi)), dtype=np.float32)
     received = interpolate((shaded + bounced) / np.float32(np.pi), scene.faces, points.face, points.barycentric)
     open_sky = SHLighting.from_envmap(small, 3).rotate(rotation)
     received *= _bend(open_sky, normals, points.normal)

@@ -190,12 +190,7 @@ class _Scene:
     """Points and an appearance on the device."""
 
     def __init__(
-        self,
-        appearance: Appearance,
-        normals: ArrayLike,
-        view: ArrayLike,
-        occlusion: Occlusion,
-        shadows: bool = True,
+        self, appearance: Appearance, normals: ArrayLike, view: ArrayLike, occlusion: Occlusion, shadows: bool = True
     ) -> None:
         import drjit as dr
         import mitsuba as mi

@@ -106,12 +106,7 @@ class ShadingModel(ABC):
         return self.transfer(n, v, lobe, coefficients, shadowed).shade(coefficients)
 
     def about(
-        self,
-        base: Jit,
-        v: Jit,
-        lobe: PreparedLobe,
-        coefficients: Sequence[Jit],
-        shadowed: Sequence[Jit] | None = None,
+        self, base: Jit, v: Jit, lobe: PreparedLobe, coefficients: Sequence[Jit], shadowed: Sequence[Jit] | None = None
     ) -> Shade:
         """Shading of normals that are bent away from those of the mesh, for which shadows were traced.
 
@@ -210,12 +205,7 @@ class ShadowedModel(ShadingModel):
         return Transfer(shadowed, lobe_transfer(lobe, axis, moments), unoccluded(n, axis, shadowed, lobe.order))
 
     def about(
-        self,
-        base: Jit,
-        v: Jit,
-        lobe: PreparedLobe,
-        coefficients: Sequence[Jit],
-        shadowed: Sequence[Jit] | None = None,
+        self, base: Jit, v: Jit, lobe: PreparedLobe, coefficients: Sequence[Jit], shadowed: Sequence[Jit] | None = None
     ) -> Shade:
         """Shadows are those of the base normal.
 
@@ -257,11 +247,6 @@ def register_model(model: ShadingModel) -> None:
     _MODELS[model.name] = model
     if model.name not in SHADINGS:
         SHADINGS.append(model.name)
-
-
-def names() -> tuple[str, ...]:
-    """Names of all models, in the order in which they were registered."""
-    return tuple(_MODELS)
 
 
 def get(name: str | ShadingModel) -> ShadingModel:

@@ -20,11 +20,12 @@ from mifit.appearance.kernels import diffuse_transfer, sh_basis
 from mifit.core.mesh import vertex_normals
 from mifit.core.sh import check_order
 from mifit.errors import InputError
+from mifit.morphable.pigment import SKIN
 
 if TYPE_CHECKING:
     from mifit.render.gbuffer import SurfaceScene
 
-BOUNCE = 0.32
+BOUNCE = float(SKIN.mean())
 """Albedo with which the mesh lights itself: skin of medium pigmentation, mean of the channels. Part of the light in
 the folds of a face has come this way; without it their albedo has to be too bright."""
 
@@ -99,12 +100,7 @@ class Occlusion:
 
     @classmethod
     def trace(
-        cls,
-        mesh: OccludingMesh,
-        points: MeshPoints,
-        illumination: Illumination,
-        seed: int = 0,
-        smooth: bool = True,
+        cls, mesh: OccludingMesh, points: MeshPoints, illumination: Illumination, seed: int = 0, smooth: bool = True
     ) -> Occlusion:
         """Trace what points of a mesh see of an illumination: of its bands, and of its compact lights.
 
@@ -248,9 +244,7 @@ def _trace(
 
     zeros = [dr.zeros(mi.Float, count) for _ in range(2 * size + 1)]
     _, seen, whole, sums = dr.while_loop(
-        state=(mi.UInt(0), zeros[0], zeros[1 : size + 1], zeros[size + 1 :]),
-        cond=lambda i, *_: i < samples,
-        body=body,
+        state=(mi.UInt(0), zeros[0], zeros[1 : size + 1], zeros[size + 1 :]), cond=lambda i, *_: i < samples, body=body
     )
     # A control variate whose integral is known: the weight with the least variance is the part that is seen, as far as
     # which directions are blocked has nothing to do with the value there.

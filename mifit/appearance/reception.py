@@ -69,10 +69,6 @@ class Reception:
         _, total = dr.while_loop(state=start, cond=lambda i, total: i < count, body=body)
         return stored([total.x, total.y, total.z], len(self.normals))
 
-    def from_mesh(self, radiance: NDArray) -> NDArray[np.float32]:
-        """(V, 3) irradiance from the mesh, whose vertices reflect a radiance (V, 3)."""
-        return np.asarray(self.exchange @ radiance, dtype=np.float32)
-
 
 def reception(scene: SurfaceScene) -> Reception:
     """That of a mesh; kept with it until its vertices move."""

@@ -12,8 +12,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from mifit.cli.arguments import one_line
-from mifit.cli.console import drop_chatter
+from mifit.cli.arguments import drop_chatter, one_line
 from mifit.cli.options import build_parser as build_parser
 from mifit.core.files import FULL
 from mifit.errors import InputError, MifitError

@@ -6,9 +6,8 @@ from argparse import Namespace
 from pathlib import Path
 
 import mifit
-from mifit.cli.arguments import check_empty, given, use_variant
+from mifit.cli.arguments import check_empty, console_progress, given, use_variant
 from mifit.cli.clips import start_times
-from mifit.cli.console import console_progress
 from mifit.errors import InputError
 
 

@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mifit.cli.arguments import given, say
-from mifit.cli.console import console_progress
+from mifit.cli.arguments import console_progress, given, say
 from mifit.core.files import Document, read_json, write_json
 from mifit.core.limits import MAX_DOCUMENT_BYTES
 from mifit.errors import InputError

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import mifit
-from mifit.cli.arguments import given, say, tell, use_variant
+from mifit.cli.arguments import console_progress, given, say, tell, use_variant
 from mifit.cli.clips import capture_of
-from mifit.cli.console import console_progress
 from mifit.cli.results import judge
 from mifit.config import PRESETS, FitConfig, NormalsConfig, ReflectanceConfig, from_mapping
 from mifit.core.diagnostics import Diagnostic

@@ -7,8 +7,7 @@ from argparse import Namespace
 from typing import TYPE_CHECKING
 
 import mifit
-from mifit.cli.arguments import given, say, tell, use_variant, writes
-from mifit.cli.console import console_progress
+from mifit.cli.arguments import console_progress, given, say, tell, use_variant, writes
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.files import write_json
 from mifit.errors import InputError

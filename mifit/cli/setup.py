@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mifit
-from mifit.cli.arguments import tell, use_variant, writes
-from mifit.cli.console import console_progress
+from mifit.cli.arguments import console_progress, tell, use_variant, writes
 from mifit.core.diagnostics import worst_first
 from mifit.core.files import Document
 

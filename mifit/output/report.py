@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import html
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,10 +17,11 @@ import mifit
 from mifit.capture import Capture
 from mifit.core.files import Document, write_text
 from mifit.core.image import to_8_bit
+from mifit.core.sh import SHLighting, bands, cosine_coefficients
 from mifit.output import figures as draw
 from mifit.output.evaluate import Comparison, compare, face_area, rgba_8_bit
 from mifit.output.scene import render_view
-from mifit.output.viewer import viewer_data
+from mifit.output.surface import shape_of, surface_maps, vertex_materials
 from mifit.result import Reconstruction
 
 NAMES = {"pca": "Stage 1 (PCA)", "diffuse": "Diffuse only", "full": "Full"}
@@ -160,6 +162,76 @@ def _view3d(result: Reconstruction, timestep: int) -> str:
 </div>
 <p class="soft" id="view3d-note">Drag to turn, pinch or scroll to zoom. Shaded in the browser without cast shadows.</p>
 <script type="application/json" id="view3d-data">{data}</script>"""
+
+
+def viewer_data(result: Reconstruction, timestep: int) -> str:
+    """JSON for the 3D view of one timestep (`assets/viewer.js`); quantised, for looking at only.
+
+    Positions have 16 bits of the bounding sphere, normals 8, texture coordinates 16; the alpha of the vertex
+    colour tells whether a face has maps (1) or none (0).
+    """
+    model, shape = result.model, shape_of(result, timestep, world=False)
+    vertices, rotation = shape.vertices / result.geometry.scale, result.geometry.rotation[result.index(timestep)]
+    named = shape.parts()
+    parts = list(named.values())  # they share no vertex
+    origin = np.concatenate([p.origin for p in parts])
+    uv = np.concatenate([p.uv for p in parts])
+    starts = np.cumsum([0, *(len(p.origin) for p in parts)])
+    kind = np.repeat([255 if name == "face" else 0 for name in named], np.diff(starts))
+    faces = np.concatenate([p.faces + start for p, start in zip(parts, starts, strict=False)])
+    position = vertices[origin]
+    normals = shape.normals[origin]
+    centre = (position.min(0) + position.max(0)) / 2
+    radius = float(np.abs(position - centre).max())
+    face_centre = vertices[np.unique(model.faces[model.face_mask])]
+    colour = np.column_stack([to_8_bit(vertex_materials(result, skin=True)[origin, :3]), kind]).astype(np.uint8)
+    wide = len(origin) > 65535
+    maps = surface_maps(result, timestep, skin=True)
+    peak = max(float(maps.specular.max()), 1e-3)
+    data: Document = {
+        "vertices": len(origin),
+        "position": _base64(np.round((position - centre) / radius * 32767), "<i2"),
+        "uv": _base64(np.round(np.clip(uv, 0, 1) * 65535), "<u2"),
+        "normal": _base64(np.round(normals * 127), "i1"),
+        "colour": _base64(colour, "u1"),
+        "index": _base64(faces, "<u4" if wide else "<u2"),
+        "index_bits": 32 if wide else 16,
+        "centre": centre.tolist(),
+        "radius": radius,
+        "focus": ((face_centre.min(0) + face_centre.max(0)) / 2).tolist(),
+        "rotation": rotation.ravel().tolist(),
+        "specular_scale": peak,
+        "maps": {
+            "diffuse": draw.jpeg_uri(to_8_bit(maps.diffuse), 90),
+            "specular": draw.jpeg_uri(np.round(255 * np.clip(maps.specular / peak, 0, 1)).astype(np.uint8), 90),
+            "normal": draw.png_uri(np.round(127.5 * (maps.normal + 1)).astype(np.uint8)),
+        },
+        **_view_lighting(result),
+    }
+    return json.dumps(data)
+
+
+def _view_lighting(result: Reconstruction) -> Document:
+    """Recovered lighting for the view's shader: of the lobe a lat-long picture, and polynomials in the cosine."""
+    irradiance = result.lighting.truncate(3).coefficients * (cosine_coefficients(3)[bands(3)] / np.pi)[:, None]
+    order = result.lighting.order
+    cosines = np.linspace(0.05, 1.0, 40)
+    albedo, tilt, factors = result.lobe.zonal(order, cosines)
+    blurred = SHLighting(factors[bands(order), None] * result.lighting.coefficients).to_latlong(64, 128)
+    peak = max(float(blurred.max()), 1e-6)
+    return {
+        "irradiance": irradiance.ravel().tolist(),
+        "glossy": draw.png_uri(np.round(255 * np.sqrt(np.clip(blurred / peak, 0, 1))).astype(np.uint8)),
+        "glossy_scale": peak,
+        "lobe_albedo": np.polynomial.polynomial.polyfit(cosines, albedo, 5).tolist(),
+        "lobe_tilt": np.polynomial.polynomial.polyfit(cosines, tilt, 5).tolist(),
+        "ambient": float(result.illumination.ambient),
+        "exponent": result.lobe.exponent,
+    }
+
+
+def _base64(values: NDArray, kind: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode()
 
 
 def _comparison(

@@ -69,7 +69,8 @@ class PathTracer:
         import drjit as dr
         import mitsuba as mi
 
-        spp = _stratified_count(spp)
+        side = math.isqrt(spp - 1) + 1
+        spp = side * (side - 1) if side * (side - 1) >= spp else side * side
         content: Document = {"type": "scene", "environment": self._emitter}
         for i, surface in enumerate(surfaces):
             content[f"surface{i}"] = make_mesh(
@@ -87,11 +88,6 @@ class PathTracer:
             image = mi.render(scene, sensor=view, integrator=self._integrator, spp=spp, seed=start)
             images.append(np.array(image, dtype=np.float32))
         return images
-
-
-def _stratified_count(spp: int) -> int:
-    side = math.isqrt(spp - 1) + 1
-    return side * (side - 1) if side * (side - 1) >= spp else side * side
 
 
 def _bsdf(material: Material, strength: float) -> Document:

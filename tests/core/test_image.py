@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from mifit.cli import console
 from mifit.core import process as quiet
 from mifit.core.image import (
     linear_to_srgb,
@@ -138,7 +137,7 @@ def test_truncated_files_are_refused_in_one_line(
     write_image(path, RNG.random((64, 64, 3)))
     data = path.read_bytes()
     path.write_bytes(data[: int(part * len(data))])
-    monkeypatch.setattr(quiet, "_around", console.no_chatter)  # as the command line does
+    monkeypatch.setattr(quiet, "_around", quiet.no_chatter)  # as the command line does
     with pytest.raises(InputError, match=f"cut{suffix}") as caught:
         read_image(path)
     assert "\n" not in str(caught.value)

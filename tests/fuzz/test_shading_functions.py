@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mifit.appearance import kernels, models
+from mifit.config import SHADINGS
 from tests.fuzz.conftest import bounded
 
 AXES = np.array([[0, 0, 1], [0, 0, -1], [0, 1, 0], [0, -1, 0], [1, 0, 0], [-1, 0, 0]], dtype=np.float64)
@@ -42,7 +43,7 @@ def check_gradients(inputs: list[Any]) -> None:
 @pytest.mark.slow
 @bounded(24, deadline=None)  # the first of a kind compiles its kernels
 @given(
-    model=st.sampled_from(models.names()),
+    model=st.sampled_from(SHADINGS[1:]),
     order=st.sampled_from([1, 3]),
     exponent=st.sampled_from([1.0, 1.5, 5.0, 200.0, 1e4]),
     fresnel=st.sampled_from([None, 0.0, 8.0]),

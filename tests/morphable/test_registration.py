@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from mifit.cli.setup import model_info, notices
 from mifit.morphable import MorphableModel
+from mifit.morphable.assemble import unwrap
 from mifit.morphable.register import register, rigid_between
 from mifit.morphable.topology import EYES_AND_MOUTH, IBUG_MIRROR
-from mifit.morphable.unwrap import unwrap
 from mifit.output.truth import nearest_points
 
 

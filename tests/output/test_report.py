@@ -17,8 +17,7 @@ from mifit.core.image import to_8_bit
 from mifit.core.sh import SHLighting
 from mifit.output.evaluate import evaluate
 from mifit.output.figures import bounding_box, energy_plot, heat_map, lighting_balls, overlay, tint
-from mifit.output.report import write_report
-from mifit.output.viewer import viewer_data
+from mifit.output.report import viewer_data, write_report
 from tests.output.conftest import ball_camera
 from tests.output.test_render_evaluate import FakeCapture
 

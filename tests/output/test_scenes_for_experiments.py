@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import mifit
-from mifit.appearance import models
 from mifit.appearance.illumination import DistantLight, Illumination
+from mifit.config import SHADINGS
 from mifit.errors import InputError
 from tests.output.conftest import ball_camera, ball_result
 from tests.output.test_result_scene import off_centre
@@ -47,7 +47,7 @@ def combinations():
 
     All three at once would take twice as long: each compiles kernels of its own.
     """
-    names, found = list(models.names()), []
+    names, found = SHADINGS[1:], []
     for i, integrator in enumerate(OURS_AND_THEIRS):
         for k, model in enumerate(names):
             for number, lighting in enumerate(LIGHTINGS):
@@ -80,7 +80,7 @@ def test_every_integrator_renders_and_differentiates_every_scene(variant, integr
         assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0, key
 
 
-@pytest.mark.parametrize("model", models.names())
+@pytest.mark.parametrize("model", SHADINGS[1:])
 def test_shdirect_shows_what_local_rendering_shows(variant, model):
     import mitsuba as mi
 

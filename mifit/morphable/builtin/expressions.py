@@ -54,7 +54,9 @@ def expression_modes(template: Template) -> tuple[NDArray[np.float32], tuple[str
         bounds[name] = (0.0, ACTION_BOUND)
 
     share = np.array([action_units.JAW_SHARE.get(n.rstrip("+-"), 0.0) for n in names])
-    modes["jawOpen"] = influence @ (share[:, None] * (_rotate_x(anchors - _TMJ, 17.0) + _TMJ - anchors))
+    (x, y, z), c, s = (anchors - _TMJ).T, np.cos(np.radians(17.0)), np.sin(np.radians(17.0))
+    opened = np.stack([x, c * y - s * z, s * y + c * z], axis=1)  # about the x axis, front downwards
+    modes["jawOpen"] = influence @ (share[:, None] * (opened + _TMJ - anchors))
     bounds["jawOpen"] = (0.0, ACTION_BOUND)
     modes["jawForward"] = influence @ (share[:, None] * np.array([0.0, 0.0, 5.0]))
     # lips that touch slide together
@@ -128,12 +130,6 @@ def _influences(template: Template) -> tuple[NDArray[np.float64], list[str]]:
         columns = np.searchsorted(template.grid[template.mouth_row], template.upper_lip)
         out[margin] = out[template.grid[template.mouth_row + row, columns]]
     return out, list(anchors)
-
-
-def _rotate_x(p: NDArray, degrees: float) -> NDArray:
-    """Turn points about the x axis, front downwards."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return np.stack([p[:, 0], c * p[:, 1] - s * p[:, 2], s * p[:, 1] + c * p[:, 2]], axis=1)
 
 
 def _lid_motion(template: Template, upper: float, lower: float) -> NDArray[np.float64]:

@@ -143,10 +143,6 @@ def smooth_step(x: NDArray, low: float, high: float) -> NDArray:
     return t * t * t * (t * (6 * t - 15) + 10)
 
 
-def _smooth_max(a: NDArray, b: NDArray, k: float) -> NDArray:
-    return 0.5 * (a + b + np.sqrt((a - b) ** 2 + k * k))
-
-
 def _along(x: NDArray, y: NDArray, line: list[tuple[float, float]], width: float) -> NDArray:
     """Gaussian ridge of unit height along a polyline."""
     best = np.full(np.shape(x), np.inf)
@@ -215,7 +211,8 @@ def lids(p: NDArray, upper: NDArray) -> NDArray:
     r2 = (x - EYE[0]) ** 2 + (y - EYE[1]) ** 2
     ball = EYE[2] + np.sqrt(np.maximum(LID_RADIUS**2 - r2, 1e-3))
     near = 1.0 - smooth_step(np.sqrt(r2), 11.5, 15.5)
-    draped = _smooth_max(z, np.where(r2 < LID_RADIUS**2, ball, -1e3), 1.5)
+    ball = np.where(r2 < LID_RADIUS**2, ball, -1e3)
+    draped = 0.5 * (z + ball + np.sqrt((z - ball) ** 2 + 1.5 * 1.5))  # a smooth maximum
     z = np.where(z > 20, z + near * (draped - z), z)
     top = lid_curves(x)[0]
     q = np.clip((x - CANTHI[0]) / (CANTHI[1] - CANTHI[0]), 0, 1)

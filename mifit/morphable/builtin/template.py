@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from mifit.morphable.builtin import sculpt
 
+Slits = tuple[int, int, tuple[int, int, int]]
+"""Rows of the slits of eyes and mouth, and columns of the inner and outer corners of an eye and of the mouth's."""
+
 
 @dataclass(frozen=True)
 class Template:
@@ -40,7 +43,7 @@ class Template:
 
 def make_template(density: float, step: int = 1) -> Template:
     """Build the head with a part of the lines that are drawn; ``step`` 2 keeps every second row and column."""
-    upper, lower, eye_row, mouth_row, corners = _half_surfaces(density)
+    upper, lower, (eye_row, mouth_row, corners) = _half_surfaces(density)
     upper, lower = upper[::step, ::step], lower[::step, ::step]
     eye_row, mouth_row = eye_row // step, mouth_row // step
     inner, outer, corner = (c // step for c in corners)
@@ -99,10 +102,10 @@ def make_template(density: float, step: int = 1) -> Template:
     )
 
 
-def _half_surfaces(density: float) -> tuple[NDArray, NDArray, int, int, tuple[int, int, int]]:
+def _half_surfaces(density: float) -> tuple[NDArray, NDArray, Slits]:
     """Points (rows, angles, 3) of the half at x >= 0, above and below the slits, and where the slits are."""
     rows, angles, eye_row, mouth_row = sculpt.grid_lines(density)
-    corners = sculpt.opening_columns(angles, rows, eye_row, mouth_row)
+    slits = eye_row, mouth_row, sculpt.opening_columns(angles, rows, eye_row, mouth_row)
     angle, position = np.meshgrid(angles, rows)
     plain = sculpt.loft(angle, position)
     row = np.arange(len(rows))[:, None]
@@ -110,27 +113,19 @@ def _half_surfaces(density: float) -> tuple[NDArray, NDArray, int, int, tuple[in
     for above in (True, False):
         over_eye = row <= eye_row if above else row < eye_row
         over_mouth = row <= mouth_row if above else row < mouth_row
-        warped = sculpt.loft(angle, _warp(plain, position, eye_row, mouth_row, corners, over_eye, density))
+        warped = sculpt.loft(angle, _warp(plain, position, slits, over_eye, density))
         points = sculpt.lips(sculpt.lids(sculpt.features(warped), np.broadcast_to(over_eye, angle.shape)), over_mouth)
-        out.append(sculpt.ears(_roll(points, eye_row, mouth_row, corners, over_eye, over_mouth, density)))
-    return out[0], out[1], eye_row, mouth_row, corners
+        out.append(sculpt.ears(_roll(points, slits, over_mouth, density)))
+    return out[0], out[1], slits
 
 
-def _warp(
-    plain: NDArray,
-    position: NDArray,
-    eye_row: int,
-    mouth_row: int,
-    corners: tuple[int, int, int],
-    over: NDArray,
-    density: float,
-) -> NDArray:
+def _warp(plain: NDArray, position: NDArray, slits: Slits, over: NDArray, density: float) -> NDArray:
     """Slide grid rows along the loft so that the slits lie on the lids' margins and on the mouth's line."""
+    eye_row, mouth_row, (inner, outer, _) = slits
     x, y = plain[..., 0], plain[..., 1]
     columns = x.shape[1]
     front = np.arange(columns) < columns // 2
     upper, lower = sculpt.lid_curves(x[eye_row])
-    inner, outer, _ = corners
     beyond = np.maximum(x[eye_row, inner] - x[eye_row], x[eye_row] - x[eye_row, outer])
     fade = front * (1 - sculpt.smooth_step(beyond, 0.0, 14.0))
     height = np.where(over, upper, lower) - y[eye_row]
@@ -145,17 +140,9 @@ def _warp(
     return out
 
 
-def _roll(
-    points: NDArray,
-    eye_row: int,
-    mouth_row: int,
-    corners: tuple[int, int, int],
-    over_eye: NDArray,
-    over_mouth: NDArray,
-    density: float,
-) -> NDArray:
+def _roll(points: NDArray, slits: Slits, over_mouth: NDArray, density: float) -> NDArray:
     """Turn the margins of lids and lips inwards, which gives them thickness."""
-    inner, outer, corner = corners
+    eye_row, mouth_row, (inner, outer, corner) = slits
     rows, columns = points.shape[:2]
     row, column = np.arange(rows)[:, None], np.arange(columns)
     at_eye = (column > inner) & (column < outer)
