@@ -1,10 +1,8 @@
 """What steps have computed, kept in files under a key of all that it was computed from.
 
 One ``.npz`` for each estimate: its arrays, its scalars as JSON, a digest of both and its key. A file whose key differs,
-or whose content isn't what was written, is not used. Written beside and renamed; loading one never runs code.
-
-A fit keeps its steps in ``RESULT/.mifit/checkpoints``, so that a killed run goes on where it stopped; the fits of a
-sweep share one folder.
+or whose content isn't what was written, is not used; loading one never runs code. A fit keeps its steps in
+``RESULT/.mifit/checkpoints``, so that a killed run goes on where it stopped; the fits of a sweep share one folder.
 """
 
 from __future__ import annotations

@@ -4,9 +4,6 @@ Each new timestep starts where the last one ended, and at its landmarks. Its sur
 the fitted timesteps, so that nothing drifts (`surface.kept_texture`). Its normals are drawn to the mean correction of
 the last frames, carried along in the tangent planes of the moving face: where the images say little the detail stays,
 where they say much it follows at once.
-
-`track` follows a face; `track_into` also writes each frame into a result folder as it finishes, so that a killed run
-goes on.
 """
 
 from __future__ import annotations

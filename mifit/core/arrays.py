@@ -1,9 +1,7 @@
 """Arrays in files: guarded readers of NumPy's files and of meshes, and rows that lie in a mapped file.
 
-Readers check every size before anything is allocated, and refuse objects. `Rows` are arrays with a row per timestep,
-which for a video are larger than memory.
-The file has no name, so nothing is left of it when the process ends, however it ends. What the machine holds of it in
-memory it gives back when something else needs the room.
+Readers check every size before anything is allocated, and refuse objects. `Rows` have one per timestep, which for a
+video are more than memory holds. Their file has no name, so nothing is left of it however the process ends.
 """
 
 from __future__ import annotations

@@ -212,11 +212,7 @@ def trust(predicted: float, actual: float, size: float, rejections: int) -> tupl
 
 
 def _bounded_step(system: System, size: float, frozen: NDArray, low: NDArray, high: NDArray) -> NDArray | None:
-    """A finite step within its bounds, damped by ``1 / size``, or None when the system is singular at this size.
-
-    Parameters that the step would carry across a bound are put on it, and the others are solved for again given
-    that; clipping alone can turn a descent into an ascent.
-    """
+    """A finite step within its bounds, damped by ``1 / size``, or None when the system is singular at this size."""
     fixed, held = np.zeros(len(frozen)), frozen
     gradient = None
     for _ in range(12):
@@ -230,6 +226,7 @@ def _bounded_step(system: System, size: float, frozen: NDArray, low: NDArray, hi
         below, above = ~held & (step < low), ~held & (step > high)
         if not (below.any() or above.any()):
             break
+        # Solved again with these on their bounds: clipping alone can turn a descent into an ascent.
         fixed = np.where(below, low, np.where(above, high, fixed))
         held = held | below | above
         gradient = system.gradient + system.product(fixed)

@@ -5,9 +5,6 @@ A pixel of the wanted view is traced to the mesh and takes a blend of the colour
 - ``cosine``: weighted by the squared cosine between the view and the surface;
 - ``nearest``: the view nearest in angle to the wanted one;
 - ``angle``: weighted by nearness in angle, as in an unstructured lumigraph (Buehler et al. 2001).
-
-A fit that doesn't beat the best of them on a held-out view has recovered nothing of how the face is lit or what its
-skin is like.
 """
 
 from __future__ import annotations

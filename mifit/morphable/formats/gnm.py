@@ -86,10 +86,7 @@ def load_gnm(path: Path) -> MorphableModel:
 
 
 def _modes(path: Path, basis: NDArray, key: str, used: NDArray, skin: NDArray, most: int) -> NDArray[np.float32]:
-    """(V', 3, K) of the vertices that are used, the modes that move the skin most, in their order.
-
-    The model has hundreds, of teeth and tongue among them.
-    """
+    """(V', 3, K) of the vertices that are used, the modes that move the skin most, in their order."""
     if basis.ndim != 3 or basis.shape[2] != 3 or basis.shape[1] <= used.max():
         raise InputError(f"{path}: {key} has shape {basis.shape}, expected (modes, vertices, 3)")
     basis = single(basis[:, used])

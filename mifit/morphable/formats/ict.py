@@ -148,11 +148,7 @@ def _assemble(
     landmarks: NDArray,
     face_area: NDArray[np.bool_],
 ) -> MorphableModel:
-    """A model of identity and expression modes (last), with the pigment model's albedo.
-
-    From ``face_area`` (F,) the faces inside the lids and behind the lips are left out. Texture coordinates with u > 1
-    belong to the back of the head and the neck, outside the face area.
-    """
+    """A model of identity and expression modes (last); of ``face_area`` (F,) without the insides of lids and lips."""
     check_mesh("ict_facekit", mean, faces, landmarks)
     return complete(
         "ict_facekit",
