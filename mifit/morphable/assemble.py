@@ -69,6 +69,7 @@ def complete(  # noqa: PLR0913
         albedo = skin_model(mean, faces[face_mask], landmarks, unit_mm, N_ALBEDO)
     if uv is None:
         uv = unwrap(mean.astype(np.float64), faces, face_mask)
+    read = mean, faces, identity, expression, landmarks, *given
     return MorphableModel(
         name=name,
         mean=mean,
@@ -85,10 +86,7 @@ def complete(  # noqa: PLR0913
         unit_mm=unit_mm,
         expression_names=expression_names,
         expression_bounds=expression_bounds,  # type: ignore[arg-type]
-        # What was read; the rest is computed from it.
-        fingerprint=content_key(VERSION, mean, faces, identity, expression, landmarks, *given).hex()[:32]
-        if computed
-        else "",
+        fingerprint=content_key(VERSION, *read).hex()[:32] if computed else "",  # the rest is computed from it
     )
 
 

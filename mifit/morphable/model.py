@@ -12,7 +12,9 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
+from mifit.core.arrays import read_npz
 from mifit.core.calls import finite, whole
+from mifit.core.files import replacing
 from mifit.core.limits import MAX_NUMBER
 from mifit.core.mesh import face_cross
 from mifit.core.uv import rasterize_uv
@@ -30,6 +32,8 @@ def provide(method: str, function: Callable[..., object]) -> None:
     _PROVIDED[method] = function
 
 
+FORMAT_KEY = "mifit_model"
+FORMAT_VERSION = 1
 VERSION = 1
 """Of what is computed for a model: the built-in head, added eyes, what a file lacks. Raise it when that changes, since
 results made with another version can't be read."""
@@ -343,8 +347,36 @@ class MorphableModel:
         return model
 
     def save(self, path: str | Path) -> None:
-        """Write the model as an ``.npz`` file, whole or not at all."""
-        _PROVIDED["save"](self, path)
+        """Write the model as an ``.npz`` file, whole or not at all; `load` gives back every array bit for bit.
+
+        InputError where the path isn't ``.npz``.
+        """
+        if Path(path).suffix != ".npz":
+            raise InputError(f"{path}: found suffix '{Path(path).suffix}', expected .npz")
+        arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self) if f.name != "symmetry"}
+        if self.symmetry is not None:
+            arrays["symmetry"] = self.symmetry
+        arrays[FORMAT_KEY] = np.asarray(FORMAT_VERSION)
+        with replacing(path) as temporary:
+            np.savez(temporary, **arrays)  # type: ignore[arg-type]
+
+
+def load_own(path: Path) -> MorphableModel:
+    """Read a model that `MorphableModel.save` wrote: fields under their names."""
+    data = read_npz(path)
+    version = data.pop(FORMAT_KEY)
+    if version.shape != () or version != FORMAT_VERSION:
+        raise InputError(f"{path}: {FORMAT_KEY} version {version}, expected {FORMAT_VERSION}")
+    known = {f.name for f in fields(MorphableModel)}
+    missing = sorted(known - {"symmetry", "fingerprint"} - set(data))
+    if missing:
+        raise InputError(f"{path}: lacks {', '.join(missing)}; expected every field of a mifit model")
+    unit = data["unit_mm"]
+    if unit.shape != () or unit.dtype.kind not in "fiu":
+        raise InputError(f"{path}: unit_mm is {unit}, expected a number")
+    values: dict = {k: v for k, v in data.items() if k in known}
+    values |= {"name": str(data["name"]), "fingerprint": str(data.get("fingerprint", "")), "unit_mm": float(unit)}
+    return MorphableModel(**values | {"expression_names": tuple(str(n) for n in data["expression_names"].ravel())})
 
 
 def _checked(name: str, key: str, value: ArrayLike, shape: tuple, dtype: type) -> NDArray:

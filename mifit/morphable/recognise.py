@@ -22,9 +22,8 @@ from mifit.morphable.formats.gnm import KEYS as GNM_KEYS
 from mifit.morphable.formats.gnm import load_gnm
 from mifit.morphable.formats.ict import is_ict_folder, is_ict_npz, load_ict_folder, load_ict_npz
 from mifit.morphable.formats.mat5 import is_mat5, mat_names
-from mifit.morphable.formats.own import FORMAT_KEY, load_own
 from mifit.morphable.formats.pickles import is_pickle
-from mifit.morphable.model import MorphableModel
+from mifit.morphable.model import FORMAT_KEY, MorphableModel, load_own
 from mifit.morphable.openings import SUFFIX, with_eyes
 
 BUILTIN = ("builtin", "builtin:coarse")

@@ -92,9 +92,8 @@ def make_base(folder: Path) -> Path:
     document = {"camera_model": "OPENCV", "units": "cm", "frames": frames}
     (capture / "transforms.json").write_text(json.dumps(document))
     result = ball_result()
-    from mifit.morphable.formats.own import save_model
 
-    save_model(result.model, folder / "ball.npz")
+    result.model.save(folder / "ball.npz")
     from dataclasses import replace
 
     replace(result, model_source=str(folder / "ball.npz")).save(folder / "result")
@@ -123,7 +122,7 @@ def make_base(folder: Path) -> Path:
     layouts.write_flame_pickle(models / "flame.pkl", small)
     layouts.write_flame_npz(models / "flame.npz", small)
     layouts.write_eos(models / "eos.bin", small, 4)
-    save_model(small, models / "own.npz")
+    small.save(models / "own.npz")
     return folder
 
 

@@ -18,9 +18,8 @@ from mifit.errors import InputError
 from mifit.morphable.builtin.expressions import expression_modes
 from mifit.morphable.builtin.landmarks import landmark_vertices
 from mifit.morphable.builtin.template import Template, make_template
-from mifit.morphable.formats.own import load_own, save_model
 from mifit.morphable.gaussian_process import deformation_modes
-from mifit.morphable.model import VERSION, MorphableModel
+from mifit.morphable.model import VERSION, MorphableModel, load_own
 from mifit.morphable.openings import with_eyes
 from mifit.morphable.pigment import skin_model
 
@@ -50,7 +49,7 @@ def builtin_model(coarse: bool = False) -> MorphableModel:
         for other in path.parent.glob(f"{name}-*.npz"):
             if time.time() - other.stat().st_mtime > 30 * 86400:  # of other versions, unused for a month
                 other.unlink(missing_ok=True)
-        save_model(model, path)
+        model.save(path)
     except (OSError, InputError):
         pass  # a cache that can't be written only costs time
     return model
