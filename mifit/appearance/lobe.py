@@ -47,17 +47,11 @@ _DEGREE_COSINE, _DEGREE_EXPONENT = 7, 11
 
 @dataclass(frozen=True)
 class Lobe:
-    """The Blinn-Phong lobe of a surface.
+    """The Blinn-Phong lobe of a surface, with an exponent from 1 to 10000.
 
-    Attributes
-    ----------
-    exponent : float
-        1 to 10000.
-    fresnel : float or None
-        Strength of the lobe at grazing views over that of a view along the normal, less 1; None for plain Blinn-Phong,
-        a number for the lobe carried about the mirror direction.
-    normalized : bool
-        Which N(m), see above.
+    ``fresnel`` is the strength of the lobe at grazing views over that of a view along the normal, less 1; None for
+    plain Blinn-Phong, a number for the lobe carried about the mirror direction. ``normalized`` says which N(m), see
+    above.
     """
 
     exponent: float

@@ -32,11 +32,7 @@ Shade = Callable[[Jit, Jit], tuple[Jit, Jit]]
 class Transfer:
     """What a point sends to the eye per unit of albedo and of each SH coefficient.
 
-    Attributes
-    ----------
-    diffuse, specular : list of B*B Floats
-    gain : Float
-        Factor on all of ``specular``.
+    ``diffuse`` and ``specular`` are B*B Floats each, ``gain`` (Float) is a factor on all of ``specular``.
     """
 
     diffuse: Sequence[Jit]
@@ -86,17 +82,11 @@ class ShadingModel(ABC):
     def transfer(
         self, n: Jit, v: Jit, lobe: PreparedLobe, coefficients: Sequence[Jit], shadowed: Sequence[Jit] | None = None
     ) -> Transfer:
-        """Transfer of points.
+        """Transfer of points with unit normals ``n`` and unit directions ``v`` towards the viewer (Vector3f).
 
-        Parameters
-        ----------
-        n, v : Vector3f
-            Unit normal, and unit direction towards the viewer.
-        lobe : PreparedLobe
-        coefficients : B*B colours
-            Radiance. A model whose transfer depends on it says so by `turns`; its gradient is wanted all the same.
-        shadowed : B*B Floats
-            Traced diffuse transfer; given where `needs_shadows`.
+        ``coefficients`` (B*B colours) are radiance. A model whose transfer depends on it says so by `turns`; its
+        gradient is wanted all the same. ``shadowed`` (B*B Floats) is traced diffuse transfer, given where
+        `needs_shadows`.
         """
 
     def shade(
@@ -108,16 +98,9 @@ class ShadingModel(ABC):
     def about(
         self, base: Jit, v: Jit, lobe: PreparedLobe, coefficients: Sequence[Jit], shadowed: Sequence[Jit] | None = None
     ) -> Shade:
-        """Shading of normals that are bent away from those of the mesh, for which shadows were traced.
+        """Shading of normals bent away from those of the mesh, ``base`` (Vector3f), for which shadows were traced.
 
-        What doesn't change with the normal is computed here, once.
-
-        Parameters
-        ----------
-        base, v : Vector3f
-            The mesh's normal, and direction towards the viewer.
-        lobe, coefficients, shadowed
-            As in `transfer`.
+        What doesn't change with the normal is computed here, once. All else is as in `transfer`.
         """
         return lambda n, toward: self.shade(n, toward, lobe, coefficients, shadowed)
 

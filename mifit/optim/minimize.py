@@ -126,21 +126,12 @@ def minimize(
 ) -> Solution:
     """Minimise a sum of squares, with optional bounds, by Levenberg and Marquardt's method.
 
-    Damping follows Nielsen's rule, see `trust`. A parameter at a bound whose gradient points outwards is frozen for
-    the step; one that would cross a bound is put on it and the others are solved for again.
+    Damping follows Nielsen's rule, see `trust`. A parameter at a bound whose gradient points outwards is frozen for the
+    step; one that would cross a bound is put on it and the others are solved for again.
 
-    Parameters
-    ----------
-    problem : Problem
-    start : (n,)
-        Clipped to the bounds.
-    lower, upper : (n,), optional
-    max_iterations : int
-        Linearisations.
-    step_tolerance : float
-        Converged when the step is this small relative to ``1 + |x|`` in the largest entry.
-    energy_tolerance : float
-        Converged when the predicted decrease is below this fraction of the energy.
+    ``start`` (n,) is clipped to the bounds ``lower`` and ``upper`` (n,); ``max_iterations`` counts linearisations. It
+    has converged when the step is within ``step_tolerance`` relative to ``1 + |x|`` in the largest entry, or the
+    predicted decrease is below the part ``energy_tolerance`` of the energy.
     """
     began = time.perf_counter()
     x = np.array(start, dtype=np.float64)
@@ -236,12 +227,8 @@ def _bounded_step(system: System, size: float, frozen: NDArray, low: NDArray, hi
 def geman_mcclure(squared: NDArray, scale: float) -> tuple[NDArray, NDArray]:
     """Geman and McClure's penalty s^2 r^2 / (s^2 + r^2): bounded, so that a gross outlier has no pull.
 
-    It equals r^2 to second order at zero; the weight rho'(r) / 2r is that of iteratively reweighted least squares.
-
-    Returns
-    -------
-    rho, weight : arrays like ``squared``
-        An infinite ``scale`` gives least squares.
+    It equals r^2 to second order at zero. Returned are rho and the weight rho'(r) / 2r of iteratively reweighted least
+    squares, like ``squared``; an infinite ``scale`` s gives least squares.
     """
     if np.isinf(scale):
         return squared, np.ones_like(squared)
