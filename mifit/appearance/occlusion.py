@@ -87,12 +87,8 @@ class VertexTransfer:
 class Occlusion:
     """Shadows of a mesh on N points of it; the default is none.
 
-    Attributes
-    ----------
-    transfer : VertexTransfer or None
-        Shadowed diffuse transfer, for models that need it.
-    visible : tuple of (N,) uint32
-        Per compact light, which of its samples each point sees.
+    ``transfer`` is shadowed diffuse transfer, for models that need it; ``visible`` has per compact light (N,) uint32,
+    which of its samples each point sees.
     """
 
     transfer: VertexTransfer | None = None

@@ -34,11 +34,7 @@ def load_scene(source: str | Path | Mapping[str, object], **parameters: object) 
 
     Equal objects are not merged, so parameters keep the names that the scene gives them. The ``radius`` of each
     ``shenv`` is set to hold the scene. ``parameters`` are values for the ``$name`` parameters of an XML file.
-
-    Raises
-    ------
-    InputError
-        The file is missing or isn't a scene, or a plugin refuses its parameters.
+    InputError where the file is missing or isn't a scene, or a plugin refuses its parameters.
     """
     import mitsuba as mi
 

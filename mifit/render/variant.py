@@ -103,12 +103,8 @@ def install_hint() -> str:
 def set_variant(name: str = "auto") -> str:
     """Name of the Mitsuba variant that is now active; the program calls this once, the library never does.
 
-    ``"auto"`` is ``cuda_ad_rgb`` where CUDA works, else ``llvm_ad_rgb``.
-
-    Raises
-    ------
-    VariantError
-        The variant doesn't exist, or the CUDA or LLVM behind it doesn't work; the message names the fix.
+    ``"auto"`` is ``cuda_ad_rgb`` where CUDA works, else ``llvm_ad_rgb``. VariantError where the variant doesn't exist,
+    or the CUDA or LLVM behind it doesn't work; the message names the fix.
     """
     if not isinstance(name, str):
         raise TypeError(f"set_variant: name: found {type(name).__name__}, expected str")
