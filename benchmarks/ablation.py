@@ -29,7 +29,7 @@ from benchmarks import heads, judge
 from benchmarks.foreign import replace_size, separation_of
 from benchmarks.heads import ICT, Case
 from benchmarks.judge import Row
-from benchmarks.record import RESULTS, conditions, record
+from benchmarks.record import RESULTS, conditions, machine, record
 from mifit import Capture, FitConfig, MorphableModel, Reconstruction, fitting
 from mifit.core.files import write_text
 from mifit.core.process import one_blas_thread
@@ -262,7 +262,7 @@ def markdown(measured: Mapping[str, Mapping[str, Any]], size: int) -> str:
         lines.append(f"| {part.label} | {' | '.join(cells)} |")
     for name, one in measured.items():
         base = one["rows"].get(BASE, {})
-        lines += ["", f"`{name}` ({one['set']}): " + ", ".join(
+        lines += ["", f"`{name}` ({one['set']}, commit {one['commit']}): " + ", ".join(
             f"{title} {base[key]:.{digits}f}" for key, (title, digits) in MEASURES.items() if key in base
         ) + f", image-based {base.get('based', float('nan')):.2f} dB", ""]  # fmt: skip
         lines += [f"| part | {' | '.join(t for t, _ in MEASURES.values())} |", "|---|" + "---|" * len(MEASURES)]
@@ -294,7 +294,7 @@ def run(
             print(f"left out: {name}: {case.missing} is not there", file=sys.stderr, flush=True)
             continue
         one = stored.setdefault(name, {"rows": {}})
-        one |= {"set": case.set, "changed": case.changed, "label": case.label}
+        one |= {"set": case.set, "changed": case.changed, "label": case.label, "commit": machine()["commit"]}
         fits, photographed = Fits(case), name in PHOTOGRAPHED
         for part in PARTS:
             useless = part.photometry and len(case.timesteps) == 1  # a head that stands still tells nothing of it

@@ -257,8 +257,8 @@ HELD_OUT: Columns = {
 SURFACE: Columns = {
     "scan to mesh, median / mean / 90 % mm": lambda c: _millimetres(c, "full"),
     "mean's spread over seeds": lambda c: _spread(c, "mean_mm", 2),
-    "paper, literal": lambda c: _millimetres(c, "paper"),
-    "paper, normalised": lambda c: _millimetres(c, "paper, normalised"),
+    "paper, literal: mean mm": lambda c: _figure(c, 2, "mesh", "paper", "mean_mm"),
+    "paper, normalised": lambda c: _figure(c, 2, "mesh", "paper, normalised", "mean_mm"),
     "normals °": lambda c: _figure(c, 1, "surface", "full", "normal_degrees"),
     "stage 1's normals °": lambda c: _figure(c, 1, "surface", "full", "normal_degrees_stage1"),
     "albedo dB, scaled / as it is": lambda c: " / ".join(
@@ -290,7 +290,7 @@ def _table(cases: Sequence[dict[str, Any]], columns: Columns) -> list[str]:
     """A row per case; columns that no case has are left out."""
     fitted = [case for case in cases if "failed" not in case]
     columns = {title: cell for title, cell in columns.items() if any(cell(case).strip("-/ ") for case in fitted)}
-    lines = ["| head (fitted model), fitted → held out | set | " + " | ".join(columns) + " |"]
+    lines = ["| head (fitted model) | set | " + " | ".join(columns) + " |"]
     lines.append("|---|---|" + "---|" * len(columns))
     for case in cases:
         start = f"| {case['label']} | {case['set']} |"

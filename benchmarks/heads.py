@@ -85,13 +85,13 @@ class Case:
 
     @property
     def label(self) -> str:
-        """What a table calls it."""
+        """What a table calls it; its cameras where they aren't left and right, third held out."""
         model = "ICT" if self.model == ICT else Path(self.model).stem
         steps = f", {len(self.timesteps)} timesteps" if len(self.timesteps) > 1 else ""
         change = f", {self.changed}" if self.changed else ""
-        return (
-            f"{Path(self.capture).name}{change} ({model}{steps}), {','.join(self.fitted)} → {','.join(self.held_out)}"
-        )
+        cameras = f", {','.join(self.fitted)} → {','.join(self.held_out)}"
+        usual = (self.fitted, self.held_out) == (PAIR, THIRD)
+        return f"{Path(self.capture).name}{change} ({model}{steps}){'' if usual else cameras}"
 
 
 MADE = tuple(f"ict_{seed}" for seed in (201, 202, 203, 204, 205))

@@ -221,9 +221,9 @@ def markdown(figures: Figures) -> str:
         for name, cost in {**part["steps"], "all": part["total"]}.items():
             row(name, cost)
     for by, part in figures.get("growth", {}).items():
-        lines += ["", f"| {by} (exponent {part['exponent']:.2f}) | {head} | by step, cpu s |", "|---|---|---|---|---|"]
+        lines += ["", f"| {by} (exponent {part['exponent']:.2f}) | {head} |", "|---|---|---|---|"]
         for one in part["rows"]:
-            row(str(one[by]), one, ", ".join(f"{name} {value:.1f}" for name, value in one["steps"].items()))
+            row(str(one[by]), one)
     for stage, rows in figures.get("error", {}).items():
         measure = "mesh_mm" if "mesh_mm" in rows[0] else "third_db"
         lines += ["", f"| {stage}, iterations | {head} | {measure} |", "|---|---|---|---|---|"]

@@ -60,9 +60,9 @@ def test_parts_are_told_against_the_base_of_their_head_and_set():
     rows = {"base": row(), one: row(skin=29.0, cpu=30.0), two: {"gone": "no such setting"}}
     other = {"base": row(skin=20.0, mm=0.5), one: row(skin=20.5, mm=0.6)}
     heads = {
-        "a": {"set": "locked", "changed": "", "rows": rows},
-        "b": {"set": "locked", "changed": "", "rows": other},
-        "c": {"set": "development", "changed": "", "rows": other},
+        "a": {"set": "locked", "changed": "", "commit": "1234567", "rows": rows},
+        "b": {"set": "locked", "changed": "", "commit": "1234567", "rows": other},
+        "c": {"set": "development", "changed": "", "commit": "1234567", "rows": other},
     }
     lines = ablation.markdown(heads, 256).splitlines()
     means = next(line for line in lines if line.startswith(f"| {one} |"))
