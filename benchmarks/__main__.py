@@ -16,7 +16,7 @@ from benchmarks.record import RESULTS, SHARED, renew_tables
 
 Runs = tuple[tuple[str, list[str]], ...]
 REDUCED: Runs = (
-    ("foreign", ["--reduced", "--seeds"]),
+    ("foreign", ["--reduced", "--seeds", "--rows", "full", "refit"]),
     ("foreign", ["--own", "--reduced", "--rows", "full", "refit"]),
     (
         "table1",

@@ -27,7 +27,16 @@ import numpy as np
 import mifit
 from mifit.cache import Cache, digest
 from mifit.capture.choose_frames import FrameChoice
-from mifit.config import FitConfig, GeometryConfig, MeshConfig, PhotometryConfig, SurfaceConfig
+from mifit.config import (
+    FitConfig,
+    GeometryConfig,
+    MeshConfig,
+    NormalsConfig,
+    PhotometryConfig,
+    ReflectanceConfig,
+    ResidualConfig,
+    SurfaceConfig,
+)
 from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, MeshEstimate, NormalsEstimate, ReflectanceEstimate, ResidualEstimate
@@ -330,18 +339,16 @@ def steps(config: FitConfig, until: Stage = "normals") -> list[Step]:
         found.append(Step("photometry", "geometry", ("geometry",), (config.photometry,), _find_photometry))
     if until == "geometry":
         return found
-    found.append(
-        Step("reflectance", "reflectance", ("geometry",), (config.reflectance,), _of_images(infer_reflectance))
-    )
+    found.append(Step("reflectance", "reflectance", ("geometry",), (config.reflectance,), _infer_reflectance))
     if until == "reflectance":
         return found
     found += [
-        Step("normals", "normals", ("geometry", "reflectance"), (config.normals,), _of_images(refine_normals)),
+        Step("normals", "normals", ("geometry", "reflectance"), (config.normals,), _refine_normals),
         Step("mesh", "mesh", ("geometry", "normals"), (config.mesh,), _refine_mesh),
     ]
     if config.residual.enabled:
         given: tuple[Part, ...] = ("geometry", "reflectance", "normals")
-        found.append(Step("residual", "residual", given, (config.residual,), _of_images(find_residual)))
+        found.append(Step("residual", "residual", given, (config.residual,), _find_residual))
     return found
 
 
@@ -410,19 +417,27 @@ def _find_photometry(
     return replace(geometry, photometry=found, report=report)
 
 
-def _of_images(find: Callable[..., Estimate]) -> Callable[..., Estimate]:
-    """A step by a function of images, of the estimates that the step names, and of its settings."""
+def _infer_reflectance(
+    source: Source, inputs: Estimates, progress: Progress, config: ReflectanceConfig
+) -> ReflectanceEstimate:
+    capture, model, cameras = source.images
+    return infer_reflectance(capture, model, inputs["geometry"], cameras, config, seed=source.seed, progress=progress)
 
-    def run(source: Source, inputs: Estimates, progress: Progress, config: DataclassInstance) -> Estimate:
-        capture, model, cameras = source.images
-        return find(capture, model, *inputs.values(), cameras, config, seed=source.seed, progress=progress)
 
-    run.__name__ = f"_{find.__name__}"  # part of the key
-    return run
+def _refine_normals(source: Source, inputs: Estimates, progress: Progress, config: NormalsConfig) -> NormalsEstimate:
+    capture, model, cameras = source.images
+    given = inputs["geometry"], inputs["reflectance"]
+    return refine_normals(capture, model, *given, cameras, config, seed=source.seed, progress=progress)
 
 
 def _refine_mesh(source: Source, inputs: Estimates, progress: Progress, config: MeshConfig) -> MeshEstimate:
     return refine_mesh(source.model, inputs["geometry"], inputs["normals"], config, progress)
+
+
+def _find_residual(source: Source, inputs: Estimates, progress: Progress, config: ResidualConfig) -> ResidualEstimate:
+    capture, model, cameras = source.images
+    given = inputs["geometry"], inputs["reflectance"], inputs["normals"]
+    return find_residual(capture, model, *given, cameras, config, seed=source.seed, progress=progress)
 
 
 def check_images(capture: Capture, cameras: Sequence[str], timesteps: Sequence[int]) -> None:
