@@ -100,6 +100,6 @@ def tiny_capture(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path
     with FileLock(folder.parent.with_suffix(".lock")):
         if not folder.exists():
             part = folder.with_name("part")
-            synthesize(part, timesteps=3, model="builtin:coarse", width=200, height=150, spp=12, seed=3)
+            synthesize(part, timesteps=3, model="builtin:coarse", width=200, height=150, spp=16, seed=3)
             part.rename(folder)
     return folder

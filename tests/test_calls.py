@@ -356,7 +356,7 @@ def test_bad_arguments_are_refused_in_words(name: str, made: SimpleNamespace, tm
             raise AssertionError(f"{name}, call {number}: {type(error).__name__}: {error}") from error
         else:
             raise AssertionError(f"{name}, call {number}: accepted, {found!r:.80}")
-        assert time.process_time() - start < 10
+        assert time.process_time() - start < 3  # it is told, not fitted
     assert not list(tmp_path.iterdir())
 
 

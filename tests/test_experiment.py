@@ -119,7 +119,8 @@ def test_dask_gives_the_same_figures(done, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_failing_run_is_named_and_the_others_finish(done, tmp_path):
+def test_a_failing_run_is_named_and_the_others_finish(variant, tmp_path, monkeypatch):
+    run_here(monkeypatch)
     path = write(tmp_path)
     text = path.read_text().replace('"render.parameters.exponent" = [5, 50]', '"render.spp" = [4, 2]')
     path.write_text(text.replace('integrator = "shdirect"', 'integrator = "shdirect", exponent = "many"'))
@@ -253,7 +254,7 @@ def test_a_study_over_a_folder_of_captures_shares_stages_and_gives_intervals(var
 
     for seed in (1, 2):
         folder = tmp_path / "people" / f"p{seed}"
-        synthesize(folder, timesteps=1, model="builtin:coarse", width=120, height=90, spp=2, seed=seed)
+        synthesize(folder, timesteps=1, model="builtin:coarse", width=120, height=90, spp=16, seed=seed)
     path = tmp_path / "study.toml"
     path.write_text(FITS)
     run_here(monkeypatch)

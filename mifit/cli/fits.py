@@ -29,7 +29,7 @@ DEMO: Document = {
     "width": 340,
     "height": 240,
     "spp": 32,
-    "timesteps": 3,
+    "timesteps": 2,
     "tone": 0.2,
     "portrait": True,
 }

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 import inspect
+import os
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mifit.core.limits import MAX_SEED
 from mifit.errors import InputError
 
 P = ParamSpec("P")
@@ -40,23 +42,20 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     """The function, which refuses objects of other classes than its annotations name, and a mesh of another model.
 
     TypeError for an object of another class; what has ``cameras`` or a ``frame`` counts as a capture. InputError for a
-    geometry that doesn't have the vertices of the model that it comes with.
+    ``seed`` that is none, and for a geometry that doesn't have the vertices of the model that it comes with.
     """
     signature = inspect.signature(function)
-    kinds = {name: str(p.annotation).removesuffix(" | None") for name, p in signature.parameters.items()}
-    wanted = {name: kind for name, kind in kinds.items() if kind in OBJECTS or kind.endswith(("Config", "Estimate"))}
+    kinds = {name: str(p.annotation) for name, p in signature.parameters.items()}
 
     @functools.wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> R:
         given = signature.bind(*args, **kwargs).arguments
-        for name in wanted.keys() & given.keys():
-            value, kind = given[name], wanted[name]
-            if value is None and str(signature.parameters[name].annotation).endswith("None"):
+        for name, value in given.items():
+            kind = kinds[name].removesuffix(" | None")
+            if (value is None and kind != kinds[name]) or _fits(value, kind):
                 continue
-            known = {cls.__name__ for cls in type(value).__mro__}
-            stand_in = kind == "Capture" and (hasattr(value, "cameras") or hasattr(value, "frame"))
-            if kind not in known and not stand_in:
-                raise TypeError(f"{function.__name__}: {name}: found {type(value).__name__}, expected {kind}")
+            raise TypeError(f"{function.__name__}: {name}: found {type(value).__name__}, expected {kind}")
+        whole(given.get("seed", 0), 0, f"{function.__name__}: seed", MAX_SEED)
         model, geometry = given.get("model"), given.get("geometry")
         if model is not None and geometry is not None and geometry.vertices.shape[1] != len(model.mean):
             raise InputError(
@@ -66,3 +65,13 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
         return function(*args, **kwargs)
 
     return run
+
+
+def _fits(value: object, kind: str) -> bool:
+    """Whether a value is what an annotation asks for; other annotations than those of `checked` aren't looked at."""
+    if kind in OBJECTS or kind.endswith(("Config", "Estimate")):
+        stands_in = kind == "Capture" and (hasattr(value, "cameras") or hasattr(value, "frame"))
+        return stands_in or kind in {cls.__name__ for cls in type(value).__mro__}
+    if kind == "Progress" or kind.startswith("Callable"):
+        return callable(value)
+    return kind != "str | Path" or isinstance(value, (str, os.PathLike))

@@ -146,7 +146,7 @@ def test_a_capture_made_here_is_not_questioned(tiny_capture: Path, model):
 
 
 def test_a_face_of_fifty_pixels_is_too_small_for_a_detector_to_judge(variant, model, tmp_path):
-    size = {"width": 120, "height": 90, "spp": 4}
+    size = {"width": 120, "height": 90, "spp": 16}
     synthesize(tmp_path / "capture", timesteps=1, model="builtin:coarse", seed=0, **size)
     assert findings(Capture.load(tmp_path / "capture"), model) == []
 

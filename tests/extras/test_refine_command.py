@@ -13,7 +13,7 @@ CONFIG = """
 [geometry]
 rounds = 1
 [surface]
-finest = 3
+enabled = false
 [reflectance]
 texture_size = 32
 shading = "prefiltered"

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mifit.appearance import kernels, models
+from mifit.appearance.arrays import aligned, on_device
 from mifit.config import SHADINGS
 from tests.fuzz.conftest import bounded
 
@@ -67,13 +68,13 @@ def test_shade(
     rng = np.random.default_rng(seed)
     pool = np.concatenate([AXES, unit(NEAR), unit(np.array(drawn))])
     i, j = np.divmod(np.arange(len(pool) ** 2), len(pool))
-    n, v = (mi.Vector3f(*(mi.Float(np.ascontiguousarray(c)) for c in pool[k].T.astype(np.float32))) for k in (i, j))
+    n, v = (on_device(mi.Vector3f, pool[k]) for k in (i, j))
     numbers = rng.choice(np.array(lighting), (order * order, 3)).astype(np.float32)
-    coefficients = [mi.Color3f(*(dr.opaque(mi.Float, float(x)) for x in row)) for row in numbers]
-    m = dr.opaque(mi.Float, exponent)
+    coefficients = [on_device(mi.Color3f, np.tile(row, (len(i), 1))) for row in numbers]
+    m = mi.Float(aligned(np.full(len(i), exponent)))  # as wide as the rest: sums would be a kernel each
     traced: list[Any] | None = None
     if model == "shadowed":
-        traced = [mi.Float(rng.choice([0.0, 0.3, -0.1], len(i)).astype(np.float32)) for _ in range(order * order)]
+        traced = [mi.Float(aligned(rng.choice([0.0, 0.3, -0.1], len(i)))) for _ in range(order * order)]
     inputs = [n, v, m, *coefficients, *(traced or [])]
     dr.enable_grad(inputs)
     chosen = models.get(model)

@@ -35,7 +35,7 @@ max_iterations = 3
 [normals]
 max_iterations = 3
 """
-SIZE = ("--timesteps", "3", "--width", "120", "--height", "90", "--spp", "4")
+SIZE = ("--timesteps", "3", "--width", "120", "--height", "90", "--spp", "16")
 
 
 def run(*arguments: str | Path) -> int:

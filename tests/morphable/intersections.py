@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -15,20 +17,19 @@ def intersections(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     corners = vertices[faces]
     centre = corners.mean(1)
     reach = np.linalg.norm(corners - centre[:, None], axis=2).max(1)
-    half = 0.5 * np.linalg.norm(b - a, axis=1)
-    found = []
-    # short and long triangles apart, so that one long one doesn't make all pairs close
-    for low, high in ((0.0, 3.0), (3.0, 6.0), (6.0, np.inf)):
-        some = np.flatnonzero((reach >= low) & (reach < high))
-        if not len(some):
+    middle, half = 0.5 * (a + b), 0.5 * np.linalg.norm(b - a, axis=1)
+    found = [np.zeros((0, 2), int)]
+    # short and long ones apart, so that one long one doesn't make all pairs close
+    sizes = ((0.0, 1.5), (1.5, 3.0), (3.0, 6.0), (6.0, np.inf))
+    for (low, high), (least, most) in itertools.product(sizes, sizes):
+        rows, some = np.flatnonzero((half >= low) & (half < high)), np.flatnonzero((reach >= least) & (reach < most))
+        if not len(rows) or not len(some):
             continue
-        tree = cKDTree(centre[some])
-        near = tree.query_ball_point(0.5 * (a + b), half + reach[some].max(), return_sorted=False)
-        count = np.array([len(n) for n in near])
-        if not count.sum():
-            continue
-        i = np.repeat(np.arange(len(e)), count)
-        j = some[np.concatenate([n for n in near if n])]
+        far = half[rows].max() + reach[some].max()
+        pairs = cKDTree(middle[rows]).sparse_distance_matrix(cKDTree(centre[some]), far, output_type="ndarray")
+        i, j = rows[pairs["i"]], some[pairs["j"]]
+        close = pairs["v"] < half[i] + reach[j]
+        i, j = i[close], j[close]
         apart = (faces[j][:, :, None] != e[i][:, None, :]).all((1, 2))
         i, j = i[apart], j[apart]
         hit = _pierces(a[i], b[i], corners[j])

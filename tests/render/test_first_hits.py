@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import mifit
+from mifit.appearance.arrays import aligned
 from tests.render.test_shdirect import ball, bitmap, make_scene, positive_light
 
 KEYS = (
@@ -170,7 +171,7 @@ def test_gradients_are_those_of_the_image_that_mitsuba_forms(hide: bool, spp: in
     from mitsuba.python.ad.integrators.common import ADIntegrator
 
     scene = textured(hide)
-    target = mi.TensorXf(np.random.default_rng(1).uniform(0, 1, (32, 32, 3)).astype(np.float32))
+    target = mi.TensorXf(aligned(np.random.default_rng(1).uniform(0, 1, (32, 32, 3))))
 
     def gradients(keys: tuple[str, ...], general: bool) -> list[np.ndarray]:
         params = mi.traverse(scene)

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 import mifit
+from mifit.appearance.arrays import aligned
 from mifit.core import sh
 from mifit.core.mesh import vertex_normals
 from mifit.render.gbuffer import make_mesh
@@ -51,7 +52,7 @@ def make_scene(mesh: tuple, bsdf: dict, c: np.ndarray, size: int = 32, rfilter: 
         {
             "type": "scene",
             "mesh": make_mesh(*mesh, bsdf=mi.load_dict(bsdf)),
-            "light": {"type": "shenv", "coefficients": mi.TensorXf(c.astype(np.float32))},
+            "light": {"type": "shenv", "coefficients": mi.TensorXf(aligned(c))},
             "sensor": sensor,
             "integrator": {"type": "shdirect", **integrator},
         }
@@ -221,7 +222,7 @@ def test_gradients_agree_with_finite_differences(model: str, light: str, fresnel
     bsdf = textured_bsdf(True, fresnel=fresnel)
     scene = make_scene(ball(), bsdf, LIGHTS[light], 24, model=model, ambient=0.1, samples=16)
     parameters = mi.traverse(scene)
-    weights = mi.TensorXf(np.random.default_rng(2).uniform(0.5, 1.5, (24, 24, 3)).astype(np.float32))
+    weights = mi.TensorXf(aligned(np.random.default_rng(2).uniform(0.5, 1.5, (24, 24, 3))))
 
     def loss() -> object:
         return dr.mean(mi.render(scene, parameters, spp=1) * weights, axis=None)
@@ -249,7 +250,7 @@ def test_gradients_agree_with_finite_differences(model: str, light: str, fresnel
         step = 4e-3 * max(np.abs(value).max(), 0.3)
         sides = []
         for sign in (1.0, -1.0):
-            moved = (value + sign * step * direction).astype(np.float32)
+            moved = aligned(value + sign * step * direction)
             parameters[key] = type(original)(moved if moved.ndim > 1 else moved.ravel())
             parameters.update()
             with dr.suspend_grad():
@@ -288,7 +289,7 @@ def test_monte_carlo_gradients_agree_statistically(integrator: str, lobe: dict) 
     parameters.update()
     centre = np.zeros((16, 16, 3), np.float32)
     centre[5:11, 5:11] = 1.0 / 108
-    weights = mi.TensorXf(centre)
+    weights = mi.TensorXf(aligned(centre))
 
     def gradients(chosen, spp: int, seed: int) -> np.ndarray:
         for key in keys:

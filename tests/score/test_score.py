@@ -30,7 +30,7 @@ HERE = Path(__file__).parent
 def folder(variant, tmp_path_factory):
     """A small capture with meshes, passes and a relit view as truth."""
     out = tmp_path_factory.mktemp("score") / "capture"
-    synthesize(out, model="builtin:coarse", width=320, height=240, spp=36, timesteps=1, seed=3)
+    synthesize(out, model="builtin:coarse", width=320, height=240, spp=16, timesteps=1, seed=3)
     model = MorphableModel.load("builtin:coarse")
     with np.load(out / "truth" / "0000.npz") as stored:
         vertices = stored["vertices"]

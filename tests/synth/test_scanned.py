@@ -88,7 +88,7 @@ def test_a_scan_becomes_a_capture_with_truth(files, variant):
     out = folder / "out"
     arguments = ["synth", "--out", out, "--head", mesh, "--unit-mm", 100, "--maps", f"albedo={folder / 'albedo.png'}",
                  f"specular={folder / 'specular.png'}", "--env", folder / "light.exr", "--relit", folder / "other.exr",
-                 "--timesteps", 2, "--width", 96, "--height", 72, "--spp", 4, "--quiet"]  # fmt: skip
+                 "--timesteps", 2, "--width", 96, "--height", 72, "--spp", 16, "--quiet"]  # fmt: skip
     assert main([str(a) for a in arguments]) == 0
     capture = Capture.load(out)
     assert capture.cameras == ("left", "right", "third") and capture.timesteps == (0, 1)

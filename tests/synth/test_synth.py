@@ -29,7 +29,7 @@ def test_a_small_capture_agrees_with_its_ground_truth(variant: str, tmp_path: Pa
         model="builtin:coarse",
         width=120,
         height=85,
-        spp=4,
+        spp=16,
         progress=lambda *a: seen.append(a),
     )
     assert seen[-1] == ("Rendering", 2, 2)
