@@ -61,6 +61,7 @@ def test_every_command_has_its_function():
         (["nonsense"], "invalid choice: 'nonsense'"),
         (["fit", "x", "--out", "y", "--timesteps", "a"], "expected numbers such as"),
         (["fit", "x", "--out", "y", "--cameras", ","], "expected names separated by commas"),
+        (["evaluate", "x", "--capture", "y", "--camera", "a", "b"], "b; the names of an option are joined by commas"),
         (["synth", "--out", "x", "--spp", "0"], "expected a whole number from 1 to 100000"),
         (["relight", "x", "--env", "e", "--out", "y", "--rotate", "nan"], "expected a finite number"),
     ],

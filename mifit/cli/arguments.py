@@ -29,6 +29,8 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the message and leave with code 2."""
+        if message.startswith("unrecognized arguments: ") and " -" not in message:
+            message += "; the names of an option are joined by commas, as left,right"
         self.exit(2, f"{self.prog}: {one_line(message)}; see {self.prog} --help\n")
 
 

@@ -5,6 +5,7 @@ Nothing here shares a formula with the fitted shading model, so a fit to these i
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -54,6 +55,7 @@ class PathTracer:
     def __init__(self, materials: dict[str, Material], environment: NDArray, specular: bool = True) -> None:
         import mitsuba as mi
 
+        gc.collect()  # a kernel has a branch for every mesh and material that is alive: garbage would make a new one
         self._bsdfs = {name: mi.load_dict(_bsdf(material, float(specular))) for name, material in materials.items()}
         bitmap = mi.Bitmap(np.ascontiguousarray(environment, dtype=np.float32))
         self._emitter = mi.load_dict({"type": "envmap", "bitmap": bitmap})
