@@ -13,12 +13,13 @@ from mifit.core.process import set_threads, threads
 from tests.variant import VARIANT
 
 LONGEST = (
-    "tests/output/test_scenes_for_experiments.py", "tests/checks/test_wrong_captures.py", "tests/test_resume.py",
-    "tests/docs/test_commands.py", "tests/stages/test_fit_geometry.py", "tests/stages/test_find_surface.py",
-    "tests/extras/test_boards.py", "tests/checks/test_odd_captures.py", "tests/checks/test_fits.py",
-    "tests/test_experiment.py", "tests/stages/test_segment.py", "tests/hostile/test_promises.py", "tests/test_cli.py",
-    "tests/render/test_shdirect.py", "tests/extras/test_calibrate_densely.py", "tests/stages/test_compact_lights.py",
-    "tests/test_experiment_page.py", "tests/extras/test_refine_command.py", "tests/test_foreign.py",
+    "tests/checks/test_wrong_captures.py", "tests/docs/test_commands.py", "tests/stages/test_find_surface.py",
+    "tests/stages/test_fit_geometry.py", "tests/extras/test_boards.py", "tests/test_experiment.py",
+    "tests/checks/test_odd_captures.py", "tests/checks/test_fits.py", "tests/hostile/test_promises.py",
+    "tests/test_resume.py", "tests/extras/test_calibrate_densely.py", "tests/stages/test_reflectance_stability.py",
+    "tests/test_film.py", "tests/stages/test_infer_reflectance.py", "tests/test_cli.py",
+    "tests/stages/test_segment.py", "tests/hostile/test_writing.py", "tests/render/test_shdirect.py",
+    "tests/test_foreign.py", "tests/test_experiment_page.py",
 )  # fmt: skip
 """Files that take longest, in that order: with two processes they go first, or one would work on after the other."""
 SHARED = Path(__file__).resolve().parents[2] / "shared"
