@@ -16,7 +16,7 @@ from benchmarks.record import RESULTS, SHARED, renew_tables
 
 Runs = tuple[tuple[str, list[str]], ...]
 REDUCED: Runs = (
-    ("foreign", ["--reduced", "--seeds", "--rows", "full", "refit"]),
+    ("foreign", ["--reduced", "--seeds"]),
     ("foreign", ["--own", "--reduced", "--rows", "full", "refit"]),
     (
         "table1",
@@ -24,7 +24,6 @@ REDUCED: Runs = (
     ),
     ("ablation", ["--heads", "scan_studio"]),
     ("speed", ["--reduced"]),
-    ("hard_cases", []),
 )
 FULL: Runs = (
     ("foreign", ["--seeds"]),

@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -66,9 +67,10 @@ def rows_of(case: Case, wanted: Sequence[str], config: FitConfig) -> dict[str, R
     if "paper" in wanted:
         for name, paper in paper_settings(case, capture).items():
             paper = replace_size(paper, config.reflectance.texture_size)
-            rows[name] = Row(
-                {t: mifit.fit(capture, model, case.fitted, (t,), paper, seed=SEED) for t in case.timesteps}
-            )
+            with suppress(MifitError):  # it may end without a face; the row then has no figures
+                rows[name] = Row(
+                    {t: mifit.fit(capture, model, case.fitted, (t,), paper, seed=SEED) for t in case.timesteps}
+                )
     return rows
 
 
