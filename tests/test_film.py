@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 import mifit
 from mifit.capture import Capture
 from mifit.capture.detect import available
+from mifit.capture.stereo import write_stereo
 from mifit.cli import main
 from mifit.core.image import to_8_bit
 from mifit.extras.boards import Board
@@ -64,21 +65,27 @@ def write_board_clips(soft: Capture, folder: Path) -> list[str]:
 
 
 @pytest.mark.slow
-def test_two_clips_become_a_face(shared: Path, tmp_path: Path, variant: str, capsys) -> None:
+@pytest.mark.parametrize("by", ["board", "calibration"])
+def test_two_clips_become_a_face(shared: Path, tmp_path: Path, variant: str, capsys, by: str) -> None:
     if not available()["mediapipe"]:
         pytest.skip("the networks that find landmarks are not here: mifit doctor --install landmarks")
     soft = Capture.load(shared / "captures" / "soft")
     out = tmp_path / "me"
     command = ["fit", *write_clips(soft, tmp_path), "--out", str(out), "--every", "5"]
-    command += ["--board", *write_board_clips(soft, tmp_path), "--pattern", BOARD]
+    if by == "board":
+        command += ["--board", *write_board_clips(soft, tmp_path), "--pattern", BOARD]
+    else:
+        write_stereo(tmp_path / "stereo.yml", soft.camera("left"), soft.camera("right").resized(SCALE))
+        command += ["--calibration", str(tmp_path / "stereo.yml")]
     (tmp_path / "fit.toml").write_text("surface.finest = 1\n")
     command += ["--until", "geometry", "--model", "builtin:coarse", "--timesteps", "auto:2"]
     command += ["--config", str(tmp_path / "fit.toml")]
     assert main(command) == 0
     said = capsys.readouterr().err
     assert "right begins 0.400 s before left, by sound" in said
-    assert "right begins 0.320 s after left, by sound" in said
-    assert "dictionary DICT_4X4_50" in said
+    if by == "board":
+        assert "right begins 0.320 s after left, by sound" in said
+        assert "dictionary DICT_4X4_50" in said
     result = mifit.Reconstruction.load(out)
     faces = np.load(shared / "models" / "ict_facekit" / "ict_facekit_head.npz")["faces"]
     gauge = np.linalg.inv(result.cameras[0].world_to_camera) @ soft.camera("left").world_to_camera
@@ -92,6 +99,8 @@ def test_two_clips_become_a_face(shared: Path, tmp_path: Path, variant: str, cap
         assert np.median(distance) < 1.0, (timestep, np.median(distance))
         means.append(distance.mean())
     assert np.mean(means) < 1.0, means
+    if by == "board":
+        return
     assert main(command) == 2
     assert "holds a result already" in capsys.readouterr().err
     assert main([*command, "--resume"]) == 0

@@ -42,7 +42,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     """The function, which refuses objects of other classes than its annotations name, and a mesh of another model.
 
     TypeError for an object of another class; what has ``cameras`` or a ``frame`` counts as a capture. InputError for a
-    ``seed`` that is none, and for a geometry that doesn't have the vertices of the model that it comes with.
+    ``seed`` that is no whole number, and for a geometry that doesn't have the vertices of the model that it comes with.
     """
     signature = inspect.signature(function)
     kinds = {name: str(p.annotation) for name, p in signature.parameters.items()}
@@ -68,7 +68,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _fits(value: object, kind: str) -> bool:
-    """Whether a value is what an annotation asks for; other annotations than those of `checked` aren't looked at."""
+    """Whether a value is what an annotation asks for; annotations of other kinds fit everything."""
     if kind in OBJECTS or kind.endswith(("Config", "Estimate")):
         stands_in = kind == "Capture" and (hasattr(value, "cameras") or hasattr(value, "frame"))
         return stands_in or kind in {cls.__name__ for cls in type(value).__mro__}

@@ -13,7 +13,7 @@ CONFIG = """
 [geometry]
 rounds = 1
 [surface]
-enabled = false
+finest = 3
 [reflectance]
 texture_size = 32
 shading = "prefiltered"

@@ -339,7 +339,7 @@ def test_an_outlier_counts_little():
 def test_biased_landmarks_bend_the_shape_less(model, bumpy):
     """Landmarks that are off the same way in every image: the surface that all views see sets them right."""
     before = after = 0.0
-    for seed in (5, 7):  # the result of one set hangs on single landmarks
+    for seed in (5, 6):  # the result of one set hangs on single landmarks
         offset = 6.0 * np.random.default_rng(seed).normal(size=(68, 2))
         biased = bumpy.changed(lambda name, t, frame, by=offset: replace(frame, landmarks=frame.landmarks + by))
         start = fitted_to(model, biased, STEPS[:1])
