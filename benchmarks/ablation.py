@@ -105,6 +105,7 @@ PARTS = (
     Part("surface: off", {"surface.enabled": False}),
     Part("surface: outlines", patches={f"{FIND}.find_borders": lambda *given: joined([])}, step="surface"),
     Part("surface: sheen left out at coarse levels", patches={"mifit.stages.surface.band.SHEEN": 0.0}, step="surface"),
+    Part("surface: shading and highlights", {"surface.shading": False}),
     Part("surface: lids and lips closed", {"surface.close_lids": False, "surface.close_lips": False}),
     Part(
         "surface: timesteps aligned",

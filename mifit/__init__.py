@@ -27,6 +27,7 @@ _NAMES = {
     "mifit.capture.choose_frames": "choose_frames",
     "mifit.stages.fit_geometry": "fit_geometry",
     "mifit.stages.find_surface": "find_surface",
+    "mifit.stages.refine_surface": "refine_surface",
     "mifit.stages.infer_reflectance": "infer_reflectance",
     "mifit.stages.normals.refine_normals": "refine_normals",
     "mifit.stages.find_residual": "find_residual",

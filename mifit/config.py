@@ -217,6 +217,7 @@ class SurfaceConfig:
         above=0,
         most=WEIGHT,
     )
+    shading: bool = flag(True, "move the surface by what its shading and highlights show, once the light is known")
     close_lips: bool = flag(True, "close the lips on the lip line where the images show a closed mouth")
     close_lids: bool = flag(True, "close the lids where the images show closed eyes")
     finest: int = number(

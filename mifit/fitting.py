@@ -57,6 +57,7 @@ from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.normals.refine_mesh import refine_mesh
 from mifit.stages.normals.refine_normals import refine_normals
 from mifit.stages.photometry import find_photometry
+from mifit.stages.refine_surface import refine_surface
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -337,6 +338,8 @@ def steps(config: FitConfig, until: Stage = "normals") -> list[Step]:
         found.append(Step("surface", "geometry", ("geometry",), (config.surface,), _find_surface))
     if config.photometry.enabled:
         found.append(Step("photometry", "geometry", ("geometry",), (config.photometry,), _find_photometry))
+    if config.surface.enabled and config.surface.shading and config.reflectance.robust:
+        found.append(Step("shading", "geometry", ("geometry",), (config.reflectance,), _refine_surface))
     if until == "geometry":
         return found
     found.append(Step("reflectance", "reflectance", ("geometry",), (config.reflectance,), _infer_reflectance))
@@ -415,6 +418,13 @@ def _find_photometry(
     found = find_photometry(capture, model, geometry, cameras, config, source.seed, progress)
     report = replace(geometry.report, seconds=geometry.report.seconds + time.perf_counter() - began)
     return replace(geometry, photometry=found, report=report)
+
+
+def _refine_surface(
+    source: Source, inputs: Estimates, progress: Progress, config: ReflectanceConfig
+) -> GeometryEstimate:
+    (capture, model, cameras), geometry = source.images, inputs["geometry"]
+    return behind_lids(model, refine_surface(capture, model, geometry, cameras, config, source.seed, progress))
 
 
 def _infer_reflectance(

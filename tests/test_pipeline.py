@@ -123,10 +123,10 @@ def test_views_from_one_place_bring_a_warning():
 
 pytestmark = pytest.mark.usefixtures("variant")
 ORDER = (
-    "geometry", "surface", "photometry", "reflectance", "normals", "mesh", "residual",
+    "geometry", "surface", "photometry", "shading", "reflectance", "normals", "mesh", "residual",
 )  # fmt: skip
 FIRST = {
-    "geometry": 0, "surface": 1, "photometry": 2, "reflectance": 3, "normals": 4, "mesh": 5, "residual": 6,
+    "geometry": 0, "surface": 1, "photometry": 2, "reflectance": 3, "normals": 5, "mesh": 6, "residual": 7,
 }  # fmt: skip
 """Section of the settings -> the first step that reads it; all later ones depend on that one's estimate."""
 
@@ -137,10 +137,10 @@ def another(section, name, value):
         "objective": "paper", "shading": "paper",
         "exponent": 77.0, "bands": 5,
     }  # fmt: skip
-    if name in allowed:
-        changed = allowed[name]
-    elif isinstance(value, bool):
+    if isinstance(value, bool):
         changed = not value
+    elif name in allowed:
+        changed = allowed[name]
     else:
         changed = type(value)(2 * value + 1)
     return dataclasses.replace(section, **{name: changed})
@@ -167,7 +167,8 @@ class Stages:
         residual = ResidualEstimate((0,), np.zeros((1, 32, 32, 3), np.float32), Report("converged"))
         result = dataclasses.replace(ball_result(), residual=residual)
         for name, part in {
-            "fit_geometry": "geometry", "find_surface": "geometry", "infer_reflectance": "reflectance",
+            "fit_geometry": "geometry", "find_surface": "geometry", "refine_surface": "geometry",
+            "infer_reflectance": "reflectance",
             "refine_normals": "normals", "refine_mesh": "mesh", "find_residual": "residual",
         }.items():  # fmt: skip
             monkeypatch.setattr(f"mifit.fitting.{name}", self.stand_in(name, getattr(result, part)))
@@ -221,6 +222,7 @@ RUNS = (
     "fit_geometry",
     "find_surface",
     "find_photometry",
+    "refine_surface",
     "infer_reflectance",
     "refine_normals",
     "refine_mesh",
@@ -238,7 +240,11 @@ def test_a_changed_setting_reruns_the_steps_that_depend_on_it(fitted, tmp_path, 
     elif (section, name) == ("residual", "enabled"):
         assert ran == []
     elif (section, name) == ("surface", "enabled"):
-        assert ran == list(RUNS[2:])
+        assert ran == ["find_photometry", *RUNS[4:]]
+    elif (section, name) == ("surface", "shading"):
+        assert ran == ["find_surface", "find_photometry", *RUNS[4:]]
+    elif (section, name) == ("reflectance", "robust"):
+        assert ran == list(RUNS[4:])
     elif section == "photometry":
         assert ran == list(RUNS[3:])
     else:
@@ -259,8 +265,8 @@ def test_a_changed_source_reruns_everything(change):
 
 
 def test_stages_that_a_shorter_fit_ran_serve_a_longer_one(fitted, tmp_path):
-    assert fitted(BASE, tmp_path, until="geometry") == list(RUNS[:3])
-    assert fitted(BASE, tmp_path, until="reflectance") == list(RUNS[3:4])
+    assert fitted(BASE, tmp_path, until="geometry") == list(RUNS[:4])
+    assert fitted(BASE, tmp_path, until="reflectance") == list(RUNS[4:5])
     assert fitted(BASE, tmp_path) == ["refine_normals", "refine_mesh", "find_residual"]
 
 

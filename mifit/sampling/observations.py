@@ -140,6 +140,11 @@ class SurfaceImage:
     footprint: NDArray[np.float32]
     outline: NDArray[np.float32]
 
+    def read(self, x: NDArray, y: NDArray) -> NDArray[np.float32]:
+        """(N, 3) colours of the usable pixels about integer-centred columns and rows (N,)."""
+        lost = np.minimum(bilinear(self.unusable, x, y), np.float32(0.5))
+        return np.asarray(bilinear(self.colour, x, y) / (1.0 - lost)[:, None], np.float32)
+
 
 class Surface:
     """The images of a capture, read at the surface points of a map.
@@ -310,6 +315,19 @@ class Surface:
             out[part] = total / np.maximum(seen.measured.sum(1), 1e-12)
         return out
 
+    def colours(self, seen: Observations, vertices: Sequence[NDArray]) -> NDArray[np.float32]:
+        """(N, J, 3) colours of observed texels whose timesteps' vertices (V, 3) have moved a little; 0 where unseen."""
+        found = np.zeros_like(seen.colour)
+        corners = self.faces, seen.face, seen.barycentric
+
+        def read(k: int) -> None:
+            image, rows = self._images[k], np.flatnonzero(seen.weight[:, k])
+            points = interpolate(vertices[image.step], *corners)[rows]
+            found[rows, k] = image.read(*(image.camera.project(points).T - 0.5))
+
+        on_all_cores(read, range(len(self._images)))
+        return found
+
     def observe(self, texel: NDArray[np.int64]) -> Observations:
         """Read all images at some of the texels (positions in the `TexelMap`).
 
@@ -333,8 +351,8 @@ class Surface:
             point[:, i] = interpolate(self.vertices[i], self.faces, face, weights)
             normal[:, i] = normalize(interpolate(self.normals[i], self.faces, face, weights))
 
-        def place(k: int) -> tuple[NDArray, NDArray, NDArray]:
-            """Texels that face camera k before usable pixels, where in the image, and which part of it is unusable."""
+        def place(k: int) -> tuple[NDArray, NDArray]:
+            """Texels that face camera k before usable pixels, and where in the image."""
             image, camera = self._images[k], self._images[k].camera
             view[:, k] = normalize(camera.position.astype(np.float32) - point[:, image.step])
             cosine[:, k] = np.einsum("nk,nk->n", normal[:, image.step], view[:, k])
@@ -345,14 +363,13 @@ class Surface:
             inside = np.logical_and(*((pixel >= 0) & (pixel <= far)))
             weight[rows[~inside], k] = 0.0
             rows, pixel = rows[inside], pixel[:, inside]
-            lost = bilinear(image.unusable, *pixel)
-            usable = lost < 0.5
+            usable = bilinear(image.unusable, *pixel) < 0.5
             weight[rows[~usable], k] = 0.0
-            return rows[usable], pixel[:, usable], lost[usable]
+            return rows[usable], pixel[:, usable]
 
         def read(k: int) -> None:
-            image, camera, (rows, pixel, lost) = self._images[k], self._images[k].camera, places[k]
-            colour[rows, k] = bilinear(image.colour, *pixel) / (1.0 - lost)[:, None]  # of the usable pixels alone
+            image, camera, (rows, pixel) = self._images[k], self._images[k].camera, places[k]
+            colour[rows, k] = image.read(*pixel)
             clipped[rows, k] = bilinear(image.clipped, *pixel) > 0.0
             if self.robust:
                 depth = (point[rows, image.step] - camera.position) @ camera.rotation[2]
@@ -360,11 +377,11 @@ class Surface:
                 inlier[rows, k] = 1.0 - outlier_prior(cosine[rows, k], millimetres)
 
         places = on_all_cores(place, range(j))
-        for k, (image, (rows, pixel, lost)) in enumerate(zip(self._images, places, strict=True)):
+        for k, (image, (rows, pixel)) in enumerate(zip(self._images, places, strict=True)):
             # Rays take all cores by themselves.
             visible = self.meshes[image.step].scene.visible_from(point[rows, image.step], image.camera.position)
             weight[rows[~visible], k] = 0.0
-            places[k] = rows[visible], pixel[:, visible], lost[visible]
+            places[k] = rows[visible], pixel[:, visible]
         on_all_cores(read, range(j))
         weight *= inlier
         step = np.array([image.step for image in self._images])

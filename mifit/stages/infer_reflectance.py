@@ -12,13 +12,12 @@ from mifit.config import ReflectanceConfig
 from mifit.core.calls import checked
 from mifit.core.diagnostics import Diagnostic
 from mifit.core.estimate import GeometryEstimate, ReflectanceEstimate, Report, hidden
-from mifit.core.mesh import interpolate
 from mifit.core.process import one_blas_thread
 from mifit.errors import ConvergenceError
 from mifit.optim import Outcome
 from mifit.progress import Progress, silent
 from mifit.sampling.observations import Surface
-from mifit.stages.reflectance.als import find_forward, fit_als
+from mifit.stages.reflectance.als import expected_albedo, find_forward, fit_als
 from mifit.stages.reflectance.fill import BLEND, blend_unseen, light_error, light_known, light_level
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.hair import find_hair, paint
@@ -83,8 +82,7 @@ def infer_reflectance(
     started = time.perf_counter()
     config = config or ReflectanceConfig()
     surface = Surface(capture, model, geometry, cameras, config.texture_size, config.robust, whole=config.robust)
-    albedo = interpolate(geometry.vertex_albedo, model.faces, surface.texels.face, surface.texels.weights)
-    albedo = np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float32)
+    albedo = expected_albedo(model, surface.texels, geometry)
     progress("Reflectance lighting", 0, 2)
     forward, first = find_forward(surface, albedo, config, seed)
     labels: tuple = ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -12,6 +13,8 @@ from mifit.appearance import models
 from mifit.appearance.formation import Appearance, form_image
 from mifit.appearance.lobe import Lobe
 from mifit.config import ReflectanceConfig
+from mifit.core.estimate import GeometryEstimate
+from mifit.core.mesh import interpolate
 from mifit.core.metrics import median_deviation
 from mifit.core.process import blocks, on_all_cores
 from mifit.core.uv import TexelMap
@@ -24,6 +27,9 @@ from mifit.stages.reflectance.fill import ALIKE
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution, active_weight, fit_lighting, noise_weight
 from mifit.stages.reflectance.maps import TexelSystems, solve_maps
+
+if TYPE_CHECKING:
+    from mifit.morphable import MorphableModel
 
 LIGHTING_TEXELS = 6000
 """Texels that determine the lighting; a few hundred unknowns against 24 values of eight images each."""
@@ -78,6 +84,12 @@ class Fitted:
     solved: SolvedMaps
     energies: dict[str, list[float]]
     outcome: Outcome
+
+
+def expected_albedo(model: MorphableModel, texels: TexelMap, geometry: GeometryEstimate) -> NDArray[np.float32]:
+    """(N, 3) diffuse albedo that the fitted model expects of texels."""
+    albedo = interpolate(geometry.vertex_albedo, model.faces, texels.face, texels.weights)
+    return np.clip(np.nan_to_num(albedo, nan=0.3), 0.01, 1.0).astype(np.float32)
 
 
 # The model and its lighting ------------------------------------------------------------------------------------------

@@ -107,7 +107,7 @@ class Forward:
         """Shadows at the observations that count, image after image of each texel."""
         if not (self.model.needs_shadows or self.lights):
             return Occlusion()
-        steps = [self.appearance.trace(mesh, _surface_points(seen, t)) for t, mesh in enumerate(self.meshes)]
+        steps = [self.appearance.trace(mesh, surface_points(seen, t)) for t, mesh in enumerate(self.meshes)]
         transfer, there = None, seen.weight > 0
         if self.model.needs_shadows:
             every = VertexTransfer.joined([s.transfer for s in steps if s.transfer is not None], seen.step)
@@ -141,6 +141,6 @@ def _flat(seen: Observations) -> tuple[NDArray, NDArray]:
     return seen.image_normal[there], seen.view[there]
 
 
-def _surface_points(seen: Observations, step: int) -> MeshPoints:
+def surface_points(seen: Observations, step: int) -> MeshPoints:
     """The texels on the mesh of one timestep."""
     return MeshPoints(seen.point[:, step], seen.normal[:, step], seen.face, seen.barycentric)

@@ -115,9 +115,7 @@ class SurfacePrior:
     def factor(self, measured: Measurements, stiffness: float) -> spl.SuperLU:
         """Of the plate and the measurements with decoupled axes, in single precision: it steers the iterations."""
         points = measured.points
-        matrix = stiffness * self.plate + points.T @ sp.diags(measured.precision) @ points
-        how = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
-        return spl.splu(matrix.tocsc().astype(np.float32), **how)
+        return symmetric_factor(stiffness * self.plate + points.T @ sp.diags(measured.precision) @ points)
 
     def move(self, coefficients: NDArray) -> NDArray[np.float64]:
         """(V, 3) change of the vertices by coefficients (K,)."""
@@ -140,6 +138,12 @@ class SurfacePrior:
                 break
             found, free = within, free & ~beyond
         return found, free
+
+
+def symmetric_factor(matrix: sp.spmatrix) -> spl.SuperLU:
+    """Of a symmetric positive definite matrix, in single precision: it steers iterations."""
+    how = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    return spl.splu(matrix.tocsc().astype(np.float32), **how)
 
 
 def bending_energy(vertices: NDArray, faces: NDArray) -> tuple[sp.csr_matrix, NDArray[np.float64]]:

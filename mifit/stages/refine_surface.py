@@ -1,0 +1,351 @@
+"""Stage 1c: the surface that explains shading and highlights, once the light is roughly known.
+
+Matches between views leave bumps of some tenths of a millimetre, a centimetre wide, on skin without texture and where
+highlights move over it. Their normals are off by degrees, which shading shows and highlights show even more. The
+surface moves by h along its normals:
+
+    min_h  sum_texels min_{x,y} sum_j w rho(I_j(h) - x D_j(n(h)) - y S_j(n(h))) + h' Q h
+
+with the images I_j read where the moved surface is seen, diffuse and specular radiance D and S at unit albedo, normals
+``n(h)``, and albedos x, y that follow exactly at every step, as they do while the lighting is found (variable
+projection, `reflectance.lighting`). Albedos that are held would keep what wrong normals had put into them. ``Q`` is the
+precision of a Gaussian field with Matern's covariance about what the views' matches found (Lindgren et al. 2011).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import combinations_with_replacement
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spl
+from numpy.typing import NDArray
+
+from mifit.appearance.formation import Appearance, BentImage, form_image, shade_bent
+from mifit.appearance.occlusion import Occlusion
+from mifit.config import ReflectanceConfig
+from mifit.core.calls import checked
+from mifit.core.estimate import GeometryEstimate
+from mifit.core.mesh import face_cross, interpolate, normalize, vertex_normals
+from mifit.core.mesh_solve import cotangent_laplacian, interior_vertices
+from mifit.core.metrics import INDEPENDENT, median_deviation
+from mifit.core.process import one_blas_thread
+from mifit.core.uv import tangent_plane
+from mifit.errors import ConvergenceError
+from mifit.progress import Progress, silent
+from mifit.sampling.observations import Observations, Surface
+from mifit.stages.find_surface import NARROWEST, neighbours
+from mifit.stages.geometry.points import corner_matrix
+from mifit.stages.reflectance.albedo_priors import BRIGHTEST, specular_pull
+from mifit.stages.reflectance.als import expected_albedo, find_forward, lighting_of_subset
+from mifit.stages.reflectance.forward import Forward, surface_points
+from mifit.stages.reflectance.lighting import CAUCHY, MISFIT, LightingSolution, noise_weight
+from mifit.stages.reflectance.maps import TexelSystems
+from mifit.stages.surface.displace import symmetric_factor
+from mifit.stages.surface.views import Resolution
+
+if TYPE_CHECKING:
+    from mifit.capture import Capture
+    from mifit.morphable import MorphableModel
+
+MAP_SIZE = 256
+"""Texels along the side of the map: about a millimetre each."""
+DEVIATION, RANGE_MM = 0.5, 20.0
+"""Standard deviation of what matches leave, pixels of parallax, and the distance over which it is alike. From 0.5 to 1
+and from 20 to 40 little changes on the scan of scan_city under two suns."""
+ROUNDS, ITERATIONS = 2, 3
+"""Lightings, and Gauss-Newton steps under each. Chosen on the scan of scan_city under two suns and in two rooms."""
+FARTHEST_MM = 0.3
+"""A step at most: images are linear over about a pixel."""
+PROBE_MM = 0.2
+"""Distance to either side over which images are differentiated."""
+LEAST = 1e-4
+"""Deviation of the residuals at the least, linear colour."""
+WEAK = 1e-3
+"""Pull of the diffuse albedo to the expected one, relative to the median texel's curvature."""
+SOLVED = 0.01
+"""Part of the residual that conjugate gradients leave."""
+PASSES = 3
+"""Robust weightings of the albedos that follow."""
+
+
+@checked
+@one_blas_thread()
+def refine_surface(
+    capture: Capture,
+    model: MorphableModel,
+    geometry: GeometryEstimate,
+    cameras: Sequence[str],
+    config: ReflectanceConfig | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> GeometryEstimate:
+    """The surface whose shading and highlights the images show.
+
+    Parameters
+    ----------
+    capture, model
+        Images, and the model that was fitted.
+    geometry : GeometryEstimate
+        Where to start, as `find_surface` leaves it; the result stays within some tenths of a millimetre.
+    cameras : sequence of str
+        Cameras to read; no other camera of the capture is touched.
+    config : ReflectanceConfig, optional
+        How light and albedos are found meanwhile; without robust weights ``geometry`` comes back, as with
+        one view, or views from nearly one place.
+    seed : int
+        Chooses the texels that determine the lighting.
+    progress : Progress
+
+    Returns
+    -------
+    GeometryEstimate
+        With another ``displacement`` of the face area, and the vertices that follow.
+    """
+    began = time.perf_counter()
+    config = config or ReflectanceConfig()
+    views, centre = [capture.camera(name) for name in cameras], geometry.vertices[0].mean(axis=0, dtype=np.float64)
+    pairs = neighbours(views, centre)
+    resolution = Resolution.of(views, centre, pairs) if pairs else None
+    if resolution is None or resolution.parallax < NARROWEST or not config.robust:
+        return geometry
+    deviation = DEVIATION * resolution.pixel / (resolution.parallax * geometry.scale)
+    field, start = Field.of(model, geometry, deviation), geometry
+    surface = Surface(capture, model, geometry, cameras, MAP_SIZE)
+    albedo = expected_albedo(model, surface.texels, geometry)
+    forward, first = find_forward(surface, albedo, config, seed)
+    height, moved, noise = np.zeros(len(field.free)), 0.0, None if first is None else first.sigma
+    for number in range(ROUNDS):
+        progress("refine surface", number, ROUNDS)
+        if number:
+            surface = Surface(capture, model, geometry, cameras, MAP_SIZE, texels=surface.texels)
+            forward = replace(forward, meshes=surface.meshes)
+        found, _ = lighting_of_subset(surface, forward, albedo, config, seed, noise)
+        height, moved = _settle(Patch.of(surface, forward, found, albedo), field, height)
+        geometry = field.moved(start, height)
+    progress("refine surface", ROUNDS, ROUNDS)
+    seconds = time.perf_counter() - began
+    phase = {
+        "name": "shading",
+        "moved_mm": float(np.sqrt(np.mean(height**2))) * field.millimetres,
+        "moved_last_mm": moved * field.millimetres,
+        "seconds": seconds,
+    }
+    return replace(geometry, report=geometry.report.after(seconds, phase))
+
+
+@dataclass(frozen=True)
+class Field:
+    """Heights of the face's vertices along its normals, in object space.
+
+    Attributes
+    ----------
+    free : (n,) int
+        The vertices inside the face area.
+    normal : (V, 3)
+        Directions in which all vertices move, those that stay included.
+    slope : three of (V, n) sparse
+        Change of the vertices' normals by heights, a component each.
+    precision : (n, n) sparse
+        Q of the heights.
+    millimetres : float
+        Per unit of the model.
+    """
+
+    free: NDArray[np.intp]
+    normal: NDArray[np.float64]
+    slope: tuple[sp.csr_matrix, ...]
+    precision: sp.csr_matrix
+    millimetres: float
+
+    @classmethod
+    def of(cls, model: MorphableModel, geometry: GeometryEstimate, deviation: float) -> Field:
+        """About the mean surface of a geometry's timesteps; ``deviation`` of the heights in units of the model."""
+        shapes = [model.shape(geometry.identity, e).astype(np.float64) for e in geometry.expression]
+        rest = np.mean(shapes, axis=0) + (0.0 if geometry.displacement is None else geometry.displacement)
+        faces, count = model.faces, len(rest)
+        free = np.flatnonzero(interior_vertices(faces, model.face_mask, count))
+        cross = face_cross(rest, faces)
+        double = np.maximum(np.linalg.norm(cross, axis=1), 1e-12)
+        corners = rest[faces]
+        # The gradient of a height over a face, averaged over the faces about a vertex, tilts its normal.
+        rows, columns = np.repeat(np.arange(len(faces)), 3), faces.ravel()
+        opposite = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
+        gradient = np.cross(cross[:, None], opposite) / (double**2)[:, None, None]
+        share = sp.csr_matrix((np.repeat(double, 3), (columns, rows)), shape=(count, len(faces)))
+        share = sp.diags(1.0 / np.maximum(np.asarray(share.sum(1)).ravel(), 1e-12)) @ share
+        slope = tuple(
+            (-share @ sp.csr_matrix((gradient[..., k].ravel(), (rows, columns)), shape=(len(faces), count)))[:, free]
+            for k in range(3)
+        )
+        # (kappa^2 - Laplacian)^2 / (4 pi kappa^2 sigma^2): smoothness 1.
+        kappa = np.sqrt(8.0) * model.unit_mm / RANGE_MM
+        area = np.bincount(columns, np.repeat(double / 6.0, 3), minlength=count)
+        area = np.maximum(area, 1e-3 * float(np.median(area)))
+        operator = kappa**2 * sp.diags(area) + cotangent_laplacian(rest, faces)
+        precision = operator @ sp.diags(1.0 / area) @ operator
+        precision *= 1.0 / (4.0 * np.pi * (kappa * deviation) ** 2)
+        normal = np.zeros_like(rest)
+        normal[free] = vertex_normals(rest, faces)[free]
+        return cls(free, normal, slope, precision.tocsr()[free][:, free], model.unit_mm)
+
+    def displacement(self, height: NDArray) -> NDArray[np.float64]:
+        """(V, 3) movement of the vertices by heights (n,)."""
+        moved = np.zeros_like(self.normal)
+        moved[self.free] = height[:, None] * self.normal[self.free]
+        return moved
+
+    def moved(self, geometry: GeometryEstimate, height: NDArray) -> GeometryEstimate:
+        """A geometry whose surface has moved by heights (n,)."""
+        by = self.displacement(height)
+        world = geometry.scale * by @ geometry.rotation.transpose(0, 2, 1)
+        before = 0.0 if geometry.displacement is None else geometry.displacement
+        return replace(
+            geometry,
+            displacement=(before + by).astype(np.float32),
+            vertices=(geometry.vertices + world).astype(np.float32),
+        )
+
+
+@dataclass(frozen=True)
+class Patch:
+    """Texels that two images or more measure, under a light; what each image sees of them stays.
+
+    Attributes
+    ----------
+    surface : Surface
+    seen : Observations
+        N texels, J images.
+    occlusion : sequence of Occlusion
+        Shadows, per timestep.
+    appearance : Appearance
+    gloss : bool
+        Whether there is specular reflection.
+    albedo : (N, 3), expected, sigma : float
+        Diffuse and specular albedo to expect, and the robust deviation of the residuals to start from.
+    tangents : (N, 2, 3)
+        Object-space directions in which normals tilt.
+    """
+
+    surface: Surface
+    seen: Observations
+    occlusion: Sequence[Occlusion]
+    appearance: Appearance
+    gloss: bool
+    albedo: NDArray
+    expected: float
+    sigma: float
+    tangents: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, surface: Surface, forward: Forward, found: LightingSolution, albedo: NDArray) -> Patch:
+        """Of a surface under a lighting; ``albedo`` (M, 3) is expected of all its texels."""
+        every = surface.observe(np.arange(len(surface)))
+        rows = np.flatnonzero((every.measured > 0).sum(axis=1) > 1)
+        seen, appearance = every.take(rows), forward.under(found.light)
+        occlusion = [appearance.trace(mesh, surface_points(seen, t)) for t, mesh in enumerate(surface.meshes)]
+        tangents = tangent_plane(seen.normal[:, 0] @ surface.geometry.rotation[0])
+        known = albedo[rows], found.expected, max(found.sigma, LEAST)
+        return cls(surface, seen, occlusion, appearance, bool(forward.gloss), *known, tangents)
+
+    def equations(self, moved: NDArray, way: NDArray, probe: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Gauss-Newton's matrices (N, 3, 3) and right-hand sides (N, 3) of two tilts of the normal and the height.
+
+        Albedos are eliminated. ``moved`` (V, 3) is how far vertices have moved, ``way`` (V, 3) their way per unit of
+        height, both in object space; images are differentiated over a ``probe`` to either side.
+        """
+        seen, surface = self.seen, self.surface
+        colour, ahead, behind = (surface.colours(seen, self._at(moved + k * probe * way)) for k in (0.0, 1.0, -1.0))
+        corners = surface.faces, seen.face, seen.barycentric
+        normals = [normalize(interpolate(vertex_normals(v, surface.faces), *corners)) for v in self._at(moved)]
+        bent = np.stack(normals, axis=1).astype(np.float32)
+        diffuse, specular = np.zeros_like(colour), np.zeros_like(colour)
+        for j, t in enumerate(seen.step):
+            diffuse[:, j], specular[:, j] = shade_bent(*self._image(j), bent[:, t])
+        specular *= self.gloss
+        texels, albedos, residual, weight = self._follow(colour, diffuse, specular)
+
+        # Slopes of the residuals; what the albedos take of them goes.
+        slopes = np.zeros((*colour.shape, 3), np.float32)
+        slopes[..., 2] = (ahead - behind) / (2.0 * probe)
+        for j, t in enumerate(seen.step):
+            turns = [self.tangents[:, a] @ surface.geometry.rotation[t].T for a in (0, 1)]
+            image = BentImage(*self._image(j), albedos, np.eye(3))
+            for a, slope in enumerate(image(bent[:, t], turns)[1]):
+                slopes[:, j, :, a] = -slope
+        weighted = weight[..., None] * slopes
+        taken = np.einsum("njc,njca->nca", diffuse, weighted), np.einsum("njc,njca->na", specular, weighted)
+        matrix = np.einsum("njca,njcb->nab", weighted, slopes).astype(np.float64)
+        for b in range(3):
+            x, y = texels.inverse(taken[0][..., b], taken[1][:, b])
+            matrix[:, :, b] -= np.einsum("nca,nc->na", taken[0], x) + taken[1] * y[:, None]
+        right = -np.einsum("njca,njc->na", weighted, residual).astype(np.float64)
+        return 0.5 * (matrix + matrix.transpose(0, 2, 1)), right
+
+    def _at(self, moved: NDArray) -> list[NDArray[np.float64]]:
+        """World-space vertices of each timestep that have moved by (V, 3) in object space."""
+        fit = self.surface.geometry
+        return [v + fit.scale * moved @ r.T for v, r in zip(self.surface.vertices, fit.rotation, strict=True)]
+
+    def _image(self, j: int) -> tuple[Appearance, NDArray, NDArray, Occlusion]:
+        """What shades the texels in an image: appearance, normals of the mesh, directions to the camera, shadows."""
+        step = int(self.seen.step[j])
+        return self.appearance, self.seen.normal[:, step], self.seen.view[:, j], self.occlusion[step]
+
+    def _follow(
+        self, colour: NDArray, diffuse: NDArray, specular: NDArray
+    ) -> tuple[TexelSystems, tuple[NDArray, NDArray], NDArray, NDArray]:
+        """Blocks of the texels, their albedos, and residuals (N, J, 3) with their robust weights, over the noise."""
+        measured = self.seen.measured
+        plain = measured[..., None] * noise_weight(colour, True)
+        plain /= max(float(np.median(plain[measured > 0])), 1e-12) if measured.any() else 1.0
+        weight, sigma, none = plain, self.sigma, np.zeros((0, 2), int)
+
+        def blocks() -> TexelSystems:
+            texels = TexelSystems.accumulate(colour, weight, diffuse, specular, none, 0.0)
+            pull = WEAK * np.median(texels.dd, axis=0) + 1e-12
+            gloss = max(WEAK * float(np.median(texels.ss)), specular_pull(self.expected, MISFIT * sigma))
+            return texels.with_priors((pull, gloss), self.albedo, self.expected)
+
+        for _ in range(PASSES):
+            texels = blocks()
+            x, y = texels.inverse(texels.dr, texels.sr)
+            albedos = np.clip(x, 0.0, BRIGHTEST).astype(np.float32), np.clip(y, 0.0, 1.0).astype(np.float32)
+            residual = colour - form_image(0.0, albedos[0][:, None], diffuse, albedos[1][:, None, None], specular)
+            sigma = max(median_deviation(residual[measured > 0]), LEAST)
+            weight = plain / (1.0 + (residual / np.float32(CAUCHY * sigma)) ** 2)
+        texels, factor = blocks(), INDEPENDENT / sigma**2
+        scaled = TexelSystems(*(factor * getattr(texels, each.name) for each in fields(texels)))
+        return scaled, albedos, residual, np.asarray(factor * weight, np.float32)
+
+
+def _settle(patch: Patch, field: Field, height: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Heights (n,) under a lighting, and the root mean square of the last step, by Gauss-Newton.
+
+    The patch's surface has moved by the heights given already.
+    """
+    seen, faces = patch.seen, patch.surface.faces
+    corners = corner_matrix(faces, seen.face, seen.barycentric, len(field.normal))
+    tilts = [corners @ slope for slope in field.slope]
+    along = [sum(sp.diags(patch.tangents[:, a, k]) @ tilt for k, tilt in enumerate(tilts)) for a in (0, 1)]
+    ways = [*along, corners[:, field.free]]
+    start, moved, factor, most = height, np.zeros_like(height), None, FARTHEST_MM / field.millimetres
+    for _ in range(ITERATIONS):
+        blocks, sides = patch.equations(field.displacement(height - start), field.normal, PROBE_MM / field.millimetres)
+        matrix, right = field.precision, -field.precision @ height
+        for a, b in combinations_with_replacement(range(3), 2):
+            part = ways[a].T @ sp.diags(blocks[:, a, b]) @ ways[b]
+            matrix = matrix + (part if a == b else part + part.T)
+        for way, side in zip(ways, sides.T, strict=True):
+            right += way.T @ side
+        if not np.isfinite(right).all():
+            raise ConvergenceError("stage 1 (surface): shading is not finite; see the images' range")
+        factor = factor or symmetric_factor(matrix)
+        near = spl.LinearOperator(matrix.shape, lambda r, f=factor: f.solve(r.astype(np.float32)).astype(np.float64))
+        moved = np.clip(spl.cg(matrix, right, rtol=SOLVED, maxiter=20, M=near)[0], -most, most)
+        height = height + moved
+    return height, float(np.sqrt(np.mean(moved**2)))
