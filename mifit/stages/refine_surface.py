@@ -41,11 +41,12 @@ from mifit.sampling.observations import Observations, Surface
 from mifit.stages.find_surface import NARROWEST, neighbours
 from mifit.stages.geometry.points import corner_matrix
 from mifit.stages.reflectance.albedo_priors import BRIGHTEST, specular_pull
-from mifit.stages.reflectance.als import expected_albedo, find_forward, lighting_of_subset
+from mifit.stages.reflectance.als import MAP_PASSES, expected_albedo, find_forward, lighting_of_subset
 from mifit.stages.reflectance.forward import Forward, surface_points
 from mifit.stages.reflectance.lighting import CAUCHY, MISFIT, LightingSolution, noise_weight
+from mifit.stages.reflectance.lighting_equations import LightingPriors
 from mifit.stages.reflectance.maps import TexelSystems
-from mifit.stages.surface.displace import symmetric_factor
+from mifit.stages.surface.displace import MOST_ITERATIONS, RELATIVE, symmetric_factor
 from mifit.stages.surface.views import Resolution
 
 if TYPE_CHECKING:
@@ -59,18 +60,8 @@ DEVIATION, RANGE_MM = 0.5, 20.0
 and from 20 to 40 little changes on the scan of scan_city under two suns."""
 ROUNDS, ITERATIONS = 2, 3
 """Lightings, and Gauss-Newton steps under each. Chosen on the scan of scan_city under two suns and in two rooms."""
-FARTHEST_MM = 0.3
-"""A step at most: images are linear over about a pixel."""
-PROBE_MM = 0.2
-"""Distance to either side over which images are differentiated."""
-LEAST = 1e-4
-"""Deviation of the residuals at the least, linear colour."""
-WEAK = 1e-3
-"""Pull of the diffuse albedo to the expected one, relative to the median texel's curvature."""
-SOLVED = 0.01
-"""Part of the residual that conjugate gradients leave."""
-PASSES = 3
-"""Robust weightings of the albedos that follow."""
+LINEAR_MM = 0.2
+"""Height over which images are taken for linear: they are differentiated over it, and no step is larger."""
 
 
 @checked
@@ -249,7 +240,7 @@ class Patch:
         seen, appearance = every.take(rows), forward.under(found.light)
         occlusion = [appearance.trace(mesh, surface_points(seen, t)) for t, mesh in enumerate(surface.meshes)]
         tangents = tangent_plane(seen.normal[:, 0] @ surface.geometry.rotation[0])
-        known = albedo[rows], found.expected, max(found.sigma, LEAST)
+        known = albedo[rows], found.expected, max(found.sigma, 1e-4)
         return cls(surface, seen, occlusion, appearance, bool(forward.gloss), *known, tangents)
 
     def equations(self, moved: NDArray, way: NDArray, probe: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -303,20 +294,20 @@ class Patch:
         measured = self.seen.measured
         plain = measured[..., None] * noise_weight(colour, True)
         plain /= max(float(np.median(plain[measured > 0])), 1e-12) if measured.any() else 1.0
-        weight, sigma, none = plain, self.sigma, np.zeros((0, 2), int)
+        weight, sigma, none, priors = plain, self.sigma, np.zeros((0, 2), int), LightingPriors()
 
         def blocks() -> TexelSystems:
             texels = TexelSystems.accumulate(colour, weight, diffuse, specular, none, 0.0)
-            pull = WEAK * np.median(texels.dd, axis=0) + 1e-12
-            gloss = max(WEAK * float(np.median(texels.ss)), specular_pull(self.expected, MISFIT * sigma))
+            pull = priors.albedo * np.median(texels.dd, axis=0) + 1e-12
+            gloss = max(priors.specular * float(np.median(texels.ss)), specular_pull(self.expected, MISFIT * sigma))
             return texels.with_priors((pull, gloss), self.albedo, self.expected)
 
-        for _ in range(PASSES):
+        for _ in range(MAP_PASSES):
             texels = blocks()
             x, y = texels.inverse(texels.dr, texels.sr)
             albedos = np.clip(x, 0.0, BRIGHTEST).astype(np.float32), np.clip(y, 0.0, 1.0).astype(np.float32)
             residual = colour - form_image(0.0, albedos[0][:, None], diffuse, albedos[1][:, None, None], specular)
-            sigma = max(median_deviation(residual[measured > 0]), LEAST)
+            sigma = max(median_deviation(residual[measured > 0]), 1e-4)
             weight = plain / (1.0 + (residual / np.float32(CAUCHY * sigma)) ** 2)
         texels, factor = blocks(), INDEPENDENT / sigma**2
         scaled = TexelSystems(*(factor * getattr(texels, each.name) for each in fields(texels)))
@@ -333,9 +324,9 @@ def _settle(patch: Patch, field: Field, height: NDArray[np.float64]) -> tuple[ND
     tilts = [corners @ slope for slope in field.slope]
     along = [sum(sp.diags(patch.tangents[:, a, k]) @ tilt for k, tilt in enumerate(tilts)) for a in (0, 1)]
     ways = [*along, corners[:, field.free]]
-    start, moved, factor, most = height, np.zeros_like(height), None, FARTHEST_MM / field.millimetres
+    start, moved, factor, step = height, np.zeros_like(height), None, LINEAR_MM / field.millimetres
     for _ in range(ITERATIONS):
-        blocks, sides = patch.equations(field.displacement(height - start), field.normal, PROBE_MM / field.millimetres)
+        blocks, sides = patch.equations(field.displacement(height - start), field.normal, step)
         matrix, right = field.precision, -field.precision @ height
         for a, b in combinations_with_replacement(range(3), 2):
             part = ways[a].T @ sp.diags(blocks[:, a, b]) @ ways[b]
@@ -346,6 +337,6 @@ def _settle(patch: Patch, field: Field, height: NDArray[np.float64]) -> tuple[ND
             raise ConvergenceError("stage 1 (surface): shading is not finite; see the images' range")
         factor = factor or symmetric_factor(matrix)
         near = spl.LinearOperator(matrix.shape, lambda r, f=factor: f.solve(r.astype(np.float32)).astype(np.float64))
-        moved = np.clip(spl.cg(matrix, right, rtol=SOLVED, maxiter=20, M=near)[0], -most, most)
+        moved = np.clip(spl.cg(matrix, right, rtol=RELATIVE, maxiter=MOST_ITERATIONS, M=near)[0], -step, step)
         height = height + moved
     return height, float(np.sqrt(np.mean(moved**2)))
