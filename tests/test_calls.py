@@ -208,6 +208,7 @@ add(
 add("fit", lambda m, v: mifit.fit(m.capture, m.model, v), [], "left")
 stage("fit_geometry", timesteps=[0])
 stage("find_surface", "geometry")
+stage("refine_surface", "geometry")
 stage("infer_reflectance", "geometry")
 stage("refine_normals", "geometry", "reflectance", config=mifit.NormalsConfig())
 stage("find_residual", "geometry", "reflectance")

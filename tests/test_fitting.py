@@ -27,8 +27,8 @@ from tests.variant import VARIANT
 
 pytestmark = pytest.mark.usefixtures("variant")
 ALL = [
-    "fit_geometry", "find_surface", "find_photometry", "infer_reflectance", "refine_normals", "refine_mesh",
-    "find_residual",
+    "fit_geometry", "find_surface", "find_photometry", "refine_surface", "infer_reflectance", "refine_normals",
+    "refine_mesh", "find_residual",
 ]  # fmt: skip
 
 
@@ -96,18 +96,18 @@ def test_a_fit_that_gave_its_model_eyes_goes_on_with_the_model_as_it_was(monkeyp
     without_eyes(model).save(tmp_path / "skin.npz")
     skin = MorphableModel.load(tmp_path / "skin.npz")
     stages, geometry = Stages(monkeypatch), mean_geometry(with_eyes(skin), (0, 3))
-    for name in ("fit_geometry", "find_surface"):
+    for name in ("fit_geometry", "find_surface", "refine_surface"):
         monkeypatch.setattr(f"mifit.fitting.{name}", stages.stand_in(name, geometry))
     out, options = tmp_path / "out", {"until": "geometry", "resume": True}
     first = fit_into(out, made_up_capture(), skin, **options)
-    assert stages.ran == ALL[:3] and len(eyeballs(first.model)) == 2
+    assert stages.ran == ALL[:4] and len(eyeballs(first.model)) == 2
     before = tree(out)
     again = fit_into(out, made_up_capture(), skin, **options)
-    assert stages.ran == ALL[:3] and tree(out) == before and again.model.digest == first.model.digest
+    assert stages.ran == ALL[:4] and tree(out) == before and again.model.digest == first.model.digest
     assert any("[geometry] eyes = false" in one.text for one in again.warnings)
     shutil.rmtree(out / CHECKPOINTS)  # the result alone says that all is there
     fit_into(out, made_up_capture(), skin, **options)
-    assert stages.ran == ALL[:3]
+    assert stages.ran == ALL[:4]
 
 
 def test_tracked_frames_stay(fit, tracked):

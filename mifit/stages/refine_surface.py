@@ -44,17 +44,16 @@ from mifit.stages.reflectance.albedo_priors import BRIGHTEST, specular_pull
 from mifit.stages.reflectance.als import MAP_PASSES, expected_albedo, find_forward, lighting_of_subset
 from mifit.stages.reflectance.forward import Forward, surface_points
 from mifit.stages.reflectance.lighting import CAUCHY, MISFIT, LightingSolution, noise_weight
-from mifit.stages.reflectance.lighting_equations import LightingPriors
 from mifit.stages.reflectance.maps import TexelSystems
 from mifit.stages.surface.displace import MOST_ITERATIONS, RELATIVE, symmetric_factor
-from mifit.stages.surface.views import Resolution
+from mifit.stages.surface.views import Resolution, texture_size
 
 if TYPE_CHECKING:
     from mifit.capture import Capture
     from mifit.morphable import MorphableModel
 
-MAP_SIZE = 256
-"""Texels along the side of the map: about a millimetre each."""
+LARGEST_MAP = 256
+"""Texels along the side of the map at most; they are as large as two pixels, or larger."""
 DEVIATION, RANGE_MM = 0.5, 20.0
 """Standard deviation of what matches leave, pixels of parallax, and the distance over which it is alike. From 0.5 to 1
 and from 20 to 40 little changes on the scan of scan_city under two suns."""
@@ -106,17 +105,18 @@ def refine_surface(
         return geometry
     deviation = DEVIATION * resolution.pixel / (resolution.parallax * geometry.scale)
     field, start = Field.of(model, geometry, deviation), geometry
-    surface = Surface(capture, model, geometry, cameras, MAP_SIZE)
+    size = texture_size(model, geometry.vertices[0].astype(np.float64), 2.0 * resolution.pixel, LARGEST_MAP)
+    surface = Surface(capture, model, geometry, cameras, size)
     albedo = expected_albedo(model, surface.texels, geometry)
     forward, first = find_forward(surface, albedo, config, seed)
     height, moved, noise = np.zeros(len(field.free)), 0.0, None if first is None else first.sigma
     for number in range(ROUNDS):
         progress("refine surface", number, ROUNDS)
         if number:
-            surface = Surface(capture, model, geometry, cameras, MAP_SIZE, texels=surface.texels)
+            surface = Surface(capture, model, geometry, cameras, size, texels=surface.texels)
             forward = replace(forward, meshes=surface.meshes)
         found, _ = lighting_of_subset(surface, forward, albedo, config, seed, noise)
-        height, moved = _settle(Patch.of(surface, forward, found, albedo), field, height)
+        height, moved = _settle(Patch.of(surface, forward, found), field, height)
         geometry = field.moved(start, height)
     progress("refine surface", ROUNDS, ROUNDS)
     seconds = time.perf_counter() - began
@@ -216,8 +216,8 @@ class Patch:
     appearance : Appearance
     gloss : bool
         Whether there is specular reflection.
-    albedo : (N, 3), expected, sigma : float
-        Diffuse and specular albedo to expect, and the robust deviation of the residuals to start from.
+    expected, sigma : float
+        Specular albedo to expect, and the robust deviation of the residuals to start from.
     tangents : (N, 2, 3)
         Object-space directions in which normals tilt.
     """
@@ -227,21 +227,20 @@ class Patch:
     occlusion: Sequence[Occlusion]
     appearance: Appearance
     gloss: bool
-    albedo: NDArray
     expected: float
     sigma: float
     tangents: NDArray[np.float64]
 
     @classmethod
-    def of(cls, surface: Surface, forward: Forward, found: LightingSolution, albedo: NDArray) -> Patch:
-        """Of a surface under a lighting; ``albedo`` (M, 3) is expected of all its texels."""
+    def of(cls, surface: Surface, forward: Forward, found: LightingSolution) -> Patch:
+        """Of a surface under a lighting."""
         every = surface.observe(np.arange(len(surface)))
         rows = np.flatnonzero((every.measured > 0).sum(axis=1) > 1)
         seen, appearance = every.take(rows), forward.under(found.light)
         occlusion = [appearance.trace(mesh, surface_points(seen, t)) for t, mesh in enumerate(surface.meshes)]
         tangents = tangent_plane(seen.normal[:, 0] @ surface.geometry.rotation[0])
-        known = albedo[rows], found.expected, max(found.sigma, 1e-4)
-        return cls(surface, seen, occlusion, appearance, bool(forward.gloss), *known, tangents)
+        known = bool(forward.gloss), found.expected, max(found.sigma, 1e-4)
+        return cls(surface, seen, occlusion, appearance, *known, tangents)
 
     def equations(self, moved: NDArray, way: NDArray, probe: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Gauss-Newton's matrices (N, 3, 3) and right-hand sides (N, 3) of two tilts of the normal and the height.
@@ -294,13 +293,12 @@ class Patch:
         measured = self.seen.measured
         plain = measured[..., None] * noise_weight(colour, True)
         plain /= max(float(np.median(plain[measured > 0])), 1e-12) if measured.any() else 1.0
-        weight, sigma, none, priors = plain, self.sigma, np.zeros((0, 2), int), LightingPriors()
+        weight, sigma, none = plain, self.sigma, np.zeros((0, 2), int)
 
         def blocks() -> TexelSystems:
             texels = TexelSystems.accumulate(colour, weight, diffuse, specular, none, 0.0)
-            pull = priors.albedo * np.median(texels.dd, axis=0) + 1e-12
-            gloss = max(priors.specular * float(np.median(texels.ss)), specular_pull(self.expected, MISFIT * sigma))
-            return texels.with_priors((pull, gloss), self.albedo, self.expected)
+            gloss = specular_pull(self.expected, MISFIT * sigma)
+            return texels.with_priors((1e-6 * np.median(texels.dd, axis=0) + 1e-12, gloss), np.zeros(3), self.expected)
 
         for _ in range(MAP_PASSES):
             texels = blocks()
