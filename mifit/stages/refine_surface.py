@@ -105,14 +105,15 @@ def refine_surface(
         return geometry
     deviation = DEVIATION * resolution.pixel / (resolution.parallax * geometry.scale)
     field, start = Field.of(model, geometry, deviation), geometry
+    progress("refine surface", 0, ROUNDS)
     size = texture_size(model, geometry.vertices[0].astype(np.float64), 2.0 * resolution.pixel, LARGEST_MAP)
     surface = Surface(capture, model, geometry, cameras, size)
     albedo = expected_albedo(model, surface.texels, geometry)
     forward, first = find_forward(surface, albedo, config, seed)
     height, moved, noise = np.zeros(len(field.free)), 0.0, None if first is None else first.sigma
     for number in range(ROUNDS):
-        progress("refine surface", number, ROUNDS)
         if number:
+            progress("refine surface", number, ROUNDS)
             surface = Surface(capture, model, geometry, cameras, size, texels=surface.texels)
             forward = replace(forward, meshes=surface.meshes)
         found, _ = lighting_of_subset(surface, forward, albedo, config, seed, noise)
@@ -318,6 +319,8 @@ def _settle(patch: Patch, field: Field, height: NDArray[np.float64]) -> tuple[ND
     The patch's surface has moved by the heights given already.
     """
     seen, faces = patch.seen, patch.surface.faces
+    if not len(seen.texel):
+        return height, 0.0
     corners = corner_matrix(faces, seen.face, seen.barycentric, len(field.normal))
     tilts = [corners @ slope for slope in field.slope]
     along = [sum(sp.diags(patch.tangents[:, a, k]) @ tilt for k, tilt in enumerate(tilts)) for a in (0, 1)]

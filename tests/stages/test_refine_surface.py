@@ -105,3 +105,20 @@ def test_right_hand_sides_are_the_gradient(scene, monkeypatch):
     assert np.isfinite(blocks).all() and np.isfinite(sides).all()
     assert_array_equal(blocks, blocks.transpose(0, 2, 1))
     assert np.linalg.eigvalsh(blocks).min() > -1e-3 * np.abs(blocks).max()
+
+
+def test_texels_that_one_image_sees_say_nothing(scene):
+    """Each camera's images show another half of the face: nothing is measured, and nothing fails."""
+
+    def half(frame, left):
+        valid = frame.valid.copy()
+        columns = np.flatnonzero(valid.any(axis=0))
+        middle = (columns[0] + columns[-1]) // 2
+        valid[:, middle - 20 :] &= not left
+        valid[:, : middle + 20] &= left
+        return replace(frame, valid=valid)
+
+    frames = {(name, t): half(frame, name == "left") for (name, t), frame in scene.frames.items() if name in BOTH}
+    start = scene.geometry.at((0,))
+    found = refine_surface(replace(scene, frames=frames), scene.model, start, BOTH, BANDS)
+    assert_allclose(found.vertices, start.vertices, atol=2e-3)
