@@ -105,6 +105,11 @@ def _functions(node: ast.AST, prefix: str) -> Iterator[tuple[str, ast.AST]]:
 
 M = Mutation
 MUTATIONS = (
+    # Shading.
+    M("heights tilt normals the wrong way", "refine_surface.Patch.equations", "slopes[:, j, :, a] = -slope",
+      "slopes[:, j, :, a] = slope", "tests/stages/test_refine_surface.py"),
+    M("heights are differentiated the wrong way", "refine_surface.Patch.equations",
+      "(ahead - behind) / (2.0 * probe)", "(behind - ahead) / (2.0 * probe)", "tests/stages/test_refine_surface.py"),
     # Conventions.
     M("pixel centres at integers", "camera.Camera.pixel_centres", "x + 0.5", "x", "tests/core/test_camera.py"),
     M("camera axes of OpenGL not turned", "camera", "np.diag([1.0, -1.0, -1.0, 1.0])", "np.diag([1.0, 1.0, 1.0, 1.0])",

@@ -29,6 +29,7 @@ from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.normals.refine_mesh import refine_mesh
 from mifit.stages.normals.refine_normals import refine_normals
 from mifit.stages.photometry import find_photometry
+from mifit.stages.refine_surface import refine_surface
 from mifit.tracking import Follower
 
 MOST = 16
@@ -92,6 +93,9 @@ def refine(
     if config.photometry.enabled:
         photometry = find_photometry(plain, model, geometry, names, config.photometry, seed, progress)
         geometry, capture = replace(geometry, photometry=photometry), plain.with_photometry(photometry)
+    if geometry.displacement is not None and config.surface.shading:
+        found = refine_surface(capture, model, geometry, names, config.reflectance, seed, progress)
+        geometry = behind_lids(model, found)
     reflectance = infer_reflectance(capture, model, geometry, names, config.reflectance, seed, progress)
     refined = {
         "timesteps": list(geometry.timesteps),

@@ -66,7 +66,7 @@ def test_one_blas_thread_ends_with_the_call() -> None:
         assert blas_threads() == {2}
 
 
-LONG = ("fit", "fit_geometry", "find_surface", "infer_reflectance", "refine_normals", "refine")
+LONG = ("fit", "fit_geometry", "find_surface", "refine_surface", "infer_reflectance", "refine_normals", "refine")
 
 
 @pytest.mark.parametrize("name", LONG)

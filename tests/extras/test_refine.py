@@ -141,11 +141,16 @@ def test_the_surface_is_found_from_all_frames_where_the_fit_has_one(scene, resul
         assert geometry.timesteps == tuple(range(FRAMES)) and tuple(names) == CAMERAS
         return replace(geometry, displacement=geometry.displacement + np.float32(0.1))
 
+    def shade(capture, model, geometry, names, config, seed, progress):
+        assert geometry.timesteps == tuple(range(FRAMES)) and tuple(names) == CAMERAS
+        return replace(geometry, displacement=2 * geometry.displacement)
+
     monkeypatch.setattr(module, "find_surface", find)
+    monkeypatch.setattr(module, "refine_surface", shade)
     assert refine(result, scene).geometry.displacement is None
     beyond = replace(result.geometry, displacement=np.zeros_like(scene.model.mean))
     found = refine(replace(result, geometry=beyond), scene)
-    assert (found.geometry.displacement == np.float32(0.1)).all() and found.timesteps == (0, 1)
+    assert (found.geometry.displacement == np.float32(0.2)).all() and found.timesteps == (0, 1)
     assert quick["reflectance"].displacement is quick["normals"].displacement is found.geometry.displacement
 
 
