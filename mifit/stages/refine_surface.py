@@ -45,7 +45,7 @@ from mifit.stages.reflectance.als import MAP_PASSES, expected_albedo, find_forwa
 from mifit.stages.reflectance.forward import Forward, surface_points
 from mifit.stages.reflectance.lighting import CAUCHY, MISFIT, LightingSolution, noise_weight
 from mifit.stages.reflectance.maps import TexelSystems
-from mifit.stages.surface.displace import MOST_ITERATIONS, RELATIVE, symmetric_factor
+from mifit.stages.surface.displace import MOST_ITERATIONS, RELATIVE, bending_energy, symmetric_factor
 from mifit.stages.surface.views import Resolution, texture_size
 
 if TYPE_CHECKING:
@@ -55,8 +55,8 @@ if TYPE_CHECKING:
 LARGEST_MAP = 256
 """Texels along the side of the map at most; they are as large as two pixels, or larger."""
 DEVIATION, DEVIATION_MM, RANGE_MM = 0.5, 0.3, 20.0
-"""Standard deviation of what matches leave, pixels of parallax and at most, and the distance over which it is alike.
-From 0.3 to 0.6 mm and from 20 to 40 little changes on the scan of scan_city under two suns; in images of the demo's
+"""Standard deviation of what matches leave, in pixels of parallax, and its limit; the distance over which it is alike.
+From 0.3 to 0.6 mm and from 20 to 40 mm little changes on the scan of scan_city under two suns; in images of the demo's
 size 0.8 mm leave creases."""
 ROUNDS, ITERATIONS = 2, 3
 """Lightings, and Gauss-Newton steps under each. Chosen on the scan of scan_city under two suns and in two rooms."""
@@ -86,8 +86,7 @@ def refine_surface(
     cameras : sequence of str
         Cameras to read; no other camera of the capture is touched.
     config : ReflectanceConfig, optional
-        How light and albedos are found meanwhile; without robust weights ``geometry`` comes back, as with
-        one view, or views from nearly one place.
+        How the light is found.
     seed : int
         Chooses the texels that determine the lighting.
     progress : Progress
@@ -95,7 +94,8 @@ def refine_surface(
     Returns
     -------
     GeometryEstimate
-        With another ``displacement`` of the face area, and the vertices that follow.
+        With another ``displacement`` of the face area, and the vertices that follow. With one view, views from nearly
+        one place, or without robust weights, ``geometry`` as it is.
     """
     began = time.perf_counter()
     config = config or ReflectanceConfig()
@@ -141,7 +141,7 @@ class Field:
     free : (n,) int
         The vertices inside the face area.
     normal : (V, 3)
-        Directions in which all vertices move, those that stay included.
+        Directions in which vertices move; 0 for those that stay.
     slope : three of (V, n) sparse
         Change of the vertices' normals by heights, a component each.
     precision : (n, n) sparse
@@ -178,14 +178,12 @@ class Field:
         )
         # (kappa^2 - Laplacian)^2 / (4 pi kappa^2 sigma^2): smoothness 1.
         kappa = np.sqrt(8.0) * model.unit_mm / RANGE_MM
-        area = np.bincount(columns, np.repeat(double / 6.0, 3), minlength=count)
-        area = np.maximum(area, 1e-3 * float(np.median(area)))
-        operator = kappa**2 * sp.diags(area) + cotangent_laplacian(rest, faces)
-        precision = operator @ sp.diags(1.0 / area) @ operator
-        precision *= 1.0 / (4.0 * np.pi * (kappa * deviation) ** 2)
+        bending, area = bending_energy(rest, faces)
+        precision = bending + 2.0 * kappa**2 * cotangent_laplacian(rest, faces) + kappa**4 * sp.diags(area)
+        precision = precision.tocsr() / (4.0 * np.pi * (kappa * deviation) ** 2)
         normal = np.zeros_like(rest)
         normal[free] = vertex_normals(rest, faces)[free]
-        return cls(free, normal, slope, precision.tocsr()[free][:, free], model.unit_mm)
+        return cls(free, normal, slope, precision[free][:, free], model.unit_mm)
 
     def displacement(self, height: NDArray) -> NDArray[np.float64]:
         """(V, 3) movement of the vertices by heights (n,)."""

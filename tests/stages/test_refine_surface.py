@@ -59,7 +59,7 @@ def refined(scene):
 
 
 def test_bumps_go(scene, refined):
-    assert off(scene, refined) < 0.5 * off(scene, bumped(scene))
+    assert off(scene, refined) < 0.45 * off(scene, bumped(scene))
 
 
 def test_a_true_surface_stays(scene):
@@ -94,8 +94,7 @@ def test_tilts_are_the_slopes_of_heights(scene):
     assert_allclose(found[inner], turned[inner], atol=0.1 * np.abs(turned).max())
 
 
-def test_right_hand_sides_are_the_gradient(scene, monkeypatch):
-    """At the true albedos' light, a small common height changes the squared residuals as the equations say."""
+def test_eliminated_albedos_leave_no_negative_curvature(scene, monkeypatch):
     seen = []
     monkeypatch.setattr(module, "_settle", lambda patch, field, height: (seen.append((patch, field)), (height, 0.0))[1])
     refine_surface(scene, scene.model, bumped(scene), BOTH, BANDS)
