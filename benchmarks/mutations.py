@@ -106,8 +106,9 @@ def _functions(node: ast.AST, prefix: str) -> Iterator[tuple[str, ast.AST]]:
 M = Mutation
 MUTATIONS = (
     # Shading.
-    M("heights tilt normals the wrong way", "refine_surface.Patch.equations", "slopes[:, j, :, a] = -slope",
-      "slopes[:, j, :, a] = slope", "tests/stages/test_refine_surface.py"),
+    M("heights tilt normals the wrong way", "refine_surface.Patch.equations",
+      "-form_image(0.0, x, slope[:, :3], self.gloss * y[:, None], slope[:, 3:])",
+      "form_image(0.0, x, slope[:, :3], self.gloss * y[:, None], slope[:, 3:])", "tests/stages/test_refine_surface.py"),
     M("heights are differentiated the wrong way", "refine_surface.Patch.equations",
       "(ahead - behind) / (2.0 * probe)", "(behind - ahead) / (2.0 * probe)", "tests/stages/test_refine_surface.py"),
     # Conventions.

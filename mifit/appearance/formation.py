@@ -116,19 +116,15 @@ def shade_bent(
     ``base`` (N, 3) are the mesh's unit normals, where shadows were traced, ``view`` (N, 3) unit directions towards the
     camera, ``normals`` (N, 3) the bent ones.
     """
-    import mitsuba as mi
-
-    scene = _Scene(appearance, base, view, occlusion)
-    if not scene.count:
-        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
-    bent = on_device(mi.Vector3f, expect(normals, (scene.count, 3), "normals"))
-    return scene.store(scene.shader()(bent, scene.v))
+    both = BentImage(appearance, base, view, occlusion)(normals)[0]
+    return both[:, :3], both[:, 3:]
 
 
 class BentImage:
     """The image of points by their normals, with all else held.
 
     ``base``, ``view`` and ``occlusion`` are as for `shade_bent`, ``albedos`` (N, 3) and (N,) diffuse and specular;
+    without them an image has six channels, diffuse and specular radiance at unit albedo and without ambient.
     ``rotation`` (3, 3) takes the normals that are given later to world space.
     """
 
@@ -138,37 +134,39 @@ class BentImage:
         base: ArrayLike,
         view: ArrayLike,
         occlusion: Occlusion,
-        albedos: tuple[NDArray, NDArray],
-        rotation: NDArray,
+        albedos: tuple[NDArray, NDArray] | None = None,
+        rotation: ArrayLike = ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     ) -> None:
         import drjit as dr
         import mitsuba as mi
 
         self._scene = _Scene(appearance, base, view, occlusion)
         self._shade = self._scene.shader() if self._scene.count else None
-        self._albedo = on_device(mi.Color3f, expect(albedos[0], (self._scene.count, 3), "albedo"))
-        self._specular = mi.Float(aligned(expect(albedos[1], (self._scene.count,), "specular albedo")))
-        self._rotation = [mi.Vector3f(*map(float, row)) for row in rotation]
+        self._albedos: tuple[Jit, Jit] | None = None
+        if albedos is not None:
+            albedo = on_device(mi.Color3f, expect(albedos[0], (self._scene.count, 3), "albedo"))
+            self._albedos = albedo, mi.Float(aligned(expect(albedos[1], (self._scene.count,), "specular albedo")))
+        self._rotation = [mi.Vector3f(*map(float, row)) for row in np.asarray(rotation)]
         self._ambient = dr.opaque(mi.Float, float(appearance.illumination.ambient))
         dr.make_opaque(self._rotation)
 
     def __call__(
         self, normals: ArrayLike, turns: Sequence[ArrayLike] = ()
     ) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
-        """The image (N, 3), and its derivatives along each turn (N, 3) of the normals: all in one kernel."""
+        """The image (N, channels), and its derivatives along each turn (N, 3) of the normals: all in one kernel."""
         import drjit as dr
         import mitsuba as mi
 
-        count = self._scene.count
+        count, channels = self._scene.count, 6 if self._albedos is None else 3
         if self._shade is None:
-            return np.zeros((0, 3), np.float32), [np.zeros((0, 3), np.float32) for _ in turns]
+            return np.zeros((0, channels), np.float32), [np.zeros((0, channels), np.float32) for _ in turns]
 
         def world(vectors: ArrayLike, name: str) -> Jit:
             given = on_device(mi.Vector3f, expect(vectors, (count, 3), name))
             return mi.Vector3f(*(dr.dot(row, given) for row in self._rotation))
 
         n = world(normals, "normals")
-        values = list(self._image(n))
+        values = self._image(n)
         for turn in turns:
             along = dr.opaque(mi.Float, 0.0)
             dr.enable_grad(along)
@@ -176,14 +174,17 @@ class BentImage:
             dr.set_grad(along, 1.0)
             dr.enqueue(dr.ADMode.Forward, along)
             dr.traverse(dr.ADMode.Forward)
-            values += list(dr.grad(image))
-        image, *slopes = columns(values, count).reshape(-1, 3, count)
-        return image.T, [slope.T for slope in slopes]
+            values += dr.grad(image)
+        found = columns(values, count).reshape(-1, channels, count)
+        return found[0].T, [slope.T for slope in found[1:]]
 
-    def _image(self, n: Jit) -> Jit:
+    def _image(self, n: Jit) -> list[Jit]:
+        """The channels under normals."""
         assert self._shade is not None
         diffuse, specular = self._shade(n, self._scene.v)
-        return form_image(self._ambient, self._albedo, diffuse, self._specular, specular)
+        if self._albedos is None:
+            return [*diffuse, *specular]
+        return list(form_image(self._ambient, self._albedos[0], diffuse, self._albedos[1], specular))
 
 
 class _Scene:
@@ -203,7 +204,7 @@ class _Scene:
             on_device(mi.Vector3f, expect(x, shape, name)) for x, name in ((normals, "normals"), (view, "view"))
         )
         self.shadowed = None
-        if shadows and self.model.needs_shadows:
+        if shadows and self.count and self.model.needs_shadows:
             if occlusion.transfer is None:
                 raise InputError(
                     f"shading model {self.model.name!r}: found no transfer vectors, expected those of trace_transfer"

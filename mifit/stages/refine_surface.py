@@ -25,8 +25,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
 
-from mifit.appearance.formation import Appearance, BentImage, form_image, shade_bent
-from mifit.appearance.occlusion import Occlusion
+from mifit.appearance.formation import BentImage, form_image
 from mifit.config import ReflectanceConfig
 from mifit.core.calls import checked
 from mifit.core.estimate import GeometryEstimate
@@ -212,9 +211,8 @@ class Patch:
     surface : Surface
     seen : Observations
         N texels, J images.
-    occlusion : sequence of Occlusion
-        Shadows, per timestep.
-    appearance : Appearance
+    images : sequence of BentImage
+        Diffuse and specular radiance at unit albedo, by the normals.
     gloss : bool
         Whether there is specular reflection.
     expected, sigma : float
@@ -225,8 +223,7 @@ class Patch:
 
     surface: Surface
     seen: Observations
-    occlusion: Sequence[Occlusion]
-    appearance: Appearance
+    images: Sequence[BentImage]
     gloss: bool
     expected: float
     sigma: float
@@ -238,10 +235,13 @@ class Patch:
         every = surface.observe(np.arange(len(surface)))
         rows = np.flatnonzero((every.measured > 0).sum(axis=1) > 1)
         seen, appearance = every.take(rows), forward.under(found.light)
-        occlusion = [appearance.trace(mesh, surface_points(seen, t)) for t, mesh in enumerate(surface.meshes)]
+        shadows = [appearance.trace(mesh, surface_points(seen, t)) for t, mesh in enumerate(surface.meshes)]
+        images = [
+            BentImage(appearance, seen.normal[:, t], seen.view[:, j], shadows[t]) for j, t in enumerate(seen.step)
+        ]
         tangents = tangent_plane(seen.normal[:, 0] @ surface.geometry.rotation[0])
         known = bool(forward.gloss), found.expected, max(found.sigma, 1e-4)
-        return cls(surface, seen, occlusion, appearance, *known, tangents)
+        return cls(surface, seen, images, *known, tangents)
 
     def equations(self, moved: NDArray, way: NDArray, probe: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Gauss-Newton's matrices (N, 3, 3) and right-hand sides (N, 3) of two tilts of the normal and the height.
@@ -254,26 +254,26 @@ class Patch:
         corners = surface.faces, seen.face, seen.barycentric
         normals = [normalize(interpolate(vertex_normals(v, surface.faces), *corners)) for v in self._at(moved)]
         bent = np.stack(normals, axis=1).astype(np.float32)
-        diffuse, specular = np.zeros_like(colour), np.zeros_like(colour)
+        radiance, tilts = np.empty((*bent[:, seen.step].shape[:2], 6), np.float32), []
         for j, t in enumerate(seen.step):
-            diffuse[:, j], specular[:, j] = shade_bent(*self._image(j), bent[:, t])
-        specular *= self.gloss
-        texels, albedos, residual, weight = self._follow(colour, diffuse, specular)
+            turns = [self.tangents[:, a] @ surface.geometry.rotation[t].T for a in (0, 1)]
+            radiance[:, j], of_image = self.images[j](bent[:, t], turns)
+            tilts.append(of_image)
+        diffuse, specular = radiance[..., :3], radiance[..., 3:] * np.float32(self.gloss)
+        texels, (x, y), residual, weight = self._follow(colour, diffuse, specular)
 
         # Slopes of the residuals; what the albedos take of them goes.
         slopes = np.zeros((*colour.shape, 3), np.float32)
         slopes[..., 2] = (ahead - behind) / (2.0 * probe)
-        for j, t in enumerate(seen.step):
-            turns = [self.tangents[:, a] @ surface.geometry.rotation[t].T for a in (0, 1)]
-            image = BentImage(*self._image(j), albedos, np.eye(3))
-            for a, slope in enumerate(image(bent[:, t], turns)[1]):
-                slopes[:, j, :, a] = -slope
+        for j, of_image in enumerate(tilts):
+            for a, slope in enumerate(of_image):
+                slopes[:, j, :, a] = -form_image(0.0, x, slope[:, :3], self.gloss * y[:, None], slope[:, 3:])
         weighted = weight[..., None] * slopes
         taken = np.einsum("njc,njca->nca", diffuse, weighted), np.einsum("njc,njca->na", specular, weighted)
         matrix = np.einsum("njca,njcb->nab", weighted, slopes).astype(np.float64)
         for b in range(3):
-            x, y = texels.inverse(taken[0][..., b], taken[1][:, b])
-            matrix[:, :, b] -= np.einsum("nca,nc->na", taken[0], x) + taken[1] * y[:, None]
+            followed = texels.inverse(taken[0][..., b], taken[1][:, b])
+            matrix[:, :, b] -= np.einsum("nca,nc->na", taken[0], followed[0]) + taken[1] * followed[1][:, None]
         right = -np.einsum("njca,njc->na", weighted, residual).astype(np.float64)
         return 0.5 * (matrix + matrix.transpose(0, 2, 1)), right
 
@@ -281,11 +281,6 @@ class Patch:
         """World-space vertices of each timestep that have moved by (V, 3) in object space."""
         fit = self.surface.geometry
         return [v + fit.scale * moved @ r.T for v, r in zip(self.surface.vertices, fit.rotation, strict=True)]
-
-    def _image(self, j: int) -> tuple[Appearance, NDArray, NDArray, Occlusion]:
-        """What shades the texels in an image: appearance, normals of the mesh, directions to the camera, shadows."""
-        step = int(self.seen.step[j])
-        return self.appearance, self.seen.normal[:, step], self.seen.view[:, j], self.occlusion[step]
 
     def _follow(
         self, colour: NDArray, diffuse: NDArray, specular: NDArray
