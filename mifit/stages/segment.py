@@ -158,16 +158,8 @@ def _segment_image(
     eyes, mouth = _polygons(hit.shape, marks, EYES_AND_MOUTH[:2]), _polygons(hit.shape, marks, EYES_AND_MOUTH[2:])
     if facial.any() and not frame.masked:
         usable = facial & frame.valid & number & ~eyes & ~mouth
-        rows, columns = box(facial)
-        step = -(-max(rows.stop - rows.start, columns.stop - columns.start) // LONGEST)
-        grid = slice(rows.start, rows.stop, step), slice(columns.start, columns.stop, step)
-        given = image[rows, columns], usable, grid, albedos, shading, model, facial, _plain(hit.shape, marks)
-        objects = _objects(view, *given)
-        found = np.zeros(hit.shape, bool)
-        shape = columns.stop - columns.start, rows.stop - rows.start
-        found[rows, columns] = cv2.resize(objects.astype(np.uint8), shape, interpolation=cv2.INTER_NEAREST) > 0
-        found &= hit
-        labels[found] = Label.OCCLUDER
+        given = albedos, shading, model, facial, _plain(hit.shape, marks)
+        labels[hit & _objects(view, image, usable, *given)] = Label.OCCLUDER
     for area, label in ((eyes, Label.EYES), (mouth, Label.MOUTH)):
         labels[area & (labels == Label.SKIN)] = label
     labels[~frame.valid] = Label.BACKGROUND
@@ -178,20 +170,22 @@ def _objects(
     view: Seen,
     image: NDArray,
     usable: NDArray[np.bool_],
-    grid: tuple[slice, slice],
     albedos: Albedos,
     shading: NDArray,
     model: MorphableModel,
     facial: NDArray[np.bool_],
     plain: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """Pixels of a grid in an image that show something in front of the face; ``image`` is the part that it spans."""
+    """Pixels of an image that show something in front of the face, found on a grid of at most `LONGEST` a side."""
+    out, about = np.zeros(facial.shape, bool), box(facial)
+    span = [part.stop - part.start for part in about]
+    grid = tuple(slice(part.start, part.stop, -(-max(span) // LONGEST)) for part in about)
     face, weights, usable = np.maximum(view.face[grid], 0), view.weights[grid], usable[grid]
     facial, plain = facial[grid], plain[grid]
     size = float(np.sqrt(usable.sum()))
     if size < MIN_SIDE:
-        return np.zeros_like(usable)
-    image = cv2.resize(image, usable.shape[::-1], interpolation=cv2.INTER_AREA)
+        return out
+    image = cv2.resize(image[about], usable.shape[::-1], interpolation=cv2.INTER_AREA)
     blur = max(BLUR * size, 0.7)
     at, shape = (face.ravel(), weights.reshape(-1, 3)), face.shape
     uv = interpolate(model.uv, model.faces_uv, *at).reshape(*shape, 2)
@@ -205,8 +199,8 @@ def _objects(
     smooth = cv2.GaussianBlur(image, (0, 0), 0.5 * blur)
     level = opponent(smooth)
     # The mesh is a little off, so the edge of a shadow may lie anywhere about there.
-    about = np.ones((2 * max(1, round(REACH * size)) + 1,) * 2, np.uint8)
-    lit = np.clip(level - colour, cv2.erode(shaded, about), cv2.dilate(shaded, about))
+    near = np.ones((2 * max(1, round(REACH * size)) + 1,) * 2, np.uint8)
+    lit = np.clip(level - colour, cv2.erode(shaded, near), cv2.dilate(shaded, near))
     departure = np.sqrt((((level - colour - lit) / albedos.deviation) ** 2).mean(axis=-1))
     departure[~usable | _highlight(smooth, np.exp(predicted @ np.linalg.inv(OPPONENT).T))] = 0.0
     weight = cv2.GaussianBlur(usable.astype(np.float32), (0, 0), blur)
@@ -219,7 +213,9 @@ def _objects(
     started, clean = (departure > SURE) & inner, (departure < CLEAN) & usable
     found = _outlines(picture, started, departure > CLEAN, clean, facial, SMALLEST, size)
     started, clean = covered & plain & inner, ~strange & plain & usable
-    return found | _outlines(picture, started, strange, clean, facial, LARGE, size, WIDE * REACH)
+    found |= _outlines(picture, started, strange, clean, facial, LARGE, size, WIDE * REACH)
+    out[about] = cv2.resize(found.astype(np.uint8), span[::-1], interpolation=cv2.INTER_NEAREST) > 0
+    return out
 
 
 def _outlines(

@@ -55,12 +55,15 @@ class Look:
         Change of the feature per world length that the point moves.
     pixel : float
         World length of a pixel of the level.
+    step : int
+        Place of the timestep among those that were posed.
     """
 
     value: NDArray[np.float64]
     weight: NDArray[np.float64]
     slope: NDArray[np.float64]
     pixel: float
+    step: int
 
 
 def align_timesteps(
@@ -109,12 +112,11 @@ def align_timesteps(
         spent[:, 6:] = geometry.expression - expected
     if not still:
         spent -= spent.mean(axis=0)
-    owner = np.repeat(np.arange(len(posed)), [len(p.images) for p in posed])
     for _ in range(ITERATIONS):
         at = start + scale * np.einsum("nck,tk->tnc", basis, changes)
         at = at @ turns.transpose(0, 2, 1) + shifts[:, None]
         looks = _looks(posed, rows, [c + x @ r.T for x, c, r in zip(at, middles, rotation, strict=True)])
-        steps = _steps(looks, still, owner, at, rotation, turns, scale * basis, wide, spent)
+        steps = _steps(looks, still, at, rotation, turns, scale * basis, wide, spent)
         if steps is None:
             return geometry
         if not still:
@@ -147,12 +149,12 @@ def _points(texels: TexelMap) -> NDArray[np.intp]:
 
 def _looks(posed: Sequence[Posed], rows: NDArray, world: Sequence[NDArray]) -> list[Look]:
     """What each view shows of its timestep's points (n, 3), which are texels' ``rows``."""
-    steps = zip(posed, world, strict=True)
-    given = [(image, at, seen[rows]) for p, at in steps for image, seen in zip(p.images, p.seen, strict=True)]
+    steps = enumerate(zip(posed, world, strict=True))
+    given = [(k, image, at, seen[rows]) for k, (p, at) in steps for image, seen in zip(p.images, p.seen, strict=True)]
     return on_all_cores(lambda view: _look(*view), given)
 
 
-def _look(image: FeatureImage, points: NDArray, seen: NDArray) -> Look:
+def _look(step: int, image: FeatureImage, points: NDArray, seen: NDArray) -> Look:
     """One view of world points (n, 3); central differences over a pixel."""
     camera = image.camera
     fx, fy = camera.fx * image.factor, camera.fy * image.factor
@@ -165,13 +167,12 @@ def _look(image: FeatureImage, points: NDArray, seen: NDArray) -> Look:
     x, y = (beside - left)[:, 0] * fx / depth, (below - above)[:, 0] * fy / depth
     slope = x[:, None] * right + y[:, None] * down - ((x * u + y * v) / depth)[:, None] * ahead
     weight = np.where(known, seen, 0.0).astype(np.float64)
-    return Look(middle[:, 0].astype(np.float64), weight, slope, float(np.median(depth)) / fx)
+    return Look(middle[:, 0].astype(np.float64), weight, slope, float(np.median(depth)) / fx, step)
 
 
 def _steps(
     looks: list[Look],
     still: Sequence[Look],
-    owner: NDArray,
     at: NDArray,
     rotation: NDArray,
     turns: NDArray,
@@ -191,8 +192,8 @@ def _steps(
     weight = np.where(used, weight / (1.0 + (residual / (2.0 * spread)) ** 2) ** 2, 0.0) * INDEPENDENT / spread**2
     prior = np.diag(wide**-2.0)
     system, gradient = np.tile(prior, (len(spent), 1, 1)), spent @ prior
-    for look, k, counts, off in zip(looks, owner, weight, residual, strict=False):  # of those that move
-        some = np.flatnonzero(counts > 0)
+    for look, counts, off in zip(looks, weight, residual, strict=False):  # of those that move
+        k, some = look.step, np.flatnonzero(counts > 0)
         slope = look.slope[some] @ rotation[k]  # by object-space movement
         bent = np.einsum("nc,nck->nk", slope @ turns[k], basis[some])
         jacobian = np.concatenate([np.cross(at[k, some], slope), slope, bent], axis=1)
