@@ -121,3 +121,18 @@ def test_texels_that_one_image_sees_say_nothing(scene):
     start = scene.geometry.at((0,))
     found = refine_surface(replace(scene, frames=frames), scene.model, start, BOTH, BANDS)
     assert_allclose(found.vertices, start.vertices, atol=2e-3)
+
+
+def test_light_that_is_off_smoothly_bends_the_surface_less(scene, monkeypatch):
+    """Shades that change slowly over the face, other ones in each image, are the light's."""
+
+    def shaded(frame, turn):
+        y, x = np.mgrid[-1 : 1 : frame.image.shape[0] * 1j, -1 : 1 : frame.image.shape[1] * 1j]
+        shade = 1.0 + 0.05 * (np.cos(turn) * x + np.sin(turn) * y)
+        return replace(frame, image=(frame.image * shade[..., None]).astype(np.float32))
+
+    frames = {key: shaded(scene.frames[key], 1.0 + 2.0 * k) for k, key in enumerate(sorted(scene.frames))}
+    given = replace(scene, frames=frames), scene.model, scene.geometry, BOTH, BANDS
+    bent = off(scene, refine_surface(*given))
+    monkeypatch.setattr(module, "LIGHT_MM", 1e4)
+    assert bent < 0.85 * off(scene, refine_surface(*given))
