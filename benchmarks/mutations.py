@@ -112,7 +112,7 @@ MUTATIONS = (
     M("heights are differentiated the wrong way", "refine_surface.Patch.equations",
       "(ahead - behind) / (2.0 * probe)", "(behind - ahead) / (2.0 * probe)", "tests/stages/test_refine_surface.py"),
     M("light that is off bends the surface", "refine_surface.Patch.equations",
-      "residual - self._mean_about(residual, weight)", "residual", "tests/stages/test_refine_surface.py"),
+      "self._mean_about(residual, weight) - residual", "-residual", "tests/stages/test_refine_surface.py"),
     # Conventions.
     M("pixel centres at integers", "camera.Camera.pixel_centres", "x + 0.5", "x", "tests/core/test_camera.py"),
     M("camera axes of OpenGL not turned", "camera", "np.diag([1.0, -1.0, -1.0, 1.0])", "np.diag([1.0, 1.0, 1.0, 1.0])",

@@ -274,24 +274,22 @@ class Patch:
         diffuse, specular = radiance[..., :3], radiance[..., 3:] * np.float32(self.gloss)
         texels, (x, y), residual, weight = self._follow(colour, diffuse, specular)
 
-        # Slopes of the residuals; what the albedos take of them goes.
-        slopes = np.zeros((*colour.shape, 3), np.float32)
-        slopes[..., 2] = (ahead - behind) / (2.0 * probe)
+        # Slopes of the residuals, and what is left to explain; what the albedos take of them goes.
+        columns = np.zeros((*colour.shape, 4), np.float32)
+        columns[..., 2] = (ahead - behind) / (2.0 * probe)
+        columns[..., 3] = self._mean_about(residual, weight) - residual
         for j, of_image in enumerate(tilts):
             for a, slope in enumerate(of_image):
-                slopes[:, j, :, a] = -form_image(0.0, x, slope[:, :3], self.gloss * y[:, None], slope[:, 3:])
-        weighted = weight[..., None] * slopes
+                columns[:, j, :, a] = -form_image(0.0, x, slope[:, :3], self.gloss * y[:, None], slope[:, 3:])
+        weighted = weight[..., None] * columns
         taken = np.einsum("njc,njca->nca", diffuse, weighted), np.einsum("njc,njca->na", specular, weighted)
-        matrix = np.einsum("njca,njcb->nab", weighted, slopes).astype(np.float64)
-        for b in range(3):
+        system = np.einsum("njca,njcb->nab", weighted[..., :3], columns).astype(np.float64)
+        for b in range(4):
             followed = texels.inverse(taken[0][..., b], taken[1][:, b])
-            matrix[:, :, b] -= np.einsum("nca,nc->na", taken[0], followed[0]) + taken[1] * followed[1][:, None]
-        residual = residual - self._mean_about(residual, weight)
-        right = -np.einsum("njca,njc->na", weighted, residual).astype(np.float64)
-        counted = weight * residual
-        followed = texels.inverse((diffuse * counted).sum(1), (specular * counted).sum((1, 2)))
-        right += np.einsum("nca,nc->na", taken[0], followed[0]) + taken[1] * followed[1][:, None]
-        return 0.5 * (matrix + matrix.transpose(0, 2, 1)), right
+            system[:, :, b] -= np.einsum("nca,nc->na", taken[0][..., :3], followed[0])
+            system[:, :, b] -= taken[1][:, :3] * followed[1][:, None]
+        matrix = system[..., :3]
+        return 0.5 * (matrix + matrix.transpose(0, 2, 1)), system[..., 3]
 
     def _at(self, moved: NDArray) -> list[NDArray[np.float64]]:
         """World-space vertices of each timestep that have moved by (V, 3) in object space."""
