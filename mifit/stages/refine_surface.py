@@ -11,8 +11,8 @@ with the images I_j read where the moved surface is seen, diffuse and specular r
 projection, `reflectance.lighting`). Albedos that are held would keep what wrong normals had put into them. ``Q`` is the
 precision of a Gaussian field with Matern's covariance about what the views' matches found (Lindgren et al. 2011).
 
-Light that is modelled a little wrong, such as a lamp near by, leaves residuals that change slowly over a face. They
-would bend the surface, so each image's residuals count without their mean over some millimetres about.
+Light that is modelled a little wrong, such as a lamp near by, leaves residuals that vary slowly over a face and would
+bend the surface. So each image's residuals lose their mean over a window of some millimetres (`LIGHT_MM`).
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ DEVIATION, DEVIATION_MM, RANGE_MM = 0.5, 0.3, 20.0
 From 0.3 to 0.6 mm and from 20 to 40 mm little changes on the scan of scan_city under two suns; in images of the demo's
 size 0.8 mm leave creases."""
 LIGHT_MM = 10.0
-"""Standard deviation of the Gaussian window over which residuals have no mean. Chosen on Emily c3,c4, scan_city, and
-its scan under two suns; 5 to 15 mm are alike."""
+"""Standard deviation of the Gaussian window over which the mean of the residuals is taken out. Chosen on Emily c3,c4,
+scan_city, and its scan under two suns; 5 to 15 mm are alike."""
 ROUNDS, ITERATIONS = 2, 3
 """Lightings, and Gauss-Newton steps under each. Chosen on the scan of scan_city under two suns and in two rooms."""
 LINEAR_MM = 0.2
@@ -297,7 +297,7 @@ class Patch:
         return [v + fit.scale * moved @ r.T for v, r in zip(self.surface.vertices, fit.rotation, strict=True)]
 
     def _mean_about(self, values: NDArray, weight: NDArray) -> NDArray[np.float32]:
-        """(N, J, 3) weighted mean of values within a window about each texel, image by image."""
+        """(N, J, 3) weighted mean of values in a window around each texel, image by image."""
         texels, rows, mean = self.surface.texels, self.seen.texel, np.empty_like(values)
 
         def blurred(of: NDArray) -> NDArray:
