@@ -134,5 +134,5 @@ def test_light_that_is_off_smoothly_bends_the_surface_less(scene, monkeypatch):
     frames = {key: shaded(scene.frames[key], 1.0 + 2.0 * k) for k, key in enumerate(sorted(scene.frames))}
     given = replace(scene, frames=frames), scene.model, scene.geometry, BOTH, BANDS
     bent = off(scene, refine_surface(*given))
-    monkeypatch.setattr(module, "LIGHT_MM", 1e4)
+    monkeypatch.setattr(module, "LIGHT_MM", 100.0)
     assert bent < 0.85 * off(scene, refine_surface(*given))
