@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -52,6 +53,31 @@ def columns(values: list[Jit], count: int) -> NDArray[np.float32]:
 def stored(values: list[Jit], count: int) -> NDArray[np.float32]:
     """Floats, of width N or 1, computed in one kernel -> (N, number of values)."""
     return np.ascontiguousarray(columns(values, count).T)
+
+
+def rows_on_device(values: NDArray) -> Jit:
+    """(V, K) numbers -> one Float of their rows, filled up to whole packets of four."""
+    import mitsuba as mi
+
+    return mi.Float(aligned(np.pad(values, ((0, 0), (0, -values.shape[1] % 4)))).ravel())
+
+
+def mean_of_rows(rows: Jit, corners: Sequence[Jit], weights: Sequence[Jit], size: int) -> list[Jit]:
+    """``size`` Floats, not evaluated: weighted sums of the rows (`rows_on_device`) with the numbers ``corners``.
+
+    Memory is read four numbers at a time, and where they are used: single reads take most of the time that it takes to
+    compile a kernel.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    packets, found = -(-size // 4), list[Jit]()
+    for packet in range(packets):
+        read = [dr.gather(mi.Vector4f, rows, corner * packets + packet) for corner in corners]
+        for i in range(4):
+            a, b, c = (weight * four[i] for weight, four in zip(weights, read, strict=True))
+            found.append(a + b + c)
+    return found[:size]
 
 
 def expect(values: ArrayLike, shape: tuple[int, ...], name: str) -> NDArray[np.float32]:

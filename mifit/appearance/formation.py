@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mifit.appearance.arrays import Jit, aligned, columns, expect, on_device, stored
+from mifit.appearance.arrays import Jit, aligned, columns, expect, mean_of_rows, on_device, rows_on_device, stored
 from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.kernels import PreparedLobe, light_transfer, prepare
 from mifit.appearance.lobe import Lobe
@@ -265,20 +265,11 @@ class _Scene:
 
 
 def _read_transfer(transfer: VertexTransfer, count: int, order: int) -> list[Jit]:
-    """B*B Floats, not evaluated: kernels gather them from rows in memory, four at a time."""
-    import drjit as dr
+    """B*B Floats of points."""
     import mitsuba as mi
 
     size = order * order
     values = expect(transfer.values, (len(transfer.values), size), "shadowed transfer")
-    expect(transfer.weights, (count, 3), "shadowed transfer: weights")
-    rows = [mi.UInt32(aligned(column, np.uint32)) for column in transfer.corners.T]
-    weights = [mi.Float(aligned(column)) for column in transfer.weights.T]
-    packets = -(-size // 4)
-    padded = np.pad(values, ((0, 0), (0, 4 * packets - size))) if 4 * packets > size else values
-    flat = mi.Float(aligned(padded).ravel())
-    found: list[Jit] = []
-    for packet in range(packets):
-        read = [dr.gather(mi.Vector4f, flat, row * packets + packet) for row in rows]
-        found += [weights[0] * read[0][i] + weights[1] * read[1][i] + weights[2] * read[2][i] for i in range(4)]
-    return found[:size]
+    weights = expect(transfer.weights, (count, 3), "shadowed transfer: weights")
+    corners = [mi.UInt32(aligned(column, np.uint32)) for column in transfer.corners.T]
+    return mean_of_rows(rows_on_device(values), corners, [mi.Float(aligned(w)) for w in weights.T], size)

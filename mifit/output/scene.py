@@ -220,7 +220,9 @@ def scene_description(
     scene["face"] = _shape(f"{files}/face.ply", {"type": "ref", "id": "skin"})
     if not mapped_faces(result).all():
         albedo = {"type": "mesh_attribute", "name": "vertex_color"}
-        bare = {"type": "blinnphong", "diffuse_reflectance": albedo, "specular_reflectance": 0.0}
+        # The skin's lobe, of no strength: `shdirect` shades both together.
+        lobe = result.lobe.parameters()
+        bare = {"type": "blinnphong", "diffuse_reflectance": albedo, "specular_reflectance": 0.0, **lobe}
         scene["rest"] = _shape(f"{files}/rest.ply", bare)
     if result.environment is not None:
         scene["light"] = {"type": "envmap", "filename": f"{files}/environment.exr"}

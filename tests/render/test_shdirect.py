@@ -39,7 +39,9 @@ def ball() -> tuple:
     return n, np.array(sphere.faces), uv, n
 
 
-def make_scene(mesh: tuple, bsdf: dict, c: np.ndarray, size: int = 32, rfilter: str = "box", **integrator):
+def make_scene(
+    mesh: tuple, bsdf: dict, c: np.ndarray, size: int = 32, rfilter: str = "box", more: dict | None = None, **integrator
+):
     import mitsuba as mi
 
     sensor = {
@@ -54,6 +56,7 @@ def make_scene(mesh: tuple, bsdf: dict, c: np.ndarray, size: int = 32, rfilter: 
             "mesh": make_mesh(*mesh, bsdf=mi.load_dict(bsdf)),
             "light": {"type": "shenv", "coefficients": mi.TensorXf(aligned(c))},
             "sensor": sensor,
+            **(more or {}),
             "integrator": {"type": "shdirect", **integrator},
         }
     )
@@ -186,6 +189,35 @@ def test_a_normal_that_faces_away_is_not_black() -> None:
     scene = make_scene(ball(), plain, LIGHTS["positive"], 24, hide_emitters=True)
     # A bent normal sees light below the surface, which a path from there doesn't find: never darker than traced.
     assert (render(scene, 16) - render(scene, 512, type="direct", hide_emitters=True))[inside].min() > -0.06
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_surfaces_side_by_side_look_as_each_alone(model: str) -> None:
+    """Two of one lobe, which are shaded together, and one of another."""
+    import mitsuba as mi
+
+    vertices, faces, uv, normals = ball()
+    lobe = {"type": "blinnphong", "exponent": 30.0, "fresnel": 8.0}
+    bsdfs = [
+        {**lobe, "diffuse_reflectance": 0.3, "specular_reflectance": 0.4},
+        {**lobe, "diffuse_reflectance": {"type": "rgb", "value": [0.6, 0.2, 0.1]}, "specular_reflectance": 0.0},
+        {"type": "blinnphong", "exponent": 5.0, "diffuse_reflectance": 0.2, "specular_reflectance": 0.5},
+    ]
+    small = 0.3 * vertices
+    meshes = [
+        (small + np.array([x, 0.0, 0.0]), faces[::step], uv, normals) for x, step in ((-0.8, 1), (0.0, -1), (0.8, -1))
+    ]
+    more = {f"mesh_{k}": make_mesh(*meshes[k], bsdf=mi.load_dict(bsdfs[k])) for k in (1, 2)}
+    options = {"type": "shdirect", "model": model, "hide_emitters": True, "samples": 1024}
+    light = LIGHTS["positive"]
+    together = render(make_scene(meshes[0], bsdfs[0], light, 48, more=more), 4, **options)
+    for k, mesh in enumerate(meshes):
+        alone = render(make_scene(mesh, bsdfs[k], light, 48), 4, **options)
+        there = alone[..., :3].min(axis=-1) > 0.01
+        assert there.sum() > 70
+        off = np.abs(together / np.maximum(alone, 1e-6) - 1.0)[there]
+        # Sides that face others lose light to them.
+        assert np.median(off) < 0.05 if model == "shadowed" else off.max() < 1e-4
 
 
 def textured_bsdf(normalized: bool, exponent: float = 12.0, fresnel: float | None = None) -> dict:

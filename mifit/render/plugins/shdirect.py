@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +20,7 @@ def make() -> type:
     from mitsuba.python.ad.integrators.common import ADIntegrator
 
     from mifit.appearance import kernels, models
+    from mifit.appearance.arrays import aligned, mean_of_rows, rows_on_device
     from mifit.appearance.formation import form_image
     from mifit.appearance.occlusion import trace_transfer
     from mifit.render.first_hits import FirstHits, recording
@@ -212,7 +214,7 @@ def make() -> type:
         ) -> tuple[mi.UInt32 | None, mi.Color3f, mi.Color3f | None, mi.Bool]:
             """Numbers of the rays that meet something (None: one entry per ray), radiance there, behind, and which."""
             index, si = self._hits.find(scene, ray, active)
-            behind = None if self.hide else self._emitters(scene)[0].radiance(ray.d)
+            behind = None if self.hide else self._emitters(scene)[0].radiance(ray.d, dr.width(ray))
             return index, self._shade(scene, si), behind, self._hits.hit(index, si, ray)
 
         def _shade(self, scene: mi.Scene, si: mi.SurfaceInteraction3f) -> mi.Color3f:
@@ -220,28 +222,11 @@ def make() -> type:
             emitter, compact = self._emitters(scene)
             flat = emitter.project()
             order = round((dr.width(flat) // 3) ** 0.5)
-            coefficients = kernels.colours(flat, order, dr.width(si) if dr.grad_enabled(flat) else 1)
+            coefficients = kernels.colours(flat, order, dr.width(si))
             hit, view = si.is_valid(), si.to_world(si.wi)
             radiance = mi.Color3f(0.0)
-            pointers = si.bsdf()
             traced = self._transfer(scene, si, hit, order) if self.model.needs_shadows else None
-            for bsdf, pointer, two_sided in self._bsdfs(scene):
-                own = hit & (pointers == pointer)
-                local = mi.SurfaceInteraction3f(si)
-                flipped = own & (si.wi.z < 0.0) & two_sided
-                local.wi.z = dr.select(flipped, -si.wi.z, si.wi.z)
-                diffuse, specular, exponent, fresnel, n = bsdf.parameters(local, own)
-                front, cosine = own & (local.wi.z > 0.0), dr.dot(local.wi, n)
-                specular = dr.select(cosine > 0.0, specular, 0.0)
-                if not self.model.normalized:
-                    fresnel = None
-                lobe = self._lobe(exponent, order, self.model.normalized and bsdf.normalized, fresnel)
-                if fresnel is not None:
-                    # The shading below brings the Fresnel factor; here is only where it stops.
-                    factor = kernels.fresnel_factor(cosine, fresnel)
-                    specular = bsdf.at_angle(diffuse, specular, fresnel, cosine) / factor
-                n.z = dr.select(flipped, -n.z, n.z)
-                normal = mi.Vector3f(si.sh_frame.to_world(n))
+            for lobe, front, diffuse, specular, normal in self._surfaces(scene, si, hit, order):
                 shaded = self.model.shade(normal, view, lobe, coefficients, traced)
                 image = form_image(self.ambient, diffuse, shaded[0], specular, shaded[1])
                 radiance = dr.select(front, image, radiance)
@@ -249,13 +234,50 @@ def make() -> type:
                 radiance += self._direct(scene, light, si, hit)
             return radiance
 
-        def _lobe(self, exponent: mi.Float, order: int, normalized: bool, fresnel: mi.Float) -> kernels.PreparedLobe:
-            """The lobe of an exponent, prepared once where all points share it and nothing differentiates by it."""
-            if dr.width(exponent) != 1 or dr.grad_enabled(exponent) or recording():
-                return kernels.prepare_exponent(exponent, order, normalized, fresnel)
-            key = float(np.ravel(exponent)[0]), order, normalized
-            lobe = self._lobes.get(key, lambda: kernels.prepare_exponent(exponent, order, normalized))
-            return replace(lobe, fresnel=fresnel)
+        def _surfaces(
+            self, scene: mi.Scene, si: mi.SurfaceInteraction3f, hit: mi.Bool, order: int
+        ) -> Iterator[tuple[kernels.PreparedLobe, mi.Bool, mi.Color3f, mi.Color3f, mi.Vector3f]]:
+            """Per lobe, the points that have it and face the viewer, their albedos, and their normals.
+
+            Shading is most of a kernel, so that surfaces of the same lobe are shaded together.
+            """
+            lobes: dict[tuple[bool, bool, float | None], tuple] = {}
+            pointers = si.bsdf()
+            for bsdf, pointer, two_sided in self._bsdfs(scene):
+                own = hit & (pointers == pointer)
+                local = mi.SurfaceInteraction3f(si)
+                flipped = own & (si.wi.z < 0.0) & two_sided
+                local.wi.z = dr.select(flipped, -si.wi.z, si.wi.z)
+                diffuse, specular, exponent, fresnel, n = bsdf.parameters(local, own)
+                front, cosine = own & (local.wi.z > 0.0), dr.dot(local.wi, n)
+                specular = mi.Color3f(dr.select(cosine > 0.0, specular, 0.0))
+                if not self.model.normalized:
+                    fresnel = None
+                if fresnel is not None:
+                    # The shading brings the Fresnel factor; here is only where it stops.
+                    factor = kernels.fresnel_factor(cosine, fresnel)
+                    specular = bsdf.at_angle(diffuse, specular, fresnel, cosine) / factor
+                n.z = dr.select(flipped, -n.z, n.z)
+                normal = mi.Vector3f(si.sh_frame.to_world(n))
+                same = dr.width(exponent) == 1 and not dr.grad_enabled(exponent) and not recording()
+                value = float(np.ravel(exponent)[0]) if same else None
+                lobe = self.model.normalized and bsdf.normalized, fresnel is None, value
+                found = front, diffuse, specular, normal, exponent, 0.0 if fresnel is None else fresnel
+                if lobe in lobes:
+                    found = dr.select(front, found, lobes[lobe])
+                lobes[lobe] = found
+            for (normalized, plain, value), (front, *albedos, normal, exponent, fresnel) in lobes.items():
+                prepared = self._lobe(exponent, value, order, normalized)
+                yield replace(prepared, fresnel=None if plain else fresnel), front, *albedos, normal
+
+        def _lobe(self, exponent: mi.Float, value: float | None, order: int, normalized: bool) -> kernels.PreparedLobe:
+            """The lobe of an exponent, prepared once where all points share its value."""
+            if value is None:
+                return kernels.prepare_exponent(exponent, order, normalized)
+            return self._lobes.get(
+                (value, order, normalized),
+                lambda: kernels.prepare_exponent(dr.opaque(mi.Float, value), order, normalized),
+            )
 
         def _emitters(self, scene: mi.Scene) -> tuple[mi.Emitter, list[mi.Emitter]]:
             """The scene's `shenv`, of which there is one, and its other emitters, none of them an environment."""
@@ -306,32 +328,21 @@ def make() -> type:
             self, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: mi.Bool, order: int
         ) -> list[mi.Float]:
             """Traced transfer vectors at the hits, interpolated between vertices."""
-            size = order * order
-            values = [mi.Float(0.0) for _ in range(size)]
-            shapes = scene.shapes()
-            tables = self._tables(shapes, order)
-            for shape, table in zip(shapes, tables, strict=True):
-                own = active & (si.shape == mi.ShapePtr(shape))
-                corners = shape.face_indices(si.prim_index, own)
-                b1, b2 = self._barycentric(shape, si, corners, own)
-                for k in range(size):
-                    at = [dr.gather(mi.Float, table, corner * size + k, own) for corner in corners]
-                    values[k] += at[0] + b1 * (at[1] - at[0]) + b2 * (at[2] - at[0])
-            return values
-
-        def _barycentric(
-            self, shape: mi.Shape, si: mi.SurfaceInteraction3f, corners: mi.Vector3u, active: mi.Bool
-        ) -> tuple[mi.Float, mi.Float]:
+            traced, face = self._traced_scene(scene.shapes(), order), mi.UInt32(si.prim_index)
+            for shape, first in zip(scene.shapes(), traced["first_faces"], strict=True):
+                face[si.shape == mi.ShapePtr(shape)] += dr.opaque(mi.UInt32, first)
             with dr.suspend_grad():
-                p0, p1, p2 = (shape.vertex_position(corner, active) for corner in corners)
+                corners = dr.gather(mi.Vector3u, traced["faces"], face, active)
+                p0, p1, p2 = (dr.gather(mi.Point3f, traced["points"], corner, active) for corner in corners)
                 e1, e2, q = p1 - p0, p2 - p0, si.p - p0
                 a, b, c = dr.dot(e1, e1), dr.dot(e1, e2), dr.dot(e2, e2)
                 d, e = dr.dot(q, e1), dr.dot(q, e2)
                 area = dr.maximum(a * c - b * b, 1e-30)
-                return (c * d - b * e) / area, (a * e - b * d) / area
+                b1, b2 = (c * d - b * e) / area, (a * e - b * d) / area
+            return mean_of_rows(traced["transfer"], corners, (1.0 - b1 - b2, b1, b2), order * order)
 
-        def _tables(self, shapes: list[mi.Shape], order: int) -> list[mi.Float]:
-            """Transfer vectors per vertex of every shape; traced again only when positions changed."""
+        def _traced_scene(self, shapes: list[mi.Shape], order: int) -> Document:
+            """Transfer vectors per vertex, points and faces of all shapes in a row; traced again where points moved."""
             if any(not shape.is_mesh() for shape in shapes):
                 raise InputError("shdirect: model 'shadowed': found a shape that isn't a mesh, expected meshes only")
             buffers = [mi.traverse(shape)[MESH_POSITIONS] for shape in shapes]
@@ -357,10 +368,16 @@ def make() -> type:
                     0,
                     self.bounce_albedo or None,
                 )
-                tables = [mi.Float(part.ravel()) for part in np.split(traced, starts[1:-1])]
                 # The buffers are kept: while they live, no other one can have their index.
-                self._traced = {"key": key, "buffers": buffers, "tables": tables}
-            return self._traced["tables"]
+                self._traced = {
+                    "key": key,
+                    "buffers": buffers,
+                    "transfer": rows_on_device(traced),
+                    "points": mi.Float(aligned(points).ravel()),
+                    "faces": mi.UInt32(aligned(everything, np.uint32).ravel()),
+                    "first_faces": np.cumsum([0, *map(len, faces[:-1])]).tolist(),
+                }
+            return self._traced
 
         def to_string(self) -> str:
             return f"SHDirect[model = {self.model.name}, ambient = {self.ambient}]"

@@ -139,10 +139,10 @@ def make() -> type:
             if not keys or "coefficients" in keys:
                 self._rebuild()
 
-        def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
-            """Clamped radiance from world directions."""
+        def radiance(self, direction: mi.Vector3f, points: int | None = None) -> mi.Color3f:
+            """Clamped radiance from world directions; ``points`` is their number, see `kernels.colours`."""
             basis_there = kernels.sh_basis(self._to_local(direction), self.order)
-            total = kernels.radiance(basis_there, kernels.colours(self.coefficients.array, self.order))
+            total = kernels.radiance(basis_there, kernels.colours(self.coefficients.array, self.order, points))
             return mi.Color3f(dr.maximum(total * self.scale, 0.0))
 
         def _to_local(self, direction: mi.Vector3f) -> mi.Vector3f:
@@ -166,8 +166,9 @@ def make() -> type:
                     mi.Float(np.ascontiguousarray(matrix, dtype=np.float32).ravel()),
                 )
             nodes, matrix = self._projections[count]
-            values = self.radiance(nodes)
             size = dr.width(nodes)
+            values = self.radiance(nodes, size)
+            dr.eval(values)  # for all three sums at once
             node = dr.arange(mi.UInt32, order * order * size) % size
             sums = [dr.block_sum(matrix * dr.gather(mi.Float, values[c], node), size) for c in range(3)]
             flat = dr.zeros(mi.Float, 3 * order * order)
