@@ -220,10 +220,9 @@ def markdown(figures: Figures) -> str:
         lines += [f"| a fit of {part['timesteps']} timesteps | {head} |", "|---|---|---|---|"]
         for name, cost in {**part["steps"], "all": part["total"]}.items():
             row(name, cost)
-    for by, part in figures.get("growth", {}).items():
-        lines += ["", f"| {by} (exponent {part['exponent']:.2f}) | {head} |", "|---|---|---|---|"]
-        for one in part["rows"]:
-            row(str(one[by]), one)
+    if "growth" in figures:
+        powers = ", ".join(f"{by} to the power of {part['exponent']:.2f}" for by, part in figures["growth"].items())
+        lines += ["", f"Processor time grows with {powers}."]
     for stage, rows in figures.get("error", {}).items():
         measure = "mesh_mm" if "mesh_mm" in rows[0] else "third_db"
         lines += ["", f"| {stage}, iterations | {head} | {measure} |", "|---|---|---|---|---|"]
