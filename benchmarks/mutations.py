@@ -167,6 +167,8 @@ MUTATIONS = (
       "bits", "tests/appearance/test_occlusion.py"),
     M("all timesteps have the first one's shadows", "occlusion.VertexTransfer.joined", "parts[s].corners + starts[s]",
       "parts[s].corners", "tests/appearance/test_occlusion.py"),
+    M("all meshes read the first one's transfer vectors", "shdirect.make", "dr.opaque(mi.UInt32, first)",
+      "dr.opaque(mi.UInt32, 0)", "tests/render/test_shdirect.py"),
     M("specular transfers without the lobe's gain", "formation.Appearance.transfers", "found.gain * t", "t",
       "tests/appearance/test_models.py"),
     # Surface and maps.
