@@ -46,7 +46,7 @@ ROWS = {
     "image_based": "image-based rendering on our mesh, where a fitted view sees it",
     "diffuse": "without specular reflection, refitted",
     "full": "everything",
-    "full_seen": "`full` on the same pixels",
+    "full_seen": "`full` on image-based rendering's pixels",
     "dropped": "`full` without its specular part and residual, nothing refitted",
     "paper": "the paper as written (`--preset paper`)",
     "perfect": "`full` from perfect landmarks",

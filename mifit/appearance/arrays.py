@@ -62,11 +62,10 @@ def rows_on_device(values: NDArray) -> Jit:
     return mi.Float(aligned(np.pad(values, ((0, 0), (0, -values.shape[1] % 4)))).ravel())
 
 
-def mean_of_rows(rows: Jit, corners: Sequence[Jit], weights: Sequence[Jit], size: int) -> list[Jit]:
-    """``size`` Floats, not evaluated: weighted sums of the rows (`rows_on_device`) with the numbers ``corners``.
+def weighted_rows(rows: Jit, corners: Sequence[Jit], weights: Sequence[Jit], size: int) -> list[Jit]:
+    """Sum of the rows (`rows_on_device`) numbered ``corners`` by ``weights``: ``size`` Floats, not evaluated.
 
-    Memory is read four numbers at a time, and where they are used: single reads take most of the time that it takes to
-    compile a kernel.
+    Rows are read four numbers at a time: single reads would be most of what there is to compile.
     """
     import drjit as dr
     import mitsuba as mi

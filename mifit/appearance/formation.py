@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mifit.appearance.arrays import Jit, aligned, columns, expect, mean_of_rows, on_device, rows_on_device, stored
+from mifit.appearance.arrays import Jit, aligned, columns, expect, on_device, rows_on_device, stored, weighted_rows
 from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.kernels import PreparedLobe, light_transfer, prepare
 from mifit.appearance.lobe import Lobe
@@ -272,4 +272,4 @@ def _read_transfer(transfer: VertexTransfer, count: int, order: int) -> list[Jit
     values = expect(transfer.values, (len(transfer.values), size), "shadowed transfer")
     weights = expect(transfer.weights, (count, 3), "shadowed transfer: weights")
     corners = [mi.UInt32(aligned(column, np.uint32)) for column in transfer.corners.T]
-    return mean_of_rows(rows_on_device(values), corners, [mi.Float(aligned(w)) for w in weights.T], size)
+    return weighted_rows(rows_on_device(values), corners, [mi.Float(aligned(w)) for w in weights.T], size)

@@ -27,11 +27,11 @@ def sh_basis(d: Jit, order: int) -> list[Jit]:
 
 
 def colours(flat: Jit, order: int, points: int | None = None) -> list[Jit]:
-    """Flat coefficients (B*B*3) -> B*B colours; outside of loops of Dr.Jit's for a number of ``points``.
+    """Flat coefficients (B*B*3) -> B*B colours for a number of ``points``, or inside a Dr.Jit loop (None).
 
-    Those with a gradient are then repeated for all points: their values are the same, but the sums over the points are
-    taken in the kernel that shades, in copies per thread, whereas the gradient of values of width one is a kernel per
-    number, each of which shades everything again. And all are read four at a time, which is compiled much faster.
+    For points they are read four at a time, which compiles much faster. Those with a gradient are repeated for every
+    point. Their values are the same, but the kernel that shades then sums the gradient over the points; values of width
+    one take a kernel per number, each of which shades everything again.
     """
     import drjit as dr
     import mitsuba as mi

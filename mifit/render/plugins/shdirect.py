@@ -20,7 +20,7 @@ def make() -> type:
     from mitsuba.python.ad.integrators.common import ADIntegrator
 
     from mifit.appearance import kernels, models
-    from mifit.appearance.arrays import aligned, mean_of_rows, rows_on_device
+    from mifit.appearance.arrays import aligned, rows_on_device, weighted_rows
     from mifit.appearance.formation import form_image
     from mifit.appearance.occlusion import trace_transfer
     from mifit.render.first_hits import FirstHits, recording
@@ -339,7 +339,7 @@ def make() -> type:
                 d, e = dr.dot(q, e1), dr.dot(q, e2)
                 area = dr.maximum(a * c - b * b, 1e-30)
                 b1, b2 = (c * d - b * e) / area, (a * e - b * d) / area
-            return mean_of_rows(traced["transfer"], corners, (1.0 - b1 - b2, b1, b2), order * order)
+            return weighted_rows(traced["transfer"], corners, (1.0 - b1 - b2, b1, b2), order * order)
 
         def _traced_scene(self, shapes: list[mi.Shape], order: int) -> Document:
             """Transfer vectors per vertex, points and faces of all shapes in a row; traced again where points moved."""
