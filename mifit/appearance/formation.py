@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mifit.appearance.arrays import Jit, aligned, columns, expect, on_device, rows_on_device, stored, weighted_rows
 from mifit.appearance.illumination import DistantLight, Illumination
-from mifit.appearance.kernels import PreparedLobe, light_transfer, prepare
+from mifit.appearance.kernels import PreparedLobe, direct_light, light_transfer, prepare
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import Shade, ShadingModel
 from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, VertexTransfer
@@ -103,8 +103,9 @@ class Appearance:
         light, point = number // count, number % count
         n, v = (dr.gather(mi.Vector3f, x, point) for x in (scene.n, scene.v))
         d = dr.gather(mi.Vector3f, towards, light)
-        seen = mi.UInt(aligned(visible, np.uint32).ravel())
-        both = stored(list(light_transfer(n, v, scene.lobe, [d], seen)), shape[0] * shape[1])
+        seen = mi.UInt(aligned(visible, np.uint32).ravel()) != 0
+        reflected = direct_light(n, v, scene.lobe, d)
+        both = stored([dr.select(seen, one, 0.0) for one in reflected], shape[0] * shape[1])
         return both[:, 0].reshape(shape), both[:, 1].reshape(shape)
 
 
@@ -165,16 +166,18 @@ class BentImage:
             given = on_device(mi.Vector3f, expect(vectors, (count, 3), name))
             return mi.Vector3f(*(dr.dot(row, given) for row in self._rotation))
 
-        n = world(normals, "normals")
-        values = self._image(n)
-        for turn in turns:
-            along = dr.opaque(mi.Float, 0.0)
-            dr.enable_grad(along)
-            image = self._image(n + along * world(turn, "turn"))
-            dr.set_grad(along, 1.0)
-            dr.enqueue(dr.ADMode.Forward, along)
-            dr.traverse(dr.ADMode.Forward)
+        n, angles = world(normals, "normals"), [dr.opaque(mi.Float, 0.0) for _ in turns]
+        for angle, turn in zip(angles, turns, strict=True):
+            dr.enable_grad(angle)
+            n = n + angle * world(turn, "turn")
+        image = self._image(n)
+        values = list(dr.detach(image))
+        for angle in angles:
+            dr.set_grad(angle, 1.0)
+            dr.enqueue(dr.ADMode.Forward, angle)
+            dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearInput | dr.ADFlag.ClearInterior)
             values += dr.grad(image)
+            dr.clear_grad(image)
         found = columns(values, count).reshape(-1, channels, count)
         return found[0].T, [slope.T for slope in found[1:]]
 
@@ -230,9 +233,9 @@ class _Scene:
         import drjit as dr
         import mitsuba as mi
 
-        directions = [mi.Vector3f(*map(float, d)) for d in light.samples()]
-        dr.make_opaque(directions)
-        return lambda n, v: light_transfer(n, v, self.lobe, directions, visible)
+        samples = light.samples()
+        directions, count = mi.Float(aligned(samples).ravel()), dr.opaque(mi.UInt32, len(samples))
+        return lambda n, v: light_transfer(n, v, self.lobe, directions, count, visible)
 
     def with_lights(self, smooth: Shade) -> Shade:
         """Add the compact lights to the shading by smooth light."""

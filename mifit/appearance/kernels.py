@@ -92,8 +92,11 @@ def prepare(lobe: Lobe, order: int) -> PreparedLobe:
 
     if not lobe.exponent > 0:
         raise InputError(f"exponent: found {float(lobe.exponent)}, expected a number from 1 to 10000")
-    # Opaque: a kernel is compiled once, not once per exponent.
-    return prepare_exponent(dr.opaque(mi.Float, float(lobe.exponent)), order, lobe.normalized, lobe.fresnel)
+    y = 2.0 * np.log(np.clip(lobe.exponent, EXPONENT_MIN, EXPONENT_MAX)) / np.log(EXPONENT_MAX) - 1.0
+    rows = np.polynomial.chebyshev.chebval(y, lobe_table(order).transpose(2, 0, 1))
+    polynomials, exponent = [list(map(mi.Float, row)) for row in rows.tolist()], mi.Float(float(lobe.exponent))
+    dr.make_opaque(polynomials, exponent)  # a kernel is compiled once, not once per exponent
+    return _with_peak(order, polynomials, exponent, lobe.normalized, lobe.fresnel)
 
 
 def prepare_exponent(exponent: Jit, order: int, normalized: bool = True, fresnel: Jit = None) -> PreparedLobe:
@@ -102,11 +105,14 @@ def prepare_exponent(exponent: Jit, order: int, normalized: bool = True, fresnel
 
     table = lobe_table(order).tolist()
     m = dr.clip(exponent, EXPONENT_MIN, EXPONENT_MAX)
-    y = dr.log(m) * (2.0 / float(np.log(EXPONENT_MAX))) - 1.0
-    t = _chebyshev(y, len(table[0][0]))
+    t = _chebyshev(dr.log(m) * (2.0 / float(np.log(EXPONENT_MAX))) - 1.0, len(table[0][0]))
     polynomials = [[radiance(row, t) for row in moment] for moment in table]
-    if dr.width(exponent) == 1 and not dr.grad_enabled(exponent):
-        dr.eval(polynomials)  # computed once; with a gradient it is cheaper per point, with one sum at the end
+    return _with_peak(order, polynomials, exponent, normalized, fresnel)
+
+
+def _with_peak(order: int, polynomials: list[list[Jit]], exponent: Jit, normalized: bool, fresnel: Jit) -> PreparedLobe:
+    import drjit as dr
+
     peak = normalization(exponent)
     if normalized:
         return PreparedLobe(order, polynomials, 1.0, exponent, peak, fresnel)
@@ -196,37 +202,43 @@ def dominant_direction(coefficients: Sequence[Jit]) -> Jit:
     return dr.select(length > floor, d * dr.rsqrt(dr.maximum(length, floor)), mi.Vector3f(0.0, 0.0, 1.0))
 
 
-def light_transfer(n: Jit, v: Jit, lobe: PreparedLobe, directions: Sequence[Jit], visible: Jit) -> tuple[Jit, Jit]:
-    """Radiance of a white diffuse and of a fully specular point per unit of a compact light's colour.
-
-    Nothing is band limited here: cosine and lobe are those of the light's own directions, and shadows are traced.
-
-    ``directions`` stand for the light's extent, at most 32 (``DistantLight.samples``); bit d of ``visible`` is 1 where
-    direction d is visible.
-    """
+def direct_light(n: Jit, v: Jit, lobe: PreparedLobe, d: Jit) -> tuple[Jit, Jit]:
+    """What a white diffuse and a fully specular point reflect of unit irradiance from a direction."""
     import drjit as dr
 
-    cosine_view = dr.dot(n, v)
-    mirror = 2.0 * cosine_view * n - v
-    peak = lobe.peak
+    cosine, cosine_view = dr.maximum(dr.dot(n, d), 0.0), dr.dot(n, v)
     if lobe.fresnel is not None:
-        peak = peak * fresnel_factor(cosine_view, lobe.fresnel)
-    diffuse, specular = 0.0, 0.0
-    for number, d in enumerate(directions):
-        open_sky = (visible & (1 << number)) != 0
-        cosine = dr.maximum(dr.dot(n, d), 0.0)
-        if lobe.fresnel is not None:
-            # About the mirror direction: the half vector's cosine of a view along the normal is that of half the angle.
-            off = dr.dot(mirror, d)
-            falloff = dr.maximum(off, 0.0) * dr.power(dr.clip(0.5 + 0.5 * off, 1e-6, 1.0), 0.5 * lobe.exponent)
-        else:
-            h = v + d
-            cos_h = dr.dot(n, h * dr.rsqrt(dr.maximum(dr.squared_norm(h), 1e-8)))
-            falloff = cosine * dr.power(dr.clip(cos_h, 1e-4, 1.0), lobe.exponent)
-        diffuse = diffuse + dr.select(open_sky, cosine, 0.0)
-        specular = specular + dr.select(open_sky, falloff, 0.0)
-    share = 1.0 / len(directions)
-    return diffuse * (share / np.pi), specular * (share * peak)
+        # About the mirror direction: the half vector's cosine of a view along the normal is that of half the angle.
+        off = dr.dot(2.0 * cosine_view * n - v, d)
+        falloff = dr.maximum(off, 0.0) * dr.power(dr.clip(0.5 + 0.5 * off, 1e-6, 1.0), 0.5 * lobe.exponent)
+        falloff *= fresnel_factor(cosine_view, lobe.fresnel)
+    else:
+        h = v + d
+        cos_h = dr.dot(n, h * dr.rsqrt(dr.maximum(dr.squared_norm(h), 1e-8)))
+        falloff = cosine * dr.power(dr.clip(cos_h, 1e-4, 1.0), lobe.exponent)
+    return cosine / dr.pi, falloff * lobe.peak
+
+
+def light_transfer(n: Jit, v: Jit, lobe: PreparedLobe, directions: Jit, count: Jit, visible: Jit) -> tuple[Jit, Jit]:
+    """Radiance of a white diffuse and of a fully specular point per unit of a compact light's colour.
+
+    Nothing here is band limited: cosine and lobe are those of the light's own directions, and shadows are traced.
+
+    A ``count`` (UInt32) of ``directions``, flat, stands for the light's extent, at most 32 (``DistantLight.samples``);
+    bit d of ``visible`` is 1 where direction d is visible. They are gone through in a loop: written out one by one they
+    would be most of what there is to compile.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    def add(k: Jit, diffuse: Jit, specular: Jit, n: Jit, v: Jit) -> tuple[Jit, ...]:
+        d, s = direct_light(n, v, lobe, dr.gather(mi.Vector3f, directions, k))
+        seen = (visible >> k) & 1 != 0
+        return k + 1, diffuse + dr.select(seen, d, 0.0), specular + dr.select(seen, s, 0.0), n, v
+
+    start = mi.UInt32(0), mi.Float(0.0), mi.Float(0.0), n, v
+    _, diffuse, specular, *_ = dr.while_loop(start, lambda k, *_: k < count, add, label="light")
+    return diffuse / count, specular / count
 
 
 def unoccluded(n: Jit, axis: Jit, traced: Sequence[Jit], order: int) -> Jit:
@@ -237,6 +249,11 @@ def unoccluded(n: Jit, axis: Jit, traced: Sequence[Jit], order: int) -> Jit:
     """
     import drjit as dr
 
-    y = sh_basis(axis, order)
-    open_sky = radiance(diffuse_transfer(n, order), y)
-    return dr.clip(radiance(traced, y) / dr.maximum(open_sky, 0.02), 0.0, 1.0)
+    # By the addition theorem the unshadowed vector's value depends on the angle between normal and axis alone.
+    legendre = np.polynomial.legendre.leg2poly(
+        (2.0 * np.arange(order) + 1.0) / (4.0 * np.pi**2) * cosine_coefficients(order)
+    )
+    x, open_sky = dr.dot(n, axis), 0.0
+    for factor in legendre[::-1].tolist():
+        open_sky = open_sky * x + factor
+    return dr.clip(radiance(traced, sh_basis(axis, order)) / dr.maximum(open_sky, 0.02), 0.0, 1.0)

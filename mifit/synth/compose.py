@@ -204,8 +204,6 @@ def _write_capture(
     """Render and write one capture; ``transforms.json`` comes last, so a broken-off folder isn't taken for whole."""
     advance(0)
     tracer = PathTracer(_materials(subject), environment)
-    first = _surfaces(subject, subject.poses[0], _world_vertices(subject, subject.poses[0]))
-    exposure = exposure_of(tracer.render(first, [cameras[0].resized(0.25)], 16, seed=subject.seed)[0])  # a quick one
     maps = subject.skin["face"]
     halves = {name: getattr(maps, name).astype(np.float16) for name in ("albedo", "specular", "roughness", "bump")}
     with replacing(folder / "truth" / "maps.npz") as temporary:
@@ -214,12 +212,14 @@ def _write_capture(
         np.savez_compressed(temporary, faces=subject.model.faces, face_mask=subject.model.face_mask)
     visibility = SurfaceScene(subject.neutral, subject.model.faces)
     bias = head.draw_bias(subject.seed, subject.landmark_bias / 10.0)  # mm -> cm
-    shots = []
+    exposure, shots = 0.0, []
     advance(1)
     for t, pose in enumerate(subject.poses):
         world = _world_vertices(subject, pose)
         seed = (subject.seed * 100_003 + t) % (MAX_SEED + 1)
         images = tracer.render(_surfaces(subject, pose, world), cameras, spp, seed=seed)
+        if not t:
+            exposure = exposure_of(images[0])
         visibility.update(world)
         for c, (camera, image) in enumerate(zip(cameras, images, strict=True)):
             rng = np.random.default_rng([subject.seed, t, c, 21])

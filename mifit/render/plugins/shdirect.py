@@ -22,6 +22,7 @@ def make() -> type:
     from mifit.appearance import kernels, models
     from mifit.appearance.arrays import aligned, rows_on_device, weighted_rows
     from mifit.appearance.formation import form_image
+    from mifit.appearance.lobe import Lobe
     from mifit.appearance.occlusion import trace_transfer
     from mifit.render.first_hits import FirstHits, recording
     from mifit.render.gbuffer import MESH_FACES, MESH_POSITIONS, SurfaceScene
@@ -276,7 +277,7 @@ def make() -> type:
                 return kernels.prepare_exponent(exponent, order, normalized)
             return self._lobes.get(
                 (value, order, normalized),
-                lambda: kernels.prepare_exponent(dr.opaque(mi.Float, value), order, normalized),
+                lambda: kernels.prepare(Lobe(value, normalized=normalized), order),
             )
 
         def _emitters(self, scene: mi.Scene) -> tuple[mi.Emitter, list[mi.Emitter]]:
