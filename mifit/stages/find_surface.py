@@ -156,8 +156,7 @@ def find_surface(
     result = close_again(model, rest.state.without_motion(model, skin).estimate(geometry, model), closed, lids)
     result, closed_lips = close_openings(capture, model, result, cameras, lips)
     world = result.vertices.astype(np.float64)
-    residuals = sight.epipolar_residuals(pairs, result.timesteps, world, result.rotation, max(finest, 1))
-    likenesses = sight.likenesses(pairs, result.timesteps[0], world[0], max(finest, 1))
+    residuals, likenesses = sight.agreement(pairs, result.timesteps, world, result.rotation)
     seconds = time.perf_counter() - began
     moved = np.linalg.norm(rest.state.displacement, axis=1)[np.unique(model.faces[model.face_mask])] * model.unit_mm
     phase = {
@@ -409,22 +408,24 @@ class Sight:
         found = find_borders(self.capture, scene, self.cameras, timestep, min(factor, 1.0))
         return found.moved(scene.faces, vertices - scene.vertices)
 
-    def epipolar_residuals(
-        self, pairs: Sequence, timesteps: Sequence[int], world: NDArray, rotation: NDArray, level: int
-    ) -> dict[str, float | None]:
-        """Median distance from one another's epipolar lines for each pair of views, pixels of the images."""
-        texels, steps = self.texels(level)[0], sorted({0, len(world) - 1})
-        posed = [self.posed(timesteps[k], world[k], texels, level) for k in steps]
-        found: dict[str, float | None] = {}
-        for a, b in pairs:
-            residual = epipolar_residual(texels, posed, rotation[steps], self.pixel * 2.0**level, (a, b))
-            found[f"{self.cameras[a]}, {self.cameras[b]}"] = None if residual is None else residual * 2.0**level
-        return found
+    def agreement(
+        self, pairs: Sequence, timesteps: Sequence[int], world: NDArray, rotation: NDArray
+    ) -> tuple[dict[str, float | None], dict[str, float | None]]:
+        """How well views agree on surfaces (T, V, 3), for each pair of cameras.
 
-    def likenesses(self, pairs: Sequence, timestep: int, vertices: NDArray, level: int) -> dict[str, float | None]:
-        """Correlation of what each pair of views shows on one timestep's surface (V, 3)."""
-        posed = self.posed(timestep, vertices, self.texels(level)[0], level)
-        return {f"{self.cameras[a]}, {self.cameras[b]}": likeness(posed, (a, b)) for a, b in pairs}
+        Returned are the median distance from one another's epipolar lines, pixels of the images, at the first and the
+        last timestep; and the correlation of what they show at the first one.
+        """
+        level, steps = max(self.finest, 1), sorted({0, len(world) - 1})
+        texels = self.texels(level)[0]
+        posed = [self.posed(timesteps[k], world[k], texels, level) for k in steps]
+        residuals, likenesses = dict[str, float | None](), dict[str, float | None]()
+        for a, b in pairs:
+            name = f"{self.cameras[a]}, {self.cameras[b]}"
+            residual = epipolar_residual(texels, posed, rotation[steps], self.pixel * 2.0**level, (a, b))
+            residuals[name] = None if residual is None else residual * 2.0**level
+            likenesses[name] = likeness(posed[0], (a, b))
+        return residuals, likenesses
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ SMALL = {
     "reflectance.exponent": 50, "reflectance.max_iterations": 3,
 }  # fmt: skip
 """Settings of fits that take seconds: what the steps find is tested elsewhere, here that they run as the pages say."""
-SIZES = ["--model", "builtin:coarse", "--width", "96", "--height", "72", "--spp", "16"]
+SIZES = ["--model", "builtin:coarse", "--width", "120", "--height", "90", "--spp", "16"]
 
 
 def commands() -> list[tuple[str, str]]:
@@ -181,7 +181,7 @@ def reduced(words: list[str], workspace: Path) -> list[str]:
             "fit.timesteps=[0]",
             *(f"fit.{key}={value}" for key, value in SMALL.items()),
         ]
-        synth = {"timesteps": 1, "width": 96, "height": 72, "spp": 16, "model": '"builtin:coarse"'}
+        synth = {"timesteps": 1, "width": 120, "height": 90, "spp": 16, "model": '"builtin:coarse"'}
         if not kept:
             changes += [f"fit.synth.{key}={value}" for key, value in synth.items()]
     else:
