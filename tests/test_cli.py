@@ -15,6 +15,7 @@ import pytest
 from mifit.cli import build_parser, main
 from mifit.cli.arguments import tell
 from mifit.cli.options import COMMANDS as TABLE
+from mifit.config import ReflectanceConfig
 from mifit.core.diagnostics import Diagnostic
 
 COMMANDS = (
@@ -256,3 +257,16 @@ def test_every_option_says_what_it_is_and_what_it_is_by_default():
         if (numbers or action.choices) and action.default is not None and "default" not in action.help:
             silent.append(name)
     assert silent == []
+
+
+@pytest.mark.slow
+def test_a_demo_runs_again_where_it_ran_before(variant, tmp_path, monkeypatch) -> None:
+    """The second one clears away what the first one left, but not what it has written itself."""
+    small = {"model": "builtin:coarse", "width": 120, "height": 90, "spp": 16, "timesteps": 1}
+    monkeypatch.setattr("mifit.cli.fits.DEMO", small)
+    monkeypatch.setattr("mifit.cli.fits.ReflectanceConfig", lambda **_: ReflectanceConfig(texture_size=32))
+    for _ in range(2):
+        assert main(["demo", "--out", str(tmp_path / "demo"), "--quiet"]) == 0
+        assert {"first.png", "third.json", "result.json", "report.html"} <= {
+            f.name for f in (tmp_path / "demo").iterdir()
+        }

@@ -64,18 +64,20 @@ def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> No
 
     out: Path = arguments.out
     capture = mifit.Capture.load(folder)
-    first: list[Path] = []
+    picture, shown = out / "first.png", list[bytes]()
 
     def show(result: Reconstruction) -> None:
-        if not first:
-            first.append(out / "first.png")
-            write_bytes(first[0], encode_png(beside(result, capture, result.cameras[0], result.timesteps[0])))
-            say(arguments, f"First picture, of the model before light and skin are found: {first[0]}")
+        if not shown:
+            shown.append(encode_png(beside(result, capture, result.cameras[0], result.timesteps[0])))
+            write_bytes(picture, shown[0])
+            say(arguments, f"First picture, of the model before light and skin are found: {picture}")
 
     model, config = mifit.MorphableModel.load(DEMO["model"]), FitConfig(reflectance=ReflectanceConfig(texture_size=256))
     options: Document = {"seed": arguments.seed, "progress": progress, "force": True, "watch": show}
     result = fit_into(out, capture, model, cameras=("left", "right"), config=config, **options)
-    remember(out, [path.name for path in first])  # after the fit, which clears away what a result before it left
+    for content in shown:  # the fit clears away what a result before it left, the same picture among it
+        write_bytes(picture, content)
+        remember(out, [picture.name])
     judged: Document = {"timesteps": None, "passes": False, "fitted": False, "strict": False, "baseline": True}
     judged |= {"camera": "third", "region": "face", "capture": folder, "json": out / "third.json"}
     judge(Namespace(quiet=arguments.quiet, result=out, **judged), result, capture)
