@@ -203,7 +203,7 @@ def dominant_direction(coefficients: Sequence[Jit]) -> Jit:
 
 
 def direct_light(n: Jit, v: Jit, lobe: PreparedLobe, d: Jit) -> tuple[Jit, Jit]:
-    """What a white diffuse and a fully specular point reflect of unit irradiance from a direction."""
+    """Radiance of a white diffuse and of a fully specular point under unit irradiance from a direction ``d``."""
     import drjit as dr
 
     cosine, cosine_view = dr.maximum(dr.dot(n, d), 0.0), dr.dot(n, v)
@@ -224,9 +224,9 @@ def light_transfer(n: Jit, v: Jit, lobe: PreparedLobe, directions: Jit, count: J
 
     Nothing here is band limited: cosine and lobe are those of the light's own directions, and shadows are traced.
 
-    A ``count`` (UInt32) of ``directions``, flat, stands for the light's extent, at most 32 (``DistantLight.samples``);
-    bit d of ``visible`` is 1 where direction d is visible. They are gone through in a loop: written out one by one they
-    would be most of what there is to compile.
+    ``directions`` (3 * count, flat) stand for the light's extent; there are ``count`` (UInt32) of them, at most 32
+    (``DistantLight.samples``). Bit d of ``visible`` is 1 where direction d is visible. A loop goes through them: a
+    kernel with a copy of the lobe for each takes long to compile.
     """
     import drjit as dr
     import mitsuba as mi

@@ -75,7 +75,7 @@ def _fit_and_judge(arguments: Namespace, folder: Path, progress: Progress) -> No
     model, config = mifit.MorphableModel.load(DEMO["model"]), FitConfig(reflectance=ReflectanceConfig(texture_size=256))
     options: Document = {"seed": arguments.seed, "progress": progress, "force": True, "watch": show}
     result = fit_into(out, capture, model, cameras=("left", "right"), config=config, **options)
-    for content in shown:  # the fit clears away what a result before it left, the same picture among it
+    for content in shown:  # again: the fit deletes the files of an earlier result, and this one if it is the same
         write_bytes(picture, content)
         remember(out, [picture.name])
     judged: Document = {"timesteps": None, "passes": False, "fitted": False, "strict": False, "baseline": True}
