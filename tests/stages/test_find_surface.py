@@ -25,7 +25,7 @@ from mifit.stages.fit_geometry import fit_geometry, fit_pose_expression
 from mifit.stages.geometry.parameters import exponential
 from mifit.stages.geometry.surfaces import Scenes, displaced
 from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surface
-from mifit.stages.surface.flow import GLARE_DEVIATIONS, _precision, _without_glare, match
+from mifit.stages.surface.flow import GLARE_DEVIATIONS, _Painted, _precision, _without_glare, match
 from mifit.stages.surface.outline import joined
 from mifit.stages.surface.views import pose_texels
 from tests.morphable.intersections import intersections
@@ -368,6 +368,24 @@ def test_a_known_offset_is_found_between_views_and_over_time(model, bumpy, pair)
     good = found.precision > np.quantile(found.precision[found.precision > 0], 0.5)
     assert good.sum() > 200
     assert np.median(found.offset[good]) == pytest.approx(-0.15, abs=0.02)
+
+
+def test_what_one_view_alone_shows_changes_nothing_in_the_comparison():
+    """A bright cheek that each view sees on its own side of a nose: on the nose both show the same."""
+    nose = 0.1 * np.random.default_rng(0).standard_normal((64, 64)).astype(np.float32)
+    sides, empty = (slice(0, 24), slice(40, 64)), np.zeros((64, 64, 2), np.float32)
+    views = []
+    for own, hidden in (sides, sides[::-1]):
+        log, shown = nose.copy(), np.ones((64, 64), np.float32)
+        log[:, own] += 2.0
+        shown[:, hidden] = 0.0
+        look = np.stack([shown, log], axis=-1)
+        views.append(_Painted(None, log, empty, empty, empty, look))  # type: ignore[arg-type]
+    whole = slice(0, 64), slice(0, 64)
+    one, other = views[0].beside(views[1], whole), views[1].beside(views[0], whole)
+    np.testing.assert_allclose(one.feature, other.feature, atol=1e-6)
+    assert one.feature[:, 24:40].std() > 0.03 and not one.feature[:, :24].any()
+    assert one.look[:, 24:40, 0].mean() > 0.9 and not one.look[:, 40:, 0].any()
 
 
 def test_a_match_off_the_epipolar_line_does_not_count(model, bumpy):

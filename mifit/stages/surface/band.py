@@ -12,11 +12,11 @@ from mifit.core.camera import Camera
 from mifit.core.image import box
 from mifit.sampling.visibility import DARKEST
 
-FINE, WINDOW = 0.6, 3.0
-"""Blurs whose difference is the band, pixels of the level."""
-SHEEN = 0.8
+FINE, WINDOW = 0.6, 4.0
+"""Blurs whose difference is the band, pixels or texels of the level; the second chosen on all development heads."""
+SHEEN = 0.9
 """Part of the least channel that all levels but the finest leave out. Highlights have much of it and move over skin,
-which has little; at the finest level noise would remain. Chosen on gloss, Emily c3,c4 and `ict_301`."""
+which has little; at the finest level noise would remain. Chosen on all development heads."""
 LARGEST = 0.3
 """Contrast in the logarithm above which a feature stops growing: highlights, hair, the edges of cast shadows."""
 
@@ -31,8 +31,9 @@ class FeatureImage:
         Of the full image.
     factor : float
         Pixels of the level per pixel of the image, at most 1.
-    values : (h, w, 3) float32
-        Feature, 1 where it is measured, and the logarithm between features and shading: how bright it is there.
+    values : (h, w, 4) float32
+        Feature, 1 where it is measured, the logarithm between features and shading, which says how bright it is there,
+        and the logarithm of which the feature is a band.
     """
 
     camera: Camera
@@ -53,7 +54,7 @@ class FeatureImage:
         return np.nan_to_num(pixels, copy=False, nan=-10.0)
 
     def sample(self, points: NDArray) -> NDArray[np.float32]:
-        """(N, 3) values at world points (N, 3), 0 outside the image."""
+        """(N, 4) values at world points (N, 3), 0 outside the image."""
         return look_up(self.values, self.place(points))
 
 
@@ -71,19 +72,27 @@ def feature_image(camera: Camera, image: NDArray, valid: NDArray[np.bool_], fact
         weight = np.asarray(cv2.resize(weight, size, interpolation=cv2.INTER_AREA), np.float32)
         small = (np.asarray(cv2.resize(x, size, interpolation=cv2.INTER_AREA), np.float32) for x in layers)
         layers = [layer / np.maximum(weight, 1e-3) for layer in small]
-    usable = (weight > 0.9).astype(np.float32)
+    usable = weight > 0.9
     # Blurs reach four deviations far; nothing is read where nothing is usable.
-    part = box(usable > 0, int(np.ceil(4.0 * WINDOW)) + 1)
+    part = box(usable, int(np.ceil(4.0 * WINDOW)) + 1)
     shown = usable[part]
     skin, whole = (np.log(np.maximum(layers[k][part], 0.0) + DARKEST) * shown for k in (0, -1))
-
-    def blurred(log: NDArray, deviation: float) -> NDArray:
-        return cv2.GaussianBlur(log, (0, 0), deviation) / np.maximum(cv2.GaussianBlur(shown, (0, 0), deviation), 1e-3)
-
-    band = LARGEST * np.tanh((blurred(skin, FINE) - blurred(skin, WINDOW)) / LARGEST)
-    values = np.zeros((*usable.shape, 3), np.float32)
-    values[part] = np.stack([band * shown, shown, blurred(whole, WINDOW) * shown], axis=-1)
+    values = np.zeros((*usable.shape, 4), np.float32)
+    values[part] = np.stack([band_pass(skin, shown), shown, _blurred(whole, shown, WINDOW), skin], axis=-1)
     return FeatureImage(camera, factor, values)
+
+
+def band_pass(log: NDArray[np.float32], shown: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The band of a logarithm (H, W) over what is ``shown``, held in check; 0 elsewhere."""
+    band = _blurred(log, shown, FINE) - _blurred(log, shown, WINDOW)
+    return np.asarray(LARGEST * np.tanh(band / LARGEST), np.float32)
+
+
+def _blurred(log: NDArray, shown: NDArray[np.bool_], deviation: float) -> NDArray[np.float32]:
+    """Mean around each pixel of what is shown; 0 elsewhere."""
+    mask = shown.astype(np.float32)
+    weight = np.maximum(cv2.GaussianBlur(mask, (0, 0), deviation), 1e-3)
+    return np.asarray(mask * cv2.GaussianBlur(log * mask, (0, 0), deviation) / weight, np.float32)
 
 
 def look_up(values: NDArray, pixels: NDArray, columns: int = 4096) -> NDArray[np.float32]:

@@ -22,7 +22,7 @@ from mifit.core.mesh import dot, normalize
 from mifit.core.metrics import INDEPENDENT, median_deviation
 from mifit.core.process import threads
 from mifit.core.uv import TexelMap
-from mifit.stages.surface.band import FeatureImage, look_up
+from mifit.stages.surface.band import FeatureImage, band_pass, look_up
 
 CONTRAST = 400.0
 """Steps of an 8-bit texture per unit of a feature."""
@@ -167,12 +167,14 @@ def matches(
                 return []
             part = box(both, PATCH)
             rows = number.reshape(both.shape)[part]
-            forth, back = _flow(one.texture[part], other.texture[part]), _flow(other.texture[part], one.texture[part])
-            found = []
-            for (a, b), ways in zip((pair, pair[::-1]), ((forth, back), (back, forth)), strict=True):
-                turn = rotation[a[0]] @ rotation[b[0]].T  # of row vectors
-                found.append((a, b, _matches(shown[a].cut(part), shown[b].cut(part), rows, ways, turn, step)))
-            return found
+            one, other = one.beside(other, part), other.beside(one, part)
+            textures = [np.clip(128.0 + CONTRAST * view.feature, 0, 255).astype(np.uint8) for view in (one, other)]
+            forth, back = _flow(*textures), _flow(*textures[::-1])
+            turn = rotation[pair[0][0]] @ rotation[pair[1][0]].T  # of row vectors
+            return [
+                (*pair, _matches(one, other, rows, (forth, back), turn, step)),
+                (*pair[::-1], _matches(other, one, rows, (back, forth), turn.T, step)),
+            ]
 
         for found in pool.map(both_ways, pairs):
             yield from found
@@ -185,18 +187,18 @@ class _Painted:
     Attributes
     ----------
     image : FeatureImage
-    texture : (S, S) uint8
-        Feature.
+    feature : (S, S) float32
+        The logarithm, and its band once the view is compared with another (`beside`).
     position, normal : (S, S, 3) float32
         World space.
     pixel : (S, S, 2) float32
         Where the view shows it.
     look : (S, S, 2) float32
-        1 where the view shows the surface and contrast on it, else 0, and its log brightness.
+        1 where the view shows the surface, and contrast on it once it is compared, else 0; its log brightness.
     """
 
     image: FeatureImage
-    texture: NDArray[np.uint8]
+    feature: NDArray[np.float32]
     position: NDArray[np.float32]
     normal: NDArray[np.float32]
     pixel: NDArray[np.float32]
@@ -207,19 +209,25 @@ class _Painted:
         """A view of the texels."""
         image = step.images[view]
         pixel = image.place(step.position)
-        feature, valid, bright = look_up(image.values, pixel).T
+        _, valid, bright, log = look_up(image.values, pixel).T
         shown = (step.seen[view] > 0) & (valid > 0.99)
-        texture = texels.to_map(np.where(shown, feature, np.float32(0)))
-        mean, square = (cv2.blur(each, (PATCH, PATCH)) for each in (texture, texture**2))
-        shown &= texels.from_map(square - mean**2) > NOISE**2
-        texture = np.clip(128.0 + CONTRAST * texture, 0, 255)
+        feature = texels.to_map(log)
         look = texels.to_map(np.stack([shown, bright], axis=1).astype(np.float32))
         position, normal, pixel = (texels.to_map(x.astype(np.float32)) for x in (step.position, step.normal, pixel))
-        return cls(image, texture.astype(np.uint8), position, normal, pixel, look)
+        return cls(image, feature, position, normal, pixel, look)
 
-    def cut(self, part: tuple[slice, slice]) -> _Painted:
-        """A part of the maps."""
-        maps = {name: getattr(self, name)[part] for name in ("texture", "position", "normal", "pixel", "look")}
+    def beside(self, other: _Painted, part: tuple[slice, slice]) -> _Painted:
+        """A part of the maps, to be compared with another view.
+
+        The band is that of what both views show. A nose hides one cheek from one of them and the other cheek from the
+        other: averages that held those would differ on the nose itself, and move it.
+        """
+        maps = {name: getattr(self, name)[part] for name in ("position", "normal", "pixel", "look", "feature")}
+        both = (maps["look"][..., 0] > 0) & (other.look[part][..., 0] > 0)
+        feature = maps["feature"] = band_pass(maps["feature"], both)
+        mean, square = (cv2.blur(each, (PATCH, PATCH)) for each in (feature, feature**2))
+        contrast = both & (square - mean**2 > NOISE**2)
+        maps["look"] = np.stack([contrast.astype(np.float32), maps["look"][..., 1]], axis=-1)
         return replace(self, **maps)
 
 
