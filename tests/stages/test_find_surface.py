@@ -370,6 +370,26 @@ def test_a_known_offset_is_found_between_views_and_over_time(model, bumpy, pair)
     assert np.median(found.offset[good]) == pytest.approx(-0.15, abs=0.02)
 
 
+def test_features_of_the_face_know_nothing_of_the_background(model, bumpy):
+    """Timesteps are aligned by them: a background that stays would hold a head that moves."""
+    texels = rasterize_uv(model.uv, model.faces_uv, 240, model.face_mask)
+    vertices = bumpy.vertices[0]
+    scene = SurfaceScene(vertices, model.faces)
+
+    def lit(name, _, frame):
+        behind = ~scene.gbuffer(bumpy.camera(name)).mask[..., None]
+        return replace(frame, image=np.where(behind, np.float32(5.0), frame.image))
+
+    for factor in (1.0, 0.5):
+        features = [
+            np.stack([image.sample(at.position) for image in at.images])[..., :2]
+            for capture in (bumpy, bumpy.changed(lit))
+            for at in [pose_texels(capture, scene, vertices, model.faces, texels, BOTH, 0, factor)]
+        ]
+        assert features[0][..., 1].mean() > 0.5
+        np.testing.assert_allclose(*features, atol=1e-5)
+
+
 def test_what_one_view_alone_shows_changes_nothing_in_the_comparison():
     """A bright cheek that each view sees on its own side of a nose: on the nose both show the same."""
     nose = 0.1 * np.random.default_rng(0).standard_normal((64, 64)).astype(np.float32)
