@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
 
 GRAZING_COSINE = 0.2  # beyond about 78 degrees a pixel covers too much surface to compare it
-OUTLINE_SCALE = 0.5  # outlines are found in images of this scale
+OUTLINE_SCALE = 0.5  # outlines are found in images of this scale; chosen on all development heads
 LONGEST_SIDE = 1000.0  # pixels of images whose texture is compared over time: larger ones are reduced
 LARGEST_TEXTURE = 512  # texels along a side, of that
 OUTLINE_SLOPE = 12.0  # depth step between neighbouring pixels, in pixel lengths, that is an outline
