@@ -402,9 +402,9 @@ def test_what_one_view_alone_shows_changes_nothing_in_the_comparison():
         look = np.stack([shown, log], axis=-1)
         views.append(_Painted(None, log, empty, empty, empty, look))  # type: ignore[arg-type]
     whole = slice(0, 64), slice(0, 64)
-    one, other = views[0].beside(views[1], whole), views[1].beside(views[0], whole)
-    np.testing.assert_allclose(one.feature, other.feature, atol=1e-6)
-    assert one.feature[:, 24:40].std() > 0.03 and not one.feature[:, :24].any()
+    (one, first), (_, second) = views[0].beside(views[1], whole), views[1].beside(views[0], whole)
+    np.testing.assert_allclose(first, second, atol=1e-6)
+    assert first[:, 24:40].std() > 0.03 and not first[:, :24].any()
     assert one.look[:, 24:40, 0].mean() > 0.9 and not one.look[:, 40:, 0].any()
 
 

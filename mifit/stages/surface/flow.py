@@ -167,8 +167,8 @@ def matches(
                 return []
             part = box(both, PATCH)
             rows = number.reshape(both.shape)[part]
-            one, other = one.beside(other, part), other.beside(one, part)
-            textures = [np.clip(128.0 + CONTRAST * view.feature, 0, 255).astype(np.uint8) for view in (one, other)]
+            (one, first), (other, second) = one.beside(other, part), other.beside(one, part)
+            textures = [np.clip(128.0 + CONTRAST * band, 0, 255).astype(np.uint8) for band in (first, second)]
             forth, back = _flow(*textures), _flow(*textures[::-1])
             turn = rotation[pair[0][0]] @ rotation[pair[1][0]].T  # of row vectors
             return [
@@ -187,8 +187,8 @@ class _Painted:
     Attributes
     ----------
     image : FeatureImage
-    feature : (S, S) float32
-        The logarithm, and its band once the view is compared with another (`beside`).
+    log : (S, S) float32
+        Logarithm of the image.
     position, normal : (S, S, 3) float32
         World space.
     pixel : (S, S, 2) float32
@@ -198,7 +198,7 @@ class _Painted:
     """
 
     image: FeatureImage
-    feature: NDArray[np.float32]
+    log: NDArray[np.float32]
     position: NDArray[np.float32]
     normal: NDArray[np.float32]
     pixel: NDArray[np.float32]
@@ -211,24 +211,23 @@ class _Painted:
         pixel = image.place(step.position)
         _, valid, bright, log = look_up(image.values, pixel).T
         shown = (step.seen[view] > 0) & (valid > 0.99)
-        feature = texels.to_map(log)
         look = texels.to_map(np.stack([shown, bright], axis=1).astype(np.float32))
         position, normal, pixel = (texels.to_map(x.astype(np.float32)) for x in (step.position, step.normal, pixel))
-        return cls(image, feature, position, normal, pixel, look)
+        return cls(image, texels.to_map(log), position, normal, pixel, look)
 
-    def beside(self, other: _Painted, part: tuple[slice, slice]) -> _Painted:
-        """A part of the maps, to be compared with another view.
+    def beside(self, other: _Painted, part: tuple[slice, slice]) -> tuple[_Painted, NDArray[np.float32]]:
+        """A part of the maps, ``look`` only where there is contrast, and the band to compare with another view's.
 
         The band is that of what both views show. A nose hides one cheek from one of them and the other cheek from the
         other: averages that held those would differ on the nose itself, and move it.
         """
-        maps = {name: getattr(self, name)[part] for name in ("position", "normal", "pixel", "look", "feature")}
+        maps = {name: getattr(self, name)[part] for name in ("log", "position", "normal", "pixel", "look")}
         both = (maps["look"][..., 0] > 0) & (other.look[part][..., 0] > 0)
-        feature = maps["feature"] = band_pass(maps["feature"], both)
-        mean, square = (cv2.blur(each, (PATCH, PATCH)) for each in (feature, feature**2))
+        band = band_pass(maps["log"], both)
+        mean, square = (cv2.blur(each, (PATCH, PATCH)) for each in (band, band**2))
         contrast = both & (square - mean**2 > NOISE**2)
         maps["look"] = np.stack([contrast.astype(np.float32), maps["look"][..., 1]], axis=-1)
-        return replace(self, **maps)
+        return replace(self, **maps), band
 
 
 def _flow(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.float32]:
