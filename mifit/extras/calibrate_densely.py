@@ -23,7 +23,7 @@ from mifit.extras.calibrate_heads import FOCAL_PRIOR, HeadCalibration, calibrate
 from mifit.extras.tracks import FEWEST_IMAGES, focal_of, follow_head, points_of, sightings_of
 from mifit.morphable import MorphableModel
 from mifit.progress import Progress, silent
-from mifit.stages.surface.flow import FEWEST
+from mifit.stages.surface.sweep import FEWEST
 
 MOST_TIMESTEPS = 6
 """Timesteps that are matched, spread evenly over more: cameras keep still, and each has its expression to find."""

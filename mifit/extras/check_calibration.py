@@ -23,7 +23,7 @@ from mifit.extras.bundle import Bundle, Freedom, Sightings, adjust_bundle
 from mifit.extras.tracks import FEWEST_IMAGES, focal_of, follow_head, points_of, sightings_of
 from mifit.morphable import MorphableModel
 from mifit.progress import Progress, silent
-from mifit.stages.surface.flow import FEWEST
+from mifit.stages.surface.sweep import FEWEST
 
 FOCALS, FOCAL, TURN = 0.08, 0.005, 0.3
 """Errors below which nothing is named: of all focal lengths, of one of them relative to the others, and degrees.

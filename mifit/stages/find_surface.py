@@ -1,10 +1,10 @@
 """Stage 1b: the surface that the images of all views and timesteps show together.
 
 The surface is the model's modes, the head's pose and a smooth displacement under one Gaussian prior
-(`surface.displace`). It is measured along its normals, by optical flow between views that are painted on it
-(`surface.flow`), and by the outlines of the head (`surface.outline`). Measurements and solutions take turns, coarse to
-fine: coarse levels reach far in few texels, and the prior holds what they don't measure. A solution weights its
-offsets anew as outliers come apart from them. Stage 1 is only a start.
+(`surface.displace`). It is measured along its normals, where two views show the same skin (`surface.sweep`), and by the
+outlines of the head (`surface.outline`). Measurements and solutions take turns, coarse to fine: coarse levels reach far
+in few texels, and the prior holds what they don't measure. A solution weights its offsets anew as outliers come apart
+from them. Stage 1 is only a start.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from mifit.stages.geometry.surfaces import Scenes
 from mifit.stages.surface.align_timesteps import align_timesteps
 from mifit.stages.surface.close_openings import LIDS, LIPS, close_again, close_openings
 from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surface
-from mifit.stages.surface.flow import FARTHEST, Found, Posed, across_time, epipolar_residual, likeness, match
 from mifit.stages.surface.outline import REACH, Borders, find_borders, joined
+from mifit.stages.surface.sweep import Found, Posed, across_time, epipolar_residual, likeness, match
 from mifit.stages.surface.views import Resolution, pose_texels, texture_size
 
 if TYPE_CHECKING:
@@ -54,6 +54,8 @@ STEP_PIXELS = 0.7
 ROBUST_STEPS = ((4.0, 2.0), (2.8, 1.4), (1.4,))
 """Distance in steps where an offset counts as an outlier: per round at a level, one for each weighting. Chosen on gloss
 and heads of Table 1 with the built-in model, Emily c3,c4, scan_city."""
+START = 6.0
+"""Steps of the coarsest level that reach as far as the surface is searched. Chosen on all development heads."""
 COARSEST = 3
 """Times that the images are halved at most."""
 LARGEST_MAP = 720
@@ -70,8 +72,8 @@ SLACK = 0.01
 """Pixels that the surface may move by before what rays meet is built anew."""
 OFF_PIXELS = 1.0
 """Median distance from epipolar lines that deserves a warning."""
-ALIKE = 0.35
-"""Correlation of two views of one face: 0.6 to 0.9 on development heads, 0.1 of two persons."""
+ALIKE = 0.55
+"""Correlation of two views of one face: 0.78 to 0.93 on development heads, 0.25 to 0.51 of two persons."""
 
 
 @checked
@@ -118,7 +120,7 @@ def find_surface(
     while texture_size(model, world[0], resolution.pixel * 2.0**finest, 4 * LARGEST_MAP) > 2 * LARGEST_MAP:
         finest += 1
     coarsest = finest
-    while coarsest < COARSEST and FARTHEST * level_step * 2**coarsest * capture.unit_mm < config.reach:
+    while coarsest < COARSEST and START * level_step * 2**coarsest * capture.unit_mm < config.reach:
         coarsest += 1
 
     # The prior: modes and plate on the skin, which pieces that were added to the model, such as eyes, go along with.

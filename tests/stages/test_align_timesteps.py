@@ -16,8 +16,8 @@ from mifit.stages.geometry.parameters import exponential
 from mifit.stages.geometry.surfaces import moved_by
 from mifit.stages.surface.align_timesteps import align_timesteps
 from mifit.stages.surface.band import FeatureImage, feature_image
-from mifit.stages.surface.flow import BEST_APART, MOST_PAIRS, Posed, across_time
 from mifit.stages.surface.kept_texture import KeptTexture
+from mifit.stages.surface.sweep import BEST_APART, MOST_PAIRS, Posed, across_time
 from mifit.stages.surface.views import pose_texels
 from tests.output.conftest import ball_camera
 from tests.stages.test_find_surface import QUICK

@@ -24,9 +24,10 @@ from mifit.stages.find_surface import Skin, State, find_surface, neighbours
 from mifit.stages.fit_geometry import fit_geometry, fit_pose_expression
 from mifit.stages.geometry.parameters import exponential
 from mifit.stages.geometry.surfaces import Scenes, displaced
+from mifit.stages.surface.band import FeatureImage
 from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surface
-from mifit.stages.surface.flow import GLARE_DEVIATIONS, _Painted, _precision, _without_glare, match
 from mifit.stages.surface.outline import joined
+from mifit.stages.surface.sweep import ALIKE, GLARE_DEVIATIONS, Posed, _precision, _Sweep, _without_glare, match
 from mifit.stages.surface.views import pose_texels
 from tests.morphable.intersections import intersections
 from tests.test_pipeline import without_eyes
@@ -292,10 +293,9 @@ def test_what_the_modes_explain_is_left_to_them():
 
 def test_a_highlight_that_one_view_shows_counts_little_and_exposure_nothing():
     rng = np.random.default_rng(5)
-    valid = np.ones(1000, bool)
     difference = 0.4 + 0.01 * rng.normal(size=1000)
     difference[:50] += 0.6
-    weight = _without_glare(difference, valid, GLARE_DEVIATIONS)
+    weight = _without_glare(difference, GLARE_DEVIATIONS)
     assert weight[:50].max() < 0.05 and weight[50:].min() > 0.5 and np.median(weight) > 0.9
 
 
@@ -392,24 +392,27 @@ def test_features_of_the_face_know_nothing_of_the_background(model, bumpy):
 
 def test_what_one_view_alone_shows_changes_nothing_in_the_comparison():
     """A bright cheek that each view sees on its own side of a nose: on the nose both show the same."""
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], np.float32)
+    texels = rasterize_uv(corners, np.array([[0, 1, 2], [0, 2, 3]]), 64)
+    row, column = np.divmod(texels.index, 64)
+    camera = Camera("ahead", 64, 64, 64.0, 64.0, 32.0, 32.0, np.eye(4))
+    at = np.stack([(column + 0.5) / 64 - 0.5, (row + 0.5) / 64 - 0.5, np.ones(len(row))], axis=1)
     nose = 0.1 * np.random.default_rng(0).standard_normal((64, 64)).astype(np.float32)
-    sides, empty = (slice(0, 24), slice(40, 64)), np.zeros((64, 64, 2), np.float32)
-    views = []
-    for own, hidden in (sides, sides[::-1]):
-        log, shown = nose.copy(), np.ones((64, 64), np.float32)
-        log[:, own] += 2.0
-        shown[:, hidden] = 0.0
-        look = np.stack([shown, log], axis=-1)
-        views.append(_Painted(None, log, empty, empty, empty, look))  # type: ignore[arg-type]
-    whole = slice(0, 64), slice(0, 64)
-    (one, first), (_, second) = views[0].beside(views[1], whole), views[1].beside(views[0], whole)
-    np.testing.assert_allclose(first, second, atol=1e-6)
-    assert first[:, 24:40].std() > 0.03 and not first[:, :24].any()
-    assert one.look[:, 24:40, 0].mean() > 0.9 and not one.look[:, 40:, 0].any()
+    images, seen = [], np.ones((2, len(row)), np.float32)
+    for view, (own, hidden) in enumerate([(column < 24, column >= 40), (column >= 40, column < 24)]):
+        log = nose + np.float32(2.0) * texels.to_map(own.astype(np.float32))
+        images.append(FeatureImage(camera, 1.0, np.stack([log, np.ones_like(log), log], axis=-1)))
+        seen[view, hidden] = 0.0
+    posed = Posed(at, np.tile([0.0, 0.0, -1.0], (len(at), 1)), images, seen)
+    sweep = _Sweep.of(texels, (posed, 0), (posed, 1), np.eye(3), 0.1)
+    assert set(column[sweep.texel]) == set(range(24, 40))
+    unlike, darker = sweep.compare(0.0)
+    assert unlike.max() < np.log(ALIKE)
+    np.testing.assert_allclose(darker, 0.0, atol=1e-3)
 
 
-def test_a_match_off_the_epipolar_line_does_not_count(model, bumpy):
-    """One camera turned by three pixels: nothing is found, rather than something wrong."""
+def test_matches_off_the_epipolar_line_count_little(model, bumpy):
+    """One camera turned by three pixels: what is found scatters, and is hardly trusted."""
     texels = rasterize_uv(model.uv, model.faces_uv, 240, model.face_mask)
     cells = rasterize_uv(model.uv, model.faces_uv, 120, model.face_mask)
     vertices, right = bumpy.vertices[0], bumpy.camera("right")
@@ -417,12 +420,12 @@ def test_a_match_off_the_epipolar_line_does_not_count(model, bumpy):
     turn[:3, :3] = exponential(np.array([3.0 / right.fy, 0.0, 0.0]))
     turned = replace(right, world_to_camera=turn @ right.world_to_camera)
     off = replace(bumpy, cameras_by_name={**bumpy.cameras_by_name, "right": turned})
-    scene, counts = SurfaceScene(vertices, model.faces), []
+    scene, trust = SurfaceScene(vertices, model.faces), []
     for capture in (bumpy, off):
         step = pose_texels(capture, scene, vertices, model.faces, texels, BOTH, 0, 1.0)
         found = match(texels, cells, [step], bumpy.rotation[:1], 0.06, [((0, 0), (0, 1))])
-        counts.append((found.precision > 0).sum())
-    assert counts[1] < 0.2 * counts[0]
+        trust.append(found.precision.sum())
+    assert trust[1] < 0.1 * trust[0]
 
 
 def test_the_report_says_whether_the_surface_rests(model, bumpy, first, found, monkeypatch):

@@ -25,7 +25,7 @@ from mifit.render.gbuffer import SurfaceScene
 from mifit.sampling.visibility import DARKEST, EDGE_PIXELS, OUTLINE_MM
 from mifit.stages.geometry.landmarks import LandmarkFit, LandmarkView, State, contradicts, world_vertices
 from mifit.stages.geometry.parameters import Frames
-from mifit.stages.surface.flow import likeness
+from mifit.stages.surface.sweep import likeness
 from mifit.stages.surface.views import LARGEST_TEXTURE, pixel_length, pose_views, texture_size
 
 SIZES = np.exp(0.01 * np.arange(-40, 41))

@@ -37,7 +37,7 @@ def object_shapes(model: MorphableModel, geometry: GeometryEstimate) -> NDArray[
 class Scenes:
     """Scenes of several timesteps, each built anew only where the surface has left the one that is kept.
 
-    Building what rays are traced against costs as much as a round of the flow.
+    Building what rays are traced against costs as much as a sweep.
 
     Parameters
     ----------

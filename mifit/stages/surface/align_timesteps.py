@@ -26,7 +26,7 @@ from mifit.core.uv import TexelMap
 from mifit.morphable import MorphableModel
 from mifit.stages.geometry.parameters import exponential
 from mifit.stages.surface.band import FeatureImage, look_up
-from mifit.stages.surface.flow import FEWEST, Posed
+from mifit.stages.surface.sweep import FEWEST, Posed
 
 POINTS = 3000
 """Texels that are compared at the most."""

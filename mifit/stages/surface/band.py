@@ -31,9 +31,8 @@ class FeatureImage:
         Of the full image.
     factor : float
         Pixels of the level per pixel of the image, at most 1.
-    values : (h, w, 4) float32
-        Feature, 1 where it is measured, the logarithm between features and shading, which says how bright it is there,
-        and the logarithm of which the feature is a band.
+    values : (h, w, 3) float32
+        Feature, 1 where it is measured, and the logarithm of which the feature is a band.
     """
 
     camera: Camera
@@ -54,7 +53,7 @@ class FeatureImage:
         return np.nan_to_num(pixels, copy=False, nan=-10.0)
 
     def sample(self, points: NDArray) -> NDArray[np.float32]:
-        """(N, 4) values at world points (N, 3), 0 outside the image."""
+        """(N, 3) values at world points (N, 3), 0 outside the image."""
         return look_up(self.values, self.place(points))
 
 
@@ -65,20 +64,19 @@ def feature_image(camera: Camera, image: NDArray, valid: NDArray[np.bool_], fact
     """
     size = (max(round(camera.width * factor), 8), max(round(camera.height * factor), 8))
     weight = valid.astype(np.float32)
-    luminance = np.where(valid, image @ np.array([0.3, 0.5, 0.2], np.float32), np.float32(0))
-    layers = [luminance]
+    layer = np.where(valid, image @ np.array([0.3, 0.5, 0.2], np.float32), np.float32(0))
     if factor < 1.0:
-        layers = [luminance - np.float32(SHEEN) * np.where(valid, image.min(axis=-1), np.float32(0)), luminance]
-        weight = np.asarray(cv2.resize(weight, size, interpolation=cv2.INTER_AREA), np.float32)
-        small = (np.asarray(cv2.resize(x, size, interpolation=cv2.INTER_AREA), np.float32) for x in layers)
-        layers = [layer / np.maximum(weight, 1e-3) for layer in small]
+        layer -= np.float32(SHEEN) * np.where(valid, image.min(axis=-1), np.float32(0))
+        small = (cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (weight, layer))
+        weight, layer = (np.asarray(x, np.float32) for x in small)
+        layer = layer / np.maximum(weight, np.float32(1e-3))
     usable = weight > 0.9
     # Blurs reach four deviations far; nothing is read where nothing is usable.
     part = box(usable, int(np.ceil(4.0 * WINDOW)) + 1)
     shown = usable[part]
-    skin, whole = (np.log(np.maximum(layers[k][part], 0.0) + DARKEST) * shown for k in (0, -1))
-    values = np.zeros((*usable.shape, 4), np.float32)
-    values[part] = np.stack([band_pass(skin, shown), shown, _blurred(whole, shown, WINDOW), skin], axis=-1)
+    log = np.log(np.maximum(layer[part], 0.0) + DARKEST) * shown
+    values = np.zeros((*usable.shape, 3), np.float32)
+    values[part] = np.stack([band_pass(log, shown), shown, log], axis=-1)
     return FeatureImage(camera, factor, values)
 
 

@@ -13,7 +13,7 @@ from mifit.core.estimate import GeometryEstimate
 from mifit.core.mesh import interpolate
 from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.surface.align_timesteps import align_timesteps, looks_at
-from mifit.stages.surface.flow import Posed
+from mifit.stages.surface.sweep import Posed
 from mifit.stages.surface.views import pose_texels, texels_of_pixels
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.render.gbuffer import SurfaceScene
 from mifit.sampling.visibility import texel_area
 from mifit.stages.surface.band import feature_image
-from mifit.stages.surface.flow import Posed
+from mifit.stages.surface.sweep import Posed
 
 if TYPE_CHECKING:
     from mifit.capture import Capture, Frame
