@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from memory_capture import rotation_angle
 
 from mifit.core.camera import Camera
 from mifit.core.mesh import normalize
@@ -20,6 +19,7 @@ from mifit.stages.geometry.landmarks import LandmarkProblem, LandmarkTerm, Landm
 from mifit.stages.geometry.parameters import Frames, Layout, exponential, left_jacobian
 from mifit.stages.geometry.points import PointBasis
 from mifit.stages.geometry.rendering import RenderingProblem
+from tests.stages.memory_capture import rotation_angle
 
 
 def head(rng, n=9, identity=4, expression=3, albedo=2):
