@@ -27,7 +27,7 @@ from mifit.stages.geometry.surfaces import Scenes, displaced
 from mifit.stages.surface.band import FeatureImage
 from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surface
 from mifit.stages.surface.outline import joined
-from mifit.stages.surface.sweep import ALIKE, GLARE_DEVIATIONS, Posed, _precision, _Sweep, _without_glare, match
+from mifit.stages.surface.sweep import GLARE_DEVIATIONS, SAME, Posed, _precision, _Sweep, _without_glare, match
 from mifit.stages.surface.views import pose_texels
 from tests.morphable.intersections import intersections
 from tests.test_pipeline import without_eyes
@@ -407,7 +407,7 @@ def test_what_one_view_alone_shows_changes_nothing_in_the_comparison():
     sweep = _Sweep.of(texels, (posed, 0), (posed, 1), np.eye(3), 0.1)
     assert set(column[sweep.texel]) == set(range(24, 40))
     unlike, darker = sweep.compare(0.0)
-    assert unlike.max() < np.log(ALIKE)
+    assert unlike.max() < np.log(SAME)
     np.testing.assert_allclose(darker, 0.0, atol=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""Images as matching sees them: the logarithm between two scales, highlights and shadows' edges held in check."""
+"""Images as the search for the surface reads them: the logarithm, and a band of it in which large contrasts end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mifit.core.image import box
 from mifit.sampling.visibility import DARKEST
 
 FINE, WINDOW = 0.6, 4.0
-"""Blurs whose difference is the band, pixels or texels of the level; the second chosen on all development heads."""
+"""Blurs whose difference is the band, pixels of the level; the second chosen on all development heads."""
 SHEEN = 0.9
 """Part of the least channel that all levels but the finest leave out. Highlights have much of it and move over skin,
 which has little; at the finest level noise would remain. Chosen on all development heads."""
@@ -75,15 +75,10 @@ def feature_image(camera: Camera, image: NDArray, valid: NDArray[np.bool_], fact
     part = box(usable, int(np.ceil(4.0 * WINDOW)) + 1)
     shown = usable[part]
     log = np.log(np.maximum(layer[part], 0.0) + DARKEST) * shown
-    values = np.zeros((*usable.shape, 3), np.float32)
-    values[part] = np.stack([band_pass(log, shown), shown, log], axis=-1)
-    return FeatureImage(camera, factor, values)
-
-
-def band_pass(log: NDArray[np.float32], shown: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """The band of a logarithm (H, W) over what is ``shown``, held in check; 0 elsewhere."""
     band = _blurred(log, shown, FINE) - _blurred(log, shown, WINDOW)
-    return np.asarray(LARGEST * np.tanh(band / LARGEST), np.float32)
+    values = np.zeros((*usable.shape, 3), np.float32)
+    values[part] = np.stack([LARGEST * np.tanh(band / LARGEST), shown, log], axis=-1)
+    return FeatureImage(camera, factor, values)
 
 
 def _blurred(log: NDArray, shown: NDArray[np.bool_], deviation: float) -> NDArray[np.float32]:

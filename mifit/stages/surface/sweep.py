@@ -30,7 +30,7 @@ WINDOW = 2.0
 """Standard deviation of the windows, texels."""
 NOISE = 0.012
 """Standard deviation of a logarithm that is noise: windows with less contrast show nothing."""
-ALIKE = 0.3
+SAME = 0.3
 """Variance of the difference of two windows, of the sum of their variances, below which they show the same skin."""
 BESIDE = 4
 """Pixels to both sides of an epipolar line where points are looked for, to tell cameras off their calibration."""
@@ -155,7 +155,7 @@ def _swept(
     pairs: Sequence[Pair],
     what: Callable[[_Sweep], T],
 ) -> Iterator[tuple[View, View, T]]:
-    """What the sweep of each view of a pair against the other one tells; parameters as for `match`."""
+    """What the sweeps of a pair tell, of each view against the other; parameters as for `match`."""
     ways = [way for one, other in pairs for way in ((one, other), (other, one))]
 
     def swept(way: Pair) -> T | None:
@@ -197,8 +197,10 @@ class _Sweep:
     def of(
         cls, texels: TexelMap, one: tuple[Posed, int], other: tuple[Posed, int], turn: NDArray, step: float
     ) -> _Sweep | None:
-        """Of two views, named by their step and their place in it, where ``turn`` takes directions of the first one's
-        world to the second's; None where nothing is seen by both."""
+        """Of two views, each a step and the view's place in it; None where nothing is seen by both.
+
+        ``turn`` takes directions of the first one's world to the second's.
+        """
         (first, i), (second, j) = one, other
         image, shows = first.images[i], second.images[j]
         both = np.flatnonzero((first.seen[i] > 0) & (second.seen[j] > 0))
@@ -261,7 +263,7 @@ class _Sweep:
         """(n,) pixels from the epipolar lines at which windows are least unlike, where they are alike."""
         unlike = np.stack([self.compare(0.0, way)[0] for way in range(-BESIDE, BESIDE + 1)])
         _, between, least = _lowest(unlike)
-        return np.abs(between - BESIDE)[np.isfinite(between) & (least < np.log(ALIKE))]
+        return np.abs(between - BESIDE)[np.isfinite(between) & (least < np.log(SAME))]
 
 
 def _lowest(values: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
