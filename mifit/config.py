@@ -180,13 +180,6 @@ class GeometryConfig:
         above=0,
         most=WEIGHT,
     )
-    albedo_prior: float = number(
-        0.2,
-        "factor on the prior of the albedo; 1: contrasts as the model's modes have them, 0.2: as those of skin",
-        source="measured spread of skin's luminance, 0.25, over that of the models' modes, 0.107",
-        least=0,
-        most=WEIGHT,
-    )
     max_iterations: int = number(30, "Gauss-Newton iterations of a round", source="limit", least=1, most=10_000)
 
 

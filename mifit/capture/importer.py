@@ -86,8 +86,9 @@ def import_capture(
         raise InputError("found more than one of calibration, transforms, expected one")
 
     def gather() -> Material:
+        unit = length_unit(units)
         if transforms is not None:
-            return scene_material(Path(transforms), sources_of(videos, images), units or "cm")
+            return scene_material(Path(transforms), sources_of(videos, images), unit)
         sources = sources_of(videos, images)
         if not sources:
             raise InputError("nothing to import: expected videos, folders of images, or a calibration with its images")
@@ -96,15 +97,14 @@ def import_capture(
             if len(sources) != 2:
                 raise InputError(f"{calibration}: describes two cameras, but {len(sources)} are given")
             views = read_stereo(calibration, [source.name for source in sources], [source.size for source in sources])
-        return Material(sources, views, {}, units or "cm")
+        return Material(sources, views, {}, unit)
 
-    return import_material(out, gather, units, **options)
+    return import_material(out, gather, **options)
 
 
 def import_material(
     out: str | Path,
     gather: Callable[[], Material],
-    units: str | None = None,
     every: int = 1,
     start: int = 0,
     count: int | None = None,
@@ -116,8 +116,6 @@ def import_material(
     out = Path(out)
     if every < 1 or start < 0 or (count is not None and count < 1):
         raise InputError(f"every {every}, start {start}, count {count}: expected every >= 1, start >= 0, count >= 1")
-    if units is not None and units not in UNITS_MM:
-        raise InputError(f"units: found {units!r}, expected one of {', '.join(UNITS_MM)}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: is there already and not empty; name another folder")
     material = gather()
@@ -132,6 +130,13 @@ def import_material(
         write_transforms(part / "transforms.json", material.views, shots, material.units)
         Capture.load(part)  # nothing is handed over that can't be read back
     return out
+
+
+def length_unit(units: str | None) -> str:
+    """The unit of length of a calibration, centimetres by default; InputError for one that isn't known."""
+    if units is not None and units not in UNITS_MM:
+        raise InputError(f"units: found {units!r}, expected one of {', '.join(UNITS_MM)}")
+    return units or "cm"
 
 
 def sources_of(videos: Sequence[str | Path], images: Sequence[str | Path]) -> list[Source]:

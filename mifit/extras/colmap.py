@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mifit.capture.importer import Material, Selection, import_material, match_views, sources_of
+from mifit.capture.importer import Material, Selection, import_material, length_unit, match_views, sources_of
 from mifit.capture.sources import ImageFiles
 from mifit.capture.transforms import View
 from mifit.core.camera import rigid
@@ -70,17 +70,17 @@ def import_colmap(
     model = Path(model)
 
     def gather() -> Material:
-        sources, found = sources_of(videos, images), read_colmap(model)
+        unit, sources, found = length_unit(units), sources_of(videos, images), read_colmap(model)
         if sources:
             views = match_views(sources, [photo.view for photo in found], str(model))
-            return Material(sources, views, {}, units or "cm")
+            return Material(sources, views, {}, unit)
         folders = (model, *model.absolute().parents[:3]) if photos is None else (Path(photos),)
         cameras = group_photos(found)
         files = [ImageFiles.of(name, [find_photo(p.name, folders) for p in group]) for name, group in cameras.items()]
         views = match_views(files, [group[0].view for group in cameras.values()], str(model))
-        return Material(files, views, {}, units or "cm")
+        return Material(files, views, {}, unit)
 
-    return import_material(out, gather, units, **options)
+    return import_material(out, gather, **options)
 
 
 def read_colmap(folder: str | Path) -> tuple[Photo, ...]:

@@ -6,6 +6,7 @@ unwrapping of the face area, the albedo from the pigment model.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,67 +28,72 @@ N_ALBEDO = 60
 """Albedo modes of the pigment model where a file has no albedo."""
 
 
-def complete(  # noqa: PLR0913
-    name: str,
-    mean: NDArray,
-    faces: NDArray,
-    identity: NDArray,
-    expression: NDArray,
-    unit_mm: float,
-    *,
-    albedo: tuple[NDArray, NDArray] | None = None,
-    uv: tuple[NDArray, NDArray] | None = None,
-    landmarks: NDArray | None = None,
-    face_mask: NDArray | None = None,
-    expression_names: tuple[str, ...] = (),
-    expression_bounds: NDArray | None = None,
-    source: Path | None = None,
-) -> MorphableModel:
-    """Build a model of what ``MorphableModel`` holds; what is None is made.
+@dataclass(frozen=True)
+class ModelData:
+    """What a model's file holds of a `MorphableModel`; what is None is made by `complete`.
 
     ``albedo`` ((V, 3), (V, 3, Ka)) are mean and modes, linear; ``uv`` ((T, 2), (F, 3)) texture vertices and their
     indices. ``source`` is the model's file: ``<name>.landmarks.json`` beside it (68 vertex indices) takes precedence
     over landmarks found or given.
     """
-    computed = albedo is None or uv is None or landmarks is None
-    given = [np.asarray(array) for pair in (albedo, uv) if pair is not None for array in pair]
-    if source is not None:
-        beside = source.parent / f"{source.name}.landmarks.json"
-        if beside.is_file():
-            landmarks = read_landmark_file(beside)
-    mean, faces = np.asarray(mean), np.asarray(faces)
-    landmarks = None if landmarks is None else np.asarray(landmarks)
-    check_mesh(name, mean, faces, landmarks)
-    if landmarks is None:
-        landmarks = transfer_landmarks(mean.astype(np.float64) * unit_mm, faces)
+
+    name: str
+    mean: NDArray
+    faces: NDArray
+    identity: NDArray
+    expression: NDArray
+    unit_mm: float
+    albedo: tuple[NDArray, NDArray] | None = None
+    uv: tuple[NDArray, NDArray] | None = None
+    landmarks: NDArray | None = None
+    face_mask: NDArray | None = None
+    expression_names: tuple[str, ...] = ()
+    expression_bounds: NDArray | None = None
+    source: Path | None = None
+
+    def complete(self) -> MorphableModel:
+        """The model, with what the file lacks; InputError for a mesh that can't be computed with."""
+        name, unit_mm, source = self.name, self.unit_mm, self.source
+        mean, faces, landmarks = np.asarray(self.mean), np.asarray(self.faces), self.landmarks
+        albedo, uv, face_mask = self.albedo, self.uv, self.face_mask
+        computed = albedo is None or uv is None or landmarks is None
+        given = [np.asarray(array) for pair in (albedo, uv) if pair is not None for array in pair]
+        if source is not None:
+            beside = source.parent / f"{source.name}.landmarks.json"
+            if beside.is_file():
+                landmarks = read_landmark_file(beside)
+        landmarks = None if landmarks is None else np.asarray(landmarks)
         check_mesh(name, mean, faces, landmarks)
-    if face_mask is None:
-        face_mask = find_face_mask(mean.astype(np.float64), faces, landmarks)
-    if not np.any(face_mask):
-        raise InputError(f"{name}: no face lies in the face area that the landmarks span; expected a face mesh")
-    if albedo is None:
-        albedo = skin_model(mean, faces[face_mask], landmarks, unit_mm, N_ALBEDO)
-    if uv is None:
-        uv = unwrap(mean.astype(np.float64), faces, face_mask)
-    read = mean, faces, identity, expression, landmarks, *given
-    return MorphableModel(
-        name=name,
-        mean=mean,
-        faces=faces,
-        identity=identity,
-        expression=expression,
-        mean_albedo=albedo[0],
-        albedo_modes=albedo[1],
-        uv=uv[0],
-        faces_uv=uv[1],
-        landmarks=landmarks.astype(np.int32),
-        face_mask=face_mask,
-        symmetry=mirror_map(mean, 0.1 / unit_mm),
-        unit_mm=unit_mm,
-        expression_names=expression_names,
-        expression_bounds=expression_bounds,  # type: ignore[arg-type]
-        fingerprint=content_key(VERSION, *read).hex()[:32] if computed else "",  # the rest is computed from it
-    )
+        if landmarks is None:
+            landmarks = transfer_landmarks(mean.astype(np.float64) * unit_mm, faces)
+            check_mesh(name, mean, faces, landmarks)
+        if face_mask is None:
+            face_mask = find_face_mask(mean.astype(np.float64), faces, landmarks)
+        if not np.any(face_mask):
+            raise InputError(f"{name}: no face lies in the face area that the landmarks span; expected a face mesh")
+        if albedo is None:
+            albedo = skin_model(mean, faces[face_mask], landmarks, unit_mm, N_ALBEDO)
+        if uv is None:
+            uv = unwrap(mean.astype(np.float64), faces, face_mask)
+        read = mean, faces, self.identity, self.expression, landmarks, *given
+        return MorphableModel(
+            name=name,
+            mean=mean,
+            faces=faces,
+            identity=self.identity,
+            expression=self.expression,
+            mean_albedo=albedo[0],
+            albedo_modes=albedo[1],
+            uv=uv[0],
+            faces_uv=uv[1],
+            landmarks=landmarks.astype(np.int32),
+            face_mask=face_mask,
+            symmetry=mirror_map(mean, 0.1 / unit_mm),
+            unit_mm=unit_mm,
+            expression_names=self.expression_names,
+            expression_bounds=self.expression_bounds,  # type: ignore[arg-type]
+            fingerprint=content_key(VERSION, *read).hex()[:32] if computed else "",  # the rest is computed from it
+        )
 
 
 def check_mesh(name: str, mean: NDArray, faces: NDArray, landmarks: NDArray | None) -> None:

@@ -105,7 +105,7 @@ def fit_geometry(
     state, world = start.state, world_vertices(model, start.state)
     seen = capture, model, cameras, timesteps
     pixels = facial_pixels(*seen, world, config.pixels, seed)
-    problem = gather(model, world, pixels, config.robust_colour, config.albedo_prior)
+    problem = gather(model, world, pixels, config.robust_colour)
     lit = _usable(fit_appearance(problem, config.max_iterations), "albedo and lighting")
     appearance = lit.value
     if config.objective == "paper":

@@ -125,7 +125,7 @@ COMPUTED = {
 def test_a_model_that_is_computed_otherwise_has_another_version(coarse, made):
     if made == "completed":
         given = coarse.mean, coarse.faces, coarse.identity, coarse.expression
-        model = assemble.complete("head", *given, coarse.unit_mm)
+        model = assemble.ModelData("head", *given, coarse.unit_mm).complete()
     else:
         model = make_head(coarse=made == "coarse")
     assert (VERSION, summary(model)) == (1, pytest.approx(COMPUTED[made], rel=1e-5))

@@ -124,7 +124,7 @@ def test_papers_objective_brings_back_a_displaced_head(model):
 
     world = world_vertices(model, state)
     pixels = facial_pixels(capture, model, BOTH, (0,), world, config.pixels, 0)
-    appearance = fit_appearance(gather(model, world, pixels, 30.0, 1.0), 30).value
+    appearance = fit_appearance(gather(model, world, pixels, 30.0), 30).value
     displaced = state.x.copy()
     displaced[layout.at("rotation", 0)] += np.radians(2.0)
     displaced[layout.at("translation", 0)] += 0.4

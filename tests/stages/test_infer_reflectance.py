@@ -13,7 +13,7 @@ from mifit.errors import InputError
 from mifit.sampling.observations import Surface
 from mifit.stages.infer_reflectance import infer_reflectance
 from mifit.stages.reflectance.albedo_priors import specular_pull
-from mifit.stages.reflectance.maps import TexelSystems, laplacian, solve_maps
+from mifit.stages.reflectance.maps import WEAK, TexelSystems, laplacian, solve_maps
 
 CONFIG = ReflectanceConfig(
     texture_size=SIZE, shading="prefiltered", bands=4, exponent=EXPONENT, specular_albedo=1.0, smoothness_weight=1e-5
@@ -187,7 +187,7 @@ def test_blocks_solve_in_closed_form():
     pairs = np.array([[0, 1], [2, 3]])
     systems, prior = TexelSystems.accumulate(colour, weight, shade, glint, pairs, 0.1), np.zeros((3, 3, 4), np.float32)
     given = systems, np.arange(7), prior, (0.0, 0.0)
-    found = solve_maps(*given, weak=0.0, iterations=2000, tolerance=1e-7)[0].reshape(-1, 4)[:7]
+    found = solve_maps(*given, pulls=(0, 0), iterations=2000, tolerance=1e-7)[0].reshape(-1, 4)[:7]
     x, y = found[:, :3], found[:, 3]
 
     def energy(x, y):
@@ -218,7 +218,7 @@ def test_admm_reaches_the_minimum_of_the_l1_problem():
         rough = np.abs(laplacian(image)).sum((0, 1))
         return ((image.reshape(n, 4) - target) ** 2).sum() + rough @ np.array([0.02, 0.02, 0.02, 0.05])
 
-    found, _ = solve_maps(systems, np.arange(n), prior, weights, weak=0, iterations=400)
+    found, _ = solve_maps(systems, np.arange(n), prior, weights, pulls=(0, 0), iterations=400)
     best = energy(found.astype(np.float64))
     assert best < 0.9 * energy(target.reshape(size, size, 4).astype(np.float64))
     for _ in range(200):
@@ -265,6 +265,6 @@ def test_noise_decides_how_far_the_specular_albedo_is_told_by_the_images():
     systems = TexelSystems(ones, none, 0.4 * ones, ones[:, 0], 0.1 * ones[:, 0])
     prior = np.full((n, n, 4), 0.01, np.float32)
     pulls = [specular_pull(0.01, sigma) for sigma in (1e-5, 1.5e-3, 0.1)]
-    values = [solve_maps(systems, np.arange(n * n), prior, (0, 0), None, pull)[0] for pull in pulls]
+    values = [solve_maps(systems, np.arange(n * n), prior, (0, 0), None, (pull, WEAK))[0] for pull in pulls]
     np.testing.assert_allclose([v[..., 3].mean() for v in values], [0.1, 0.055, 0.01], atol=2e-3)
     np.testing.assert_allclose([v[..., :3].mean() for v in values], 0.4, atol=2e-3)

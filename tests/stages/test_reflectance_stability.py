@@ -230,7 +230,7 @@ def recover(scene, shading, bands, exponent, fresnel, monkeypatch):
     systems = TexelSystems.accumulate(seen.colour, weight, shade, glint, surface.pairs, 0.1)
     prior = np.full((FINE, FINE, 4), 0.3, np.float32)
     where = surface.texels.index[seen.texel]
-    to_the_end = {"weak": 1e-7, "iterations": 1000, "tolerance": 1e-7}
+    to_the_end = {"pulls": (0.0, 1e-7), "iterations": 1000, "tolerance": 1e-7}
     maps, _ = solve_maps(systems, where, prior, (0.0, 0.0), **to_the_end)
     confidence = surface.texels.to_map(surface.quality())
     return light, maps, confidence

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mifit.core.files import check_file
 from mifit.core.limits import MAX_MODEL_BYTES, MAX_UNPACKING, UNPACKING_SLACK
 from mifit.errors import InputError
-from mifit.morphable.assemble import complete, interleaved, single, srgb_albedo
+from mifit.morphable.assemble import ModelData, interleaved, single, srgb_albedo
 from mifit.morphable.model import MorphableModel
 from mifit.morphable.topology import oriented_outwards
 
@@ -47,7 +47,7 @@ def load_bfm_h5(path: Path) -> MorphableModel:
             with open_h5(beside) as h5:
                 if h5.dataset("diffuseAlbedo/model/mean").size == 3 * n:
                     albedo = _pca(h5, "diffuseAlbedo", False, n)
-    return complete(
+    return ModelData(
         f"bfm:{path.stem}",
         single(mean),
         oriented_outwards(mean, faces),
@@ -56,7 +56,7 @@ def load_bfm_h5(path: Path) -> MorphableModel:
         1.0,
         albedo=albedo,
         source=path,
-    )
+    ).complete()
 
 
 def _already_scaled(h5: Reader) -> bool:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mifit.core.files import opened, read_text
 from mifit.core.limits import MAX_MODEL_BYTES, MAX_SETTINGS_BYTES
 from mifit.errors import InputError
-from mifit.morphable.assemble import complete, find_face_mask, interleaved, single, srgb_albedo
+from mifit.morphable.assemble import ModelData, find_face_mask, interleaved, single, srgb_albedo
 from mifit.morphable.formats.mat5 import read_mat
 from mifit.morphable.model import MorphableModel
 from mifit.morphable.topology import oriented_outwards
@@ -44,7 +44,7 @@ def load_bfm2009(path: Path, add_expression_mean: bool = False) -> MorphableMode
     expression, mean_offset = _facewarehouse(path.parent, n3 // 3)
     if add_expression_mean:
         mean = mean + mean_offset
-    return complete(
+    return ModelData(
         "bfm2009",
         single(mean / 1000.0).reshape(-1, 3),
         faces,
@@ -53,7 +53,7 @@ def load_bfm2009(path: Path, add_expression_mean: bool = False) -> MorphableMode
         1.0,
         albedo=albedo,
         source=path,
-    )
+    ).complete()
 
 
 def _facewarehouse(folder: Path, n: int) -> tuple[NDArray, NDArray]:
@@ -130,7 +130,7 @@ def load_3ddfa(path: Path) -> MorphableModel:
         _, ke = check_modes(beside, extra["w_exp"], "w_exp", n3)
         expression = interleaved(extra["w_exp"] * (vector(beside, extra["sigma_exp"], "sigma_exp", ke) / 1000.0))
         mean = mean + vector(beside, extra["mu_exp"], "mu_exp", n3)
-    return complete(
+    return ModelData(
         "3ddfa",
         single(mean / 1000.0).reshape(-1, 3),
         oriented_outwards(mean.reshape(-1, 3), faces),
@@ -139,7 +139,7 @@ def load_3ddfa(path: Path) -> MorphableModel:
         1.0,
         landmarks=_keypoints(path, data["keypoints"], n3 // 3),
         source=path,
-    )
+    ).complete()
 
 
 def _keypoints(path: Path, values: NDArray, n: int) -> NDArray:
@@ -166,7 +166,7 @@ def load_deep3d(path: Path) -> MorphableModel:
         skin = vector(path, data["skinmask"], "skinmask", n3 // 3) > 0.5
         mask &= skin[faces].all(1)
     texture = vector(path, data["meantex"], "meantex", n3).reshape(-1, 3) / 255.0
-    return complete(
+    return ModelData(
         "deep3dfacerecon",
         single(mean),
         faces,
@@ -177,4 +177,4 @@ def load_deep3d(path: Path) -> MorphableModel:
         landmarks=keypoints,
         face_mask=mask,
         source=path,
-    )
+    ).complete()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mifit.core.files import read_bytes
 from mifit.core.limits import MAX_FILE_BYTES
 from mifit.errors import InputError
-from mifit.morphable.assemble import complete, interleaved, single
+from mifit.morphable.assemble import ModelData, interleaved, single
 from mifit.morphable.model import MorphableModel
 from mifit.morphable.topology import oriented_outwards
 
@@ -99,7 +99,7 @@ def load_eos(path: Path) -> MorphableModel:
     if len(uv) and not np.array_equal(flipped, faces):
         faces_uv = faces_uv[:, [1, 0, 2]]
     # eos stores v from the top
-    return complete(
+    return ModelData(
         f"eos:{path.stem}",
         single(mean).reshape(-1, 3),
         flipped,
@@ -111,7 +111,7 @@ def load_eos(path: Path) -> MorphableModel:
         expression_names=names,
         expression_bounds=bounds,
         source=path,
-    )
+    ).complete()
 
 
 def _pca(c: _Cursor, path: Path, what: str, allow_empty: bool = False) -> tuple[NDArray, NDArray, NDArray, NDArray]:

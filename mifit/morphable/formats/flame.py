@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mifit.core.arrays import read_npz
 from mifit.core.uv import sample_map
 from mifit.errors import InputError
-from mifit.morphable.assemble import complete, single, srgb_albedo
+from mifit.morphable.assemble import ModelData, single, srgb_albedo
 from mifit.morphable.formats.pickles import plain_array, read_pickle
 from mifit.morphable.model import MorphableModel
 
@@ -44,7 +44,7 @@ def _build(path: Path, data: Mapping[str, object]) -> MorphableModel:
     split = 300 if directions.shape[2] > 300 else directions.shape[2] * 3 // 4
     faces = faces.astype(np.int64)
     uv, albedo = _texture(path.parent, mean.shape[0], faces)
-    return complete(
+    return ModelData(
         f"flame:{path.stem}",
         single(mean),
         faces,
@@ -54,7 +54,7 @@ def _build(path: Path, data: Mapping[str, object]) -> MorphableModel:
         albedo=albedo,
         uv=uv,
         source=path,
-    )
+    ).complete()
 
 
 def _texture(

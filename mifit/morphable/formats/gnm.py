@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mifit.core.arrays import read_npz
 from mifit.errors import InputError
-from mifit.morphable.assemble import N_ALBEDO, check_mesh, complete, find_face_mask, single, transfer_landmarks
+from mifit.morphable.assemble import N_ALBEDO, ModelData, check_mesh, find_face_mask, single, transfer_landmarks
 from mifit.morphable.model import MorphableModel
 from mifit.morphable.openings import IRIS_ALBEDO, MARGIN, MOUTH_ALBEDO, PUPIL_ALBEDO, SCLERA_ALBEDO, STRIP
 from mifit.morphable.pigment import skin_model
@@ -70,7 +70,7 @@ def load_gnm(path: Path) -> MorphableModel:
         if name in groups:
             albedo[groups[name][used]], albedo_modes[groups[name][used]] = colour, 0.0
     albedo_modes[~skin] = 0.0
-    return complete(
+    return ModelData(
         f"gnm:{path.stem}",
         single(mean),
         faces,
@@ -82,7 +82,7 @@ def load_gnm(path: Path) -> MorphableModel:
         landmarks=landmarks,
         face_mask=face_mask,
         source=path,
-    )
+    ).complete()
 
 
 def _modes(path: Path, basis: NDArray, key: str, used: NDArray, skin: NDArray, most: int) -> NDArray[np.float32]:

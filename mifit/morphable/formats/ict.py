@@ -11,7 +11,7 @@ from mifit.core.arrays import read_npz
 from mifit.core.files import read_bytes, read_json
 from mifit.core.limits import MAX_FILE_BYTES, MAX_SETTINGS_BYTES
 from mifit.errors import InputError
-from mifit.morphable.assemble import check_mesh, complete
+from mifit.morphable.assemble import ModelData, check_mesh
 from mifit.morphable.model import MorphableModel
 from mifit.morphable.topology import opening_faces
 
@@ -150,7 +150,7 @@ def _assemble(
 ) -> MorphableModel:
     """A model of identity and expression modes (last); of ``face_area`` (F,) without the insides of lids and lips."""
     check_mesh("ict_facekit", mean, faces, landmarks)
-    return complete(
+    return ModelData(
         "ict_facekit",
         mean,
         faces,
@@ -162,4 +162,4 @@ def _assemble(
         face_mask=face_area & ~opening_faces(mean, faces, landmarks),
         expression_names=names,
         expression_bounds=np.tile(np.array([0.0, 1.0 / EXPRESSION_SIGMA], dtype=np.float32), (len(names), 1)),
-    )
+    ).complete()

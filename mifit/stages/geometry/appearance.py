@@ -43,7 +43,6 @@ class AppearanceProblem:
         1 / (number of the view's pixels).
     robust : float
         Residual in 0..255 where the penalty turns.
-    albedo_prior : float
     level : (3, Ka)
         Change of the face's mean albedo by each mode, relative to that of the model's mean face.
     """
@@ -54,7 +53,6 @@ class AppearanceProblem:
     observed: NDArray
     weight: NDArray
     robust: float
-    albedo_prior: float
     level: NDArray
 
     @property
@@ -84,8 +82,7 @@ class AppearanceProblem:
         return WHITE * (np.float32(x[-1]) + albedo * shade - self.observed), albedo, shade
 
     def _priors(self) -> NDArray[np.float64]:
-        weights = [self.albedo_prior, SHADING_PRIOR, AMBIENT_PRIOR * WHITE**2]
-        return np.repeat(weights, [self.albedo_size, 27, 1])
+        return np.repeat([1.0, SHADING_PRIOR, AMBIENT_PRIOR * WHITE**2], [self.albedo_size, 27, 1])
 
     def energies(self, x: NDArray) -> dict[str, float]:
         """Energy per term."""
@@ -115,9 +112,7 @@ class AppearanceProblem:
         return DenseSystem(normal[:-1, :-1] + prior, normal[:-1, -1] + prior @ x)
 
 
-def gather(
-    model: MorphableModel, world: NDArray, views: Sequence[PixelView], robust: float, albedo_prior: float
-) -> AppearanceProblem:
+def gather(model: MorphableModel, world: NDArray, views: Sequence[PixelView], robust: float) -> AppearanceProblem:
     """Collect the pixels of all views; ``world`` (T, V, 3) is the held geometry."""
     flat = model.albedo_modes.reshape(len(model.mean), -1)
     normals = [vertex_normals(vertices, model.faces) for vertices in world]
@@ -135,7 +130,7 @@ def gather(
     level = np.maximum(model.mean_albedo[face].mean(axis=0, dtype=np.float64), DARKEST)
     change = model.albedo_modes[face].mean(axis=0, dtype=np.float64) / level[:, None]
     mean, shifts, harmonics, observed, weight = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return AppearanceProblem(mean, shifts, harmonics, observed, weight, robust, albedo_prior, change)
+    return AppearanceProblem(mean, shifts, harmonics, observed, weight, robust, change)
 
 
 def fit_appearance(problem: AppearanceProblem, max_iterations: int) -> Solution:

@@ -26,7 +26,7 @@ from mifit.stages.reflectance.compact_lights import EXPONENT, ITERATIONS, OBSERV
 from mifit.stages.reflectance.fill import ALIKE
 from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import LightingSolution, active_weight, fit_lighting, noise_weight
-from mifit.stages.reflectance.maps import TexelSystems, solve_maps
+from mifit.stages.reflectance.maps import WEAK, TexelSystems, solve_maps
 
 if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
@@ -274,7 +274,7 @@ def solve_texels(
             observability = specular_observability(surface.texels, joined, each, usual, expected)
         pull = specular_pull(expected, sigma) if config.robust else 0.0
         iterations = -(-MAP_ITERATIONS // 2) if number == 0 < passes - 1 else MAP_ITERATIONS
-        maps, outcome = solve_maps(joined, index, prior, smoothness, maps, pull, iterations=iterations)
+        maps, outcome = solve_maps(joined, index, prior, smoothness, maps, (pull, WEAK), iterations=iterations)
     progress("Reflectance maps", passes * len(chunks), passes * len(chunks))
     assert maps is not None
     return SolvedMaps(maps, energy, sigma, outcome, observability)

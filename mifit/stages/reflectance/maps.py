@@ -21,6 +21,8 @@ from mifit.optim import Outcome
 
 SPLIT = 0.5
 """Weight of ADMM's splits relative to the median curvature of the blocks."""
+WEAK = 1e-4
+"""Weight of what is expected relative to the median block: it decides where no image measures."""
 RELAX = 1.7
 """Over-relaxation of both splits (Boyd et al. 2011, section 3.4.3): 40 iterations end nearer to it than 60 did."""
 
@@ -198,17 +200,9 @@ def _over_channels(values: NDArray) -> NDArray:
     return values[0] + values[1] + values[2]
 
 
-def plane_laplacian(planes: NDArray) -> NDArray:
-    """Five-point Laplacian of planes (..., S, S) with mirrored borders."""
-    if planes.ndim > 2:
-        return np.stack([plane_laplacian(plane) for plane in planes])
-    return cv2.Laplacian(planes, cv2.CV_32F, borderType=cv2.BORDER_REPLICATE)
-
-
 def laplacian(image: NDArray) -> NDArray:
-    """Five-point Laplacian of (S, S, ...) with mirrored borders."""
-    padded = np.pad(image, [(1, 1), (1, 1)] + [(0, 0)] * (image.ndim - 2), mode="edge")
-    return padded[2:, 1:-1] + padded[:-2, 1:-1] + padded[1:-1, 2:] + padded[1:-1, :-2] - 4.0 * image
+    """Five-point Laplacian of (S, S) or (S, S, C <= 4) with mirrored borders."""
+    return cv2.Laplacian(image, -1, borderType=cv2.BORDER_REPLICATE)
 
 
 def laplacian_eigenvalues(size: int) -> NDArray[np.float32]:
@@ -223,8 +217,7 @@ def solve_maps(
     prior: NDArray,
     smoothness: tuple[float, float],
     start: NDArray | None = None,
-    pull: float = 0.0,
-    weak: float = 1e-4,
+    pulls: tuple[float, float] = (0.0, WEAK),
     iterations: int = 60,
     tolerance: float = 1e-4,
 ) -> tuple[NDArray[np.float32], Outcome]:
@@ -242,10 +235,9 @@ def solve_maps(
         lambda_H of the L1 norm of the Laplacian: of the diffuse offset, and of the specular map.
     start : (S, S, 4), optional
         Start; the prior by default.
-    pull : float
-        Weight of the expected specular albedo, in the blocks' own units, where it is above the weak one.
-    weak : float
-        Weight of all that is expected, relative to the median block: decides where no image measures.
+    pulls : (float, float)
+        Weight of the expected specular albedo, in the blocks' own units, and that of all that is expected, relative to
+        the median block: the latter decides where no image measures, and where it is above the former.
     iterations : int
     tolerance : float
         Stop when no map moves by more than this.
@@ -262,19 +254,19 @@ def solve_maps(
     base[3] = 0.0  # the paper smooths the offset from the model's albedo, and C_s itself
     scale = np.array([float(np.median(systems.dd))] * 3 + [float(np.median(systems.ss))], dtype=np.float32)
     scale = np.maximum(scale, 1e-6)
-    pulls = weak * scale
-    pulls[3] = max(pulls[3], pull)
+    drawing = pulls[1] * scale
+    drawing[3] = max(drawing[3], pulls[0])
     # Splitting weights near the blocks' own curvature let both sides of a split move at the same pace.
     rho = (SPLIT * scale)[:, None]
     threshold = np.array([smoothness[0]] * 3 + [smoothness[1]], dtype=np.float32)[:, None] / rho
     inverse = 1.0 / (1.0 + laplacian_eigenvalues(size) ** 2)
     # Planes (4, S, S) without their base: the smooth copy, and the sums of each split's copy and its multiplier.
     smooth = (prior if start is None else start.transpose(2, 0, 1).astype(np.float32)) - base
-    level, bend = smooth.copy(), plane_laplacian(smooth)
+    level, bend = smooth.copy(), np.stack([laplacian(plane) for plane in smooth])
     # Texels without a block are solved like all others, by what draws them alone.
     flat = prior.reshape(4, -1), base.reshape(4, -1)
-    drawn = pulls[:, None] * flat[0] + 0.5 * rho * flat[1]
-    every = _Blocks.of(systems, index, 0.5 * rho + pulls[:, None], drawn, 0.5 * rho)
+    drawn = drawing[:, None] * flat[0] + 0.5 * rho * flat[1]
+    every = _Blocks.of(systems, index, 0.5 * rho + drawing[:, None], drawn, 0.5 * rho)
     rows = blocks(size * size, 64)
     lines = blocks(size, 64 * size)
     parts = [(every.take(r), r) for r in rows]
@@ -288,7 +280,7 @@ def solve_maps(
 
     def smooth_plane(k: int) -> float:
         """One plane's smooth copy and multipliers; the largest change of the copy."""
-        bent, bound = plane_laplacian(smooth[k]), float(threshold[k, 0])
+        bent, bound = laplacian(smooth[k]), float(threshold[k, 0])
         for part in lines:
             shifted = 2.0 * bent[part]
             shifted -= bend[k, part]
@@ -300,7 +292,7 @@ def solve_maps(
             change -= smooth[k, part]
             change *= RELAX
             level[k, part] += change
-        waves = plane_laplacian(bend[k])
+        waves = laplacian(bend[k])
         waves += level[k]
         waves = dctn(waves, type=2, overwrite_x=True)
         waves *= inverse
