@@ -1,9 +1,10 @@
-"""NumPy arrays in the form in which Dr.Jit's kernels stay the same from call to call."""
+"""Mitsuba and Dr.Jit, loaded late, and NumPy arrays in the form in which kernels stay the same from call to call."""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -15,6 +16,23 @@ OFFSET = 1e-3
 """Part of a mesh's diagonal by which rays start off its surface: facets don't shadow themselves."""
 Jit: TypeAlias = Any
 """A Dr.Jit array, vector or colour: its class belongs to the active variant, so no type can name it."""
+
+
+class _Late:
+    """A module that is imported when it is first used: LLVM is chosen before that, and commands start without it."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(importlib.import_module(self._name), name)
+
+
+if TYPE_CHECKING:
+    import drjit as dr
+    import mitsuba as mi
+else:
+    dr, mi = _Late("drjit"), _Late("mitsuba")
 
 
 def aligned(values: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray:
@@ -40,9 +58,6 @@ def on_device(kind: Jit, values: NDArray) -> Jit:
 
 def columns(values: list[Jit], count: int) -> NDArray[np.float32]:
     """Floats, of width N or 1, computed in one kernel -> (number of values, N)."""
-    import drjit as dr
-    import mitsuba as mi
-
     if not count:
         return np.zeros((len(values), 0), np.float32)
     floats = [mi.Float(value) for value in values]
@@ -57,8 +72,6 @@ def stored(values: list[Jit], count: int) -> NDArray[np.float32]:
 
 def rows_on_device(values: NDArray) -> Jit:
     """(V, K) numbers -> one Float of their rows, filled up to whole packets of four."""
-    import mitsuba as mi
-
     return mi.Float(aligned(np.pad(values, ((0, 0), (0, -values.shape[1] % 4)))).ravel())
 
 
@@ -67,9 +80,6 @@ def weighted_rows(rows: Jit, corners: Sequence[Jit], weights: Sequence[Jit], siz
 
     Rows are read four numbers at a time: single reads would be most of what there is to compile.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     packets, found = -(-size // 4), list[Jit]()
     for packet in range(packets):
         read = [dr.gather(mi.Vector4f, rows, corner * packets + packet) for corner in corners]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.arrays import on_device, stored
+from mifit.appearance.arrays import dr, mi, on_device, stored
 from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.kernels import diffuse_transfer, radiance
 from mifit.appearance.occlusion import MeshPoints
@@ -131,9 +131,6 @@ def diffuse_light(
 
 def _bend(light: SHLighting, normals: NDArray, base: NDArray) -> NDArray[np.float32]:
     """(N, 3) irradiance at bent normals over that at the mesh's."""
-    import drjit as dr
-    import mitsuba as mi
-
     rows = [mi.Color3f(*map(float, row)) for row in light.coefficients]
     dr.make_opaque(rows)
     bent, open_sky = (radiance(diffuse_transfer(on_device(mi.Vector3f, n), 3), rows) for n in (normals, base))

@@ -12,7 +12,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mifit.appearance.arrays import Jit, aligned, columns, expect, on_device, rows_on_device, stored, weighted_rows
+from mifit.appearance.arrays import (
+    Jit,
+    aligned,
+    columns,
+    dr,
+    expect,
+    mi,
+    on_device,
+    rows_on_device,
+    stored,
+    weighted_rows,
+)
 from mifit.appearance.illumination import DistantLight, Illumination
 from mifit.appearance.kernels import PreparedLobe, direct_light, light_transfer, prepare
 from mifit.appearance.lobe import Lobe
@@ -89,9 +100,6 @@ class Appearance:
         ``normals`` and ``view`` (N, 3) are as in `shade`, ``directions`` (M, 3) unit vectors; ``visible`` (M, N) bool
         says which of them each point sees.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         dark = Appearance(self.model, Illumination.dark(1), self.lobe)
         scene = _Scene(dark, normals, view, Occlusion(), shadows=False)
         shape = len(directions), scene.count
@@ -138,9 +146,6 @@ class BentImage:
         albedos: tuple[NDArray, NDArray] | None = None,
         rotation: ArrayLike = ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     ) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         self._scene = _Scene(appearance, base, view, occlusion)
         self._shade = self._scene.shader() if self._scene.count else None
         self._albedos: tuple[Jit, Jit] | None = None
@@ -155,9 +160,6 @@ class BentImage:
         self, normals: ArrayLike, turns: Sequence[ArrayLike] = ()
     ) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
         """The image (N, channels), and its derivatives along each turn (N, 3) of the normals: all in one kernel."""
-        import drjit as dr
-        import mitsuba as mi
-
         count, channels = self._scene.count, 6 if self._albedos is None else 3
         if self._shade is None:
             return np.zeros((0, channels), np.float32), [np.zeros((0, channels), np.float32) for _ in turns]
@@ -196,9 +198,6 @@ class _Scene:
     def __init__(
         self, appearance: Appearance, normals: ArrayLike, view: ArrayLike, occlusion: Occlusion, shadows: bool = True
     ) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         self.appearance, self.model = appearance, appearance.model
         illumination, order = appearance.illumination, appearance.order
         self.count = len(np.asarray(normals))
@@ -230,18 +229,12 @@ class _Scene:
 
     def light(self, light: DistantLight, visible: Jit) -> Shade:
         """Radiance at unit albedo per unit of a light's colour, as a function of normal and view."""
-        import drjit as dr
-        import mitsuba as mi
-
         samples = light.samples()
         directions, count = mi.Float(aligned(samples).ravel()), dr.opaque(mi.UInt32, len(samples))
         return lambda n, v: light_transfer(n, v, self.lobe, directions, count, visible)
 
     def with_lights(self, smooth: Shade) -> Shade:
         """Add the compact lights to the shading by smooth light."""
-        import drjit as dr
-        import mitsuba as mi
-
         lights = self.appearance.illumination.lights
         if not lights:
             return smooth
@@ -260,8 +253,6 @@ class _Scene:
 
     def store(self, shaded: tuple[Jit, Jit]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Two colours -> two arrays (N, 3)."""
-        import mitsuba as mi
-
         d, s = (mi.Color3f(part) for part in shaded)
         both = stored([d.x, d.y, d.z, s.x, s.y, s.z], self.count)
         return both[:, :3], both[:, 3:]
@@ -269,8 +260,6 @@ class _Scene:
 
 def _read_transfer(transfer: VertexTransfer, count: int, order: int) -> list[Jit]:
     """B*B Floats of points."""
-    import mitsuba as mi
-
     size = order * order
     values = expect(transfer.values, (len(transfer.values), size), "shadowed transfer")
     weights = expect(transfer.weights, (count, 3), "shadowed transfer: weights")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mifit.appearance.arrays import Jit
+from mifit.appearance.arrays import Jit, dr, mi
 from mifit.appearance.lobe import EXPONENT_MAX, EXPONENT_MIN, Lobe, lobe_table
 from mifit.core.sh import bands, cosine_coefficients
 from mifit.errors import InputError
@@ -21,8 +21,6 @@ from mifit.errors import InputError
 
 def sh_basis(d: Jit, order: int) -> list[Jit]:
     """The basis functions at unit directions, B*B of them."""
-    import drjit as dr
-
     return dr.sh_eval(d, order - 1)
 
 
@@ -33,9 +31,6 @@ def colours(flat: Jit, order: int, points: int | None = None) -> list[Jit]:
     point. Their values are the same, but the kernel that shades then sums the gradient over the points; values of width
     one take a kernel per number, each of which shades everything again.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     size = 3 * order * order
     if not dr.is_jit_v(mi.Float):
         numbers = [flat[k] for k in range(size)]
@@ -87,9 +82,6 @@ class PreparedLobe:
 
 def prepare(lobe: Lobe, order: int) -> PreparedLobe:
     """Load a lobe."""
-    import drjit as dr
-    import mitsuba as mi
-
     if not lobe.exponent > 0:
         raise InputError(f"exponent: found {float(lobe.exponent)}, expected a number from 1 to 10000")
     y = 2.0 * np.log(np.clip(lobe.exponent, EXPONENT_MIN, EXPONENT_MAX)) / np.log(EXPONENT_MAX) - 1.0
@@ -101,8 +93,6 @@ def prepare(lobe: Lobe, order: int) -> PreparedLobe:
 
 def prepare_exponent(exponent: Jit, order: int, normalized: bool = True, fresnel: Jit = None) -> PreparedLobe:
     """Prepare the lobe of a Dr.Jit exponent, differentiable and of any width."""
-    import drjit as dr
-
     table = lobe_table(order).tolist()
     m = dr.clip(exponent, EXPONENT_MIN, EXPONENT_MAX)
     t = _chebyshev(dr.log(m) * (2.0 / float(np.log(EXPONENT_MAX))) - 1.0, len(table[0][0]))
@@ -111,8 +101,6 @@ def prepare_exponent(exponent: Jit, order: int, normalized: bool = True, fresnel
 
 
 def _with_peak(order: int, polynomials: list[list[Jit]], exponent: Jit, normalized: bool, fresnel: Jit) -> PreparedLobe:
-    import drjit as dr
-
     peak = normalization(exponent)
     if normalized:
         return PreparedLobe(order, polynomials, 1.0, exponent, peak, fresnel)
@@ -129,15 +117,11 @@ def _chebyshev(x: Jit, count: int) -> list[Jit]:
 
 def normalization(exponent: Jit) -> Jit:
     """The normalised lobe's factor N(m), see ``lobe.normalization``."""
-    import drjit as dr
-
     return (exponent + 2.0) * (exponent + 4.0) / (8.0 * dr.pi * (exponent + dr.exp2(-0.5 * exponent)))
 
 
 def fresnel_factor(cosine: Jit, fresnel: Jit) -> Jit:
     """Factor on the specular albedo towards grazing angles, Schlick's ``1 + fresnel (1 - cosine)^5``."""
-    import drjit as dr
-
     return 1.0 + fresnel * (1.0 - dr.clip(cosine, 0.0, 1.0)) ** 5
 
 
@@ -147,8 +131,6 @@ def carried_lobe(wi: Jit, wo: Jit, n: Jit, exponent: Jit) -> tuple[Jit, Jit]:
     Returned are ``f / (C_s N(m))`` without the Fresnel factor, and the density of wo when ``((1 + r.wo) / 2)^(m/2)`` is
     sampled.
     """
-    import drjit as dr
-
     cos_i, cos_o = dr.dot(wi, n), dr.dot(wo, n)
     c = 2.0 * cos_i * cos_o - dr.dot(wi, wo)
     # The power of a floor instead of zero: its logarithm, and so the derivative by the exponent, stays finite.
@@ -164,8 +146,6 @@ def specular_transfer(n: Jit, v: Jit, lobe: PreparedLobe) -> list[Jit]:
 
 def lobe_axis(n: Jit, v: Jit, lobe: PreparedLobe) -> tuple[Jit, list[Jit]]:
     """Mean direction of the reflected lobe, and the lobe's moments."""
-    import drjit as dr
-
     cosine = dr.dot(n, v)
     mirror = 2.0 * cosine * n - v
     if lobe.fresnel is not None:
@@ -190,9 +170,6 @@ def dominant_direction(coefficients: Sequence[Jit]) -> Jit:
 
     Lighting without a linear band has none: the result is (0, 0, 1) there, with finite derivatives.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     if len(coefficients) < 4:
         return mi.Vector3f(0.0, 0.0, 1.0)
     y, z, x = (mi.luminance(mi.Color3f(c)) for c in coefficients[1:4])
@@ -204,8 +181,6 @@ def dominant_direction(coefficients: Sequence[Jit]) -> Jit:
 
 def direct_light(n: Jit, v: Jit, lobe: PreparedLobe, d: Jit) -> tuple[Jit, Jit]:
     """Radiance of a white diffuse and of a fully specular point under unit irradiance from a direction ``d``."""
-    import drjit as dr
-
     cosine, cosine_view = dr.maximum(dr.dot(n, d), 0.0), dr.dot(n, v)
     if lobe.fresnel is not None:
         # About the mirror direction: the half vector's cosine of a view along the normal is that of half the angle.
@@ -228,8 +203,6 @@ def light_transfer(n: Jit, v: Jit, lobe: PreparedLobe, directions: Jit, count: J
     (``DistantLight.samples``). Bit d of ``visible`` is 1 where direction d is visible. A loop goes through them: a
     kernel with a copy of the lobe for each takes long to compile.
     """
-    import drjit as dr
-    import mitsuba as mi
 
     def add(k: Jit, diffuse: Jit, specular: Jit, n: Jit, v: Jit) -> tuple[Jit, ...]:
         d, s = direct_light(n, v, lobe, dr.gather(mi.Vector3f, directions, k))
@@ -247,8 +220,6 @@ def unoccluded(n: Jit, axis: Jit, traced: Sequence[Jit], order: int) -> Jit:
     The traced vector holds the product of visibility and cosine. Its value at the axis, relative to that of
     the unshadowed vector, is the visibility there as sharply as B bands can.
     """
-    import drjit as dr
-
     # By the addition theorem the unshadowed vector's value depends on the angle between normal and axis alone.
     legendre = np.polynomial.legendre.leg2poly(
         (2.0 * np.arange(order) + 1.0) / (4.0 * np.pi**2) * cosine_coefficients(order)

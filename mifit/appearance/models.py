@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from mifit.appearance.arrays import Jit
+from mifit.appearance.arrays import Jit, dr, mi
 from mifit.appearance.kernels import (
     PreparedLobe,
     diffuse_transfer,
@@ -144,8 +144,6 @@ class PrintedModel(PaperModel):
 
 def paper_specular(n: Jit, v: Jit, direction: Jit, exponent: Jit, guard: float) -> Jit:
     """Factor by which the paper's specular term scales the shading: ``(n . h)^m / (n . d)``, guarded."""
-    import drjit as dr
-
     c = dr.maximum(dr.dot(n, direction), 0.0)
     h = v + direction
     cos_h = dr.dot(n, h * dr.rsqrt(dr.maximum(dr.squared_norm(h), 1e-8)))
@@ -195,9 +193,6 @@ class ShadowedModel(ShadingModel):
         For a bent one the unshadowed change is added, dimmed by the part of the light that reaches the point, and the
         lobe keeps its dimming.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         shadowed = self._traced(shadowed)
         blocked = radiance(shadowed, coefficients)
         open_sky = radiance(diffuse_transfer(base, lobe.order), coefficients)

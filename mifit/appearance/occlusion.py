@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from mifit.appearance.arrays import OFFSET, Jit, on_device, stored
+from mifit.appearance.arrays import OFFSET, Jit, dr, mi, on_device, stored
 from mifit.appearance.illumination import Illumination
 from mifit.appearance.kernels import diffuse_transfer, sh_basis
 from mifit.core.mesh import vertex_normals
@@ -146,8 +146,6 @@ def trace_transfer(
     light that reaches the points after one diffuse reflection off the mesh, with this albedo. InputError for points and
     normals of unequal shapes, no sample, or no band.
     """
-    import drjit as dr
-
     check_order(order)
     vertices, faces = np.asarray(scene.vertices, dtype=np.float64), np.asarray(scene.faces)
     p, n = np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
@@ -173,9 +171,6 @@ class _Hits:
     """What each of the rays of N points hits, filled in by `_trace`."""
 
     def __init__(self, count: int, samples: int) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         self._samples = samples
         self._face = dr.full(mi.UInt, 0xFFFFFFFF, count * samples)
         self._u, self._v = dr.zeros(mi.Float, count * samples), dr.zeros(mi.Float, count * samples)
@@ -183,8 +178,6 @@ class _Hits:
 
     def keep(self, point: Jit, ray: Jit, hit: Jit, blocked: Jit) -> None:
         """Write down the hit of one ray of each point."""
-        import drjit as dr
-
         at = point * self._samples + ray
         dr.scatter(self._face, hit.prim_index, at, blocked)
         dr.scatter(self._u, hit.prim_uv.x, at, blocked)
@@ -207,9 +200,6 @@ def _trace(
 
     What the rays hit is kept, not gathered: B*B numbers at three corners for each take six times as long as tracing.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     count, size = len(points), order * order
     if not count:
         return np.zeros((0, size), np.float32)

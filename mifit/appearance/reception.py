@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from mifit.appearance.arrays import OFFSET, Jit, aligned, on_device, stored
+from mifit.appearance.arrays import OFFSET, Jit, aligned, dr, mi, on_device, stored
 from mifit.core.mesh import normalize, vertex_normals
 from mifit.core.sh import LUMINANCE
 
@@ -51,9 +51,6 @@ class Reception:
         def summed(values: NDArray) -> NDArray[np.float64]:
             return np.stack([np.bincount(nearest, column, minlength=len(self.directions)) for column in values.T], 1)
 
-        import drjit as dr
-        import mitsuba as mi
-
         middle = normalize(summed(toward * (power @ LUMINANCE)[:, None]) + 1e-12 * self.directions)
         n, words = on_device(mi.Vector3f, self.normals), self.open_sky.shape[1]
         bits, vertex = mi.UInt(aligned(self.open_sky, np.uint32).ravel()), dr.arange(mi.UInt, len(self.normals))
@@ -89,9 +86,6 @@ def _trace(scene: SurfaceScene) -> Reception:
 
 def _exchange(scene: SurfaceScene, positions: NDArray, normals: NDArray) -> csr_matrix:
     """Cosine-distributed rays of every vertex, as a matrix over the vertices that they meet."""
-    import drjit as dr
-    import mitsuba as mi
-
     count = len(positions)
     # Opaque: the kernel is compiled once, not once for every mesh.
     offset: Jit = dr.opaque(mi.Float, OFFSET * float(np.linalg.norm(np.ptp(positions, axis=0))))

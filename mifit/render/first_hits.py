@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from mifit.appearance.arrays import dr, mi
 from mifit.core.files import Document
 from mifit.render.gbuffer import MESH_BUFFERS
-
-if TYPE_CHECKING:
-    import mitsuba as mi
 
 KEPT_RAYS = 2**22
 """Rays whose hits are kept at most, a dozen views of 680 x 480: a gigabyte."""
@@ -16,8 +14,6 @@ KEPT_RAYS = 2**22
 
 def recording() -> bool:
     """Are operations noted down for later, so that no value can be looked at?"""
-    import drjit as dr
-
     return bool(dr.flag(dr.JitFlag.SymbolicScope) or dr.flag(dr.JitFlag.FreezingScope))
 
 
@@ -36,9 +32,6 @@ class FirstHits:
 
     def find(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.UInt32 | None, mi.SurfaceInteraction3f]:
         """The points that a sensor's rays meet, and the numbers of their rays; None where each ray has an entry."""
-        import drjit as dr
-        import mitsuba as mi
-
         shapes, last, self.last = scene.shapes(), self.last, None
         plain = dr.is_jit_v(mi.Float) and all(shape.is_mesh() for shape in shapes)
         if not plain or recording() or last is None or last[1] is not ray or (camera := _state(last[0])) is None:
@@ -73,9 +66,6 @@ class FirstHits:
 
     def hit(self, index: mi.UInt32 | None, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Bool:
         """Which rays meet something, given what `find` found."""
-        import drjit as dr
-        import mitsuba as mi
-
         if index is None:
             return si.is_valid()
         met = dr.zeros(mi.Bool, dr.width(ray))
@@ -85,9 +75,6 @@ class FirstHits:
 
 def _state(sensor: mi.Sensor) -> list[Any] | None:
     """What a camera's rays follow from; None for a plugin that may not show all of it."""
-    import drjit as dr
-    import mitsuba as mi
-
     if sensor.class_name() != "PerspectiveCamera" and type(sensor).__name__ != "Pinhole":
         return None
     matrix = sensor.world_transform().matrix

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mifit.appearance.arrays import OFFSET, aligned, on_device
+from mifit.appearance.arrays import OFFSET, aligned, dr, mi, on_device
 from mifit.core.arrays import Recent
 from mifit.core.camera import Camera
 from mifit.core.mesh import lengths
 from mifit.errors import InputError
-
-if TYPE_CHECKING:
-    import mitsuba as mi
 
 MESH_POSITIONS = "vertex_positions"
 MESH_FACES = "faces"
@@ -57,8 +53,6 @@ def make_mesh(
 
     InputError for wrong shapes, indices out of range or positions that are not finite.
     """
-    import mitsuba as mi
-
     vertices, faces = np.asarray(vertices), np.asarray(faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices):
         raise InputError(f"vertices: found shape {vertices.shape}, expected (V, 3)")
@@ -97,8 +91,6 @@ class SurfaceScene:
     """
 
     def __init__(self, vertices: NDArray, faces: NDArray) -> None:
-        import mitsuba as mi
-
         self._mesh = make_mesh(vertices, faces)
         self.vertices, self.faces = np.asarray(vertices), np.asarray(faces)
         self.rays = mi.load_dict({"type": "scene", "mesh": self._mesh})
@@ -144,9 +136,6 @@ class SurfaceScene:
         return self._kept.get(full, lambda: self._traced(camera))
 
     def _traced(self, camera: Camera) -> _Hits:
-        import drjit as dr
-        import mitsuba as mi
-
         box = self._box(camera)
         part = tuple(len(range(size)[side]) for side, size in zip(box, (camera.height, camera.width), strict=True))
         if not all(part):
@@ -185,8 +174,6 @@ class SurfaceScene:
         by its own surface. A point that faces away is hidden by what lies in front of it; at silhouettes the caller
         should test the normal as well.
         """
-        import mitsuba as mi
-
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         if not len(points):
             return np.zeros(0, dtype=bool)
@@ -206,9 +193,6 @@ class SurfaceScene:
         the horizon counts as hidden. ``points`` and unit ``normals`` are (N, 3), unit ``directions`` (D, 3), at most
         32.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         if len(directions) > 32:
             raise InputError(f"directions: found {len(directions)}, expected at most 32")
         if not len(points):
@@ -231,9 +215,6 @@ class SurfaceScene:
 
 def _box_rays(camera: Camera, box: tuple[slice, slice]) -> tuple[mi.Vector3f, mi.Float]:
     """Unit directions through the centres of a box of pixels, row by row, and their parts along the camera's axis."""
-    import drjit as dr
-    import mitsuba as mi
-
     rows, columns = (range(size)[side] for side, size in zip(box, (camera.height, camera.width), strict=True))
     number = dr.arange(mi.UInt32, len(rows) * len(columns))
     width = dr.opaque(mi.UInt32, len(columns))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.arrays import dr, mi
 from mifit.core.camera import Camera
 from mifit.core.files import Document
 from mifit.render.gbuffer import make_mesh
@@ -53,8 +54,6 @@ class PathTracer:
     """
 
     def __init__(self, materials: dict[str, Material], environment: NDArray, specular: bool = True) -> None:
-        import mitsuba as mi
-
         gc.collect()  # a kernel has a branch for every mesh and material that is alive: garbage would make a new one
         self._bsdfs = {name: mi.load_dict(_bsdf(material, float(specular))) for name, material in materials.items()}
         bitmap = mi.Bitmap(np.ascontiguousarray(environment, dtype=np.float32))
@@ -68,9 +67,6 @@ class PathTracer:
 
         ``spp`` samples per pixel at the least, rounded up to the next k * k or k * (k + 1), which stratify well.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         side = math.isqrt(spp - 1) + 1
         spp = side * (side - 1) if side * (side - 1) >= spp else side * side
         content: Document = {"type": "scene", "environment": self._emitter}
@@ -114,8 +110,6 @@ def _bsdf(material: Material, strength: float) -> Document:
 
 
 def _texture(values: NDArray) -> Document:
-    import mitsuba as mi
-
     data = np.ascontiguousarray(values, dtype=np.float32)
     bitmap = mi.Bitmap(data if data.ndim == 3 else data[..., None])
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "repeat", "format": "variant"}

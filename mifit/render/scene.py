@@ -12,18 +12,15 @@ import re
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.arrays import mi
 from mifit.core.camera import Camera
 from mifit.core.files import Document
 from mifit.errors import InputError
 from mifit.render.plugins import register_plugins
-
-if TYPE_CHECKING:
-    import mitsuba as mi
 
 OWN = {"blinnphong": "BSDF", "pinhole": "Sensor", "shenv": "Emitter"}
 """What mifit's plugins are, by the names of ``mi.ObjectType``: they are registered with one variant, or with none."""
@@ -36,8 +33,6 @@ def load_scene(source: str | Path | Mapping[str, object], **parameters: object) 
     ``shenv`` is set to hold the scene. ``parameters`` are values for the ``$name`` parameters of an XML file.
     InputError where the file is missing or isn't a scene, or a plugin refuses its parameters.
     """
-    import mitsuba as mi
-
     register_plugins()
     if isinstance(source, Mapping):
         where, load = "scene dictionary", partial(mi.load_dict, dict(source))
@@ -61,8 +56,6 @@ def load_scene(source: str | Path | Mapping[str, object], **parameters: object) 
 
 def fit_environment(scene: mi.Scene) -> None:
     """Give each ``shenv`` a radius about the origin that holds the scene and its sensors."""
-    import mitsuba as mi
-
     box = scene.bbox()
     corners = [np.array(box.corner(i)).ravel() for i in range(8)] if box.valid() else []
     reach = max((float(np.linalg.norm(corner)) for corner in corners), default=1.0)
@@ -86,8 +79,6 @@ def render_scene(
 
     ``parameters`` are values of the file's ``<default>`` names, ``sensor`` says which of the scene's sensors.
     """
-    import mitsuba as mi
-
     scene = load_scene(path, **parameters)
     image = mi.render(scene, sensor=sensor, spp=spp, seed=seed)  # type: ignore[arg-type]
     return np.array(image, dtype=np.float32)
@@ -132,16 +123,12 @@ def sensor_description(camera: Camera, spp: int = 16) -> Document:
 
 def make_sensor(camera: Camera, spp: int = 16) -> mi.Sensor:
     """The loaded ``mi.Sensor`` of `sensor_description`; InputError as there."""
-    import mitsuba as mi
-
     register_plugins()
     return mi.load_dict(to_mitsuba(sensor_description(camera, spp)))
 
 
 def to_mitsuba(description: Mapping[str, object], transform: Callable[[np.ndarray], object] | None = None) -> Document:
     """The description for ``mi.load_dict``: its transforms are Mitsuba's, by default of the active variant."""
-    import mitsuba as mi
-
     made = transform or mi.ScalarTransform4f
 
     def convert(value: object) -> object:
@@ -157,7 +144,6 @@ def to_xml(description: Mapping[str, object], comment: str = "") -> str:
 
     ``$spp``, ``$resx`` and ``$resy`` are parameters of the file, and ``$max_depth`` where the integrator has one.
     """
-    import mitsuba as mi
     from mitsuba import scalar_rgb
 
     content = to_mitsuba(description, scalar_rgb.ScalarTransform4d)

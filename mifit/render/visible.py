@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mifit.appearance.arrays import mi
 from mifit.appearance.occlusion import OccludingMesh
 from mifit.core.arrays import Recent, content_key
 from mifit.core.camera import Camera
@@ -91,8 +92,6 @@ def occluding_mesh(vertices: NDArray, faces: NDArray) -> OccludingMesh:
     Reports, evaluations and turning lights draw the same few meshes again and again, and their shadows cost
     more than all else in a picture.
     """
-    import mitsuba as mi
-
     # A fit holds its vertices in double precision, its result in single: the same mesh, whose shadows are traced once.
     vertices = np.asarray(vertices, dtype=np.float64)
     key = content_key(mi.variant(), vertices, faces)

@@ -6,6 +6,8 @@ without an error and misbehave. So the classes are made once per variant.
 
 from __future__ import annotations
 
+from mifit.appearance.arrays import mi
+
 _CLASSES: dict[str, dict[str, type]] = {}
 
 
@@ -14,8 +16,6 @@ def register_plugins() -> dict[str, type]:
 
     Harmless to repeat. VariantError where no variant is active.
     """
-    import mitsuba as mi
-
     from mifit.errors import VariantError
     from mifit.render.plugins import blinnphong, pinhole, shdirect, shenv
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+from mifit.appearance.arrays import dr, mi
 from mifit.appearance.lobe import EXPONENT_MAX, EXPONENT_MIN
 
 
 def make() -> type:
     """Define the plugin class for the current variant."""
-    import drjit as dr
-    import mitsuba as mi
-
     from mifit.appearance.kernels import carried_lobe, fresnel_factor, normalization
 
     class BlinnPhong(mi.BSDF):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from mifit.appearance.arrays import dr, mi
 from mifit.errors import InputError
 
 
 def make() -> type:
     """Define the plugin class for the current variant."""
-    import drjit as dr
-    import mitsuba as mi
 
     class Pinhole(mi.Sensor):
         r"""

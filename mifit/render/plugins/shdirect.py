@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mifit.appearance.arrays import dr, mi
 from mifit.core.arrays import Recent
 from mifit.core.files import Document
 from mifit.core.mesh import vertex_normals
@@ -15,8 +16,6 @@ from mifit.errors import InputError
 
 def make() -> type:
     """Define the plugin class for the current variant."""
-    import drjit as dr
-    import mitsuba as mi
     from mitsuba.python.ad.integrators.common import ADIntegrator
 
     from mifit.appearance import kernels, models

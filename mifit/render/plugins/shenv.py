@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mifit.appearance.arrays import dr, mi
 from mifit.core.sh import LUMINANCE, basis, order_of, quadrature
 from mifit.errors import InputError
 
@@ -47,9 +48,6 @@ def read_coefficients(value: ArrayLike) -> np.ndarray:
 
 def make() -> type:
     """Define the plugin class for the current variant."""
-    import drjit as dr
-    import mitsuba as mi
-
     from mifit.appearance import kernels
 
     class SHEnvironment(mi.Emitter):
