@@ -110,17 +110,16 @@ def growth(reduced: bool) -> Figures:
 
 
 def error(reduced: bool) -> Figures:
-    """Error of the mesh and of the third view as more iterations are allowed, one timestep."""
-    limits = (1, 3, 30) if reduced else (1, 2, 4, 8, 30)
+    """Error of the mesh and of the third view as images and maps are larger, one timestep."""
     geometry, reflectance = [], []
-    for limit in limits:
-        result, costs = by_step(settings(geometry={"max_iterations": limit}), 1, "geometry")
+    for finest in (2, 0) if reduced else (3, 2, 1, 0):
+        result, costs = by_step(settings(surface={"finest": finest}), 1, "geometry")
         millimetres = mesh_error(result, Path(data()[0].path))["mesh_mm"]
-        geometry.append({"iterations": limit, "mesh_mm": millimetres, **total(costs)})
-    for limit in limits:
-        result, costs = by_step(settings(128, reflectance={"max_iterations": limit}), 1, "reflectance")
-        reflectance.append({"iterations": limit, "third_db": held_out(result), **costs["reflectance"]})
-    return {"stage 1": geometry, "stage 2": reflectance}
+        geometry.append({"number": finest, "mesh_mm": millimetres, **total(costs)})
+    for texels in (64, 256) if reduced else (64, 128, 256, 512):
+        result, costs = by_step(settings(texels), 1)
+        reflectance.append({"number": texels, "third_db": held_out(result), **total(costs)})
+    return {"surface, halvings of images": geometry, "whole fit, texels a side": reflectance}
 
 
 def first(reduced: bool) -> Figures:
@@ -212,8 +211,8 @@ def markdown(figures: Figures) -> str:
     head = " | ".join(COLUMNS.values())
     lines: list[str] = []
 
-    def row(name: str, cost: Mapping[str, float], *more: str) -> None:
-        lines.append(f"| {name} | " + " | ".join([*(f"{cost[key]:.1f}" for key in COLUMNS), *more]) + " |")
+    def row(name: str, cost: Mapping[str, float]) -> None:
+        lines.append(f"| {name} | " + " | ".join(f"{cost[key]:.1f}" for key in COLUMNS) + " |")
 
     if "steps" in figures:
         part = figures["steps"]
@@ -223,15 +222,10 @@ def markdown(figures: Figures) -> str:
     if "growth" in figures:
         powers = ", ".join(f"{by} to the power of {part['exponent']:.2f}" for by, part in figures["growth"].items())
         lines += ["", f"Processor time grows with {powers}."]
-    for stage, rows in figures.get("error", {}).items():
-        measure = "mesh_mm" if "mesh_mm" in rows[0] else "third_db"
-        lines += ["", f"| {stage}, iterations | {head} | {measure} |", "|---|---|---|---|---|"]
-        for one in rows:
-            row(str(one["iterations"]), one, f"{one[measure]:.2f}")
     if "first" in figures:
-        lines += ["", f"| one timestep, 128 texels | {head} |", "|---|---|---|---|"]
-        for name, cost in figures["first"].items():
-            row(f"{name} fit of a process", cost)
+        costs = [figures["first"][name]["processor_seconds"] for name in ("first", "second")]
+        text = "The first fit of a process takes {:.1f} cpu s, the second {:.1f} (one timestep, 128 texels)."
+        lines += ["", text.format(*costs)]
     if "render" in figures:
         part = figures["render"]
         lines += [
@@ -260,10 +254,8 @@ def draw(figures: Figures, folder: Path = IMAGES) -> list[Path]:
                 measure = "mesh_mm" if "mesh_mm" in rows[0] else "third_db"
                 axis.plot([r["processor_seconds"] for r in rows], [r[measure] for r in rows], "o-")
                 for r in rows:
-                    axis.annotate(
-                        r["iterations"], (r["processor_seconds"], r[measure]), (3, 4), textcoords="offset points"
-                    )
-                axis.set(xlabel="processor seconds", ylabel=measure, title=f"{stage} (numbers: iterations)")
+                    axis.annotate(r["number"], (r["processor_seconds"], r[measure]), (3, 4), textcoords="offset points")
+                axis.set(xlabel="processor seconds", ylabel=measure, title=stage)
     return out
 
 

@@ -40,14 +40,14 @@ def test_growth_and_errors_are_drawn_and_tabled(tmp_path):
     cost = {"processor_seconds": 3.0, "steady_seconds": 2.0, "peak_mb": 100.0}
     rows = [{"timesteps": n, **cost, "steps": {"surface": 1.0 * n}} for n in (1, 2)]
     texels = [{"texels": n, **cost, "steps": {"surface": 1.0}} for n in (64, 256)]
-    error = [{"iterations": n, "mesh_mm": 1.0 / n, **cost} for n in (1, 4)]
+    error = [{"number": n, "mesh_mm": 1.0 / n, **cost} for n in (1, 4)]
     figures = {
         "growth": {"timesteps": {"rows": rows, "exponent": 0.5}, "texels": {"rows": texels, "exponent": 0.0}},
-        "error": {"stage 1": error, "stage 2": [{"iterations": 1, "third_db": 30.0, **cost}]},
+        "error": {"surface": error, "reflectance": [{"number": 1, "third_db": 30.0, **cost}]},
         "first": {"first": cost, "second": cost},
     }
     assert [path.name for path in draw(figures, tmp_path)] == ["speed_growth.svg", "speed_error.svg"]
     assert all("<svg" in path.read_text() for path in tmp_path.iterdir())
     text = markdown(figures)
     assert "Processor time grows with timesteps to the power of 0.50, texels to the power of 0.00." in text
-    assert "| 4 | 3.0 | 2.0 | 100.0 | 0.25 |" in text and "first fit of a process" in text
+    assert "The first fit of a process takes 3.0 cpu s, the second 3.0" in text
