@@ -207,7 +207,7 @@ def test_appearance_recovers_albedo_and_lighting():
     observed = ((mean + modes @ albedo) * (harmonics @ shading) + 0.02).astype(np.float32)
     observed[:100] = 1.0  # a highlight
     untold = np.zeros((3, 5))
-    problem = AppearanceProblem(mean, modes, harmonics, observed, np.full(n, 1.0 / n), 30.0, 1e-4, untold)
+    problem = AppearanceProblem(mean, modes, harmonics, observed, np.full(n, 1.0 / n), 30.0, untold)
     solution = fit_appearance(problem, 50)
     assert solution.usable
     np.testing.assert_allclose(solution.value[:5], albedo, atol=0.02)
@@ -239,7 +239,7 @@ def test_the_level_of_the_albedo_is_held_whatever_the_light(tint):
         return (mean + modes @ solution.value[:7]).mean(axis=0) / whole
 
     weight = np.full(n, 1.0 / n)
-    held = AppearanceProblem(mean, modes, harmonics, observed, weight, 30.0, 1.0, level)
+    held = AppearanceProblem(mean, modes, harmonics, observed, weight, 30.0, level)
     np.testing.assert_allclose(levels(held), 1.0, atol=2e-3)
     assert (levels(replace(held, level=np.zeros_like(level))) < 0.95).all()  # what it is held against
 

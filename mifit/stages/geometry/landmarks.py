@@ -328,7 +328,7 @@ def fit_landmarks(
         term = LandmarkTerm(views, SURE * noise * widening)
         problem = LandmarkProblem(layout, state.frames, term, priors)
         least, most = np.where(held, state.x, low), np.where(held, state.x, high)
-        solution = minimize(problem, state.x, lower=least, upper=most, max_iterations=100, energy_tolerance=1e-5)
+        solution = minimize(problem, state.x, lower=least, upper=most, max_iterations=30, energy_tolerance=1e-5)
         state = replace(state, x=solution.value)
     return LandmarkFit(state, solution, views, noise)
 
