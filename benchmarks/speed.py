@@ -37,6 +37,7 @@ from mifit.progress import silent
 
 CAMERAS, IMAGES = ("left", "right"), Path(__file__).resolve().parents[1] / "docs" / "images"
 COLUMNS = {"processor_seconds": "cpu s", "steady_seconds": "wall s", "peak_mb": "MB"}
+ERRORS = {"mesh_mm": "mesh, mm from the truth", "third_db": "third view, dB"}
 Figures = dict[str, Any]
 
 
@@ -251,11 +252,11 @@ def draw(figures: Figures, folder: Path = IMAGES) -> list[Path]:
         out.append(folder / "speed_error.svg")
         with figure(out[-1], (9, 3.6), 2) as axes:
             for axis, (stage, rows) in zip(axes, figures["error"].items(), strict=True):
-                measure = "mesh_mm" if "mesh_mm" in rows[0] else "third_db"
+                measure = next(key for key in ERRORS if key in rows[0])
                 axis.plot([r["processor_seconds"] for r in rows], [r[measure] for r in rows], "o-")
                 for r in rows:
                     axis.annotate(r["number"], (r["processor_seconds"], r[measure]), (3, 4), textcoords="offset points")
-                axis.set(xlabel="processor seconds", ylabel=measure, title=stage)
+                axis.set(xlabel="processor seconds", ylabel=ERRORS[measure], title=stage)
     return out
 
 
