@@ -114,7 +114,6 @@ PARTS = (
     ),
     Part("surface: pairs across time", patches={f"{FIND}.across_time": lambda posed, turned: ()}, step="surface"),
     Part("stage 1: eyes that are added", {"geometry.eyes": False}),
-    Part("stage 1: albedo prior of skin's contrast", {"geometry.albedo_prior": 1.0}),
     Part(
         "light: compact lights",
         patches={"mifit.stages.reflectance.als.find_lights": _smooth_light_alone},
