@@ -244,8 +244,8 @@ class ReflectanceConfig:
     )
     exponent: float | None = number(
         None,
-        "Blinn-Phong exponent; none: 5 for paper, otherwise the one that explains the images best",
-        source="estimated",
+        "Blinn-Phong exponent; none: 5 for paper, else 80",
+        source="chosen on gloss",
         least=1,
         most=10_000,
     )

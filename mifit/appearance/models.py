@@ -60,7 +60,7 @@ class ShadingModel(ABC):
     bands : int or None
         Bands of the lighting that it is fitted with; None for as many as the settings ask for.
     exponent : float or None
-        Exponent where none is given; None where it is to be estimated.
+        Exponent where none is given; None for that of skin.
     fresnel : float or None
         Fresnel factor of the lobe that it is fitted with, see ``lobe.Lobe``.
     normalized : bool

@@ -29,7 +29,6 @@ from mifit.stages.reflectance.forward import Forward
 from mifit.stages.reflectance.lighting import (
     LightingSolution,
     Residuals,
-    fit_lighting,
     lighting_problem,
     solve_lighting,
 )
@@ -44,10 +43,6 @@ FAINT = 0.1
 """Part of the mean colour that a light must reflect. Data without noise show fainter ones where there are none."""
 LIGHTS = 3
 """Compact lights at the most: a face shows a few lamps apart, and what more there are is smooth light to it."""
-EXPONENT = 40.0
-"""Exponent of the lobe beforehand: as wide as a Beckmann roughness of 0.2."""
-EXPONENTS = 0.25 * EXPONENT, 2.0 * EXPONENT
-"""Exponents between which the lobe is looked for: Beckmann roughness 0.4 to 0.15."""
 ITERATIONS = 8
 """Gauss-Newton iterations of all light and albedos under lights in given places, and places that are tried."""
 SLOPE = np.radians(1.0)
@@ -160,29 +155,3 @@ def _place_steps(problem: LightingProblem, found: LightingSolution, slopes: Sequ
     system += 1e-6 * float(np.diag(system).mean()) * np.eye(len(system))
     steps = np.linalg.solve(system, tied.T @ right)[3 * k :].reshape(-1, 3)
     return np.asarray(steps, dtype=np.float64)
-
-
-def best_exponent(
-    seen: Observations, forward: Forward, albedo: NDArray, robust: bool, found: LightingSolution
-) -> tuple[Forward, LightingSolution]:
-    """The exponent of the lobe that leaves least unexplained, an octave at a time from the physical one.
-
-    Parameters as in `find_lights`, with the lights in ``forward``, and with all light ``found`` so far.
-    """
-
-    def score(forward: Forward, found: LightingSolution) -> float:
-        # A prior of one octave beside so many independent measurements.
-        octaves = np.log2(forward.lobe.exponent / EXPONENT)
-        return float(np.log(max(found.unexplained, 1e-12)) + 0.5 / PATCHES * octaves**2)
-
-    best = forward, found
-    for factor in (2.0, 0.5):
-        while EXPONENTS[0] <= (exponent := factor * best[0].lobe.exponent) <= EXPONENTS[1]:
-            other = forward.with_lobe(replace(forward.lobe, exponent=exponent))
-            trial = other, fit_lighting(seen, other, albedo, robust, ITERATIONS)
-            if score(*trial) >= score(*best):
-                break
-            best = trial
-        if best[0] is not forward:
-            break
-    return best
