@@ -59,8 +59,10 @@ class Part:
         The first step of a fit that the patches touch.
     without : tuple of str
         Steps that are left out.
+    moving : bool
+        Whether it does nothing for a head of one timestep.
     photometry : bool
-        Whether it is tried on changed photographs too; with two timesteps alone.
+        Whether it is tried on changed photographs too.
     """
 
     label: str
@@ -68,6 +70,7 @@ class Part:
     patches: Mapping[str, Any] = field(default_factory=dict)
     step: str = ""
     without: tuple[str, ...] = ()
+    moving: bool = False
     photometry: bool = False
 
     def config(self, size: int) -> FitConfig:
@@ -111,8 +114,14 @@ PARTS = (
         "surface: timesteps aligned",
         patches={f"{FIND}.align_timesteps": lambda model, fit, texels, posed, **_: fit},
         step="surface",
+        moving=True,
     ),
-    Part("surface: pairs across time", patches={f"{FIND}.across_time": lambda posed, turned: ()}, step="surface"),
+    Part(
+        "surface: pairs across time",
+        patches={f"{FIND}.across_time": lambda posed, turned: ()},
+        step="surface",
+        moving=True,
+    ),
     Part("stage 1: eyes that are added", {"geometry.eyes": False}),
     Part(
         "light: compact lights",
@@ -141,7 +150,7 @@ PARTS = (
     Part("stage 3: off", without=("normals", "mesh", "residual")),
     Part("stage 3: mesh", without=("mesh",)),
     Part("residual", {"residual.enabled": False}),
-    Part("photometry: gains and exposures", {"photometry.enabled": False}, photometry=True),
+    Part("photometry: gains and exposures", {"photometry.enabled": False}, moving=True, photometry=True),
 )
 """Every part, switched off alone."""
 
@@ -297,7 +306,7 @@ def run(
         one |= {"set": case.set, "changed": case.changed, "label": case.label, "commit": machine()["commit"]}
         fits, photographed = Fits(case), name in PHOTOGRAPHED
         for part in PARTS:
-            useless = part.photometry and len(case.timesteps) == 1  # a head that stands still tells nothing of it
+            useless = part.moving and len(case.timesteps) == 1
             if (photographed and part.label != BASE and not part.photometry) or useless:
                 continue
             if part.label != BASE and not wanted(part.label):
