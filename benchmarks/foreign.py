@@ -84,7 +84,7 @@ def without_specular(
     normals = mifit.refine_normals(*given, reflectance, cameras, config.normals, seed=SEED)
     residual = full.residual
     if residual is not None:
-        residual = mifit.find_residual(*given, reflectance, normals, cameras, config.residual, SEED)
+        residual = mifit.find_residual(*given, reflectance, normals, cameras, config.residual)
     return replace(full, reflectance=reflectance, normals=normals, mesh=None, residual=residual)
 
 

@@ -447,7 +447,7 @@ def _refine_mesh(source: Source, inputs: Estimates, progress: Progress, config: 
 def _find_residual(source: Source, inputs: Estimates, progress: Progress, config: ResidualConfig) -> ResidualEstimate:
     capture, model, cameras = source.images
     given = inputs["geometry"], inputs["reflectance"], inputs["normals"]
-    return find_residual(capture, model, *given, cameras, config, seed=source.seed, progress=progress)
+    return find_residual(capture, model, *given, cameras, config, progress)
 
 
 def check_images(capture: Capture, cameras: Sequence[str], timesteps: Sequence[int]) -> None:

@@ -41,12 +41,12 @@ def _synth_scan(arguments: Namespace) -> None:
     from mifit.synth.scanned import ScannedHead, maps_of, synthesize_scan
 
     head = ScannedHead.load(arguments.head, maps_of(arguments.maps or ()), arguments.unit_mm, arguments.flip_v)
-    environment = read_environment(arguments.env) if arguments.env else studio_environment(arguments.seed)
-    relit = {path.stem: read_environment(path) for path in arguments.relit or ()}
+    own = read_environment(arguments.env) if arguments.env else studio_environment(arguments.seed)
+    environments = {"": own, **{path.stem: read_environment(path) for path in arguments.relit or ()}}
     use_variant(arguments)
     cameras, progress = place_cameras(arguments.width, arguments.height), console_progress(arguments.quiet)
     options = given(arguments, "timesteps", "seed", "spp")
-    synthesize_scan(arguments.out, head, cameras, environment, relit, **options, progress=progress)
+    synthesize_scan(arguments.out, head, cameras, environments, **options, progress=progress)
     print(f"Capture: {arguments.out}; it has no landmarks yet: mifit landmarks {arguments.out}")
 
 

@@ -112,7 +112,7 @@ def refine(
     residual = None
     if result.residual is not None:
         given = capture, model, home, reflectance, normals, names
-        residual = find_residual(*given, config.residual, seed=seed, progress=progress)
+        residual = find_residual(*given, config.residual, progress)
     return replace(result, geometry=home, reflectance=reflectance, normals=normals, mesh=mesh, residual=residual)
 
 

@@ -42,7 +42,6 @@ def find_residual(
     normals: NormalsEstimate | None,
     cameras: Sequence[str],
     config: ResidualConfig | None = None,
-    seed: int = 0,
     progress: Progress = silent,
 ) -> ResidualEstimate:
     """What the images of each timestep hold beyond reflectance and light.
@@ -60,8 +59,6 @@ def find_residual(
     cameras : sequence of str
         Cameras to read; no other camera of the capture is touched.
     config : ResidualConfig, optional
-    seed : int
-        Of the tracing of shadows.
     progress : Progress
 
     Returns
@@ -91,7 +88,7 @@ def find_residual(
         refined = None
         if normals is not None and timestep in normals.timesteps:
             refined = texels.from_map(normals.normal_object[normals.timesteps.index(timestep)])
-        rows, difference, weight = _difference(surface, reflectance, refined, geometry.rotation[i], seed)
+        rows, difference, weight = _difference(surface, reflectance, refined, geometry.rotation[i])
         found = (weight[..., None] * difference).sum(1) / (config.prior + weight.sum(1))[:, None]
         values = np.zeros((len(texels.index), 3), dtype=np.float32)
         values[rows] = found
@@ -108,13 +105,13 @@ def find_residual(
 
 
 def _difference(
-    surface: Surface, reflectance: ReflectanceEstimate, refined: NDArray | None, rotation: NDArray, seed: int
+    surface: Surface, reflectance: ReflectanceEstimate, refined: NDArray | None, rotation: NDArray
 ) -> tuple[NDArray, NDArray[np.float32], NDArray[np.float32]]:
     """Texels (n,) that images of one timestep measure, what each shows beyond the model (n, J, 3), and its weight.
 
     The weight is the probability that the image shows the point: 1 for a view that does for sure, however it sees it.
     """
-    rows, seen, images = texel_images(surface, reflectance, seed)
+    rows, seen, images = texel_images(surface, reflectance)
     normal = seen.normal[:, 0] @ rotation
     if refined is not None:
         known = np.any(refined[rows] != 0, axis=1)

@@ -145,8 +145,7 @@ def synthesize_scan(
     out: str | Path,
     head: ScannedHead,
     cameras: Sequence[Camera],
-    environment: NDArray,
-    relit: Mapping[str, NDArray] | None = None,
+    environments: Mapping[str, NDArray],
     timesteps: int = 4,
     seed: int = 0,
     spp: int = 64,
@@ -160,10 +159,11 @@ def synthesize_scan(
     ``truth/environment_NAME.exr`` that environment; all linear. ``truth/meta.json`` has the factor of each to the
     sensor's range. There are no landmarks: `mifit landmarks` finds them. ``transforms.json`` is written last.
 
-    The last camera is the held-out view by custom; ``environment`` (H, W, 3) is lat-long radiance, and ``relit`` are
-    those of the relit truths by name.
+    The last camera is the held-out view by custom. ``environments`` are lat-long radiance (H, W, 3) by name: the first
+    lights the images, the others the relit truths.
     """
-    out, relit = Path(out), dict(relit or {})
+    out, (environment, *_) = Path(out), environments.values()
+    relit = list(environments.items())[1:]
     total = timesteps + len(relit)
     maps = head.maps
     material = Material(maps["albedo"], maps["specular"], maps["roughness"], maps["displacement"])
@@ -199,7 +199,7 @@ def synthesize_scan(
     with replacing(out / "truth" / "maps.npz") as temporary:
         halves = {name: value.astype(np.float16) for name, value in maps.items()}
         np.savez_compressed(temporary, **halves)  # type: ignore[arg-type]
-    for i, (name, light) in enumerate(relit.items()):
+    for i, (name, light) in enumerate(relit):
         light = reduced(light)
         image = PathTracer({"head": material}, light).render([surface(poses[0])], cameras[-1:], spp, seed=seed + i)[0]
         relit_exposure[name] = exposure_of(image)

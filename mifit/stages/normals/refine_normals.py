@@ -169,7 +169,7 @@ def solve_normals(problem: NormalProblem, max_iterations: int, start: NDArray, t
 
 
 def texel_images(
-    surface: Surface, reflectance: ReflectanceEstimate, seed: int
+    surface: Surface, reflectance: ReflectanceEstimate, seed: int = 0
 ) -> tuple[NDArray[np.intp], Observations, list[TexelImage]]:
     """Texels (n,) that images of a surface's one timestep measure, what these show, and the model's image of each.
 
