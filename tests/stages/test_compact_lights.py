@@ -184,7 +184,7 @@ def test_a_light_without_a_shadow_is_found_by_cosine_and_highlight(variant):
     assert len(found.illumination.lights) == 1 and degrees_off(found, KEY) < 3.0
 
 
-def test_without_an_exponent_the_lobe_is_that_of_skin_and_lights_are_found_still(walled):
+def test_without_a_given_exponent_the_lobe_is_that_of_skin_and_the_light_is_found(walled):
     config = replace(CONFIG, texture_size=24, exponent=None)
     found = infer_reflectance(walled, walled.model, walled.geometry, CAMERAS, config)
     assert found.lobe.exponent == SKIN_EXPONENT

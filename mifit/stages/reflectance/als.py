@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from mifit.morphable import MorphableModel
 
 EXPONENT = 80.0
-"""Exponent of the lobe where none is given: a Beckmann roughness of 0.15. Narrower ones gain nothing on gloss, Emily
-c3,c4, scan_city and four heads of Table 1, where it was chosen."""
+"""Exponent of the lobe where none is given: a Beckmann roughness of 0.15. Chosen on gloss; narrower lobes gain less
+than 0.1 dB there, and nothing on scan_city and the first head of Table 1."""
 WIDE = 0.5 * EXPONENT
-"""Exponent under which compact lights are looked for, as directions that are tried lie about 10 degrees apart."""
+"""Exponent while compact lights are looked for: the directions that are tried lie about 10 degrees apart."""
 LIGHTING_TEXELS = 6000
 """Texels that determine the lighting; a few hundred unknowns against 24 values of eight images each."""
 MAP_PASSES = 3
