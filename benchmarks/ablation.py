@@ -165,7 +165,7 @@ PHOTOGRAPHED = {
     f"scan_studio, {change or 'as it is'}": Case("scan_studio", timesteps=TWO, changed=change)
     for change in ("", *heads.CHANGES)
 }
-"""Heads by which photometric parts are tried."""
+"""Heads by which photometric parts are tried, and with photographs as they are those that need several timesteps."""
 
 
 class Fits:
@@ -302,7 +302,8 @@ def run(
         fits, photographed = Fits(case), name in PHOTOGRAPHED
         for part in PARTS:
             useless = part.moving and len(case.timesteps) == 1
-            if (photographed and part.label != BASE and not part.photometry) or useless:
+            tried = part.label == BASE or part.photometry or (part.moving and not case.changed)
+            if (photographed and not tried) or useless:
                 continue
             if part.label != BASE and not wanted(part.label):
                 continue
