@@ -140,6 +140,11 @@ PARTS = (
         patches={f"{INFER}.light_known": lambda *given: 1.0},
         step="reflectance",
     ),
+    Part(
+        "stage 2: sheen taken out of the albedo",
+        patches={"mifit.stages.reflectance.fill.sheen_left": lambda texels, albedo, *_: np.zeros(len(albedo))},
+        step="reflectance",
+    ),
     Part("stage 2: hair", patches={f"{INFER}.find_hair": lambda *given: None}, step="reflectance"),
     Part("stage 2: difference term", {"reflectance.specular_difference_weight": 0.0}),
     Part("stage 3: off", without=("normals", "mesh", "residual")),

@@ -208,6 +208,8 @@ MUTATIONS = (
       "np.abs(self.value) > SURE * self.deviation", "True", "tests/stages/test_photometry.py"),
     M("either half shows the other's skin", "fill.bilateral_change", "(total + beyond)", "(2.0 * beyond)",
       "tests/stages/test_fill.py"),
+    M("brighter skin is sheen", "fill.sheen_left", "np.minimum(sheen, brighter)", "brighter",
+      "tests/stages/test_fill.py"),
     M("normals smoothed by a tenth", "refine_normals.frame_problem", "0.5 * config.laplacian_weight / WHITE",
       "0.05 * config.laplacian_weight / WHITE", "tests/stages/test_refine_normals.py tests/test_paper.py"),
     # Calibration.

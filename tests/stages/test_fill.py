@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from mifit.core.mesh import interpolate
-from mifit.core.uv import rasterize_uv
+from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs
-from mifit.stages.reflectance.fill import blend_unseen, light_error, light_known, light_level
+from mifit.stages.reflectance.fill import blend_unseen, light_error, light_known, light_level, sheen_left
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +108,23 @@ def test_the_lit_half_decides_what_skin_is(half_seen):
     error, before = (np.abs(v - truth[:, :3])[~seen & inside].mean() for v in (found, tinted[:, :3]))
     assert error < 0.25 * before
     np.testing.assert_allclose(found[seen & inside], truth[seen & inside, :3], atol=0.03)
+
+
+def test_sheen_is_brighter_and_paler_than_the_skin_around():
+    """Brighter skin of the same colour, and a pale mark that is darker, are no sheen."""
+    texels = TexelMap(100, np.arange(100**2), np.zeros(100**2, np.int32), np.ones((100**2, 3)) / 3)
+    skin = np.array([0.5, 0.3, 0.2])
+    rng = np.random.default_rng(0)
+    albedo = skin * rng.normal(1.0, 0.02, (100**2, 1))
+    y, x = np.divmod(np.arange(100**2), 100)
+    sheen, bright, scar = (np.hypot(x - at, y - 50) < 1.5 for at in (20, 50, 80))
+    albedo[sheen] += 0.15
+    albedo[bright] *= 1.4
+    albedo[scar] = 0.2
+    found = sheen_left(texels, albedo, np.ones_like(albedo), np.ones(len(albedo)))
+    assert np.abs(found[sheen] - 0.15).max() < 0.03
+    assert found[~sheen].max() < 0.02
+    assert not sheen_left(texels, albedo, np.ones_like(albedo), np.zeros(len(albedo))).any()
 
 
 def test_a_fine_mark_stays_on_its_side(half_seen):

@@ -25,6 +25,11 @@ BLEND = 0.05
 """Confidence at which a texel's own estimate counts as much as its surroundings'."""
 ALIKE = 0.01
 """Distance over which skin is alike on both halves of a face, relative to the map: chosen on scan_city."""
+SHEEN = 0.02
+"""Standard deviation of the surroundings that show a skin's colour, relative to the map: chosen on scan_city, and
+on its head under two other suns."""
+CONTRAST = 0.1
+"""Contrast of skin in the logarithm: what differs by more from its surroundings says less of their colour."""
 TYPICAL = 3e-4
 """Weight of the typical value of skin beside that of a texel of confidence 1: it decides far from what was seen."""
 STIFFNESS = 0.02
@@ -79,9 +84,9 @@ def blend_unseen(
         How far images determine the specular albedo, 0..1: not at all for a well visible texel in deep shade, or where
         no lobe points at a light.
     lit : (N,), optional
-        Share of the images in the diffuse albedo where visibility is full (`light_known`). With it the albedo is
-        skin's under any light: both halves share what they show (`bilateral_change`). Without it the albedo stays as
-        the capture's own light shows it.
+        Share of the images in the diffuse albedo where visibility is full (`light_known`). With it the
+        albedo is skin's under any light: without sheen (`sheen_left`), and both halves share what they show
+        (`bilateral_change`). Without it the albedo stays as the capture's own light shows it.
     """
     expected = np.maximum(interpolate(model.mean_albedo, model.faces, texels.face, texels.weights), DARKEST)
     found = texels.from_map(maps).astype(np.float64)
@@ -94,6 +99,10 @@ def blend_unseen(
     variance = 1.0 / np.maximum(confidence, 1e-9) + (1.0 / np.maximum(light, 1e-9) - 1.0) / BLEND
     confidence = confidence * light
     known = np.where(confidence > 0, 1.0 / variance, 0.0)
+    if lit is not None:
+        albedo = expected * np.exp(found[:, :3])
+        sheen = sheen_left(texels, albedo, expected, skin * known)
+        found[:, :3] = np.log(np.maximum(albedo - sheen[:, None], DARKEST) / expected)
     if model.symmetry is not None:
         opposite = mirrored_coordinates(model, texels)
         if lit is not None:
@@ -127,6 +136,30 @@ def _blurred(texels: TexelMap, values: NDArray, deviation: float) -> NDArray[np.
     """Values (N, ...) of texels, blurred by a deviation relative to the map; 0 counts beside them."""
     image = texels.to_map(values.astype(np.float32))
     return texels.from_map(cv2.GaussianBlur(image, (0, 0), deviation * texels.size))
+
+
+def sheen_left(texels: TexelMap, albedo: NDArray, expected: NDArray, known: NDArray) -> NDArray[np.float64]:
+    """(N,) what of a diffuse albedo (N, 3) is sheen: brighter than the skin around a texel, and as much paler.
+
+    Highlights that the lobe or the mesh doesn't place right are left in the diffuse albedo. They have the light's
+    colour, skin of another brightness keeps its own. ``expected`` (N, 3) is the mean face's albedo, ``known`` (N,) the
+    weight of each texel.
+    """
+    found = np.full(len(albedo), np.inf)
+    for like in (expected, np.ones_like(expected)):  # what the mean face or the skin around explains isn't sheen
+        factor, weight = np.log(np.maximum(albedo, DARKEST) / like), known
+        for _ in range(3):
+            count = np.maximum(_blurred(texels, weight, SHEEN), 1e-9)[:, None]
+            around = _blurred(texels, weight[:, None] * factor, SHEEN) / count
+            weight = known / (1.0 + ((factor - around).mean(axis=1) / CONTRAST) ** 2)
+        skin = like * np.exp(around)
+        # albedo = part of the skin's + sheen, least squares over the channels; sheen beforehand is as bright as skin.
+        square, total = (skin**2).sum(axis=1), skin.sum(axis=1)
+        determinant = (3.0 + CONTRAST**2) * square - total**2
+        sheen = (square * albedo.sum(axis=1) - total * (albedo * skin).sum(axis=1)) / determinant
+        brighter = (albedo - skin).mean(axis=1)
+        found = np.minimum(found, np.minimum(sheen, brighter))
+    return np.where(known > 0, np.maximum(found, 0.0), 0.0)
 
 
 def bilateral_change(texels: TexelMap, values: NDArray, known: NDArray, opposite: NDArray) -> NDArray[np.float64]:
