@@ -4,9 +4,9 @@
 
 `PARTS` is the table: a name, and how the part is switched off, by settings or by what stands in for a function of the
 package. Steps of a fit that a part doesn't touch are run once per head. Judged by the held-out view over skin and over
-the whole face, relit views, separation of the specular image, and distances from the scan; cost is processor seconds of
-the whole fit. A part that the package doesn't have is named as gone. Rows that aren't asked for keep their figures.
-Writes ``benchmarks/results/ablation.json`` and ``ablation.md``.
+the whole face, relit views, the scan's albedo, separation of the specular image, and distances from the scan; cost is
+processor seconds of the whole fit. A part that the package doesn't have is named as gone. Rows that aren't asked for
+keep their figures. Writes ``benchmarks/results/ablation.json`` and ``ablation.md``.
 """
 
 from __future__ import annotations
@@ -141,8 +141,8 @@ PARTS = (
         step="reflectance",
     ),
     Part(
-        "stage 2: sheen taken out of the albedo",
-        patches={"mifit.stages.reflectance.fill.sheen_left": lambda texels, albedo, *_: np.zeros(len(albedo))},
+        "stage 2: filling of colours that no pigment makes",
+        patches={"mifit.stages.reflectance.fill.pigment_weight": lambda texels, albedo, *_: np.ones(len(albedo))},
         step="reflectance",
     ),
     Part("stage 2: hair", patches={f"{INFER}.find_hair": lambda *given: None}, step="reflectance"),
@@ -225,6 +225,8 @@ def figures(case: Case, result: Reconstruction) -> dict[str, Any]:
     }
     if judge.scan_of(case, capture, case.timesteps[0]) is not None:
         out["mm"] = judge.judge_mesh(case, capture, rows["full"])["mean_mm"]
+        albedo = judge.judge_surface(case, capture, rows["full"]).get("albedo_psnr")
+        out |= {} if albedo is None else {"albedo": albedo}
     if relit_truths(capture) and not case.changed:
         relit = judge.judge_relit(case, capture, {"full": rows["full"]}, ("local",), 1, LIGHTS)
         out["relit"] = relit["full, local"]["mean"]
@@ -248,7 +250,7 @@ def row_of(part: Part, fits: Fits, size: int) -> dict[str, Any]:
 
 MEASURES: dict[str, tuple[str, int]] = {
     "skin": ("skin dB", 2), "alone": ("model alone", 2), "whole": ("whole face", 2), "relit": ("relit dB", 2),
-    "mm": ("mm", 3), "separation": ("separation", 2), "cpu": ("cpu s", 0),
+    "albedo": ("albedo dB", 2), "mm": ("mm", 3), "separation": ("separation", 2), "cpu": ("cpu s", 0),
 }  # fmt: skip
 
 

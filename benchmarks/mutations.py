@@ -208,7 +208,7 @@ MUTATIONS = (
       "np.abs(self.value) > SURE * self.deviation", "True", "tests/stages/test_photometry.py"),
     M("either half shows the other's skin", "fill.bilateral_change", "(total + beyond)", "(2.0 * beyond)",
       "tests/stages/test_fill.py"),
-    M("brighter skin is sheen", "fill.sheen_left", "np.minimum(sheen, brighter)", "brighter",
+    M("skin with fewer pigments is skin", "fill.beyond_pigments", "(amount >= 0).all(axis=1)", "True",
       "tests/stages/test_fill.py"),
     M("normals smoothed by a tenth", "refine_normals.frame_problem", "0.5 * config.laplacian_weight / WHITE",
       "0.05 * config.laplacian_weight / WHITE", "tests/stages/test_refine_normals.py tests/test_paper.py"),

@@ -4,12 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 from mifit.core.mesh import interpolate
 from mifit.core.uv import TexelMap, rasterize_uv
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import eyeballs
-from mifit.stages.reflectance.fill import blend_unseen, light_error, light_known, light_level, sheen_left
+from mifit.morphable.pigment import HAEMOGLOBIN, MELANIN
+from mifit.stages.reflectance.fill import (
+    beyond_pigments,
+    blend_unseen,
+    light_error,
+    light_known,
+    light_level,
+    pigment_weight,
+)
 
 
 @pytest.fixture(scope="module")
@@ -110,21 +119,45 @@ def test_the_lit_half_decides_what_skin_is(half_seen):
     np.testing.assert_allclose(found[seen & inside], truth[seen & inside, :3], atol=0.03)
 
 
-def test_sheen_is_brighter_and_paler_than_the_skin_around():
-    """Brighter skin of the same colour, and a pale mark that is darker, are no sheen."""
+def test_skin_is_what_pigments_make_of_the_skin_around():
+    """Moles and redness are skin. Sheen, a shadow that has the sky's colour, and light from other skin are not."""
     texels = TexelMap(100, np.arange(100**2), np.zeros(100**2, np.int32), np.ones((100**2, 3)) / 3)
-    skin = np.array([0.5, 0.3, 0.2])
-    rng = np.random.default_rng(0)
+    skin, rng = np.array([0.5, 0.3, 0.2]), np.random.default_rng(0)
     albedo = skin * rng.normal(1.0, 0.02, (100**2, 1))
     y, x = np.divmod(np.arange(100**2), 100)
-    sheen, bright, scar = (np.hypot(x - at, y - 50) < 1.5 for at in (20, 50, 80))
-    albedo[sheen] += 0.15
-    albedo[bright] *= 1.4
-    albedo[scar] = 0.2
-    found = sheen_left(texels, albedo, np.ones_like(albedo), np.ones(len(albedo)))
-    assert np.abs(found[sheen] - 0.15).max() < 0.03
-    assert found[~sheen].max() < 0.02
-    assert not sheen_left(texels, albedo, np.ones_like(albedo), np.zeros(len(albedo))).any()
+    marks = dict(zip(("mole", "red", "hair", "sheen", "shadow", "orange"), (8, 25, 42, 58, 75, 92), strict=True))
+    spots = {name: np.hypot(x - at, y - 50) < 1.5 for name, at in marks.items()}
+    albedo[spots["mole"]] *= np.exp(-0.5 * MELANIN)
+    albedo[spots["red"]] *= np.exp(-0.3 * HAEMOGLOBIN)
+    albedo[spots["hair"]] *= 0.4
+    albedo[spots["sheen"]] += 0.15
+    albedo[spots["shadow"]] *= (0.5, 0.7, 0.9)
+    albedo[spots["orange"]] *= (1.4, 1.2, 1.0)
+    plain = ~np.any(list(spots.values()), axis=0)
+    found = pigment_weight(texels, albedo, np.ones_like(albedo), np.ones(len(albedo)))
+    assert found[plain].min() > 0.5 and found[plain].mean() > 0.9
+    assert min(found[spots[name]].min() for name in ("mole", "red", "hair")) > 0.7
+    assert max(found[spots[name]].max() for name in ("sheen", "shadow", "orange")) < 0.3
+    assert np.isfinite(pigment_weight(texels, albedo, np.ones_like(albedo), np.zeros(len(albedo)))).all()
+
+
+def test_distances_from_what_pigments_make_are_those_of_non_negative_least_squares():
+    changes = np.random.default_rng(1).normal(0.0, 0.3, (200, 3))
+    axes = np.stack([MELANIN, HAEMOGLOBIN, np.ones(3)], axis=1)
+    np.testing.assert_allclose(beyond_pigments(changes), [nnls(axes, -c)[1] ** 2 for c in changes], atol=1e-9)
+
+
+def test_sheen_in_the_albedo_gives_way_to_the_skin_around(half_seen):
+    model, texels, truth, *_ = half_seen
+    shiny = truth.astype(np.float32).copy()
+    place = interpolate(model.mean, model.faces, texels.face, texels.weights) * model.unit_mm
+    spot = np.linalg.norm(place - place[len(place) // 3], axis=1) < 3.0
+    shiny[spot, :3] += 0.2
+    sure = np.ones(len(truth), np.float32)
+    given = model, texels, texels.to_map(shiny), sure, sure
+    kept, found = (texels.from_map(blend_unseen(*given, lit).diffuse)[spot] for lit in (None, sure))
+    before, after = (np.abs(each - truth[spot, :3]).mean() for each in (kept, found))
+    assert before > 0.15 and after < 0.3 * before
 
 
 def test_a_fine_mark_stays_on_its_side(half_seen):

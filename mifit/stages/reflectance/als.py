@@ -313,7 +313,7 @@ def specular_observability(
     ``sizes`` (N, 2) are the sum of the deviations of each texel's residuals at weight 1, and their number, ``usual`` is
     the deviation of all; ``expected`` is the specular albedo beforehand.
     """
-    side = 2 * max(1, round(ALIKE * texels.size)) + 1
+    side = 2 * max(1, round(0.5 * ALIKE * texels.size)) + 1
     image, border = texels.to_map(sizes), cv2.BORDER_CONSTANT
     around = cv2.boxFilter(image, cv2.CV_32F, (side, side), normalize=False, borderType=border)
     total, count = texels.from_map(around).T

@@ -1,12 +1,14 @@
-"""Skin where no image looked or no light came: like the other half of the face, or the mean face in proportion.
+"""Skin where no image looked, no light came or the albedo found is no skin's: like the other half of the face, or the
+mean face in proportion.
 
-Maps are solved with the mesh's normals and a smooth lighting. What both miss ends in the diffuse map, the more the less
+Maps are solved with the mesh's normals and the light found. What both miss ends in the diffuse map, the more the less
 light there is: an error of the light moves the log albedo of a dim texel far.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -17,23 +19,22 @@ from mifit.core.mesh_solve import membrane
 from mifit.core.uv import TexelMap, sample_map
 from mifit.morphable import MorphableModel
 from mifit.morphable.openings import skin_faces
-from mifit.morphable.pigment import SPREAD
+from mifit.morphable.pigment import HAEMOGLOBIN, MELANIN, SPREAD
 from mifit.sampling.visibility import DARKEST
 from mifit.stages.geometry.points import corner_matrix
 
 BLEND = 0.05
 """Confidence at which a texel's own estimate counts as much as its surroundings'."""
-ALIKE = 0.01
-"""Distance over which skin is alike on both halves of a face, relative to the map: chosen on scan_city."""
-SHEEN = 0.02
-"""Standard deviation of the surroundings that show a skin's colour, relative to the map: chosen on scan_city, and
-on its head under two other suns."""
-CONTRAST = 0.1
-"""Contrast of skin in the logarithm: what differs by more from its surroundings says less of their colour."""
-TYPICAL = 3e-4
+ALIKE = 0.02
+"""Distance over which skin is alike around a place and on both halves of a face, relative to the map: chosen on
+scan_city, gloss and the first heads of Table 1; half and twice as much change little."""
+CONTRAST = 0.15
+"""Contrast of skin in the logarithm beside what pigments make: what differs by more is hardly skin. Chosen on
+scan_city, gloss and the first heads of Table 1; 0.05 to 0.2 are alike."""
+TYPICAL = 1.5e-3
 """Weight of the typical value of skin beside that of a texel of confidence 1: it decides far from what was seen."""
-STIFFNESS = 0.02
-"""Of the membrane, beside texels of confidence 1."""
+STIFFNESS = 0.1
+"""Of the membrane, beside texels of confidence 1: chosen as `ALIKE` is; up to 1 little changes if `TYPICAL` follows."""
 FEATURE = 0.06
 """Extent of the widest dark feature of a face, relative to the map: brows."""
 BORDER = 0.03
@@ -85,8 +86,8 @@ def blend_unseen(
         no lobe points at a light.
     lit : (N,), optional
         Share of the images in the diffuse albedo where visibility is full (`light_known`). With it the
-        albedo is skin's under any light: without sheen (`sheen_left`), and both halves share what they show
-        (`bilateral_change`). Without it the albedo stays as the capture's own light shows it.
+        albedo is skin's under any light: what no pigment makes (`pigment_weight`) is filled too, and both halves share
+        what they show (`bilateral_change`). Without it the albedo stays as the capture's own light shows it.
     """
     expected = np.maximum(interpolate(model.mean_albedo, model.faces, texels.face, texels.weights), DARKEST)
     found = texels.from_map(maps).astype(np.float64)
@@ -95,18 +96,16 @@ def blend_unseen(
     # Eyes are no skin: their light is as it is found, and neither is like the other.
     skin = skin_faces(model)[texels.face]
     light = np.ones_like(confidence) if lit is None else np.where(skin, lit, 1.0)
-    # Variances add: that of visibility, and that of the light, both in units of `BLEND`'s texel.
-    variance = 1.0 / np.maximum(confidence, 1e-9) + (1.0 / np.maximum(light, 1e-9) - 1.0) / BLEND
-    confidence = confidence * light
-    known = np.where(confidence > 0, 1.0 / variance, 0.0)
+    known = sure = _weight(confidence, light)
     if lit is not None:
-        albedo = expected * np.exp(found[:, :3])
-        sheen = sheen_left(texels, albedo, expected, skin * known)
-        found[:, :3] = np.log(np.maximum(albedo - sheen[:, None], DARKEST) / expected)
+        natural = pigment_weight(texels, expected * np.exp(found[:, :3]), expected, skin * known)
+        natural = np.where(skin, natural, 1.0)
+        known, sure = _weight(confidence, light * natural), known * natural
+    confidence = confidence * light
     if model.symmetry is not None:
         opposite = mirrored_coordinates(model, texels)
         if lit is not None:
-            found[:, :3] += skin[:, None] * bilateral_change(texels, found[:, :3], skin * known, opposite)
+            found[:, :3] += skin[:, None] * bilateral_change(texels, found[:, :3], skin * sure, opposite)
         there, values = (_across(texels, of, opposite) for of in (known, found * known[:, None]))
         taken = there * (1.0 - np.clip(known / BLEND, 0.0, 1.0))
         total = np.maximum(known + taken, 1e-12)[:, None]
@@ -124,6 +123,13 @@ def blend_unseen(
     return Filled(image[..., :3], image[..., 3], *both)
 
 
+def _weight(confidence: NDArray, share: NDArray) -> NDArray[np.float64]:
+    """(N,) weight of texels' own albedo. Variances add: that of visibility, and that of the light, of which a ``share``
+    (N,) is known; both in units of `BLEND`'s texel."""
+    variance = 1.0 / np.maximum(confidence, 1e-9) + (1.0 / np.maximum(share, 1e-9) - 1.0) / BLEND
+    return np.where(confidence * share > 0, 1.0 / variance, 0.0)
+
+
 def continued(
     model: MorphableModel, texels: TexelMap, values: NDArray, weight: NDArray, stiffness: float
 ) -> NDArray[np.float64]:
@@ -138,28 +144,34 @@ def _blurred(texels: TexelMap, values: NDArray, deviation: float) -> NDArray[np.
     return texels.from_map(cv2.GaussianBlur(image, (0, 0), deviation * texels.size))
 
 
-def sheen_left(texels: TexelMap, albedo: NDArray, expected: NDArray, known: NDArray) -> NDArray[np.float64]:
-    """(N,) what of a diffuse albedo (N, 3) is sheen: brighter than the skin around a texel, and as much paler.
+def pigment_weight(texels: TexelMap, albedo: NDArray, expected: NDArray, known: NDArray) -> NDArray[np.float64]:
+    """(N,) how far diffuse albedos (N, 3) are skin's own, 0..1: what pigments make of the skin around them.
 
-    Highlights that the lobe or the mesh doesn't place right are left in the diffuse albedo. They have the light's
-    colour, skin of another brightness keeps its own. ``expected`` (N, 3) is the mean face's albedo, ``known`` (N,) the
-    weight of each texel.
+    Sheen, shadows that lie beside where the mesh throws them and light from other skin end in the albedo too, and have
+    other colours. ``expected`` (N, 3) is the mean face's albedo, ``known`` (N,) the weight of each texel.
     """
-    found = np.full(len(albedo), np.inf)
-    for like in (expected, np.ones_like(expected)):  # what the mean face or the skin around explains isn't sheen
+    unlike = np.full(len(albedo), np.inf)
+    for like in (expected, np.ones_like(expected)):  # what the mean face or the skin around explains is skin
         factor, weight = np.log(np.maximum(albedo, DARKEST) / like), known
         for _ in range(3):
-            count = np.maximum(_blurred(texels, weight, SHEEN), 1e-9)[:, None]
-            around = _blurred(texels, weight[:, None] * factor, SHEEN) / count
+            count = np.maximum(_blurred(texels, weight, ALIKE), 1e-9)[:, None]
+            around = _blurred(texels, weight[:, None] * factor, ALIKE) / count
             weight = known / (1.0 + ((factor - around).mean(axis=1) / CONTRAST) ** 2)
-        skin = like * np.exp(around)
-        # albedo = part of the skin's + sheen, least squares over the channels; sheen beforehand is as bright as skin.
-        square, total = (skin**2).sum(axis=1), skin.sum(axis=1)
-        determinant = (3.0 + CONTRAST**2) * square - total**2
-        sheen = (square * albedo.sum(axis=1) - total * (albedo * skin).sum(axis=1)) / determinant
-        brighter = (albedo - skin).mean(axis=1)
-        found = np.minimum(found, np.minimum(sheen, brighter))
-    return np.where(known > 0, np.maximum(found, 0.0), 0.0)
+        unlike = np.minimum(unlike, beyond_pigments(factor - around))
+    return np.asarray(1.0 / (1.0 + unlike / CONTRAST**2))
+
+
+def beyond_pigments(change: NDArray) -> NDArray[np.float64]:
+    """(N,) squared distance of changes (N, 3) of log albedo from those that more of some pigments makes: melanin,
+    haemoglobin and what darkens all channels alike, as hair does."""
+    least = (change**2).sum(axis=1)
+    for count in (1, 2, 3):
+        for chosen in combinations((MELANIN, HAEMOGLOBIN, np.ones(3)), count):
+            axes = np.stack(chosen, axis=1)
+            amount = -change @ np.linalg.pinv(axes).T
+            beyond = ((change + amount @ axes.T) ** 2).sum(axis=1)
+            least = np.where((amount >= 0).all(axis=1), np.minimum(least, beyond), least)
+    return least
 
 
 def bilateral_change(texels: TexelMap, values: NDArray, known: NDArray, opposite: NDArray) -> NDArray[np.float64]:
