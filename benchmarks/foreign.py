@@ -8,8 +8,8 @@ without specular reflection, one albedo for the whole head under the recovered l
 (literal units, and colours and pixels both normalised; each pair of photographs by itself, scale free), and
 image-based rendering by three blends on our mesh and on the scan. All on the same pixels, with the same samples per
 pixel. ``--own`` takes the path-traced heads that the fitted model holds. With nothing but defaults (or ``--own`` or
-``--reduced``) the figures become ``benchmarks/results/foreign.json`` (``captures.json``) and the tables beside them,
-with ``--seeds`` those of three seeds ``seeds.json``.
+``--reduced``) the figures become ``benchmarks/results/foreign.json`` (``captures.json``) and the tables beside them;
+``--seeds`` writes ``seeds.json`` too.
 """
 
 from __future__ import annotations
@@ -441,7 +441,7 @@ def main() -> int:
             if whole and not skipped:  # after each case, so that a run that is broken off leaves what it measured
                 name = "captures" if a.own else "foreign"
                 record(name, out, seeds=SEED)
-                if a.seeds:
+                if a.seeds and not a.own:
                     over = [{key: one.get(key) for key in ("label", "set", "seeds")} for one in found]
                     record("seeds", {"settings": settings, "cases": over}, seeds=[SEED, *FURTHER_SEEDS])
                 write_text(RESULTS / f"{name}.md", short(found) if a.own else markdown(found, out))

@@ -30,11 +30,12 @@ ALIKE = 0.02
 scan_city, gloss and the first heads of Table 1; half and twice as much change little."""
 CONTRAST = 0.15
 """Contrast of skin in the logarithm beside what pigments make: what differs by more is hardly skin. Chosen on
-scan_city, gloss and the first heads of Table 1; 0.05 to 0.2 are alike."""
+scan_city, gloss and the first heads of Table 1; 0.1 to 0.2 are alike."""
 TYPICAL = 1.5e-3
 """Weight of the typical value of skin beside that of a texel of confidence 1: it decides far from what was seen."""
 STIFFNESS = 0.1
-"""Of the membrane, beside texels of confidence 1: chosen as `ALIKE` is; up to 1 little changes if `TYPICAL` follows."""
+"""Of the membrane, beside texels of confidence 1: chosen as `ALIKE` is; three times as much, and as much more of
+`TYPICAL`, gains 0.1 dB of the albedo there."""
 FEATURE = 0.06
 """Extent of the widest dark feature of a face, relative to the map: brows."""
 BORDER = 0.03
@@ -96,16 +97,17 @@ def blend_unseen(
     # Eyes are no skin: their light is as it is found, and neither is like the other.
     skin = skin_faces(model)[texels.face]
     light = np.ones_like(confidence) if lit is None else np.where(skin, lit, 1.0)
-    known = sure = _weight(confidence, light)
+    known = compared = _weight(confidence, light)
     if lit is not None:
         natural = pigment_weight(texels, expected * np.exp(found[:, :3]), expected, skin * known)
         natural = np.where(skin, natural, 1.0)
-        known, sure = _weight(confidence, light * natural), known * natural
+        # What isn't skin's is filled as where light is dim; between the halves it counts in proportion.
+        known, compared = _weight(confidence, light * natural), known * natural
     confidence = confidence * light
     if model.symmetry is not None:
         opposite = mirrored_coordinates(model, texels)
         if lit is not None:
-            found[:, :3] += skin[:, None] * bilateral_change(texels, found[:, :3], skin * sure, opposite)
+            found[:, :3] += skin[:, None] * bilateral_change(texels, found[:, :3], skin * compared, opposite)
         there, values = (_across(texels, of, opposite) for of in (known, found * known[:, None]))
         taken = there * (1.0 - np.clip(known / BLEND, 0.0, 1.0))
         total = np.maximum(known + taken, 1e-12)[:, None]
@@ -124,8 +126,10 @@ def blend_unseen(
 
 
 def _weight(confidence: NDArray, share: NDArray) -> NDArray[np.float64]:
-    """(N,) weight of texels' own albedo. Variances add: that of visibility, and that of the light, of which a ``share``
-    (N,) is known; both in units of `BLEND`'s texel."""
+    """(N,) weight of texels' own albedo, from confidence (N,) and the ``share`` (N,) of images in it.
+
+    Variances add: that of visibility, and that of the light, both in units of `BLEND`'s texel.
+    """
     variance = 1.0 / np.maximum(confidence, 1e-9) + (1.0 / np.maximum(share, 1e-9) - 1.0) / BLEND
     return np.where(confidence * share > 0, 1.0 / variance, 0.0)
 
@@ -147,8 +151,8 @@ def _blurred(texels: TexelMap, values: NDArray, deviation: float) -> NDArray[np.
 def pigment_weight(texels: TexelMap, albedo: NDArray, expected: NDArray, known: NDArray) -> NDArray[np.float64]:
     """(N,) how far diffuse albedos (N, 3) are skin's own, 0..1: what pigments make of the skin around them.
 
-    Sheen, shadows that lie beside where the mesh throws them and light from other skin end in the albedo too, and have
-    other colours. ``expected`` (N, 3) is the mean face's albedo, ``known`` (N,) the weight of each texel.
+    Sheen, misplaced shadows and light from other skin end in the albedo too, and have other colours. ``expected``
+    (N, 3) is the mean face's albedo, ``known`` (N,) the weight of each texel.
     """
     unlike = np.full(len(albedo), np.inf)
     for like in (expected, np.ones_like(expected)):  # what the mean face or the skin around explains is skin
@@ -162,8 +166,10 @@ def pigment_weight(texels: TexelMap, albedo: NDArray, expected: NDArray, known: 
 
 
 def beyond_pigments(change: NDArray) -> NDArray[np.float64]:
-    """(N,) squared distance of changes (N, 3) of log albedo from those that more of some pigments makes: melanin,
-    haemoglobin and what darkens all channels alike, as hair does."""
+    """(N,) squared distance of changes (N, 3) of log albedo from those that more pigment makes.
+
+    Pigments are melanin, haemoglobin, and hair's, which darkens all channels alike.
+    """
     least = (change**2).sum(axis=1)
     for count in (1, 2, 3):
         for chosen in combinations((MELANIN, HAEMOGLOBIN, np.ones(3)), count):
