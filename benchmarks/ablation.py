@@ -107,6 +107,7 @@ PARTS = (
     Part(BASE),
     Part("surface: off", {"surface.enabled": False}),
     Part("surface: outlines", patches={f"{FIND}.find_borders": lambda *given: joined([])}, step="surface"),
+    Part("surface: walls keep a thickness", patches={f"{FIND}.WALL_MM": 1e-3}, step="surface"),
     Part("surface: sheen left out at coarse levels", patches={"mifit.stages.surface.band.SHEEN": 0.0}, step="surface"),
     Part("surface: shading and highlights", {"surface.shading": False}),
     Part("surface: lids and lips closed", {"surface.close_lids": False, "surface.close_lips": False}),

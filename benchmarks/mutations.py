@@ -188,6 +188,8 @@ MUTATIONS = (
       "tests/stages/test_find_surface.py -k one_view_alone"),
     M("windows without contrast count", "sweep._Sweep.compare", "(variance > 2 * noise)", "True",
       "tests/stages/test_find_surface.py -k nothing_is_seen"),
+    M("walls are held wherever they are", "displace.Walls.at", "lacks > 0", "lacks < 0",
+      "tests/stages/test_find_surface.py -k a_wall"),
     M("views that are read beside the epipolar line read on it", "sweep._Sweep.compare", "[-beside, beside]",
       "[0.0, 0.0]", "tests/stages/test_find_surface.py -k off_its_calibration"),
     M("offsets that scatter are as precise", "sweep._precision", "FINEST**2 + scatter", "FINEST**2",

@@ -36,7 +36,7 @@ from mifit.stages.geometry.points import corner_matrix
 from mifit.stages.geometry.surfaces import Scenes
 from mifit.stages.surface.align_timesteps import align_timesteps
 from mifit.stages.surface.close_openings import LIDS, LIPS, close_again, close_openings
-from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surface
+from mifit.stages.surface.displace import Measurements, SurfacePrior, Walls, solve_surface
 from mifit.stages.surface.outline import REACH, Borders, find_borders, joined
 from mifit.stages.surface.sweep import Found, Posed, across_time, epipolar_residual, likeness, match
 from mifit.stages.surface.views import Resolution, pose_texels, texture_size
@@ -66,6 +66,8 @@ FORGET_MM = 150.0
 """Wavelength above which displacements fall back to the model where nothing is measured."""
 CONTACT_MM = 1.5
 """Gap below which opposed parts of the surface, such as closed lips, move together."""
+WALL_MM = 5.0
+"""Distance between both sides of the skin below which they are a wall, such as the nose's wing: set by hand."""
 POSE_MM = 10.0
 """Standard deviation of the head's pose in the first estimate, as movement of its surface."""
 SLACK = 0.01
@@ -138,8 +140,9 @@ def find_surface(
     reach = config.reach / capture.unit_mm
     sight = Sight(capture, model, tuple(cameras), scenes, world[0], resolution.pixel, reach, finest)
     landmarks = Landmarks.of(capture, model, cameras, geometry)
+    walls = Walls.of(model.mean[: skin.count], skin.faces, WALL_MM / model.unit_mm)
     search = Search(
-        geometry, model, pairs, skin, prior, motion, landmarks, sight, level_step, config.stiffness, progress
+        geometry, model, pairs, skin, prior, motion, landmarks, walls, sight, level_step, config.stiffness, progress
     )
 
     # Measure and solve in turn, coarse to fine. The finest level measures lids that have closed.
@@ -320,6 +323,10 @@ class State:
             displacement=skin.spread(((moved - shift) @ turn - shape)[: skin.count]),
         )
 
+    def shape(self, model: MorphableModel) -> NDArray[np.float64]:
+        """(V, 3) vertices of the mean expression, object space."""
+        return model.shape(self.identity, self.expression.mean(axis=0)).astype(np.float64) + self.displacement
+
     def world(self, model: MorphableModel) -> NDArray[np.float64]:
         """(T, V, 3) vertices."""
         shapes = [model.shape(self.identity, e).astype(np.float64) + self.displacement for e in self.expression]
@@ -452,6 +459,7 @@ class Search:
     prior: SurfacePrior
     motion: Motion
     landmarks: Landmarks
+    walls: Walls
     sight: Sight
     level_step: float
     stiffness: float
@@ -493,6 +501,7 @@ class Search:
             rows = measurements(state, model, cells, world, found, outlines, marks, robust)
             if skin.weights is not None:
                 rows = replace(rows, points=rows.points @ skin.weights)
+            rows = rows.with_others(self.walls.at(state.shape(model)[: skin.count]))
             mean = state.expression.mean(axis=0)
             coefficients = np.concatenate([state.identity, mean, np.zeros(6)])
             surface = self.prior.move(coefficients) + state.displacement[: skin.count]

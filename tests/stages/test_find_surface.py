@@ -25,7 +25,7 @@ from mifit.stages.fit_geometry import fit_geometry, fit_pose_expression
 from mifit.stages.geometry.parameters import exponential
 from mifit.stages.geometry.surfaces import Scenes, displaced
 from mifit.stages.surface.band import FeatureImage
-from mifit.stages.surface.displace import Measurements, SurfacePrior, solve_surface
+from mifit.stages.surface.displace import THINNEST, Measurements, SurfacePrior, Walls, solve_surface
 from mifit.stages.surface.outline import joined
 from mifit.stages.surface.sweep import GLARE_DEVIATIONS, SAME, Posed, _precision, _Sweep, _without_glare, match
 from mifit.stages.surface.views import pose_texels
@@ -312,6 +312,34 @@ def test_offsets_that_scatter_and_lone_matches_are_less_precise_by_scatter():
     assert (precision[~matched] == 0).all() and (precision[matched] > 0).all()
     even, anywhere, lone = (np.median(precision[matched & (band == b)]) for b in range(3))
     assert even > 15 * anywhere and even > 15 * lone
+
+
+def test_a_wall_keeps_a_part_of_its_thickness():
+    """Views see one side of a sheet of a quarter's thickness and move it beyond the other, which follows."""
+    across = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0), [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
+    quads = [(6 * i + j, 6 * i + j + 6, 6 * i + j + 7, 6 * i + j + 1) for i in range(5) for j in range(5)]
+    up = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    vertices, faces = (
+        np.concatenate([across + np.array([0.0, 0.0, 0.25]), across]),
+        np.concatenate([up, up[:, ::-1] + 36]),
+    )
+    prior, walls = SurfacePrior.of(vertices, faces, np.zeros((72, 3, 1)), longest=10.0), Walls.of(vertices, faces, 0.5)
+    assert len(walls.least) == 72 and not Walls.of(vertices, faces, 0.2).least.size
+    assert not walls.at(vertices).precision.any()
+    points = sp.identity(72, format="csr")[:36]
+    normal, ones = np.tile([0.0, 0.0, 1.0], (36, 1)), np.ones(36)
+
+    def thickness(with_walls: bool) -> np.ndarray:
+        moved = np.zeros((72, 3))
+        for _ in range(3):
+            seen = Measurements(points, normal, -1.0 - moved[:36, 2], 100.0 * ones, np.full((36, 1), 1e9))
+            rows = seen.with_others(walls.at(vertices + moved)) if with_walls else seen
+            moved, _ = solve_surface(prior, rows, moved, np.array([[-np.inf, np.inf]]), 0.1)
+        np.testing.assert_allclose(moved[:36, 2], -1.0, atol=0.1)
+        return (vertices + moved)[:36, 2] - (vertices + moved)[36:, 2]
+
+    assert thickness(False).max() < -0.5
+    assert thickness(True).min() > 0.5 * THINNEST * 0.25
 
 
 def test_an_outlier_counts_little():

@@ -27,7 +27,7 @@ import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mifit.core.mesh import face_cross, normalize, vertex_normals
+from mifit.core.mesh import dot, face_cross, normalize, vertex_normals
 from mifit.core.mesh_solve import cotangent_laplacian
 
 CONTACT_WEIGHT = 30.0
@@ -39,6 +39,9 @@ RELATIVE = 0.1
 MOST_ITERATIONS = 60
 ACROSS = 0.7
 """Cosine of the angle between the normals and the way from one sheet to the other."""
+THINNEST = 0.25
+"""Part of a wall's thickness at rest below which it is held, and the deviation that holds it.
+Chosen on gloss, Emily c3,c4."""
 SLIDE = 0.02
 """Part of a point's weight that holds it along the surface, where it is."""
 
@@ -68,6 +71,59 @@ class Measurements:
     def where(self, used: NDArray[np.bool_]) -> Measurements:
         """Some of them."""
         return Measurements(*(getattr(self, name)[used] for name in self.__dataclass_fields__))
+
+    def with_others(self, other: Measurements) -> Measurements:
+        """All of both; ``robust`` of the others may be one for all weightings."""
+        robust = np.broadcast_to(other.robust, (len(other.offsets), self.robust.shape[1]))
+        return Measurements(
+            sp.vstack([self.points, other.points]).tocsr(),
+            np.concatenate([self.normals, other.normals]),
+            np.concatenate([self.offsets, other.offsets]),
+            np.concatenate([self.precision, other.precision]),
+            np.concatenate([self.robust, robust]),
+        )
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Parts of the skin that are thin, such as the nose's wing: the side that is seen may not pass the other.
+
+    Attributes
+    ----------
+    points : (N, V) sparse
+        A vertex less the nearest one behind it, on the other side.
+    across : (N, 3)
+        From there to the vertex.
+    least : (N,)
+        Thickness below which a wall is held.
+    """
+
+    points: sp.csr_matrix
+    across: NDArray[np.float64]
+    least: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, vertices: NDArray, faces: NDArray, thickest: float) -> Walls:
+        """Of a rest mesh (V, 3), (F, 3); both sides lie nearer to each other than ``thickest``."""
+        rest, used = np.asarray(vertices, np.float64), np.unique(faces)
+        pairs = used[cKDTree(rest[used]).query_pairs(thickest, output_type="ndarray")]
+        front, back = np.concatenate([pairs, pairs[:, ::-1]]).T
+        normal, across = vertex_normals(rest, faces), normalize(rest[front] - rest[back])
+        opposed = (dot(normal[front], across) > ACROSS) & (dot(normal[back], across) < -ACROSS)
+        thickness = np.linalg.norm(rest[front] - rest[back], axis=1)
+        order = np.flatnonzero(opposed)
+        order = order[np.argsort(thickness[order], kind="stable")]
+        nearest = order[np.unique(front[order], return_index=True)[1]]
+        signs, rows = np.repeat([1.0, -1.0], len(nearest)), np.tile(np.arange(len(nearest)), 2)
+        columns = np.concatenate([front[nearest], back[nearest]])
+        points = sp.csr_matrix((signs, (rows, columns)), shape=(len(nearest), len(rest)))
+        return cls(points, across[nearest], THINNEST * thickness[nearest])
+
+    def at(self, surface: NDArray) -> Measurements:
+        """What they measure where a surface (V, 3) is thinner than it may be."""
+        lacks = self.least - dot(self.points @ surface, self.across)
+        precision = np.where(lacks > 0, 1.0 / self.least**2, 0.0)
+        return Measurements(self.points, self.across, lacks, precision, np.full((len(lacks), 1), np.inf))
 
 
 @dataclass(frozen=True)
