@@ -547,14 +547,14 @@ def measurements(
     normals = interpolate(np.mean(of_vertices, axis=0), model.faces, cells.face, cells.weights)
     face = np.concatenate([cells.face, borders.face])
     weights = np.concatenate([cells.weights, borders.weights])
-    points = sp.vstack([corner_matrix(model.faces, face, weights, model.n_vertices), marks.points]).tocsr()
-    return Measurements(
-        points,
-        np.concatenate([normalize(normals), borders.normal, marks.normals]),
-        np.concatenate([found.offset, borders.offset, marks.offsets]) / scale,
-        np.concatenate([found.precision, borders.precision, marks.precision]) * scale**2,
-        np.concatenate([np.tile(robust, (len(face), 1)), np.repeat(marks.robust, len(robust), axis=1)]) / scale,
-    )
+    rows = Measurements(
+        corner_matrix(model.faces, face, weights, model.n_vertices),
+        np.concatenate([normalize(normals), borders.normal]),
+        np.concatenate([found.offset, borders.offset]),
+        np.concatenate([found.precision, borders.precision]),
+        np.tile(robust, (len(face), 1)),
+    ).with_others(marks)
+    return replace(rows, offsets=rows.offsets / scale, precision=rows.precision * scale**2, robust=rows.robust / scale)
 
 
 def moved_with(model: MorphableModel, texels: TexelMap, posed: Sequence[Posed], moved: NDArray) -> list[Posed]:

@@ -6,9 +6,10 @@ deviation) and a smooth displacement d. Minimised over both, in object space:
     sum_i p_i rho(n_i . (W U)_i - o_i) + stiffness * E(d) + |m|^2
     E(d) = sum_v |(L d)_v|^2 / a_v + (2 pi / longest)^4 a_v |d_v|^2
 
-with the measured points W (barycentric), their normals n, offsets o and precisions p, the cotangent Laplacian L and
-areas a of the rest mesh. Only the normal component of U is measured: a point that slides on the surface costs nothing,
-so that what the views show decides where the surface lies and the prior decides how the mesh lies on it.
+with the measured points W (barycentric; of a thin wall, one side less the other), their normals n, offsets o and
+precisions p, the cotangent Laplacian L and areas a of the rest mesh. Only the normal component of U is measured: a
+point that slides on the surface costs nothing, so that what the views show decides where the surface lies and the prior
+decides how the mesh lies on it.
 
 Coefficients stay within the model's bounds: one that would leave them is held there for a solution. The others are
 eliminated: with the plate's matrix K and the stiffness s, the best ones for a surface are
@@ -53,7 +54,7 @@ class Measurements:
     Attributes
     ----------
     points : (N, V) sparse
-        Barycentric weights of the measured points.
+        Barycentric weights of the measured points; of a wall, one side less the other.
     normals : (N, 3)
         The directions that are measured.
     offsets, precision : (N,)
@@ -111,8 +112,8 @@ class Walls:
         normal, across = vertex_normals(rest, faces), normalize(rest[front] - rest[back])
         opposed = (dot(normal[front], across) > ACROSS) & (dot(normal[back], across) < -ACROSS)
         thickness = np.linalg.norm(rest[front] - rest[back], axis=1)
-        order = np.flatnonzero(opposed)
-        order = order[np.argsort(thickness[order], kind="stable")]
+        order = np.argsort(thickness, kind="stable")
+        order = order[opposed[order]]
         nearest = order[np.unique(front[order], return_index=True)[1]]
         signs, rows = np.repeat([1.0, -1.0], len(nearest)), np.tile(np.arange(len(nearest)), 2)
         columns = np.concatenate([front[nearest], back[nearest]])
