@@ -21,6 +21,7 @@ from mifit.core.image import to_8_bit
 from mifit.core.mesh import interpolate, normalize, vertex_normals
 from mifit.core.metrics import psnr_from_rmse
 from mifit.core.uv import sample_map
+from mifit.errors import InputError
 from mifit.output.compare import Errors, face_region, relit_region, scaled_psnr, skin_region
 from mifit.output.truth import (
     TrueMesh,
@@ -163,7 +164,10 @@ def judge_relit(
         for label, row in rows.items():
             if timestep not in row.results:
                 continue
-            lit = row.results[timestep].relight(str(environment))
+            try:
+                lit = row.results[timestep].relight(str(environment))
+            except InputError:  # the paper's light may be darker than none: it has no level to keep
+                continue
             for integrator in integrators if label in ("full", "refit") else ("local",):
                 count = samples if integrator == "path" else None
                 image = lit.render(at.camera, timestep, row.method, integrator, count)  # type: ignore[arg-type]

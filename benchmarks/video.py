@@ -37,6 +37,7 @@ CAMERAS = ("left", "right")
 FITTED = 4
 SIZE = {"width": 340, "height": 240, "spp": 64}
 """With 16 samples a pixel the noise of the path tracer alone holds every held-out view at 29 dB."""
+OPTIONS = [part for key, value in SIZE.items() for part in (f"--{key}", value)]
 SCAN_UNIT_MM = 37.0
 """Of the scan's file."""
 SCAN_MAPS = {
@@ -53,9 +54,8 @@ def video(subject: int, frames: int, work: Path) -> Path:
         made = Subject(subject)
         environment = made.light()
         light = ["--env", environment] if environment.exists() else []
-        options = [part for key, value in SIZE.items() for part in (f"--{key}", value)]
         command("synth", "--out", folder, "--seed", made.seed, "--force", "--tone", made.tone,
-              "--outside", made.outside, "--landmark-bias", BIAS, "--timesteps", frames, *options,
+              "--outside", made.outside, "--landmark-bias", BIAS, "--timesteps", frames, *OPTIONS,
               *light)  # fmt: skip
     return folder
 
@@ -64,11 +64,10 @@ def scan_video(frames: int, work: Path) -> Path:
     """Folder of the shared scan's video, rendered once, with detected landmarks."""
     folder, source = work / "scan" / "capture", SHARED / "models" / "lee_perry_smith"
     if not (folder / "landmarks").exists():
-        options = [part for key, value in SIZE.items() for part in (f"--{key}", value)]
         maps = [f"{name}={source / file}" for name, file in SCAN_MAPS.items()]
         command("synth", "--out", folder, "--head", source / "LeePerrySmith.glb", "--unit-mm", SCAN_UNIT_MM, "--flip-v",
               "--maps", *maps, "--env", SHARED / "hdri" / "city.hdr", "--timesteps", frames, "--force",
-              *options)  # fmt: skip
+              *OPTIONS)  # fmt: skip
         command("landmarks", folder)
     return folder
 

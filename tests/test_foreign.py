@@ -6,6 +6,7 @@ import runpy
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,6 +21,7 @@ from mifit.output.truth import nearest_points
 from mifit.render.image_based import BLENDS, image_based
 from tests.output.conftest import RADIUS, ball_camera, ball_result
 
+ROOT = Path(__file__).resolve().parents[1]
 TOOL = SHARED / "tools" / "held_out.py"
 
 
@@ -63,6 +65,20 @@ def test_image_based_rendering_shows_the_points_colours_where_a_view_sees_them(s
     assert (one.hit == found.hit).all() and one.seen.sum() < 0.95 * found.seen.sum()
     columns = np.flatnonzero(found.seen[32] & ~one.seen[32])
     assert len(columns) and columns.min() > 32  # what the left view doesn't see is on the right
+
+
+def test_light_that_is_darker_than_none_leaves_a_gap_in_the_relit_figures(variant, monkeypatch):
+    result, camera = ball_result(), ball_camera("third", 0)
+    size, below = (camera.height, camera.width), np.full((9, 3), -1.0)
+    truth = SimpleNamespace(environment=ROOT / "scenes" / "relighting" / "studio.hdr", image=np.ones((*size, 3)))
+    at = SimpleNamespace(camera=camera, box=np.s_[:, :], relit=np.ones(size, bool))
+    monkeypatch.setattr(judge, "relit_truths", lambda capture: {"studio": truth})
+    monkeypatch.setattr(judge, "view", lambda *_: at)
+    dark = result.with_illumination(replace(result.illumination, radiance=below))
+    rows = {name: judge.Row.of(each) for name, each in (("paper", dark), ("full", result))}
+    capture = SimpleNamespace(timesteps=result.timesteps)
+    found = judge.judge_relit(heads.Case("ball"), capture, rows, ("local",), 1, 1)
+    assert list(found) == ["full, local"] and found["full, local"]["mean"] > 0
 
 
 def test_what_hides_a_point_from_a_view_is_not_painted_onto_it(sphere):

@@ -51,7 +51,6 @@ def test_model_registers_to_a_subject_of_its_own(coarse):
 
 
 def test_builtin_spans_ict_heads(coarse, ict):
-    """Two heads here; `python -m benchmarks.builtin register` takes twenty."""
     on_face = np.unique(coarse.faces[coarse.face_mask])
     for seed in (100, 101):
         head = 10.0 * ict.shape(ict.sample(seed)[0]).astype(float)

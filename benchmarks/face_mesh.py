@@ -1,12 +1,9 @@
-"""A table that is fitted with the built-in model, and how well it fits heads of another.
+"""The table that turns MediaPipe's 478 Face Mesh points into 68 iBUG landmarks.
 
-    python -m benchmarks.builtin register [--heads 20]       # benchmarks/results/register_builtin.json
-    python -m benchmarks.builtin face-mesh --out mifit/capture/face_mesh_68.json [--subjects 40]
+    python -m benchmarks.face_mesh --out mifit/capture/face_mesh_68.json [--subjects 40]
 
-``register`` fits the model to random ICT-FaceKit heads by landmarks and closest points. ``face-mesh`` fits the table
-that turns MediaPipe's 478 Face Mesh points into 68 iBUG landmarks: heads with known landmarks are synthesised,
-MediaPipe looks at them, and every landmark becomes the affine combination of its nearest mesh points that predicts it
-best.
+Heads with known landmarks are synthesised, MediaPipe looks at them, and every landmark becomes the affine combination
+of its nearest mesh points that predicts it best.
 """
 
 from __future__ import annotations
@@ -14,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -22,53 +18,16 @@ from numpy.typing import NDArray
 
 import mifit
 from benchmarks.heads import ICT
-from benchmarks.record import record
 from mifit.capture import Capture
 from mifit.core.files import write_text
 from mifit.core.image import load_image, to_8_bit
 from mifit.morphable import MorphableModel
-from mifit.morphable.register import register
-from mifit.output.truth import nearest_points
 from mifit.synth import synthesize
 
 POINTS = 64
 """Mesh points that a landmark is combined of."""
 RIDGE = 1e-3
 """Penalty on the weights, relative to squared eye distances."""
-
-
-def distances(model: MorphableModel, ict: MorphableModel, seed: int) -> dict[str, float]:
-    """Fit the model to one random head; distances in mm, both ways, over the area that both surfaces share."""
-    head = ict.unit_mm * ict.shape(ict.sample(seed)[0]).astype(np.float64)
-    start = time.perf_counter()
-    fit = register(model, head, ict.faces, ict.landmarks)
-    seconds = time.perf_counter() - start
-    there = nearest_points(fit.vertices[np.unique(model.faces[model.face_mask])], head, ict.faces)[0]
-    # Back: the head's face between its contour landmarks, forehead included, without ears and neck.
-    p = head[ict.landmarks]
-    brow, chin = p[17:27, 1].max(), p[8, 1]
-    inside = (head[:, 1] > chin) & (head[:, 1] < brow + 35) & (head[:, 2] > p[[0, 16], 2].mean())
-    region = np.intersect1d(np.unique(ict.faces[ict.face_mask]), np.flatnonzero(inside))
-    back = nearest_points(head[region], fit.vertices, model.faces[model.face_mask])[0]
-    return {
-        "model_to_head_mean_mm": float(there.mean()),
-        "head_to_model_mean_mm": float(back.mean()),
-        "head_to_model_p95_mm": float(np.percentile(back, 95)),
-        "coefficients_rms": float(np.sqrt((fit.identity**2).mean())),
-        "seconds": seconds,
-    }
-
-
-def measure_registration(heads: int, name: str) -> None:
-    """Mean and worst distances over some heads."""
-    model, ict = MorphableModel.load(name), MorphableModel.load(ICT)
-    rows = [distances(model, ict, seed) for seed in range(heads)]
-    summary = {
-        kind: {key: float(of([row[key] for row in rows])) for key in rows[0]}
-        for kind, of in (("mean", np.mean), ("worst", np.max))
-    }
-    record("register_builtin", {"model": name, "heads": heads, **summary, "per_head": rows}, seeds=list(range(heads)))
-    print(json.dumps(summary, indent=1))
 
 
 def fit_table(seen: list[tuple[NDArray, NDArray, NDArray]]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -116,17 +75,12 @@ def fit_face_mesh(name: str, subjects: int, seed: int, out: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["register", "face-mesh"])
-    parser.add_argument("--heads", type=int, default=20)
-    parser.add_argument("--model", help="default: builtin:coarse to register, the ICT model to synthesise")
+    parser.add_argument("--model", default=ICT)
     parser.add_argument("--subjects", type=int, default=40)
     parser.add_argument("--seed", type=int, default=5000)
     parser.add_argument("--out", type=Path, default=Path("face_mesh_68.json"))
     a = parser.parse_args()
-    if a.what == "register":
-        measure_registration(a.heads, a.model or "builtin:coarse")
-    else:
-        fit_face_mesh(a.model or ICT, a.subjects, a.seed, a.out)
+    fit_face_mesh(a.model, a.subjects, a.seed, a.out)
 
 
 if __name__ == "__main__":
