@@ -14,26 +14,23 @@ from pathlib import Path
 
 from benchmarks.record import RESULTS, SHARED, renew_tables
 
-Runs = tuple[tuple[str, list[str]], ...]
+Runs = tuple[tuple[str, str], ...]
 REDUCED: Runs = (
-    ("foreign", ["--reduced", "--seeds"]),
-    ("foreign", ["--own", "--reduced", "--rows", "full", "refit"]),
-    (
-        "table1",
-        ["--reduced", "--subjects", "8", "--no-paper", "--relight", "--jobs", "2", "--work", "out/table1_reduced"],
-    ),
-    ("ablation", ["--heads", "scan_studio"]),
-    ("speed", ["--reduced"]),
+    ("foreign", "--reduced --seeds"),
+    ("foreign", "--own --reduced --rows full refit"),
+    ("table1", "--reduced --subjects 8 --no-paper --relight --jobs 2 --work out/table1_reduced"),
+    ("ablation", "--heads scan_studio"),
+    ("speed", "--reduced"),
 )
 FULL: Runs = (
-    ("foreign", ["--seeds"]),
-    ("foreign", ["--own"]),
-    ("table1", ["--relight", "--jobs", "2"]),
-    ("ablation", []),
-    ("speed", []),
-    ("hard_cases", []),
-    ("video", ["--scan"]),
-    ("mutations", []),
+    ("foreign", "--seeds"),
+    ("foreign", "--own"),
+    ("table1", "--relight --jobs 2"),
+    ("ablation", ""),
+    ("speed", ""),
+    ("hard_cases", ""),
+    ("video", "--scan"),
+    ("mutations", ""),
 )
 NEED_SHARED = ("foreign", "ablation", "speed")
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,7 +47,7 @@ def main() -> int:
             print(f"{name}: left out, it needs the data folder {SHARED}", file=sys.stderr)
             continue
         started = time.perf_counter()
-        done = subprocess.run([sys.executable, "-m", f"benchmarks.{name}", *options], check=False)
+        done = subprocess.run([sys.executable, "-m", f"benchmarks.{name}", *options.split()], check=False)
         print(f"{name}: {time.perf_counter() - started:.0f} s, exit code {done.returncode}", file=sys.stderr)
         failed += [name] * bool(done.returncode)
         for page in PAGES:

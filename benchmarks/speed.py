@@ -245,9 +245,12 @@ def draw(figures: Figures, folder: Path = IMAGES) -> list[Path]:
         with figure(out[-1], (9, 3.6), len(figures["growth"])) as axes:
             for axis, (by, part) in zip(axes, figures["growth"].items(), strict=True):
                 for name in part["rows"][0]["steps"]:
-                    axis.plot([r[by] for r in part["rows"]], [r["steps"][name] for r in part["rows"]], "o-", label=name)
+                    worked = [(r[by], r["steps"][name]) for r in part["rows"] if r["steps"][name] > 0.01]
+                    axis.plot(*np.reshape(worked, (-1, 2)).T, "o-", label=name)
                 axis.set(xlabel=by, ylabel="processor seconds", xscale="log", yscale="log")
-            axes[0].legend(fontsize=8)
+                axis.set_xticks(sizes := [r[by] for r in part["rows"]], sizes)
+                axis.set_xticks([], minor=True)
+            axes[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     if "error" in figures:
         out.append(folder / "speed_error.svg")
         with figure(out[-1], (9, 3.6), 2) as axes:

@@ -152,14 +152,6 @@ def run_video(
     return found
 
 
-def means(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Mean of every figure over the heads, of the fit and refined."""
-    return {
-        kind: {key: round(statistics.fmean(row[kind][key] for row in rows), 4) for key in rows[0][kind]}
-        for kind in ("fit", "refined")
-    }
-
-
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -175,7 +167,11 @@ def main() -> None:
         run_video(f"subject_{i:02d}", Capture.load(video(i, *given[:2])), judge, *given)
         for i in range(arguments.subjects)
     ]
-    figures = {"size": SIZE, "texels": arguments.texels, "rows": rows, "means": means(rows)}
+    means = {
+        kind: {key: round(statistics.fmean(row[kind][key] for row in rows), 4) for key in rows[0][kind]}
+        for kind in ("fit", "refined")
+    }
+    figures = {"size": SIZE, "texels": arguments.texels, "rows": rows, "means": means}
     if arguments.scan:
         figures["scan"] = run_video("scan", Capture.load(scan_video(*given[:2])), judge_scan, *given)
     record("video", figures, [Subject(i).seed for i in range(arguments.subjects)])
