@@ -33,8 +33,8 @@ quick:
 
 attack:
 	@.ci/setup test
-	$(BIN)/python -m tests.hostile.attack --json benchmarks/results/attacks.json
-	$(BIN)/python -m tests.hostile.endure --json benchmarks/results/endurance.json
+	$(BIN)/python -m tests.hostile.attack
+	$(BIN)/python -m tests.hostile.endure
 
 bench:
 	@.ci/setup bench
