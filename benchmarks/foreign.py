@@ -240,7 +240,7 @@ def _unconverged(case: dict[str, Any]) -> str:
 HELD_OUT: Columns = {
     "set": lambda c: c["set"],
     "`full`": lambda c: _psnr(c, "full"),
-    "spread over seeds": lambda c: _spread(c),
+    "spread": lambda c: _spread(c),
     "`full`, model alone": lambda c: _psnr(c, "model alone"),
     "refitted without specular": lambda c: _psnr(c, "refit"),
     "one albedo": lambda c: _psnr(c, "constant albedo"),
