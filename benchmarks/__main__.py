@@ -14,15 +14,14 @@ from pathlib import Path
 
 from benchmarks.record import RESULTS, SHARED, renew_tables
 
-Runs = tuple[tuple[str, str], ...]
-REDUCED: Runs = (
+REDUCED = (
     ("foreign", "--reduced --seeds"),
     ("foreign", "--own --reduced --rows full refit"),
     ("table1", "--reduced --subjects 8 --no-paper --relight --jobs 2 --work out/table1_reduced"),
     ("ablation", "--heads scan_studio"),
     ("speed", "--reduced"),
 )
-FULL: Runs = (
+FULL = (
     ("foreign", "--seeds"),
     ("foreign", "--own"),
     ("table1", "--relight --jobs 2"),

@@ -166,8 +166,10 @@ def judge_relit(
                 continue
             try:
                 lit = row.results[timestep].relight(str(environment))
-            except InputError:  # the paper's light may be darker than none: it has no level to keep
-                continue
+            except InputError:
+                if label.startswith("paper"):  # its light may be darker than none, and has no level to keep then
+                    continue
+                raise
             for integrator in integrators if label in ("full", "refit") else ("local",):
                 count = samples if integrator == "path" else None
                 image = lit.render(at.camera, timestep, row.method, integrator, count)  # type: ignore[arg-type]

@@ -199,9 +199,7 @@ def render(reduced: bool) -> Figures:
     return {"shdirect": closed, "shdirect, again": again, "prb, 4 spp": replay, "ratio": 2 * replay / (closed + again)}
 
 
-PARTS: dict[str, Callable[[bool], Figures]] = {
-    "steps": steps, "growth": growth, "error": error, "first": first, "render": render,
-}  # fmt: skip
+PARTS: dict[str, Callable[[bool], Figures]] = {f.__name__: f for f in (steps, growth, error, first, render)}
 
 
 # -- tables and plots ------------------------------------------------------------
@@ -244,11 +242,12 @@ def draw(figures: Figures, folder: Path = IMAGES) -> list[Path]:
         out.append(folder / "speed_growth.svg")
         with figure(out[-1], (9, 3.6), len(figures["growth"])) as axes:
             for axis, (by, part) in zip(axes, figures["growth"].items(), strict=True):
+                sizes = [r[by] for r in part["rows"]]
                 for name in part["rows"][0]["steps"]:
                     worked = [(r[by], r["steps"][name]) for r in part["rows"] if r["steps"][name] > 0.01]
                     axis.plot(*np.reshape(worked, (-1, 2)).T, "o-", label=name)
                 axis.set(xlabel=by, ylabel="processor seconds", xscale="log", yscale="log")
-                axis.set_xticks(sizes := [r[by] for r in part["rows"]], sizes)
+                axis.set_xticks(sizes, sizes)
                 axis.set_xticks([], minor=True)
             axes[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     if "error" in figures:

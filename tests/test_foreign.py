@@ -16,6 +16,7 @@ import mifit
 from benchmarks import ablation, foreign, heads, judge
 from benchmarks.record import SHARED
 from mifit.cli import main
+from mifit.errors import InputError
 from mifit.output.compare import scaled_psnr
 from mifit.output.truth import nearest_points
 from mifit.render.image_based import BLENDS, image_based
@@ -79,6 +80,8 @@ def test_light_that_is_darker_than_none_leaves_a_gap_in_the_relit_figures(varian
     capture = SimpleNamespace(timesteps=result.timesteps)
     found = judge.judge_relit(heads.Case("ball"), capture, rows, ("local",), 1, 1)
     assert list(found) == ["full, local"] and found["full, local"]["mean"] > 0
+    with pytest.raises(InputError, match="mean luminance"):  # of our own fit it is a failure
+        judge.judge_relit(heads.Case("ball"), capture, {"full": rows["paper"]}, ("local",), 1, 1)
 
 
 def test_what_hides_a_point_from_a_view_is_not_painted_onto_it(sphere):
