@@ -43,20 +43,18 @@ MOST = pytest.param("shdirect", "prefiltered", "10 bands and a compact light", m
 
 
 def combinations():
-    """Every integrator with every model, with every lighting and every model with every lighting.
+    """Ours with every model and lighting; every other integrator with the paper's model, and with one that stands for
+    the rest, which differ in `shdirect` alone, under either lighting in turn.
 
-    All three at once would take twice as long: each compiles kernels of its own.
+    All at once would take twice as long: each compiles kernels of its own.
     """
-    names, found = SHADINGS[1:], []
-    for i, integrator in enumerate(OURS_AND_THEIRS):
-        for k, model in enumerate(names):
-            for number, lighting in enumerate(LIGHTINGS):
-                if model == "paper" and lighting != "3 bands":
-                    continue  # the paper's model has three bands
-                quick = integrator in QUICK and lighting == "3 bands"
-                if quick or model == "paper" or (i + k) % 2 == number or integrator == "shdirect":
-                    found.append(pytest.param(integrator, model, lighting, marks=[] if quick else pytest.mark.slow))
-    return [*found, MOST]
+    plain, rich = LIGHTINGS
+    ours = [(model, light) for model in SHADINGS[1:] for light in LIGHTINGS if model != "paper" or light == plain]
+    found = [("shdirect", *each) for each in ours]
+    for i, integrator in enumerate(OURS_AND_THEIRS[1:]):
+        found += [(integrator, "paper", plain), (integrator, "prefiltered", (plain, rich)[i % 2])]
+    quick = {(integrator, model, plain) for integrator in QUICK for model in SHADINGS[1:]}
+    return [pytest.param(*each, marks=[] if each in quick else pytest.mark.slow) for each in found] + [MOST]
 
 
 @pytest.mark.parametrize(("integrator", "model", "lighting"), combinations())
