@@ -353,8 +353,9 @@ def _settle(patch: Patch, field: Field, height: NDArray[np.float64]) -> tuple[ND
     for _ in range(ITERATIONS):
         blocks, sides = patch.equations(field.displacement(height - start), field.normal, step)
         matrix, right = field.precision, -field.precision @ height
-        for a, b in combinations_with_replacement(range(3), 2):
-            part = ways[a].T @ sp.diags(blocks[:, a, b]) @ ways[b]
+        pairs = list(combinations_with_replacement(range(3), 2))
+        parts = on_all_cores(_product, [(ways[a], blocks[:, a, b], ways[b]) for a, b in pairs])
+        for (a, b), part in zip(pairs, parts, strict=True):
             matrix = matrix + (part if a == b else part + part.T)
         for way, side in zip(ways, sides.T, strict=True):
             right += way.T @ side
@@ -365,3 +366,8 @@ def _settle(patch: Patch, field: Field, height: NDArray[np.float64]) -> tuple[ND
         moved = np.clip(spl.cg(matrix, right, rtol=RELATIVE, maxiter=MOST_ITERATIONS, M=near)[0], -step, step)
         height = height + moved
     return height, float(np.sqrt(np.mean(moved**2)))
+
+
+def _product(given: tuple[sp.csr_matrix, NDArray, sp.csr_matrix]) -> sp.csr_matrix:
+    """A' diag(w) B."""
+    return given[0].T @ sp.diags(given[1]) @ given[2]

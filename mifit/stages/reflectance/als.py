@@ -202,10 +202,6 @@ class _Shaded:
         colour = seen.colour - np.float32(found.ambient)
         return cls(seen.texel, rows, len(texels), colour, weight, diffuse, specular, seen.clipped)
 
-    @property
-    def _parts(self) -> list[slice]:
-        return blocks(len(self.rows), 32 * self.colour.shape[1])
-
     def residual(self, albedo: NDArray) -> NDArray[np.float32]:
         """(n, J, 3) what images show beyond albedos (n, 4)."""
         found = np.empty_like(self.colour)
@@ -214,18 +210,12 @@ class _Shaded:
             x, y = albedo[part, None, :3], albedo[part, 3, None, None]
             found[part] = self.colour[part] - form_image(0.0, x, self.diffuse[part], y, self.specular[part])
 
-        on_all_cores(fill, self._parts)
+        on_all_cores(fill, blocks(len(self.rows), 32 * self.colour.shape[1]))
         return found
 
     def systems(self, weight: NDArray, pairs: NDArray, difference: float) -> TexelSystems:
         """Blocks of all N texels, zero where nothing is seen, under weights (n, J, 3)."""
-
-        def accumulate(part: slice) -> TexelSystems:
-            diffuse, specular = self.diffuse[part], self.specular[part]
-            return TexelSystems.accumulate(self.colour[part], weight[part], diffuse, specular, pairs, difference)
-
-        parts = on_all_cores(accumulate, self._parts or [slice(0, 0)])
-        joined = TexelSystems.join(parts)
+        joined = TexelSystems.accumulate(self.colour, weight, self.diffuse, self.specular, pairs, difference)
         return TexelSystems(*(self.spread(getattr(joined, f.name)) for f in fields(joined)))
 
     def spread(self, values: NDArray) -> NDArray:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 
-from mifit.core.process import blocks, threads
+from mifit.core.process import blocks, on_all_cores, threads
 from mifit.optim import Outcome
 
 SPLIT = 0.5
@@ -66,15 +66,20 @@ class TexelSystems:
         difference : float
             Weight of the difference term, lambda_S.
         """
-        wd = weight * diffuse_light
-        ss = (weight * specular_light * specular_light).sum((1, 2))
-        sr = (weight * specular_light * colour).sum((1, 2))
-        for a, b in pairs:
-            both = difference * np.minimum(weight[:, a], weight[:, b])
-            step = specular_light[:, a] - specular_light[:, b]
-            ss += (both * step * step).sum(1)
-            sr += (both * step * (colour[:, a] - colour[:, b])).sum(1)
-        return cls((wd * diffuse_light).sum(1), (wd * specular_light).sum(1), (wd * colour).sum(1), ss, sr)
+
+        def add(rows: slice) -> TexelSystems:
+            seen, w, d, s = colour[rows], weight[rows], diffuse_light[rows], specular_light[rows]
+            wd = w * d
+            ss = (w * s * s).sum((1, 2))
+            sr = (w * s * seen).sum((1, 2))
+            for a, b in pairs:
+                both = difference * np.minimum(w[:, a], w[:, b])
+                step = s[:, a] - s[:, b]
+                ss += (both * step * step).sum(1)
+                sr += (both * step * (seen[:, a] - seen[:, b])).sum(1)
+            return cls((wd * d).sum(1), (wd * s).sum(1), (wd * seen).sum(1), ss, sr)
+
+        return cls.join(on_all_cores(add, blocks(len(colour), 32 * colour.shape[1]) or [slice(0, 0)]))
 
     @classmethod
     def join(cls, parts: list[TexelSystems]) -> TexelSystems:
