@@ -48,10 +48,8 @@ L1_FLOOR = 1e-4
 """Radians below which the L1 norm is rounded off: sqrt(c^2 + floor^2); its reweighting stays finite."""
 MOST = 1.0
 """Offset along either tangent at the most: 53 degrees, where a mesh of the face is never off by as much."""
-SETTLED, SOLVED = 3e-3, 0.03
-"""Part of the energy that the last step may promise, and of the residual that conjugate gradients leave. Views of
-scan_city, gloss and Emily c3,c4 held out change by less than 0.01 dB from a third to thirty times of the first; images
-with outliers ask for no more."""
+SETTLED, SOLVED = 1e-3, 0.03
+"""Part of the energy that the last step may promise, and of the residual that conjugate gradients leave."""
 
 TexelImage = Callable[..., tuple[NDArray, list[NDArray]]]
 """Image colours (N, 3) of texels with normals (N, 3), and their derivatives along changes of the normals."""
