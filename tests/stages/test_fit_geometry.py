@@ -345,8 +345,8 @@ def test_contour_points_slide_to_the_silhouette(model):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["soft", "hard"])
-def test_path_traced_captures(shared, ict_path, variant, name):
+@pytest.mark.parametrize(("name", "finest"), [("soft", 1), ("hard", 0)])
+def test_path_traced_captures(shared, ict_path, variant, name, finest):
     """Under a millimetre and half a degree in world space without alignment; truth is only compared with.
 
     How much of a turn is the head's and how much its shape's is a convention: the face itself is turned by less.
@@ -356,7 +356,7 @@ def test_path_traced_captures(shared, ict_path, variant, name):
     capture = Capture.load(shared / "captures" / name)
     head = MorphableModel.load(ict_path)
     start = fit_geometry(capture, head, BOTH, (0, 2), GeometryConfig())
-    estimate = find_surface(capture, head, start, BOTH, SurfaceConfig(finest=1))
+    estimate = find_surface(capture, head, start, BOTH, SurfaceConfig(finest=finest))
     with np.load(ict_path) as data:
         facial = int(data["face_area_vertices"])
     for k, timestep in enumerate(estimate.timesteps):
