@@ -167,8 +167,8 @@ def test_columns_that_are_not_seen_have_no_vote():
     seen = np.arange(len(COLUMNS)) < 0.4 * len(COLUMNS)
     strip[:, len(heights(2.0)) // 2] = 0.05
     opening = np.full(len(COLUMNS), 2.0)
-    assert read_strip(strip, seen, opening, 0.8).closed is None
-    assert read_strip(strip, np.ones(len(seen), bool), opening, 0.8).closed
+    assert read_strip(strip, seen, opening, 0.8).inside is None
+    assert read_strip(strip, np.ones(len(seen), bool), opening, 0.8).inside == 0.0
 
 
 def test_a_model_whose_face_area_has_no_mouth_is_left_alone(model, start):

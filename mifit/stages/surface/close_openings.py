@@ -11,7 +11,7 @@ expressions of the other timesteps undo the movement there, so that what is open
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,13 +22,14 @@ from mifit.render.gbuffer import SurfaceScene
 from mifit.stages.geometry.surfaces import moved_by, object_shapes
 from mifit.stages.surface.closed_line import (
     BEYOND_MM,
+    OPEN,
     STEP_MM,
     Strip,
+    eyeball,
     heights,
     read_strip,
     sample,
-    shows_an_eye,
-    shows_teeth,
+    teeth,
 )
 from mifit.stages.surface.margins import UP, Gap, Margins, Region
 
@@ -57,11 +58,11 @@ class Opening:
     apart_mm : float
         What is left between its margins.
     blinks : bool
-        Whether it opens and closes with the others that do: where one is seen open none closes. Where other timesteps
+        Whether it opens and closes with the others that do: what all of them show decides. Where other timesteps
         show it open it closes by expression alone: expressions that undo a movement of the neutral surface leave a
         part of it, and a blink shouldn't make all others squint.
-    shows_inside : callable
-        Whether a strip of an image says that it is open.
+    inside : callable
+        Part of a strip of an image that shows what lies inside.
     """
 
     name: str
@@ -69,12 +70,12 @@ class Opening:
     widest_mm: float
     apart_mm: float
     blinks: bool
-    shows_inside: Callable[[Strip], bool]
+    inside: Callable[[Strip], float]
 
 
-LIPS = (Opening("mouth", slice(60, 68), 6.0, 0.08, False, shows_teeth),)
+LIPS = (Opening("mouth", slice(60, 68), 6.0, 0.08, False, teeth),)
 LIDS = tuple(
-    Opening(name, slice(first, first + 6), np.inf, 0.04, True, shows_an_eye)
+    Opening(name, slice(first, first + 6), np.inf, 0.04, True, eyeball)
     for name, first in (("right eye", 36), ("left eye", 42))
 )
 
@@ -110,32 +111,35 @@ def close_openings(
     known = [(opening, margins) for opening in openings if (margins := Margins.of(model, opening.marks)) is not None]
     if not known:
         return geometry, {}
-    seen: list[_Seen] = [_Seen() for _ in known]
-    open_eyed: set[int] = set()
     shapes = object_shapes(model, geometry)
     scene = SurfaceScene(geometry.vertices[0].astype(np.float64), model.faces)
+    looks: list[list[_Look]] = []  # by timestep and opening
     for k, shape in enumerate(shapes):
         if k:
             scene.update(geometry.vertices[k].astype(np.float64))
-        for (opening, margins), found in zip(known, seen, strict=True):
-            gap = Gap.of(shape, margins)
-            closed, line, pixel = _closed_line(capture, scene, geometry, k, gap, cameras, opening, model.unit_mm)
-            found.heights_mm.append(gap.height(model.unit_mm))
-            found.pixel = min(found.pixel, pixel)
-            if line is not None:
-                found.lines[k] = line
-            elif closed is False and opening.blinks:
-                open_eyed.add(k)
+        gaps = [Gap.of(shape, margins) for _, margins in known]
+        looks.append(
+            [
+                _look(capture, scene, geometry, k, gap, cameras, opening, model.unit_mm)
+                for gap, (opening, _) in zip(gaps, known, strict=True)
+            ]
+        )
     details = {}
-    for (opening, margins), found in zip(known, seen, strict=True):
-        if opening.blinks:
-            found.lines = {k: line for k, line in found.lines.items() if k not in open_eyed}
+    for n, (opening, margins) in enumerate(known):
+        lines = {}
+        for k, row in enumerate(looks):
+            alike = [look for look, (other, _) in zip(row, known, strict=True) if opening.blinks and other.blinks]
+            parts = [part for look in alike or [row[n]] for part in look.inside]
+            line = row[n].line
+            if line is not None and np.mean(parts) < OPEN:
+                lines[k] = line
         details[opening.name] = {
-            "closed": [int(geometry.timesteps[k]) for k in found.lines],
-            "opening_mm": dict(zip(map(str, geometry.timesteps), found.heights_mm, strict=True)),
+            "closed": [int(geometry.timesteps[k]) for k in lines],
+            "opening_mm": {str(t): row[n].height_mm for t, row in zip(geometry.timesteps, looks, strict=True)},
         }
-        if found.lines and np.mean([found.heights_mm[k] for k in found.lines]) >= SMALLEST_PIXELS * found.pixel:
-            geometry = _closed(model, geometry, margins, found.lines, opening)
+        pixel = min(row[n].pixel for row in looks)
+        if lines and np.mean([looks[k][n].height_mm for k in lines]) >= SMALLEST_PIXELS * pixel:
+            geometry = _closed(model, geometry, margins, lines, opening)
     return geometry, details
 
 
@@ -153,13 +157,26 @@ def close_again(
     return geometry
 
 
-@dataclass
-class _Seen:
-    """What the images show of one opening: by index of the timestep, lines (C, 3) where it is closed."""
+@dataclass(frozen=True)
+class _Look:
+    """What the images of one timestep show of an opening.
 
-    lines: dict[int, NDArray[np.float64]] = field(default_factory=dict)
-    heights_mm: list[float] = field(default_factory=list)
-    pixel: float = np.inf
+    Attributes
+    ----------
+    height_mm : float
+        Of the modelled opening.
+    inside : list of float
+        By view that tells, the part that shows what lies inside.
+    line : (C, 3) or None
+        Where its margins meet if it is closed, object space.
+    pixel : float
+        Size of the smallest pixel there, mm.
+    """
+
+    height_mm: float
+    inside: list[float]
+    line: NDArray[np.float64] | None
+    pixel: float
 
 
 def _closed(
@@ -179,7 +196,7 @@ def _closed(
     return moved_by(model, replace(geometry, expression=expression), shared)
 
 
-def _closed_line(
+def _look(
     capture: Capture,
     scene: SurfaceScene,
     geometry: GeometryEstimate,
@@ -188,15 +205,12 @@ def _closed_line(
     cameras: Sequence[str],
     opening: Opening,
     unit_mm: float,
-) -> tuple[bool | None, NDArray[np.float64] | None, float]:
-    """Whether the images show the opening closed, None where they don't tell; (C, 3) line; and mm of a pixel there.
-
-    The line is in object space and None but for what is closed.
-    """
+) -> _Look:
+    """What all views of a timestep show of an opening."""
     rotation, middle = geometry.rotation[k], gap.middle
     median = gap.height(unit_mm)
     if median > opening.widest_mm:
-        return False, None, np.inf
+        return _Look(median, [1.0], None, np.inf)
     height = heights(median) / unit_mm
 
     def world(points: NDArray) -> NDArray:
@@ -206,28 +220,28 @@ def _closed_line(
     points = world(middle[:, None] + height[None, :, None] * UP)
     front = world(middle + BEYOND_MM / unit_mm * FORWARD)  # seen where lips and lids don't hide it
     opening_mm = (gap.upper - gap.lower) @ UP * unit_mm
-    votes, rows, pixel = [], [], np.inf
+    inside, rows, pixel = [], [], np.inf
     for name in cameras:
         camera, frame = capture.camera(name), capture.frame(name, geometry.timesteps[k])
         pixels = camera.project(points.reshape(-1, 3)).reshape(*points.shape[:2], 2)
         spacing = float(np.median(np.linalg.norm(np.diff(pixels, axis=1), axis=2)))
         pixel = min(pixel, (height[1] - height[0]) * unit_mm / max(spacing, 1e-9))
         x, y = pixels[..., 0], pixels[..., 1]
-        inside = np.all((x > 1) & (x < camera.width - 1) & (y > 1) & (y < camera.height - 1), axis=1)
-        seen = inside & scene.visible_from(front, camera.position)
+        framed = np.all((x > 1) & (x < camera.width - 1) & (y > 1) & (y < camera.height - 1), axis=1)
+        seen = framed & scene.visible_from(front, camera.position)
         good = (frame.valid & ~frame.clipped).astype(np.float32)[..., None].repeat(3, axis=2)
-        seen &= sample(good, np.where(inside[:, None, None], pixels, 1.0))[..., 0].mean(axis=1) > 0.5
-        read = read_strip(sample(frame.image, pixels), seen, opening_mm, column_mm, opening.shows_inside)
-        if read.closed is None:
+        seen &= sample(good, np.where(framed[:, None, None], pixels, 1.0))[..., 0].mean(axis=1) > 0.5
+        read = read_strip(sample(frame.image, pixels), seen, opening_mm, column_mm, opening.inside)
+        if read.inside is None:
             continue
-        votes.append(read.closed)
+        inside.append(read.inside)
         # Depth moves what a view shows at a height: by how much, across the line.
         at, up, deep = (camera.project(world(middle + d * STEP_MM / unit_mm)) for d in (0.0 * UP, UP, FORWARD))
         tangent = np.gradient(at, axis=0)
         across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
         rows.append((read.height, read.weight, ((deep - at) * across).sum(1) / ((up - at) * across).sum(1)))
-    if 2 * sum(votes) <= len(votes):
-        return (False if votes else None), None, pixel
+    if not rows:
+        return _Look(median, inside, None, pixel)
     h, weight, slope = (np.stack(part) for part in zip(*rows, strict=True))
     precision = weight / weight.max() / STEP_MM**2
     a, b, c = (precision.sum(0) + 1e-6, (precision * slope).sum(0), (precision * slope**2).sum(0) + DEPTH_MM**-2.0)
@@ -236,4 +250,4 @@ def _closed_line(
     up, deep = (c * p - b * q) / determinant, (a * q - b * p) / determinant
     clear = np.flatnonzero(precision.sum(0) > 0)
     up, deep = (np.interp(np.arange(len(v)), clear, v[clear]) / unit_mm for v in (up, deep))
-    return True, middle + up[:, None] * UP + deep[:, None] * FORWARD, pixel
+    return _Look(median, inside, middle + up[:, None] * UP + deep[:, None] * FORWARD, pixel)

@@ -46,15 +46,15 @@ class ClosedLine:
 
     Attributes
     ----------
-    closed : bool or None
-        None: it doesn't tell.
+    inside : float or None
+        Part that shows what lies inside; above `OPEN` it is open. None: the image doesn't tell.
     height : (C,)
         Of the line above the middle between the modelled margins, mm along object space's y axis.
     weight : (C,)
         Trust in ``height``; 0 where the line isn't seen.
     """
 
-    closed: bool | None
+    inside: float | None
     height: NDArray[np.float64]
     weight: NDArray[np.float64]
 
@@ -95,16 +95,16 @@ class Strip:
     opening_mm: NDArray[np.float64]
 
 
-def shows_teeth(strip: Strip) -> bool:
-    """Whether the line runs along teeth rather than between lips."""
+def teeth(strip: Strip) -> float:
+    """Part of the columns in which the line runs along teeth rather than between lips."""
     red, seen = strip.red, strip.seen
     window = np.abs(np.arange(red.shape[1])[None] - strip.row[:, None]) <= round(LINE_MM / STEP_MM)
     least = np.where(window, red, np.inf).min(axis=1)
-    return float((least[seen] < np.median(red[seen]) - LESS_RED).mean()) >= OPEN
+    return float((least[seen] < np.median(red[seen]) - LESS_RED).mean())
 
 
-def shows_an_eye(strip: Strip) -> bool:
-    """Whether white, iris or pupil lie between the modelled lids."""
+def eyeball(strip: Strip) -> float:
+    """Part of what lies between the modelled lids that is white, iris or pupil."""
     count = len(strip.seen)
     inner = np.abs(np.arange(count) / (count - 1) - 0.5) < 0.5 - MARGINAL
     columns = np.flatnonzero(strip.seen & inner)
@@ -116,7 +116,7 @@ def shows_an_eye(strip: Strip) -> bool:
     dark, red = strip.dark[columns], strip.red[columns]
     pale = red < np.nanmedian(beside * red) - CONTRAST
     black = dark < np.nanmedian(beside * dark, axis=1, keepdims=True) - DARK  # shading changes along the eye
-    return bool((pale | black)[within].mean() > OPEN) if within.any() else True
+    return float((pale | black)[within].mean()) if within.any() else 1.0
 
 
 def read_strip(
@@ -124,7 +124,7 @@ def read_strip(
     seen: NDArray,
     opening_mm: NDArray,
     column_mm: float,
-    shows_inside: Callable[[Strip], bool] = shows_teeth,
+    inside: Callable[[Strip], float] = teeth,
 ) -> ClosedLine:
     """The line in which lips or lids meet, in an image that was straightened along them.
 
@@ -138,8 +138,8 @@ def read_strip(
         Height of the modelled opening.
     column_mm : float
         Distance between columns.
-    shows_inside : callable
-        Whether what lies between says that it is open.
+    inside : callable
+        Part of a strip that shows what lies inside.
     """
     opening = float(np.median(opening_mm))
     height = heights(opening)
@@ -160,11 +160,11 @@ def read_strip(
     found = np.where(seen, depth[columns, row], 0.0)
     if np.median(found[seen]) < CONTRAST:
         return nothing
-    closed = not shows_inside(Strip(dark, red, seen, row, np.minimum(opening_mm, opening + BEYOND_MM)))
+    part = inside(Strip(dark, red, seen, row, np.minimum(opening_mm, opening + BEYOND_MM)))
     weight = np.maximum(found, 0.0)
     clear = np.flatnonzero(weight)
     smooth = gaussian_filter1d(np.interp(columns, clear, height[row[clear]]), 1.5, mode="nearest")
-    return ClosedLine(closed, smooth, weight)
+    return ClosedLine(part, smooth, weight)
 
 
 def _seam(value: NDArray) -> NDArray[np.intp]:
