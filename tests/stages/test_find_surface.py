@@ -28,7 +28,7 @@ from mifit.stages.surface.band import FeatureImage
 from mifit.stages.surface.displace import THINNEST, Measurements, SurfacePrior, Walls, solve_surface
 from mifit.stages.surface.outline import joined
 from mifit.stages.surface.sweep import GLARE_DEVIATIONS, SAME, Posed, _precision, _Sweep, _without_glare, match
-from mifit.stages.surface.views import pose_texels
+from mifit.stages.surface.views import pose_texels, shows_surface
 from tests.morphable.intersections import intersections
 from tests.test_pipeline import without_eyes
 
@@ -416,6 +416,18 @@ def test_features_of_the_face_know_nothing_of_the_background(model, bumpy):
         ]
         assert features[0][..., 1].mean() > 0.5
         np.testing.assert_allclose(*features, atol=1e-5)
+
+
+def test_a_surface_is_left_out_at_its_outline_but_not_where_it_hides_itself(variant):
+    """A nose that is too small grows only if what shows beyond its own outline is compared."""
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    near, far = (np.column_stack([half * square, np.full(4, depth)]) for half, depth in ((0.25, 1.0), (1.0, 2.0)))
+    faces = np.array([[0, 2, 1], [0, 3, 2]])
+    scene = SurfaceScene(np.concatenate([near, far]), np.concatenate([faces, faces + 4]))
+    camera = Camera("ahead", 64, 64, 48.0, 48.0, 32.0, 32.0, np.eye(4))  # the far one covers 24 pixels to each side
+    shown = shows_surface(scene, camera)
+    assert shown[32, 12:52].all()
+    assert not shown[32, :9].any() and not shown[32, 55:].any()
 
 
 def test_what_one_view_alone_shows_changes_nothing_in_the_comparison():

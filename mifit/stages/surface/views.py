@@ -27,7 +27,6 @@ GRAZING_COSINE = 0.2  # beyond about 78 degrees a pixel covers too much surface 
 OUTLINE_SCALE = 0.5  # outlines are found in images of this scale; chosen on all development heads
 LONGEST_SIDE = 1000.0  # pixels of images whose texture is compared over time: larger ones are reduced
 LARGEST_TEXTURE = 512  # texels along a side, of that
-OUTLINE_SLOPE = 12.0  # depth step between neighbouring pixels, in pixel lengths, that is an outline
 
 
 def pose_texels(
@@ -71,13 +70,12 @@ def pose_views(
 
 
 def shows_surface(scene: SurfaceScene, camera: Camera) -> NDArray[np.bool_]:
-    """(H, W) pixels that show the surface, away from its outlines against the background and against itself."""
-    small = camera.resized(OUTLINE_SCALE)
-    buffer = scene.gbuffer(small)
-    depth = np.where(buffer.mask, buffer.depth, np.float32(0))
-    around = np.ones((3, 3), np.uint8)
-    outline = cv2.dilate(depth, around) - cv2.erode(depth, around) > OUTLINE_SLOPE * depth / small.fx
-    shown = (buffer.mask & ~outline).astype(np.uint8)
+    """(H, W) pixels that show the surface, away from its outline against the background.
+
+    Outlines against the surface itself stay: beyond that of a nose which is too small lies the skin that it lacks.
+    """
+    mask = scene.gbuffer(camera.resized(OUTLINE_SCALE)).mask
+    shown = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
     return cv2.resize(shown, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST) > 0
 
 
