@@ -117,19 +117,18 @@ def close_openings(
     for k, shape in enumerate(shapes):
         if k:
             scene.update(geometry.vertices[k].astype(np.float64))
-        gaps = [Gap.of(shape, margins) for _, margins in known]
         looks.append(
             [
-                _look(capture, scene, geometry, k, gap, cameras, opening, model.unit_mm)
-                for gap, (opening, _) in zip(gaps, known, strict=True)
+                _look(capture, scene, geometry, k, Gap.of(shape, margins), cameras, opening, model.unit_mm)
+                for opening, margins in known
             ]
         )
     details = {}
     for n, (opening, margins) in enumerate(known):
         lines = {}
+        together = [m for m, (other, _) in enumerate(known) if m == n or (opening.blinks and other.blinks)]
         for k, row in enumerate(looks):
-            alike = [look for look, (other, _) in zip(row, known, strict=True) if opening.blinks and other.blinks]
-            parts = [part for look in alike or [row[n]] for part in look.inside]
+            parts = [part for m in together for part in row[m].inside]
             line = row[n].line
             if line is not None and np.mean(parts) < OPEN:
                 lines[k] = line
