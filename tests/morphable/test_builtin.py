@@ -275,24 +275,32 @@ def test_jaw_opens_the_mouth_and_smile_widens_it(coarse):
 
 _TIMING = """
 import time
+import numpy as np
 from mifit.morphable import MorphableModel
 m = MorphableModel.load("builtin:coarse")
 identity, expression, albedo = m.sample(0)
-times = []
-for _ in range(20):
-    start = time.process_time()
+plain = [(np.ones((3 * m.n_vertices, len(c)), np.float32), c) for c in (identity, expression, albedo)]
+def evaluate():
     m.shape(identity, expression)
     m.albedo(albedo)
-    times.append(time.process_time() - start)
-print(min(times) * 30_000 / m.n_vertices)
+def multiply():
+    for basis, coefficients in plain:
+        basis @ coefficients
+times = {evaluate: [], multiply: []}
+for _ in range(30):
+    for work in times:
+        start = time.process_time()
+        work()
+        times[work].append(time.process_time() - start)
+print(min(times[evaluate]) / min(times[multiply]))
 """
 
 
-def test_evaluation_is_fast(coarse):
-    """Scaled to full size, with one thread in a process of its own: other work on the machine must not matter."""
+def test_evaluation_costs_three_plain_products(coarse):
+    """One thread in a process of its own, against products of the same size, so that no machine's speed matters; a copy of a basis costs more."""
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     out = subprocess.run([sys.executable, "-c", _TIMING], env=environment, capture_output=True, text=True, check=True)
-    assert float(out.stdout) < 0.020
+    assert float(out.stdout) < 2
 
 
 def test_jacobian_products_copy_no_basis(coarse):
