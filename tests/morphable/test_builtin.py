@@ -297,7 +297,7 @@ print(min(times[evaluate]) / min(times[multiply]))
 
 
 def test_evaluation_costs_three_plain_products(coarse):
-    """One thread in a process of its own, against products of the same size, so that no machine's speed matters; a copy of a basis costs more."""
+    """In one thread, so that other work matters little; a copy of a basis would cost more."""
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     out = subprocess.run([sys.executable, "-c", _TIMING], env=environment, capture_output=True, text=True, check=True)
     assert float(out.stdout) < 2

@@ -191,15 +191,24 @@ def _steps(
     residual = np.where(used, value - mean, 0.0)
     spread = max(median_deviation(residual[used]), LEAST_SPREAD)
     weight = np.where(used, weight / (1.0 + (residual / (2.0 * spread)) ** 2) ** 2, 0.0) * INDEPENDENT / spread**2
+
+    def equations(part: tuple[Look, NDArray, NDArray]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """What one view adds to its timestep's system and gradient."""
+        look, counts, off = part
+        k, some = look.step, np.flatnonzero(counts > 0)
+        root = np.sqrt(counts[some, None])
+        slope = root * (look.slope[some] @ rotation[k])  # by object-space movement
+        bent = (slope @ turns[k]).astype(np.float32)[:, None] @ basis[some]
+        rigid = np.concatenate([np.cross(at[k, some], slope), slope], axis=1).astype(np.float32)
+        jacobian = np.concatenate([rigid, bent[:, 0]], axis=1)
+        return jacobian.T @ jacobian, jacobian.T @ (root[:, 0] * off[some]).astype(np.float32)
+
+    moving = list(zip(looks, weight, residual, strict=False))
     prior = np.diag(wide**-2.0)
     system, gradient = np.tile(prior, (len(spent), 1, 1)), spent @ prior
-    for look, counts, off in zip(looks, weight, residual, strict=False):  # of those that move
-        k, some = look.step, np.flatnonzero(counts > 0)
-        slope = look.slope[some] @ rotation[k]  # by object-space movement
-        bent = np.einsum("nc,nck->nk", slope @ turns[k], basis[some])
-        jacobian = np.concatenate([np.cross(at[k, some], slope), slope, bent], axis=1)
-        system[k] += (jacobian * counts[some, None]).T @ jacobian
-        gradient[k] += jacobian.T @ (counts[some] * off[some])
+    for look, (curvature, slope) in zip(looks, on_all_cores(equations, moving), strict=True):
+        system[look.step] += curvature
+        gradient[look.step] += slope
     return np.asarray(-np.linalg.solve(system, gradient[..., None])[..., 0], np.float64)
 
 
