@@ -121,6 +121,7 @@ def minimize(
     lower: NDArray | None = None,
     upper: NDArray | None = None,
     max_iterations: int = 50,
+    damping: float = 1e-3,
     step_tolerance: float = 1e-8,
     energy_tolerance: float = 1e-8,
 ) -> Solution:
@@ -129,9 +130,9 @@ def minimize(
     Damping follows Nielsen's rule, see `trust`. A parameter at a bound whose gradient points outwards is frozen for the
     step; one that would cross a bound is put on it and the others are solved for again.
 
-    ``start`` (n,) is clipped to the bounds ``lower`` and ``upper`` (n,); ``max_iterations`` counts linearisations. It
-    has converged when the step is within ``step_tolerance`` relative to ``1 + |x|`` in the largest entry, or the
-    predicted decrease is below the part ``energy_tolerance`` of the energy.
+    ``start`` (n,) is clipped to the bounds ``lower`` and ``upper`` (n,); ``max_iterations`` counts linearisations;
+    ``damping`` is that of the first step. It has converged when the step is within ``step_tolerance`` relative to
+    ``1 + |x|`` in the largest entry, or the predicted decrease is below the part ``energy_tolerance`` of the energy.
     """
     began = time.perf_counter()
     x = np.array(start, dtype=np.float64)
@@ -142,7 +143,7 @@ def minimize(
     history = {name: [value] for name, value in terms.items()}
     energy = sum(terms.values())
     evaluations, rejected, iterations = 1, 0, 0
-    size, outcome = 1e3, Outcome.MAX_ITERATIONS
+    size, outcome = 1.0 / damping, Outcome.MAX_ITERATIONS
     if not np.isfinite(energy):
         outcome, max_iterations = Outcome.DIVERGED, 0
     while iterations < max_iterations:
