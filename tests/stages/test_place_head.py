@@ -9,11 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from mifit.capture import Capture
 from mifit.config import GeometryConfig
 from mifit.morphable import MorphableModel
 from mifit.stages.fit_geometry import fit_geometry
+from mifit.stages.geometry import place_head
 from mifit.stages.geometry.place_head import outline_contrast
 
 SIZE = 1.08
@@ -68,6 +70,21 @@ def test_other_views_say_how_large_a_head_is(
     assert [w.camera for w in found.report.warnings if w.code == "landmarks-left-out"] == ["right"] * (
         landmarks == "wrong"
     )
+
+
+def test_what_stands_out_at_every_size_says_nothing(
+    larger: Callable[[str], Capture], model: MorphableModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def busy(mask: NDArray, log: NDArray) -> float | None:
+        contrast = outline_contrast(mask, log)
+        return None if contrast is None else 5.0 + contrast
+
+    monkeypatch.setattr(place_head, "likeness", lambda *views: None)  # outlines alone
+    capture = larger("missing")
+    plain = fit_geometry(capture, model, PAIR, (0,), GeometryConfig()).scale
+    monkeypatch.setattr(place_head, "outline_contrast", busy)
+    assert plain > 1.03
+    assert fit_geometry(capture, model, PAIR, (0,), GeometryConfig()).scale == pytest.approx(plain, rel=1e-3)
 
 
 def test_landmarks_that_agree_decide_by_themselves(larger: Callable[[str], Capture], model: MorphableModel) -> None:
