@@ -297,7 +297,7 @@ print(min(times[evaluate]) / min(times[multiply]))
 
 
 def test_evaluation_costs_three_plain_products(coarse):
-    """In one thread, so that other work matters little; a copy of a basis would cost more."""
+    """In one thread, beside products of the same size, so that the machine's speed matters little."""
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     out = subprocess.run([sys.executable, "-c", _TIMING], env=environment, capture_output=True, text=True, check=True)
     assert float(out.stdout) < 2

@@ -50,7 +50,6 @@ MOST = 1.0
 """Offset along either tangent at the most: 53 degrees, where a mesh of the face is never off by as much."""
 SETTLED, SOLVED = 1e-3, 0.03
 """Part of the energy that the last step may promise, and of the residual that conjugate gradients leave."""
-
 DAMPING = 0.1
 """Of the first step: highlights bend more than a linearisation says. Chosen on gloss, for speed."""
 

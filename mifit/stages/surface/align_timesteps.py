@@ -206,9 +206,9 @@ def _steps(
     moving = list(zip(looks, weight, residual, strict=False))
     prior = np.diag(wide**-2.0)
     system, gradient = np.tile(prior, (len(spent), 1, 1)), spent @ prior
-    for look, (curvature, slope) in zip(looks, on_all_cores(equations, moving), strict=True):
+    for look, (curvature, pull) in zip(looks, on_all_cores(equations, moving), strict=True):
         system[look.step] += curvature
-        gradient[look.step] += slope
+        gradient[look.step] += pull
     return np.asarray(-np.linalg.solve(system, gradient[..., None])[..., 0], np.float64)
 
 

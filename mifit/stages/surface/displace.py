@@ -278,7 +278,7 @@ def solve_surface(
     def without_modes(x: NDArray) -> NDArray[np.float64]:
         """What the free modes take from the plate's pull on a surface (V, 3), flat."""
         along_modes = stiffness * (bent.T @ x.ravel().astype(np.float32)).astype(np.float64)
-        return np.asarray(bent @ la.cho_solve(inner, along_modes, check_finite=False).astype(np.float32), np.float64)
+        return np.asarray(bent @ la.cho_solve(inner, along_modes).astype(np.float32), np.float64)
 
     change, size, goal = np.zeros_like(start), (start.size, start.size), None
     for robust in measured.robust.T:

@@ -72,7 +72,7 @@ def pose_views(
 def shows_surface(scene: SurfaceScene, camera: Camera) -> NDArray[np.bool_]:
     """(H, W) pixels that show the surface, away from its outline against the background.
 
-    Outlines against the surface itself stay: where a nose is too small, the skin that it lacks shows beyond its own.
+    Outlines against the surface itself stay: where a nose is too small, the missing skin shows beyond its outline.
     """
     mask = scene.gbuffer(camera.resized(OUTLINE_SCALE)).mask
     shown = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
