@@ -25,7 +25,7 @@ from mifit.appearance.arrays import (
     weighted_rows,
 )
 from mifit.appearance.illumination import DistantLight, Illumination
-from mifit.appearance.kernels import PreparedLobe, direct_light, light_transfer, prepare
+from mifit.appearance.kernels import PreparedLobe, SmoothLight, direct_light, light_transfer, prepare
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import Shade, ShadingModel
 from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, VertexTransfer
@@ -225,7 +225,8 @@ class _Scene:
 
     def shader(self) -> Shade:
         """Shading of bent normals, compact lights included."""
-        return self.with_lights(self.model.about(self.n, self.v, self.lobe, self.coefficients, self.shadowed))
+        light = SmoothLight.of(self.appearance.illumination.radiance)
+        return self.with_lights(self.model.about(self.n, self.v, self.lobe, light, self.shadowed))
 
     def light(self, light: DistantLight, visible: Jit) -> Shade:
         """Radiance at unit albedo per unit of a light's colour, as a function of normal and view."""

@@ -12,10 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mifit.appearance.arrays import Jit, dr, mi
 from mifit.appearance.lobe import EXPONENT_MAX, EXPONENT_MIN, Lobe, lobe_table
-from mifit.core.sh import bands, cosine_coefficients
+from mifit.core.sh import bands, cosine_coefficients, turning
 from mifit.errors import InputError
 
 
@@ -160,9 +161,49 @@ def lobe_axis(n: Jit, v: Jit, lobe: PreparedLobe) -> tuple[Jit, list[Jit]]:
 
 def lobe_transfer(lobe: PreparedLobe, axis: Jit, moments: list[Jit]) -> list[Jit]:
     """Transfer vector of the zonal lobe with these moments about an axis, see `lobe_axis`."""
-    albedo = moments[0] * lobe.scale
-    factors = [albedo, *(albedo * c for c in moments[2:])]
+    factors = lobe_factors(lobe, moments)
     return [factors[band] * y for band, y in zip(bands(lobe.order), sh_basis(axis, lobe.order), strict=True)]
+
+
+def lobe_factors(lobe: PreparedLobe, moments: list[Jit]) -> list[Jit]:
+    """Factors of the bands by which a lobe with these moments smooths light, see `lobe_axis`."""
+    albedo = moments[0] * lobe.scale
+    return [albedo, *(albedo * c for c in moments[2:])]
+
+
+@dataclass(frozen=True)
+class SmoothLight:
+    """SH coefficients of radiance on the device, with what gives its slopes: for one value of each, not a transfer.
+
+    ``coefficients`` are B*B colours, ``turning`` three times as many, see ``core.sh.turning``.
+    """
+
+    coefficients: list[Jit]
+    turning: list[list[Jit]]
+
+    @classmethod
+    def of(cls, radiance: NDArray) -> SmoothLight:
+        """Of coefficients (B*B, 3)."""
+        both = [[mi.Color3f(*row) for row in each] for each in (radiance.tolist(), *turning(radiance).tolist())]
+        dr.make_opaque(both)
+        return cls(both[0], both[1:])
+
+    def about(self, axis: Jit, factors: Sequence[Jit]) -> Jit:
+        """Radiance (Color3f) smoothed by a zonal kernel about unit directions; ``factors`` of its B bands.
+
+        Its gradient is that by the factors, and by the axis along the sphere.
+        """
+        at = dr.detach(axis)
+        basis = sh_basis(at, len(factors))
+        parts = [slice(band * band, (band + 1) ** 2) for band in range(len(factors))]
+        light = radiance(factors, [radiance(basis[part], self.coefficients[part]) for part in parts])
+        if dr.grad_enabled(axis):
+            smoothed = [dr.detach(factor) * y for factor, part in zip(factors, parts, strict=True) for y in basis[part]]
+            torque = [radiance(smoothed, each) for each in self.turning]
+            for channel in range(3):
+                slope = dr.cross(mi.Vector3f(*(each[channel] for each in torque)), at)
+                light[channel] += dr.replace_grad(mi.Float(0.0), dr.dot(slope, axis))
+        return light
 
 
 def dominant_direction(coefficients: Sequence[Jit]) -> Jit:
@@ -204,14 +245,29 @@ def light_transfer(n: Jit, v: Jit, lobe: PreparedLobe, directions: Jit, count: J
     kernel with a copy of the lobe for each takes long to compile.
     """
 
-    def add(k: Jit, diffuse: Jit, specular: Jit, n: Jit, v: Jit) -> tuple[Jit, ...]:
-        d, s = direct_light(n, v, lobe, dr.gather(mi.Vector3f, directions, k))
-        seen = (visible >> k) & 1 != 0
-        return k + 1, diffuse + dr.select(seen, d, 0.0), specular + dr.select(seen, s, 0.0), n, v
+    sloped, at = dr.grad_enabled(n), dr.detach(n)
 
-    start = mi.UInt32(0), mi.Float(0.0), mi.Float(0.0), n, v
-    _, diffuse, specular, *_ = dr.while_loop(start, lambda k, *_: k < count, add, label="light")
-    return diffuse / count, specular / count
+    def add(k: Jit, sums: list[Jit], slopes: list[Jit]) -> tuple[Jit, list[Jit], list[Jit]]:
+        normal = mi.Vector3f(at)
+        if sloped:
+            dr.enable_grad(normal)
+        seen, slopes = (visible >> k) & 1 != 0, list(slopes)
+        reflected = direct_light(normal, v, lobe, dr.gather(mi.Vector3f, directions, k))
+        for i, part in enumerate(reflected):
+            if sloped:
+                dr.set_grad(part, 1.0)
+                dr.enqueue(dr.ADMode.Backward, part)
+                dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearInput | dr.ADFlag.ClearInterior)
+                slopes[i] = slopes[i] + dr.select(seen, dr.grad(normal), 0.0)
+                dr.clear_grad(normal)
+        sums = [total + dr.select(seen, dr.detach(part), 0.0) for total, part in zip(sums, reflected, strict=True)]
+        return k + 1, sums, slopes
+
+    start = mi.UInt32(0), [mi.Float(0.0), mi.Float(0.0)], [mi.Vector3f(0.0), mi.Vector3f(0.0)] if sloped else []
+    _, sums, slopes = dr.while_loop(start, lambda k, *_: k < count, add, label="light")
+    if sloped:
+        sums = [dr.replace_grad(total, dr.dot(slope, n)) for total, slope in zip(sums, slopes, strict=True)]
+    return sums[0] / count, sums[1] / count
 
 
 def unoccluded(n: Jit, axis: Jit, traced: Sequence[Jit], order: int) -> Jit:

@@ -10,18 +10,23 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from mifit.appearance.arrays import Jit, dr, mi
 from mifit.appearance.kernels import (
     PreparedLobe,
+    SmoothLight,
     diffuse_transfer,
     dominant_direction,
     lobe_axis,
+    lobe_factors,
     lobe_transfer,
     radiance,
     specular_transfer,
     unoccluded,
 )
 from mifit.config import SHADINGS
+from mifit.core.sh import cosine_coefficients
 from mifit.errors import InputError
 
 Shade = Callable[[Jit, Jit], tuple[Jit, Jit]]
@@ -96,13 +101,13 @@ class ShadingModel(ABC):
         return self.transfer(n, v, lobe, coefficients, shadowed).shade(coefficients)
 
     def about(
-        self, base: Jit, v: Jit, lobe: PreparedLobe, coefficients: Sequence[Jit], shadowed: Sequence[Jit] | None = None
+        self, base: Jit, v: Jit, lobe: PreparedLobe, light: SmoothLight, shadowed: Sequence[Jit] | None = None
     ) -> Shade:
         """Shading of normals bent away from those of the mesh, ``base`` (Vector3f), for which shadows were traced.
 
         What doesn't change with the normal is computed here, once. All else is as in `transfer`.
         """
-        return lambda n, toward: self.shade(n, toward, lobe, coefficients, shadowed)
+        return lambda n, toward: self.shade(n, toward, lobe, light.coefficients, shadowed)
 
 
 # The package's models ----------------------------------------------------------------------------------------------
@@ -186,26 +191,24 @@ class ShadowedModel(ShadingModel):
         return Transfer(shadowed, lobe_transfer(lobe, axis, moments), unoccluded(n, axis, shadowed, lobe.order))
 
     def about(
-        self, base: Jit, v: Jit, lobe: PreparedLobe, coefficients: Sequence[Jit], shadowed: Sequence[Jit] | None = None
+        self, base: Jit, v: Jit, lobe: PreparedLobe, light: SmoothLight, shadowed: Sequence[Jit] | None = None
     ) -> Shade:
         """Shadows are those of the base normal.
 
         For a bent one the unshadowed change is added, dimmed by the part of the light that reaches the point, and the
         lobe keeps its dimming.
         """
-        shadowed = self._traced(shadowed)
-        blocked = radiance(shadowed, coefficients)
-        open_sky = radiance(diffuse_transfer(base, lobe.order), coefficients)
+        shadowed, lambertian = self._traced(shadowed), (cosine_coefficients(lobe.order) / np.pi).tolist()
+        blocked, open_sky = radiance(shadowed, light.coefficients), light.about(base, lambertian)
         passed = dr.clip(mi.luminance(blocked) / dr.maximum(mi.luminance(open_sky), 1e-6), 0.0, 1.0)
-        axis, _ = lobe_axis(base, v, lobe)
-        specular_passed = unoccluded(base, axis, shadowed, lobe.order)
+        specular_passed = unoccluded(base, lobe_axis(base, v, lobe)[0], shadowed, lobe.order)
         rest = blocked - passed * open_sky
         dr.eval(rest, passed, specular_passed)
 
         def shade(n: Jit, toward: Jit) -> tuple[Jit, Jit]:
-            diffuse = radiance(diffuse_transfer(n, lobe.order), coefficients)
-            specular = radiance(specular_transfer(n, toward, lobe), coefficients)
-            return rest + passed * diffuse, specular_passed * specular
+            axis, moments = lobe_axis(n, toward, lobe)
+            specular = light.about(axis, lobe_factors(lobe, moments))
+            return rest + passed * light.about(n, lambertian), specular_passed * specular
 
         return shade
 

@@ -74,6 +74,10 @@ class VertexTransfer:
     corners: NDArray
     weights: NDArray[np.float32]
 
+    def take(self, rows: NDArray) -> VertexTransfer:
+        """That of some of the points."""
+        return VertexTransfer(self.values, self.corners[rows], self.weights[rows])
+
     @classmethod
     def joined(cls, parts: Sequence[VertexTransfer], step: NDArray[np.int64]) -> VertexTransfer:
         """Of points that were looked up on several meshes: for each of ``step`` its mesh's, side by side per point."""
@@ -108,6 +112,10 @@ class Occlusion:
             at_vertices = mesh.transfer(illumination.order, seed)
             transfer = VertexTransfer(at_vertices, mesh.scene.faces[points.face], points.barycentric)
         return cls(transfer, tuple(_visible(mesh.scene, points, [light.samples() for light in illumination.lights])))
+
+    def take(self, rows: NDArray) -> Occlusion:
+        """That of some of the points."""
+        return Occlusion(self.transfer and self.transfer.take(rows), tuple(bits[rows] for bits in self.visible))
 
 
 def _visible(scene: SurfaceScene, points: MeshPoints, samples: Sequence[NDArray]) -> list[NDArray[np.uint32]]:

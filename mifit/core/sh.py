@@ -151,6 +151,15 @@ def rotation_matrix(rotation: ArrayLike, order: int) -> Array:
     return np.where(band[:, None] == band[None, :], matrix, 0.0)
 
 
+def turning(coefficients: Array) -> Array:
+    """(3, B*B, K) change of a field with coefficients (B*B, K) as its argument d turns about x, y, z: d + t e x d."""
+    order = order_of(coefficients)
+    d, w = quadrature(order)
+    values, gradient = basis_gradient(d, order)
+    slopes = coefficients.T @ gradient  # (N, K, 3)
+    return np.stack([values.T @ (w[:, None] * (slopes @ np.cross(e, d)[..., None])[..., 0]) for e in np.eye(3)])
+
+
 def latlong_directions(height: int, width: int) -> Array:
     """(H, W, 3) world directions of the pixel centres of a lat-long image."""
     theta = (np.arange(height) + 0.5) * (np.pi / height)

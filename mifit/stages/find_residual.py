@@ -116,6 +116,7 @@ def _difference(
     if refined is not None:
         known = np.any(refined[rows] != 0, axis=1)
         normal = np.where(known[:, None], normalize(refined[rows]), normal)
-    difference = seen.colour - np.stack([image(normal)[0] for image in images], axis=1)
-    weight = np.where(seen.measured > 0, seen.inlier, np.float32(0.0)).astype(np.float32)
-    return rows, np.where(weight[..., None] > 0, difference, np.float32(0.0)), weight
+    difference = np.zeros_like(seen.colour)
+    for j, (at, image) in enumerate(images):
+        difference[at, j] = seen.colour[at, j] - image(normal[at])[0]
+    return rows, difference, np.where(seen.measured > 0, seen.inlier, np.float32(0.0)).astype(np.float32)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from mifit.core import sh
 from mifit.core.image import read_image
@@ -58,6 +59,15 @@ def test_the_gradient_agrees_with_differences() -> None:
         e = step * np.eye(3)[axis]
         difference = (sh.basis(d + e, 9) - sh.basis(d - e, 9)) / (2 * step)
         assert np.abs(gradient[..., axis] - difference).max() < 1e-7
+
+
+@pytest.mark.parametrize("order", [1, 3, 8])
+def test_turning_is_the_change_under_small_rotations(order):
+    c, step = np.random.default_rng(0).normal(size=(order * order, 3)), 1e-5
+    for axis, change in zip(np.eye(3), sh.turning(c), strict=True):
+        turns = [Rotation.from_rotvec(-s * step * axis).as_matrix() for s in (1, -1)]
+        after, before = (sh.rotation_matrix(turn, order) @ c for turn in turns)
+        np.testing.assert_allclose(change, (after - before) / (2 * step), atol=1e-7)
 
 
 def test_cosine_coefficients_are_the_published_ones() -> None:

@@ -75,7 +75,7 @@ def sphere_problem(w1=1e-3 * 127.5 / 255**2, w2=1e-3, size=96, seed=0):
     def shade(n, turns=()):
         return image(n), [(image(n + 1e-6 * turn) - image(n - 1e-6 * turn)) / 2e-6 for turn in turns]
 
-    tangents, view = tangent_plane(base), NormalView(image(true), np.ones(len(base)), shade)
+    tangents, view = tangent_plane(base), NormalView(np.arange(len(base)), image(true), np.ones(len(base)), shade)
     return NormalProblem(base, tangents, texel_neighbours(texels), [view], w1, w2), base, tangents, true
 
 

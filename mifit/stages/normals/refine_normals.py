@@ -180,23 +180,27 @@ def solve_normals(problem: NormalProblem, max_iterations: int, start: NDArray, t
 
 def texel_images(
     surface: Surface, reflectance: ReflectanceEstimate, seed: int = 0
-) -> tuple[NDArray[np.intp], Observations, list[TexelImage]]:
-    """Texels (n,) that images of a surface's one timestep measure, what these show, and the model's image of each.
+) -> tuple[NDArray[np.intp], Observations, list[tuple[NDArray[np.intp], TexelImage]]]:
+    """Texels (n,) that images of a surface's one timestep measure, what these show, and the model's image for each.
 
-    Images are those of normals in object space. What stage 2 found in front of the face is left out.
+    An image is that of the texels that it measures, places in n, by their normals in object space. What stage 2 found
+    in front of the face is left out.
     """
     surface, texels = surface.without_hidden(reflectance), surface.texels
     every = surface.observe(np.arange(len(texels.index)))
     rows = np.flatnonzero((every.measured > 0).any(1))
     seen = every.take(rows)
-    albedos = texels.from_map(reflectance.lit_diffuse)[rows], texels.from_map(reflectance.specular)[rows]
+    albedos = [texels.from_map(each)[rows] for each in (reflectance.lit_diffuse, reflectance.specular)]
     appearance = Appearance(models.get(reflectance.shading_model), reflectance.illumination, reflectance.lobe)
     base = seen.normal[:, 0]
     points = MeshPoints(seen.point[:, 0], base, seen.face, seen.barycentric)
     occlusion = appearance.trace(surface.meshes[0], points, seed)
-    fixed = albedos, surface.geometry.rotation[0]
-    views = range(len(seen.step))
-    return rows, seen, [BentImage(appearance, base, seen.view[:, j], occlusion, *fixed) for j in views]
+    images: list[tuple[NDArray[np.intp], TexelImage]] = []
+    for j in range(len(seen.step)):
+        at = np.flatnonzero(seen.measured[:, j] > 0)
+        fixed = seen.view[at, j], occlusion.take(at), (albedos[0][at], albedos[1][at]), surface.geometry.rotation[0]
+        images.append((at, BentImage(appearance, base[at], *fixed)))
+    return rows, seen, images
 
 
 def frame_problem(
@@ -217,7 +221,7 @@ def frame_problem(
     if not len(rows):
         return None, rows, base
 
-    views = [NormalView(seen.colour[:, j], seen.measured[:, j], image) for j, image in enumerate(images)]
+    views = [NormalView(at, seen.colour[at, j], seen.measured[at, j], image) for j, (at, image) in enumerate(images)]
     patch = TexelMap(texels.size, texels.index[rows], texels.face[rows], texels.weights[rows])
     # Single precision: it is that of the images.
     problem = NormalProblem(
@@ -234,18 +238,25 @@ def frame_problem(
 
 @dataclass(frozen=True)
 class NormalView:
-    """One image of N texels.
+    """One image of n of the texels.
 
     Attributes
     ----------
-    colour : (N, 3), weight : (N,)
-        Linear image colour, and weight of its squared residual; 0 where the image doesn't measure the texel.
+    texel : (n,) int
+        Which they are.
+    colour : (n, 3), weight : (n,)
+        Linear image colour, and weight of its squared residual.
     shade : TexelImage
     """
 
+    texel: NDArray[np.intp]
     colour: NDArray
     weight: NDArray
     shade: TexelImage
+
+    def rows(self, values: NDArray) -> NDArray:
+        """Those of the texels of values (N, 3), column by column."""
+        return values.T[:, self.texel].T
 
 
 class NormalProblem:
@@ -276,10 +287,7 @@ class NormalProblem:
     ) -> None:
         # Columns are contiguous: all that follows goes through them one by one.
         self.normals, self.tangents = np.asfortranarray(normals), np.asfortranarray(tangents)
-        self.views = [
-            replace(view, colour=np.where((view.weight > 0)[:, None], view.colour, 0.0).astype(view.colour.dtype, "F"))
-            for view in views
-        ]
+        self.views = [replace(view, colour=np.asfortranarray(view.colour)) for view in views]
         self.laplacian = graph_laplacian(neighbours).astype(self.normals.dtype)
         self.w1, self.w2 = laplacian_weight, magnitude_weight
         self.prior = 0.0 if prior is None else bend(self.normals, self.tangents, prior) - self.normals
@@ -292,7 +300,7 @@ class NormalProblem:
         n = bend(self.normals, self.tangents, self._offsets(x))
         data = 0.0
         for view in self.views:
-            residual = view.colour - view.shade(n)[0]
+            residual = view.colour - view.shade(view.rows(n))[0]
             data += float(np.sum(view.weight * dot(residual, residual), dtype=np.float64))
         delta = n - self.normals
         rough = magnitude = 0.0
@@ -318,12 +326,12 @@ class NormalProblem:
         gradient = [dot(first, pull), dot(second, pull)]
         blocks = [self.w2 * dot(first, first), self.w2 * dot(first, second), self.w2 * dot(second, second)]
         for view in self.views:
-            image, (along, across) = view.shade(n, [first, second])
+            image, (along, across) = view.shade(view.rows(n), [view.rows(first), view.rows(second)])
             residual = view.colour - image
             for i, slope in enumerate((along, across)):
-                gradient[i] -= view.weight * dot(slope, residual)
+                gradient[i][view.texel] -= view.weight * dot(slope, residual)
             for i, product in enumerate((dot(along, along), dot(along, across), dot(across, across))):
-                blocks[i] += view.weight * product
+                blocks[i][view.texel] += view.weight * product
         flat = np.stack(gradient, axis=1, dtype=np.float64).ravel()
         return NormalSystem(flat, np.stack(blocks), turns, stiffness, self.laplacian)
 

@@ -111,7 +111,7 @@ class Forward:
         transfer, there = None, seen.weight > 0
         if self.model.needs_shadows:
             every = VertexTransfer.joined([s.transfer for s in steps if s.transfer is not None], seen.step)
-            transfer = VertexTransfer(every.values, every.corners[there.ravel()], every.weights[there.ravel()])
+            transfer = every.take(there.ravel())
         visible = tuple(
             np.stack(bits, axis=1)[:, seen.step][there] for bits in zip(*(s.visible for s in steps), strict=True)
         )
