@@ -19,7 +19,7 @@ from mifit.core.files import Document
 from mifit.core.photometry import Photometry
 
 if TYPE_CHECKING:
-    from mifit.appearance.illumination import Illumination
+    from mifit.appearance.illumination import DistantLight, Illumination
     from mifit.appearance.lobe import Lobe
 
 
@@ -79,7 +79,8 @@ class GeometryEstimate:
     which are divided out when a capture is read for this fit. ``displacement`` (V, 3) is the neutral surface beyond the
     model's span, object space: ``model.mean`` plus this is what coefficients add to; None where the surface is the
     model's. ``landmark_noise`` is the standard deviation of a landmark coordinate, pixels: of the detector as set, or
-    of residuals where that is more.
+    of residuals where that is more. ``lights`` are the compact lights that shading showed, without colour; None where
+    it wasn't looked at.
     """
 
     timesteps: tuple[int, ...]
@@ -97,6 +98,7 @@ class GeometryEstimate:
     photometry: Photometry = field(default_factory=Photometry)
     displacement: NDArray | None = None
     landmark_noise: float = 0.0
+    lights: tuple[DistantLight, ...] | None = None
 
     def index(self, timestep: int) -> int:
         """Position of a timestep in the per-timestep arrays; KeyError when it was not fitted."""

@@ -100,8 +100,8 @@ def refine_surface(
     Returns
     -------
     GeometryEstimate
-        With another ``displacement`` of the face area, and the vertices that follow. With one view, views from nearly
-        one place, or without robust weights, ``geometry`` as it is.
+        With another ``displacement`` of the face area, the vertices that follow, and ``lights``. With one view, views
+        from nearly one place, or without robust weights, ``geometry`` as it is.
     """
     began = time.perf_counter()
     config = config or ReflectanceConfig()
@@ -135,7 +135,8 @@ def refine_surface(
         "moved_last_mm": moved * field.millimetres,
         "seconds": seconds,
     }
-    return replace(geometry, report=geometry.report.after(seconds, phase))
+    lights = forward.appearance.illumination.lights if forward.model.needs_shadows else None
+    return replace(geometry, lights=lights, report=geometry.report.after(seconds, phase))
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from stages.reflectance_scene import EXPONENT, SIZE, render, turning_dome
 
+from mifit.appearance.illumination import DistantLight
 from mifit.config import ReflectanceConfig
 from mifit.errors import InputError
 from mifit.sampling.observations import Surface
@@ -138,6 +139,12 @@ def test_auto_is_the_shadowed_model_without_lights_that_are_not_there(dome):
     estimate = infer(dome, replace(CONFIG, shading="auto"))
     assert estimate.shading_model == "shadowed" and estimate.illumination.lights == ()
     assert estimate.report.details["shading"] == {"model": "shadowed", "exponent": EXPONENT, "lights": 0}
+
+
+def test_lights_that_shading_showed_keep_their_places(dome):
+    given = DistantLight(np.array([0.0, 0.6, 0.8]), 0.05, np.zeros(3))
+    (found,) = infer(dome, replace(CONFIG, shading="auto"), lights=(given,)).illumination.lights
+    assert found.radius == given.radius and (found.direction == given.direction).all()
 
 
 def test_without_specular_reflection_all_is_diffuse(dome):

@@ -105,7 +105,8 @@ def find_forward(
 ) -> tuple[Forward, LightingSolution | None]:
     """The model that is fitted, its compact lights and its lobe, and a first lighting of some of the texels.
 
-    That lighting is None where weights aren't robust: nothing is found out then before the fit itself.
+    Lights are those of the geometry where it has any. The lighting is None where weights aren't robust: nothing is
+    found out then before the fit itself.
     """
     model = models.get("shadowed" if config.shading == "auto" else config.shading)
     given, robust, found = config.exponent or model.exponent, config.robust, None
@@ -115,10 +116,12 @@ def find_forward(
     if robust:
         some = surface.sample(max(1, OBSERVATIONS // surface.image_count), np.random.default_rng(seed))
         seen, expected = surface.observe(some), albedo[some]
-        if model.needs_shadows:
+        lights = surface.geometry.lights if model.needs_shadows else ()
+        if lights is None:
             lights, found = find_lights(seen, forward, expected)
             forward = forward.with_lights(lights)
         else:
+            forward = forward.with_lights(lights)
             found = fit_lighting(seen, forward, expected, robust, ITERATIONS)
     return forward.with_lobe(replace(lobe, exponent=given or EXPONENT)), found
 
