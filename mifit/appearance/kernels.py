@@ -173,9 +173,9 @@ def lobe_factors(lobe: PreparedLobe, moments: list[Jit]) -> list[Jit]:
 
 @dataclass(frozen=True)
 class SmoothLight:
-    """SH coefficients of radiance on the device, with what gives its slopes: for one value of each, not a transfer.
+    """SH coefficients of radiance on the device, and how they change as directions turn, for its slopes.
 
-    ``coefficients`` are B*B colours, ``turning`` three times as many, see ``core.sh.turning``.
+    ``coefficients`` are B*B colours; ``turning`` has as many for each of three axes, see ``core.sh.turning``.
     """
 
     coefficients: list[Jit]
@@ -188,10 +188,11 @@ class SmoothLight:
         dr.make_opaque(both)
         return cls(both[0], both[1:])
 
-    def about(self, axis: Jit, factors: Sequence[Jit]) -> Jit:
-        """Radiance (Color3f) smoothed by a zonal kernel about unit directions; ``factors`` of its B bands.
+    def convolved(self, axis: Jit, factors: Sequence[Jit]) -> Jit:
+        """Radiance (Color3f) about unit directions, convolved with the zonal kernel whose bands have these factors.
 
-        Its gradient is that by the factors, and by the axis along the sphere.
+        Its gradient is that by the factors, and by the axis along the sphere: in closed form, from the same basis
+        functions as the value.
         """
         at = dr.detach(axis)
         basis = sh_basis(at, len(factors))
@@ -242,9 +243,9 @@ def light_transfer(n: Jit, v: Jit, lobe: PreparedLobe, directions: Jit, count: J
 
     ``directions`` (3 * count, flat) stand for the light's extent; there are ``count`` (UInt32) of them, at most 32
     (``DistantLight.samples``). Bit d of ``visible`` is 1 where direction d is visible. A loop goes through them: a
-    kernel with a copy of the lobe for each takes long to compile.
+    kernel with a copy of the lobe for each takes long to compile. It sums gradients by the normal too, where these are
+    wanted; there is none by anything else.
     """
-
     sloped, at = dr.grad_enabled(n), dr.detach(n)
 
     def add(k: Jit, sums: list[Jit], slopes: list[Jit]) -> tuple[Jit, list[Jit], list[Jit]]:

@@ -199,7 +199,7 @@ class ShadowedModel(ShadingModel):
         lobe keeps its dimming.
         """
         shadowed, lambertian = self._traced(shadowed), (cosine_coefficients(lobe.order) / np.pi).tolist()
-        blocked, open_sky = radiance(shadowed, light.coefficients), light.about(base, lambertian)
+        blocked, open_sky = radiance(shadowed, light.coefficients), light.convolved(base, lambertian)
         passed = dr.clip(mi.luminance(blocked) / dr.maximum(mi.luminance(open_sky), 1e-6), 0.0, 1.0)
         specular_passed = unoccluded(base, lobe_axis(base, v, lobe)[0], shadowed, lobe.order)
         rest = blocked - passed * open_sky
@@ -207,8 +207,8 @@ class ShadowedModel(ShadingModel):
 
         def shade(n: Jit, toward: Jit) -> tuple[Jit, Jit]:
             axis, moments = lobe_axis(n, toward, lobe)
-            specular = light.about(axis, lobe_factors(lobe, moments))
-            return rest + passed * light.about(n, lambertian), specular_passed * specular
+            specular = light.convolved(axis, lobe_factors(lobe, moments))
+            return rest + passed * light.convolved(n, lambertian), specular_passed * specular
 
         return shade
 

@@ -53,8 +53,8 @@ FEWEST = 200
 
 VALID_AND_LOG = [1, 2]
 """Channels of a feature image."""
-MARGIN, OUTSIDE, UNSEEN = 8, -10.0, 9.0
-"""Texels that windows reach; a pixel that no image has; more than windows can be unlike."""
+MARGIN, OUTSIDE, UNSEEN, BLIND = 5, -10.0, 9.0, -1e9
+"""Texels that windows reach; a pixel that no image has; more than windows can be unlike; a logarithm of no colour."""
 
 T = TypeVar("T")
 View = tuple[int, int]
@@ -180,8 +180,8 @@ class _Sweep:
         Numbers of the texels, and of their places in the maps, which are a part of those of all texels.
     first : (h, w) float32
         The first view's logarithm.
-    second : two of (H, W) float32
-        The second view's image: 1 where it is measured, and the logarithm.
+    second : (H, W) float32
+        The second view's logarithm, `BLIND` where it isn't measured.
     place, slope : (h, w, 2) float32
         Its pixels that show the texels, and how far a step along the first view's rays moves them.
     """
@@ -189,7 +189,7 @@ class _Sweep:
     texel: NDArray[np.intp]
     at: NDArray[np.intp]
     first: NDArray[np.float32]
-    second: tuple[NDArray[np.float32], NDArray[np.float32]]
+    second: NDArray[np.float32]
     place: NDArray[np.float32]
     slope: NDArray[np.float32]
 
@@ -224,8 +224,8 @@ class _Sweep:
             return out.reshape(*size, *values.shape[1:])
 
         place, slope = spread(0.5 * (near + far), OUTSIDE), spread((far - near) / (2.0 * FARTHEST))
-        valid, seen = (np.ascontiguousarray(shows.values[..., k]) for k in VALID_AND_LOG)
-        return cls(both, at, spread(log), (valid, seen), place, slope)
+        valid, seen = (shows.values[..., k] for k in VALID_AND_LOG)
+        return cls(both, at, spread(log), np.where(valid > 0.99, seen, np.float32(BLIND)), place, slope)
 
     def compare(self, offset: float, beside: float = 0.0) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(n,) how unlike the windows of both views are, and how much brighter the first one is.
@@ -236,11 +236,11 @@ class _Sweep:
         if beside:
             along = self.slope / np.maximum(np.linalg.norm(self.slope, axis=-1, keepdims=True), np.float32(1e-9))
             place += along[..., ::-1] * np.array([-beside, beside], np.float32)
-        valid, log = (cv2.remap(each, place, None, cv2.INTER_LINEAR) for each in self.second)  # type: ignore[call-overload]
-        known = (valid > 0.99).astype(np.float32)
+        log = cv2.remap(self.second, place, None, cv2.INTER_LINEAR, borderValue=BLIND)  # type: ignore[call-overload]
+        known = (log > 1e-8 * BLIND).astype(np.float32)
         a, b = known * self.first, known * log
         maps = known, a, b, a * a + b * b, a * b
-        weight, *sums = (np.take(cv2.GaussianBlur(one, (0, 0), WINDOW), self.at) for one in maps)
+        weight, *sums = (np.take(cv2.GaussianBlur(one, (2 * MARGIN + 1,) * 2, WINDOW), self.at) for one in maps)
         a, b, squares, product = (one / np.maximum(weight, np.float32(1e-3)) for one in sums)
         variance = np.maximum(squares - a * a - b * b, 0)
         of_difference = np.maximum(variance - 2 * (product - a * b), 0)
