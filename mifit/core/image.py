@@ -166,8 +166,8 @@ def _decode_raster(data: bytes, path: str | Path) -> Image:
         has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
         codes = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
     alpha = np.float32(1 / 255) * codes[..., 3] if has_alpha else None
-    colour = codes[..., :3]
-    return Image(_linear(8)[colour], alpha, (colour == 255).any(-1), 8)
+    colour = np.ascontiguousarray(codes[..., :3])
+    return Image(_linear(8)[colour], alpha, cv2.inRange(colour, (0, 0, 0), (254, 254, 254)) == 0, 8)
 
 
 @functools.lru_cache(maxsize=2)
