@@ -25,10 +25,11 @@ from mifit.appearance.arrays import (
     weighted_rows,
 )
 from mifit.appearance.illumination import DistantLight, Illumination
-from mifit.appearance.kernels import PreparedLobe, SmoothLight, direct_light, light_transfer, prepare
+from mifit.appearance.kernels import PreparedLobe, SmoothLight, constants, direct_light, light_transfer, prepare
 from mifit.appearance.lobe import Lobe
 from mifit.appearance.models import Shade, ShadingModel
 from mifit.appearance.occlusion import MeshPoints, OccludingMesh, Occlusion, VertexTransfer
+from mifit.core.sh import turning
 from mifit.errors import InputError
 
 OPEN = Occlusion()
@@ -218,14 +219,13 @@ class _Scene:
                 f"{len(illumination.lights)}; trace it with Occlusion.trace"
             )
         self.visible = [mi.UInt(aligned(bits, np.uint32)) for bits in occlusion.visible]
-        # Inputs of the kernel instead of constants in it, so that it is compiled once.
-        self.coefficients = [mi.Color3f(*map(float, row)) for row in illumination.radiance]
-        dr.make_opaque(self.coefficients)
+        self.coefficients = constants(illumination.radiance)
         self.lobe: PreparedLobe = prepare(appearance.lobe, order)
 
     def shader(self) -> Shade:
         """Shading of bent normals, compact lights included."""
-        light = SmoothLight.of(self.appearance.illumination.radiance)
+        turned = [constants(each) for each in turning(self.appearance.illumination.radiance)]
+        light = SmoothLight(self.coefficients, turned)
         return self.with_lights(self.model.about(self.n, self.v, self.lobe, light, self.shadowed))
 
     def light(self, light: DistantLight, visible: Jit) -> Shade:
@@ -240,8 +240,7 @@ class _Scene:
         if not lights:
             return smooth
         parts = [self.light(*pair) for pair in zip(lights, self.visible, strict=True)]
-        colours = [mi.Color3f(*map(float, light.colour)) for light in lights]
-        dr.make_opaque(colours)
+        colours = constants(np.array([light.colour for light in lights]))
 
         def shade(n: Jit, v: Jit) -> tuple[Jit, Jit]:
             diffuse, specular = smooth(n, v)

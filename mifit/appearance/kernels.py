@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mifit.appearance.arrays import Jit, dr, mi
 from mifit.appearance.lobe import EXPONENT_MAX, EXPONENT_MIN, Lobe, lobe_table
-from mifit.core.sh import bands, cosine_coefficients, turning
+from mifit.core.sh import bands, cosine_coefficients
 from mifit.errors import InputError
 
 
@@ -171,6 +171,13 @@ def lobe_factors(lobe: PreparedLobe, moments: list[Jit]) -> list[Jit]:
     return [albedo, *(albedo * c for c in moments[2:])]
 
 
+def constants(values: NDArray) -> list[Jit]:
+    """Colours (K, 3) as inputs of kernels instead of constants in them, so that these are compiled once."""
+    found = [mi.Color3f(*row) for row in values.tolist()]
+    dr.make_opaque(found)
+    return found
+
+
 @dataclass(frozen=True)
 class SmoothLight:
     """SH coefficients of radiance on the device, and how they change as directions turn, for its slopes.
@@ -180,13 +187,6 @@ class SmoothLight:
 
     coefficients: list[Jit]
     turning: list[list[Jit]]
-
-    @classmethod
-    def of(cls, radiance: NDArray) -> SmoothLight:
-        """Of coefficients (B*B, 3)."""
-        both = [[mi.Color3f(*row) for row in each] for each in (radiance.tolist(), *turning(radiance).tolist())]
-        dr.make_opaque(both)
-        return cls(both[0], both[1:])
 
     def convolved(self, axis: Jit, factors: Sequence[Jit]) -> Jit:
         """Radiance (Color3f) about unit directions, convolved with the zonal kernel whose bands have these factors.

@@ -54,7 +54,8 @@ FEWEST = 200
 VALID_AND_LOG = [1, 2]
 """Channels of a feature image."""
 MARGIN, OUTSIDE, UNSEEN, BLIND = 5, -10.0, 9.0, -1e9
-"""Texels that windows reach; a pixel that no image has; more than windows can be unlike; a logarithm of no colour."""
+"""Texels that windows reach, chosen on gloss, Emily c3,c4, scan_city; a pixel that no image has; more than windows can
+be unlike; a logarithm of no colour."""
 
 T = TypeVar("T")
 View = tuple[int, int]
